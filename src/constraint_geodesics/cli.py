@@ -1,0 +1,119 @@
+"""The command `geodesics`, and how a stage starts."""
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from constraint_geodesics.params import Params, ParamsError, load_params
+from constraint_geodesics.paths import Layout
+
+WRONG_USAGE = 2
+
+app = typer.Typer(
+    help="Shortest robot paths that keep a task constraint.", no_args_is_help=True, add_completion=True,
+    pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]},
+)  # fmt: skip
+
+
+def main() -> None:
+    """Entry point of the command: an error of the user's is one line, not a traceback."""
+    try:
+        app()
+    except (ValueError, OSError, RuntimeError) as error:
+        raise SystemExit(_complain(error)) from None
+
+
+def run_stage(stage: Callable[..., None], arguments: Sequence[str]) -> None:
+    """Run one stage in this checkout: check params.yaml first, and report a bad input in one line.
+
+    arguments: the names after (params, layout), as dvc.yaml passes them; each must be one that params.yaml has.
+    """
+    try:
+        params = load_params()
+        _check_names(params, arguments)
+        stage(params, Layout(), *arguments)
+    except (ValueError, OSError, RuntimeError) as error:
+        if os.environ.get("GEODESICS_TRACEBACK"):
+            raise
+        raise SystemExit(_complain(error)) from None
+
+
+def _check_names(params: Params, arguments: Sequence[str]) -> None:
+    known = [*params.manifolds, *params.constraints, *params.geodesics.analytic]
+    for name in arguments:
+        if name not in known:
+            raise ParamsError(f"params.yaml: there is no {name!r}: must be one of {known}")
+
+
+def _complain(error: Exception) -> int:
+    print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+    return WRONG_USAGE if isinstance(error, ParamsError) else 1
+
+
+@app.command("params")
+def check_params(file: Annotated[Path, typer.Argument(help="The file to check.")] = Path("params.yaml")) -> None:
+    """Check a params.yaml: one line naming the first bad entry, or "ok"."""
+    load_params(file)
+    print(f"{file}: ok")
+
+
+@app.command("constraints")
+def list_constraints() -> None:
+    """List the constraints of params.yaml."""
+    for name, constraint in load_params().constraints.items():
+        print(f"{name:20s} {' '.join(map(str, constraint.axes))}  {constraint.description}")
+
+
+@app.command("results")
+def show_results() -> None:
+    """Print the committed result table and how to look further."""
+    table = Layout().root / "reports" / "table.md"
+    if not table.is_file():
+        raise FileNotFoundError(f"{table}: no results yet; run `make repro`")
+    recordings = recordings_of(Layout())
+    print(table.read_text().rstrip())
+    print("\nOpen the runs in MLflow:    make ui")
+    if recordings:
+        print(f"Replay a path in Rerun:     make replay FILE={recordings[0]}")
+    print("Read the report offline:    reports/index.html")
+
+
+@app.command("replay")
+def replay(
+    files: Annotated[list[Path] | None, typer.Argument(help="Recordings to open; none lists them.")] = None,
+    web: Annotated[bool, typer.Option(help="Open in a browser on this machine instead of a window.")] = False,
+) -> None:
+    """Replay recorded paths in Rerun; without a file, list the recordings."""
+    from constraint_geodesics.tracking.recording import open_recordings
+
+    if not files:
+        found = recordings_of(Layout())
+        if not found:
+            raise FileNotFoundError("data/recordings: no recordings yet; run `make repro`")
+        print("\n".join(map(str, found)))
+        print(f"\nOpen one with: geodesics replay {found[0]}")
+        return
+    for file in files:
+        if not file.is_file():
+            raise FileNotFoundError(f"{file}: no such recording")
+    raise SystemExit(open_recordings(files, web=web))
+
+
+@app.command("ui")
+def ui(port: Annotated[int, typer.Option(help="Port on 127.0.0.1.", min=1, max=65535)] = 5000) -> None:
+    """Open MLflow's dashboard for this checkout, on this machine only."""
+    from constraint_geodesics.tracking.experiment import ui_command
+
+    command = ui_command(Path().resolve(), port)
+    print(f"http://127.0.0.1:{port}  (stop with Ctrl-C)", flush=True)
+    os.execvp(command[0], command)
+
+
+def recordings_of(layout: Layout) -> list[Path]:
+    """All recordings of this checkout, level cup and learned paths first."""
+    found = (layout.root / "data" / "recordings").rglob("*.rrd")
+    return sorted(found, key=lambda file: ("level_cup" not in str(file), "train_geodesics" not in str(file), str(file)))

@@ -1,0 +1,174 @@
+"""The one function through which all parallel work goes: on the cores of this machine, or on a Dask scheduler's.
+
+A task gets one thread wherever it runs, so that the order of floating-point sums, and with it every result, is the
+same on any backend and with any number of workers.
+"""
+
+import asyncio
+import os
+import reprlib
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+import joblib
+from joblib.externals.loky.process_executor import BrokenProcessPool
+from threadpoolctl import threadpool_limits
+
+from constraint_geodesics.params import ComputeParams
+from constraint_geodesics.progress import progress
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+DASK_CONNECT_S = 5
+DASK_WORKERS_S = 10
+
+
+class ComputeError(RuntimeError):
+    """Parallel work that failed; the message is one line with the item and what went wrong with it."""
+
+
+def parallel_map(
+    function: Callable[[Item], Result], items: Sequence[Item], settings: ComputeParams, *, description: str = ""
+) -> list[Result]:
+    """[function(item) for item in items], in parallel; the results come in the order of the items.
+
+    `function` must depend on its item alone (randomness through a seed in the item) and leave the item unchanged: then
+    the results are identical for every backend and number of workers.  One worker or one item needs no second
+    process.  `description` names the work in the progress on standard error; without it there is none.
+    `settings.workers` counts processes on this machine (0: one per core this process may use); on Dask all of the
+    scheduler's workers take part, which need this package installed.
+    Raises ComputeError, one line, for the first item that fails, a worker that dies, or a scheduler that does not
+    answer; the tasks that have not started are dropped.
+    """
+    if not items:
+        return []
+    task = _Task(function, description)
+    results: dict[int, Result] = {}
+    with progress(description, len(items)) as advance, closing(_outcomes(task, items, settings)) as outcomes:
+        for index, result in outcomes:
+            results[index] = result
+            advance()
+    return [results[index] for index in range(len(items))]
+
+
+@dataclass(frozen=True)
+class _Task(Generic[Item, Result]):
+    """What a worker runs: the function, under a name for its errors."""
+
+    function: Callable[[Item], Result]
+    description: str
+
+    def __call__(self, index: int, item: Item) -> tuple[int, Result]:
+        try:
+            return index, self.function(item)
+        except Exception as error:
+            name = f"{self.description or self.function.__qualname__}, item {index} ({reprlib.repr(item)})"
+            raise ComputeError(f"{name}: {type(error).__name__}: {' '.join(str(error).split())}") from error
+
+    def in_worker(self, index: int, item: Item) -> tuple[int, Result]:
+        # never undone: a Dask worker may run other tasks beside this one
+        threadpool_limits(1)
+        _set_torch_threads(1)
+        return self(index, item)
+
+
+def _outcomes(
+    task: _Task[Item, Result], items: Sequence[Item], settings: ComputeParams
+) -> Iterator[tuple[int, Result]]:
+    workers = min(settings.workers or joblib.cpu_count(), len(items))
+    if settings.backend == "dask":
+        return _on_dask(task, items, str(settings.dask_address))
+    return _in_process(task, items) if workers == 1 else _on_loky(task, items, workers)
+
+
+def _in_process(task: _Task[Item, Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+    for index, item in enumerate(items):
+        with _one_thread():
+            outcome = task(index, item)
+        yield outcome
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """What a worker process has by its environment, for a task inside this process."""
+    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    torch_threads = sys.modules["torch"].get_num_threads() if "torch" in sys.modules else None
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # for libraries that the task is the first to load
+    try:
+        with threadpool_limits(1):
+            _set_torch_threads(1)
+            yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+        if torch_threads is not None:
+            _set_torch_threads(torch_threads)
+
+
+def _set_torch_threads(count: int) -> None:
+    """Torch's own count, where a task has loaded torch; loading it for this alone would take seconds."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(count)
+
+
+def _on_loky(task: _Task[Item, Result], items: Sequence[Item], workers: int) -> Iterator[tuple[int, Result]]:
+    # max_nbytes=None: joblib would hand large arrays over read-only, which the other backends don't
+    with joblib.parallel_config(backend="loky", n_jobs=workers, inner_max_num_threads=1, max_nbytes=None):
+        try:
+            yield from _run(task, items)
+        except BrokenProcessPool as error:
+            reason = "a worker process died (killed, or out of memory)"
+            raise ComputeError(f"{task.description or 'parallel work'}: {reason}") from error
+
+
+def _on_dask(task: _Task[Item, Result], items: Sequence[Item], address: str) -> Iterator[tuple[int, Result]]:
+    with _dask_client(address) as client, joblib.parallel_config(backend="dask", client=client):
+        yield from _run(task, items)
+
+
+def _run(task: _Task[Item, Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+    calls = (joblib.delayed(task.in_worker)(index, item) for index, item in enumerate(items))
+    outcomes: Any = joblib.Parallel(return_as="generator_unordered")(calls)
+    with closing(outcomes):
+        yield from outcomes
+
+
+@contextmanager
+def _dask_client(address: str) -> Iterator["Client"]:
+    from distributed import Client
+
+    _check_scheduler(address)
+    client = Client(address, timeout=DASK_CONNECT_S, set_as_default=False)
+    try:
+        client.wait_for_workers(1, timeout=DASK_WORKERS_S)
+        yield client
+    except TimeoutError as error:
+        raise ComputeError(f"compute.dask_address={address!r}: the scheduler has no workers") from error
+    finally:
+        client.close()
+
+
+def _check_scheduler(address: str) -> None:
+    """Ask the scheduler who it is: a Client that finds none there leaves threads behind that time out noisily."""
+    from distributed import Security, rpc
+
+    async def identity() -> None:
+        async with rpc(address, connection_args=Security().get_connection_args("client")) as scheduler:
+            await scheduler.identity()
+
+    async def in_time() -> None:
+        await asyncio.wait_for(identity(), DASK_CONNECT_S)
+
+    try:
+        asyncio.run(in_time())
+    except Exception as error:  # whatever else listens there may answer anything
+        reason = " ".join(str(error).split()) or f"no answer in {DASK_CONNECT_S} s"
+        raise ComputeError(f"compute.dask_address={address!r}: no Dask scheduler: {reason}") from error

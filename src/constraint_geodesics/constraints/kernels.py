@@ -1,0 +1,322 @@
+"""Compiled constraint residual, its Jacobian and the Gauss-Newton retraction, one configuration at a time.
+
+The orientation residual neither wraps nor locks.  With E = R R_refᵀ the rotation away from the reference:
+three held axes: the rotation vector of E; two held axes, axis k free: the swing that turns e_k back, i.e. the
+angle θ between R R_refᵀ e_k and e_k times its direction; one held axis k: the twist of E about e_k.
+The swing keeps its size up to θ = π, where the horizontal part of the axis alone would vanish upside down too.
+"""
+
+import numpy as np
+from numba import njit
+
+from constraint_geodesics.robot.kernels import geometric_jacobian, pose_of
+
+_COMPILE = {"cache": True, "fastmath": False, "nogil": True}
+_SMALL = 1e-9
+
+
+@njit(**_COMPILE)
+def _quaternion(e):  # type: ignore[no-untyped-def]
+    """Unit quaternion (w ≥ 0, x, y, z) of a rotation matrix, by Shepperd's branch with the largest component."""
+    q = np.empty(4)
+    trace = e[0, 0] + e[1, 1] + e[2, 2]
+    if trace > 0.0:
+        s = 2.0 * np.sqrt(trace + 1.0)
+        q[0], q[1] = 0.25 * s, (e[2, 1] - e[1, 2]) / s
+        q[2], q[3] = (e[0, 2] - e[2, 0]) / s, (e[1, 0] - e[0, 1]) / s
+    elif e[0, 0] >= e[1, 1] and e[0, 0] >= e[2, 2]:
+        s = 2.0 * np.sqrt(1.0 + e[0, 0] - e[1, 1] - e[2, 2])
+        q[0], q[1] = (e[2, 1] - e[1, 2]) / s, 0.25 * s
+        q[2], q[3] = (e[0, 1] + e[1, 0]) / s, (e[0, 2] + e[2, 0]) / s
+    elif e[1, 1] >= e[2, 2]:
+        s = 2.0 * np.sqrt(1.0 + e[1, 1] - e[0, 0] - e[2, 2])
+        q[0], q[1] = (e[0, 2] - e[2, 0]) / s, (e[0, 1] + e[1, 0]) / s
+        q[2], q[3] = 0.25 * s, (e[1, 2] + e[2, 1]) / s
+    else:
+        s = 2.0 * np.sqrt(1.0 + e[2, 2] - e[0, 0] - e[1, 1])
+        q[0], q[1] = (e[1, 0] - e[0, 1]) / s, (e[0, 2] + e[2, 0]) / s
+        q[2], q[3] = (e[1, 2] + e[2, 1]) / s, 0.25 * s
+    if q[0] < 0.0:
+        q *= -1.0
+    return q
+
+
+@njit(**_COMPILE)
+def _swing(w, k, r, linear):  # type: ignore[no-untyped-def]
+    """Swing rotation vector into r (3,) from e_k to the unit vector w; derivative (3, 3) to ω, where ẇ = ω × w."""
+    i, j = (k + 1) % 3, (k + 2) % 3
+    # e_k × w has the components (−w_j, w_i) along (e_i, e_j)
+    si, sj, c = -w[j], w[i], w[k]
+    s = np.sqrt(si * si + sj * sj)
+    theta = np.arctan2(s, c)
+    if s > _SMALL:
+        g = theta / s
+        dg = (s - theta * c) / (s * s)
+    else:
+        # upside down the direction is lost: lean towards e_i, so that a step is still taken
+        g = 1.0 if c > 0.0 else np.pi / _SMALL
+        dg = 0.0
+        if c < 0.0:
+            si = _SMALL
+    r[i], r[j] = g * si, g * sj
+    for a in range(3):
+        # ω = e_a gives ẇ = e_a × w
+        w0 = 0.0 if a == 0 else (w[2] if a == 1 else -w[1])
+        w1 = -w[2] if a == 0 else (0.0 if a == 1 else w[0])
+        w2 = w[1] if a == 0 else (-w[0] if a == 1 else 0.0)
+        dw = (w0, w1, w2)
+        dsi, dsj, dc = -dw[j], dw[i], dw[k]
+        dtheta = (c * (si * dsi + sj * dsj) / s - s * dc) if s > _SMALL else 0.0
+        linear[k, a] = 0.0
+        linear[i, a] = g * dsi + dg * dtheta * si
+        linear[j, a] = g * dsj + dg * dtheta * sj
+
+
+@njit(**_COMPILE)
+def _rotation_vector(quaternion, linear):  # type: ignore[no-untyped-def]
+    """Rotation vector (3,) of a unit quaternion and the inverse left Jacobian of SO(3), its derivative to ω."""
+    x, y, z = quaternion[1], quaternion[2], quaternion[3]
+    n = np.sqrt(x * x + y * y + z * z)
+    theta = 2.0 * np.arctan2(n, quaternion[0])
+    scale = theta / n if n > _SMALL else 2.0
+    r = np.array([x * scale, y * scale, z * scale])
+    if theta > 1e-4:
+        half = 0.5 * theta
+        b = (1.0 - half * np.cos(half) / np.sin(half)) / (theta * theta)
+    else:
+        b = 1.0 / 12.0
+    square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
+    for a in range(3):
+        for k in range(3):
+            linear[a, k] = b * r[a] * r[k]
+        linear[a, a] += 1.0 - b * square
+    linear[0, 1] += 0.5 * r[2]
+    linear[0, 2] -= 0.5 * r[1]
+    linear[1, 0] -= 0.5 * r[2]
+    linear[1, 2] += 0.5 * r[0]
+    linear[2, 0] += 0.5 * r[1]
+    linear[2, 1] -= 0.5 * r[0]
+    return r
+
+
+@njit(**_COMPILE)
+def _twist(quaternion, k, linear):  # type: ignore[no-untyped-def]
+    """Twist about e_k in component k of a (3,) vector, and its derivative to ω in row k of `linear`."""
+    r = np.zeros(3)
+    w, v = quaternion[0], quaternion[1:]
+    r[k] = 2.0 * np.arctan2(v[k], w)
+    square = max(w * w + v[k] * v[k], _SMALL)
+    i, j = (k + 1) % 3, (k + 2) % 3
+    # q̇ = ½ ω ⊗ q, so ẇ = −½ ω·v and v̇_k = ½ (w ω_k + (ω × v)_k) with (ω × v)_k = ω_i v_j − ω_j v_i
+    linear[k, k] = (w * w + v[k] * v[k]) / square
+    linear[k, i] = (w * v[j] + v[k] * v[i]) / square
+    linear[k, j] = (-w * v[i] + v[k] * v[j]) / square
+    return r
+
+
+@njit(**_COMPILE)
+def residual_of(held, reference_position, reference_rotation, position, rotation, residual, linear):  # type: ignore[no-untyped-def]
+    """Residual (6,) [m, rad] of one tool pose, and the (3, 3) matrix that turns ω into its orientation part.
+
+    Entries of axes that are not held are zero.
+    """
+    for i in range(3):
+        residual[i] = position[i] - reference_position[i] if held[i] else 0.0
+        residual[3 + i] = 0.0
+    linear[:, :] = 0.0
+    count = 0
+    for i in range(3):
+        count += held[3 + i]
+    if count == 0:
+        return
+    if count == 2:
+        free = 0
+        for i in range(3):
+            if not held[3 + i]:
+                free = i
+        v0, v1, v2 = reference_rotation[free, 0], reference_rotation[free, 1], reference_rotation[free, 2]
+        w = (
+            rotation[0, 0] * v0 + rotation[0, 1] * v1 + rotation[0, 2] * v2,
+            rotation[1, 0] * v0 + rotation[1, 1] * v1 + rotation[1, 2] * v2,
+            rotation[2, 0] * v0 + rotation[2, 1] * v1 + rotation[2, 2] * v2,
+        )
+        _swing(w, free, residual[3:], linear)
+        return
+    e = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                e[i, j] += rotation[i, k] * reference_rotation[j, k]
+    if count == 3:
+        residual[3:] = _rotation_vector(_quaternion(e), linear)
+    else:
+        axis = 0
+        for i in range(3):
+            if held[3 + i]:
+                axis = i
+        residual[3:] = _twist(_quaternion(e), axis, linear)
+
+
+@njit(**_COMPILE)
+def excess_of(held, tolerance, residual, excess, active):  # type: ignore[no-untyped-def]
+    """What of the residual lies outside the tolerance, signed, eq. 7; marks the rows a step must correct.
+
+    Held angles that share one tolerance form a cone (a ball, for three of them): the size of their vector counts.
+    """
+    worst = 0.0
+    shared = True
+    common = -1.0
+    square = 0.0
+    for i in range(6):
+        excess[i] = 0.0
+        active[i] = False
+        if i >= 3 and held[i]:
+            square += residual[i] * residual[i]
+            if common < 0.0:
+                common = tolerance[i]
+            elif tolerance[i] != common:
+                shared = False
+    size = np.sqrt(square)
+    for i in range(6):
+        if not held[i]:
+            continue
+        if i >= 3 and shared:
+            if size > common:
+                excess[i] = residual[i] * (1.0 - common / size)
+                active[i] = True
+                worst = max(worst, size - common)
+        else:
+            over = abs(residual[i]) - tolerance[i]
+            if over > 0.0:
+                excess[i] = over if residual[i] > 0.0 else -over
+                active[i] = True
+                worst = max(worst, over)
+    return worst
+
+
+@njit(**_COMPILE)
+def residual_batch(chain, held, reference_position, reference_rotation, q, residuals, jacobians):  # type: ignore[no-untyped-def]
+    """Residuals (B, 6) and their Jacobians (B, 6, D) of q (B, D); rows of axes that are not held are zero."""
+    origins, axes, prismatic, base, tool = chain
+    dof = q.shape[1]
+    position = np.empty(3)
+    rotation = np.empty((3, 3))
+    joint_origins = np.empty((dof, 3))
+    joint_axes = np.empty((dof, 3))
+    geometric = np.empty((6, dof))
+    linear = np.empty((3, 3))
+    for b in range(q.shape[0]):
+        pose_of(origins, axes, prismatic, base, tool, q[b], position, rotation, joint_origins, joint_axes)
+        residual_of(held, reference_position, reference_rotation, position, rotation, residuals[b], linear)
+        geometric_jacobian(prismatic, position, joint_origins, joint_axes, geometric)
+        for i in range(6):
+            for d in range(dof):
+                value = 0.0
+                if held[i] and i < 3:
+                    value = geometric[i, d]
+                elif held[i]:
+                    for k in range(3):
+                        value += linear[i - 3, k] * geometric[3 + k, d]
+                jacobians[b, i, d] = value
+
+
+@njit(**_COMPILE)
+def excess_batch(held, tolerance, residuals, excesses, worst):  # type: ignore[no-untyped-def]
+    """Signed excesses (B, 6) of residuals (B, 6), and the largest of each row (B,)."""
+    active = np.empty(6, dtype=np.bool_)
+    for b in range(residuals.shape[0]):
+        worst[b] = excess_of(held, tolerance, residuals[b], excesses[b], active)
+
+
+@njit(**_COMPILE)
+def _solve(matrix, right, size):  # type: ignore[no-untyped-def]
+    """Solve a small symmetric positive definite system in place by Cholesky's method; False if it is singular."""
+    for i in range(size):
+        for j in range(i + 1):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= matrix[i, k] * matrix[j, k]
+            if i == j:
+                if value <= 0.0:
+                    return False
+                matrix[i, i] = np.sqrt(value)
+            else:
+                matrix[i, j] = value / matrix[j, j]
+    for i in range(size):
+        for k in range(i):
+            right[i] -= matrix[i, k] * right[k]
+        right[i] /= matrix[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            right[i] -= matrix[k, i] * right[k]
+        right[i] /= matrix[i, i]
+    return True
+
+
+@njit(**_COMPILE)
+def retract_batch(  # type: ignore[no-untyped-def]
+    chain, held, tolerances, reference_position, reference_rotation, q, accuracy, iterations, largest_step, worst
+):
+    """Gauss-Newton onto the constraint, in place: q ← q − Jᵀ(JJᵀ)⁻¹ ι(q) until |ι| ≤ accuracy, for q (B, D).
+
+    tolerances: (B, 6), one band a configuration.  A step is never longer than `largest_step` [rad], so that a
+    point far away walks to its own branch instead of jumping to another.  worst (B,) gets the remaining excess.
+    """
+    origins, axes, prismatic, base, tool = chain
+    dof = q.shape[1]
+    position = np.empty(3)
+    rotation = np.empty((3, 3))
+    joint_origins = np.empty((dof, 3))
+    joint_axes = np.empty((dof, 3))
+    geometric = np.empty((6, dof))
+    linear = np.empty((3, 3))
+    residual = np.empty(6)
+    excess = np.empty(6)
+    active = np.empty(6, dtype=np.bool_)
+    rows = np.empty((6, dof))
+    normal = np.empty((6, 6))
+    right = np.empty(6)
+    step = np.empty(dof)
+    for b in range(q.shape[0]):
+        for iteration in range(iterations + 1):
+            pose_of(origins, axes, prismatic, base, tool, q[b], position, rotation, joint_origins, joint_axes)
+            residual_of(held, reference_position, reference_rotation, position, rotation, residual, linear)
+            worst[b] = excess_of(held, tolerances[b], residual, excess, active)
+            if not worst[b] > accuracy or iteration == iterations:
+                break
+            geometric_jacobian(prismatic, position, joint_origins, joint_axes, geometric)
+            size = 0
+            for i in range(6):
+                if not active[i]:
+                    continue
+                for d in range(dof):
+                    if i < 3:
+                        rows[size, d] = geometric[i, d]
+                    else:
+                        rows[size, d] = 0.0
+                        for k in range(3):
+                            rows[size, d] += linear[i - 3, k] * geometric[3 + k, d]
+                right[size] = excess[i]
+                size += 1
+            trace = 0.0
+            for i in range(size):
+                for j in range(i + 1):
+                    value = 0.0
+                    for d in range(dof):
+                        value += rows[i, d] * rows[j, d]
+                    normal[i, j] = value
+                trace += normal[i, i]
+            for i in range(size):
+                normal[i, i] += 1e-10 * trace + 1e-300
+            if not _solve(normal, right, size):
+                break
+            length = 0.0
+            for d in range(dof):
+                step[d] = 0.0
+                for i in range(size):
+                    step[d] += rows[i, d] * right[i]
+                length += step[d] * step[d]
+            length = np.sqrt(length)
+            scale = 1.0 if length <= largest_step else largest_step / length
+            for d in range(dof):
+                q[b, d] -= scale * step[d]

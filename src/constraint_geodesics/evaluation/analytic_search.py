@@ -1,0 +1,109 @@
+"""Policy search on manifolds whose distances are known: Fig. 3, and a check of the search against exact answers."""
+
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from constraint_geodesics.evaluation.geodesic_search import SeedLog
+from constraint_geodesics.geodesics.environment import COEFFICIENT_SCALE, begin
+from constraint_geodesics.geodesics.policy_search import TrainedPolicy, episode_settings, follow, train_policy
+from constraint_geodesics.geodesics.problem import ChartProblem, Ends
+from constraint_geodesics.geometry.analytic import Plane, Sphere
+from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.params import GeodesicParams
+
+PAIRS = 100
+PAIRS_SEED = 11
+DRAWN_ROLLOUTS = 12
+DRAWN = 65
+"""Points of a drawn curve."""
+
+MANIFOLDS = {
+    "plane": (Plane(), (-1.5, -1.5), (1.5, 1.5)),
+    "sphere": (Sphere(), (-1.0, -1.2), (1.0, 1.2)),
+}
+"""Manifold and the box of its chart that ends are drawn from: Cartesian, and elevation and azimuth [rad]."""
+
+
+@dataclass(frozen=True)
+class AnalyticTask:
+    """One seed on one analytic manifold."""
+
+    name: str
+    params: GeodesicParams
+    seed: int
+    scratch: Path
+    run: AbstractContextManager[SeedLog]
+
+
+@dataclass(frozen=True)
+class AnalyticResult:
+    """Length over exact distance for unseen pairs, of the first random curve and of the shortest one the policy's
+    mean meets from there, and curves to draw.
+
+    sampled: (n, T, 2) curves met while the policy searched the first pair; learned: (T, 2) the one it ended with.
+    """
+
+    seed: int
+    policy: TrainedPolicy
+    first_ratio: Float[np.ndarray, "P"]
+    ratio: Float[np.ndarray, "P"]
+    sampled: Float[np.ndarray, "n T 2"]
+    learned: Float[np.ndarray, "T 2"]
+
+    def figures(self) -> dict[str, float]:
+        """What is compared between seeds."""
+        return {"mean_ratio": float(self.ratio.mean()), "first_mean_ratio": float(self.first_ratio.mean())}
+
+
+def analytic_problem(name: str, params: GeodesicParams) -> ChartProblem:
+    """Geodesics on an analytic manifold by name."""
+    manifold, low, high = MANIFOLDS[name]
+    return ChartProblem(
+        manifold, PinnedPolynomial(manifold.dim, params.degree), np.array(low), np.array(high), params.nodes
+    )
+
+
+def run_analytic(task: AnalyticTask) -> AnalyticResult:
+    """Train a policy, then follow its mean on unseen pairs from curves that are anything but straight.
+
+    The straight line is no start here: in the plane it is the answer.
+    """
+    problem = analytic_problem(task.name, task.params)
+    with task.run as run:
+        policy = train_policy(problem, task.params, task.seed, task.scratch, run.log)
+    rng = np.random.default_rng(PAIRS_SEED)
+    settings, size = episode_settings(task.params), problem.curve.coefficients
+    ends = problem.sample_ends(PAIRS, rng)
+    first = begin(problem, ends, rng.normal(scale=COEFFICIENT_SCALE, size=(PAIRS, size)))
+    visited = follow(problem, policy.actor, settings, first, np.zeros((task.params.episode_steps, PAIRS, size)))
+    lengths = np.array([states.length for states in visited])
+    best = visited[int(lengths[:, 0].argmin())].phi[:1]
+    manifold = MANIFOLDS[task.name][0]
+    exact = manifold.distance(torch.from_numpy(ends.z_start), torch.from_numpy(ends.z_goal)).numpy()
+    return AnalyticResult(
+        task.seed, policy, lengths[0] / exact, lengths.min(axis=0) / exact,
+        _sampled(problem, policy, task, ends, rng), _points(problem, best, ends)[0],
+    )  # fmt: skip
+
+
+def _sampled(
+    problem: ChartProblem, policy: TrainedPolicy, task: AnalyticTask, ends: Ends, rng: np.random.Generator
+) -> Float[np.ndarray, "n T 2"]:
+    """Curves that sampled roll-outs between the first pair of ends meet."""
+    size = problem.curve.coefficients
+    first = begin(problem, ends[np.zeros(DRAWN_ROLLOUTS, int)], rng.normal(size=(DRAWN_ROLLOUTS, size)))
+    noise = rng.normal(size=(task.params.episode_steps, DRAWN_ROLLOUTS, size))
+    visited = follow(problem, policy.actor, episode_settings(task.params), first, noise)
+    return np.concatenate([_points(problem, states.phi, ends) for states in visited])
+
+
+def _points(problem: ChartProblem, phi: Float[np.ndarray, "n p"], ends: Ends) -> Float[np.ndarray, "n T 2"]:
+    """Points of curves between the first pair of ends."""
+    t = torch.linspace(0.0, 1.0, DRAWN, dtype=torch.float64)
+    arrays = (torch.from_numpy(x) for x in (phi, ends.z_start[:1], ends.z_goal[:1]))
+    return problem.curve.evaluate(*arrays, t)[0].numpy()

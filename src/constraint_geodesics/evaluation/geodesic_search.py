@@ -1,0 +1,198 @@
+"""One seed of policy search, from training to measured paths: the task that the seeds of a stage run in parallel."""
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float
+
+from constraint_geodesics.constraints.scene import Scene
+from constraint_geodesics.constraints.submanifold import GraphSubmanifold, Submanifold, component_of
+from constraint_geodesics.evaluation.metrics import Free, PathMeasures, measure_path
+from constraint_geodesics.constraints.vector import ConstraintManifold
+from constraint_geodesics.geodesics.policy_search import TrainedPolicy, save_policy, search, train_policy
+from constraint_geodesics.geodesics.problem import Ends, Geodesic, LearnedProblem
+from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.learning.dataset import Queries
+from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.params import GeodesicParams, JudgeParams, Params, SubmanifoldParams
+from constraint_geodesics.paths import Layout
+
+PLANNER, STRAIGHT = "learned_geodesic", "straight_latent_line"
+
+
+class SeedLog(Protocol):
+    """Where a seed reports while it trains."""
+
+    def log(self, step: int, metrics: dict[str, float]) -> None:
+        """Figures at an environment step."""
+        ...
+
+
+@dataclass(frozen=True)
+class SeedTask:
+    """Everything one seed needs; picklable, so that it may run in another process or on another machine."""
+
+    problem: LearnedProblem
+    scene: Scene
+    params: GeodesicParams
+    judge: JudgeParams
+    chart_name: str
+    queries: Queries
+    connected: Bool[np.ndarray, "Q"]
+    seed: int
+    scratch: Path
+    run: AbstractContextManager[SeedLog]
+
+
+@dataclass(frozen=True)
+class SeedResult:
+    """A trained policy, one row and one joint path a query, and the coefficients found (Q, p)."""
+
+    seed: int
+    policy: TrainedPolicy
+    rows: list[dict[str, Any]]
+    paths: list[Float[np.ndarray, "T D"]]
+    phi: Float[np.ndarray, "Q p"]
+
+    def figures(self) -> dict[str, float]:
+        """What is compared between seeds."""
+        valid = [row for row in self.rows if row["valid"]]
+        lengths = [row["length_rad"] for row in valid]
+        return {
+            "success": len(valid) / len(self.rows),
+            "length_median_rad": float(np.median(lengths)) if lengths else float("nan"),
+            "final_saving": self.policy.curve[-1]["saving"] if self.policy.curve else float("nan"),
+        }
+
+
+def run_seed(task: SeedTask) -> SeedResult:
+    """Train one policy, then search every query's geodesic with it and measure what was found."""
+    with task.run as run:
+        policy = train_policy(task.problem, task.params, task.seed, task.scratch, run.log)
+    rows, paths, coefficients = [], [], []
+    with task.scene.world() as world:
+        for query in range(len(task.queries)):
+            ends = query_ends(task.problem, task.queries, query)
+            accept = exact_check(task, ends, world.free)
+            if task.connected[query]:
+                found = search(task.problem, policy.actor, task.params, ends, task.seed, accept)
+            else:
+                found = Geodesic("not_connected", np.zeros(task.problem.curve.coefficients), *_NOTHING)
+            row, path = measured(task, query, found, ends, world.free)
+            rows.append({"planner": PLANNER, "query": query, "seed": task.seed, **row})
+            paths.append(path)
+            coefficients.append(found.phi)
+    return SeedResult(task.seed, policy, rows, paths, np.array(coefficients))
+
+
+def straight_rows(task: SeedTask) -> tuple[list[dict[str, Any]], list[Float[np.ndarray, "T D"]]]:
+    """The same rows and paths for the straight latent line, no policy: what policy search has to beat."""
+    phi = np.zeros(task.problem.curve.coefficients)
+    rows, paths = [], []
+    with task.scene.world() as world:
+        for query in range(len(task.queries)):
+            ends = query_ends(task.problem, task.queries, query)
+            costs = task.problem.evaluate(phi[None], ends)
+            found = Geodesic("solved", phi, float(costs.length[0]), float(costs.length[0]), 1, float("nan"))
+            row, path = measured(task, query, found, ends, world.free)
+            rows.append({"planner": STRAIGHT, "query": query, "seed": 0, **row})
+            paths.append(path)
+    return rows, paths
+
+
+def connected_queries(
+    submanifold: Submanifold, problem: LearnedProblem, queries: Queries, free: Free, params: SubmanifoldParams
+) -> Bool[np.ndarray, "Q"]:
+    """Which queries have both ends in one component; a drawn plane (two dimensions) says nothing about its exact set."""
+    if not isinstance(submanifold, GraphSubmanifold):
+        return np.ones(len(queries), dtype=bool)
+
+    def component(q: np.ndarray) -> int:
+        return component_of(submanifold, problem.chart, problem.manifold, q, free, params)
+
+    pairs = [(component(a), component(b)) for a, b in zip(queries.starts, queries.goals, strict=True)]
+    return np.array([a == b or min(a, b) < 0 for a, b in pairs])
+
+
+def geodesic_problem(
+    params: Params, chart: LearnedManifold, manifold: ConstraintManifold, joints: Float[np.ndarray, "n D"], name: str
+) -> LearnedProblem:
+    """The problem that params.yaml describes on the learned manifold `name`."""
+    geodesics = params.geodesics
+    curve = PinnedPolynomial(chart.dim, geodesics.degree)
+    retract = params.manifolds[name].retract
+    return LearnedProblem(
+        chart, manifold, curve, joints, geodesics.nodes, retract, geodesics.reward.inclusion_weight
+    )
+
+
+def query_ends(problem: LearnedProblem, queries: Queries, query: int) -> Ends:
+    """One query as ends of a batch of one."""
+    return problem.ends(queries.starts[query][None], queries.goals[query][None])
+
+
+def exact_check(task: SeedTask, ends: Ends, free: Free) -> Callable[[np.ndarray], bool]:
+    """The judge itself as the last check of a candidate; the paper's latent curves are taken as they come."""
+
+    def accept(phi: np.ndarray) -> bool:
+        if not task.problem.retract:
+            return True
+        path = task.problem.path(phi, ends, task.judge.spacing_rad)
+        return judged(task, path, ends, free).valid
+
+    return accept
+
+
+def judged(task: SeedTask, path: np.ndarray, ends: Ends, free: Free) -> PathMeasures:
+    """The path's measures, with the latent length on the manifold it was searched on."""
+    charts = {task.chart_name: task.problem.chart}
+    return measure_path(path, ends.q_start[0], ends.q_goal[0], task.problem.manifold, charts, free, task.judge)
+
+
+def measured(
+    task: SeedTask, query: int, found: Geodesic, ends: Ends, free: Free
+) -> tuple[dict[str, Any], Float[np.ndarray, "T D"]]:
+    """A result as a row of the table, and its joint path (empty where nothing was found)."""
+    empty = np.zeros((0, ends.q_start.shape[1]))
+    path = task.problem.path(found.phi, ends, task.judge.spacing_rad) if found.status == "solved" else empty
+    row = {"status": found.status, "time_s": found.time_s, "evaluations": found.evaluations}
+    return row | judged(task, path, ends, free).row(), path
+
+
+def save_seeds(
+    results: Sequence[SeedResult], queries: Queries, layout: Layout, stage: str, manifold: str, constraint: str
+) -> None:
+    """Weights and curves under data/, learning curves under reports/."""
+    folder, item = layout.geodesics(manifold, constraint), f"{manifold}-{constraint}"
+    folder.mkdir(parents=True, exist_ok=True)
+    for result in results:
+        save_policy(result.policy, folder, result.seed)
+    with (folder / "curves.npz").open("wb") as file:
+        np.savez_compressed(
+            file, phi=np.array([result.phi for result in results]), seeds=np.array([r.seed for r in results]),
+            starts=queries.starts, goals=queries.goals,
+        )  # fmt: skip
+    learning = [{"seed": result.seed, **row} for result in results for row in result.policy.curve]
+    write_table(learning, layout.report(stage, f"{item}-learning", "csv"))
+
+
+def write_table(rows: Sequence[Mapping[str, Any]], file: Path, **columns: str) -> None:
+    """Rows as CSV, with the same text in the given columns of each."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    pd.DataFrame(rows).assign(**columns).to_csv(file, index=False)
+
+
+def geodesic_figures(results: Sequence[SeedResult], connected: Bool[np.ndarray, "Q"]) -> dict[str, float]:
+    """Means and spreads over the seeds."""
+    per_seed = pd.DataFrame([result.figures() for result in results])
+    figures = {f"{name}_mean": float(per_seed[name].mean()) for name in per_seed}
+    figures |= {f"{name}_std": float(per_seed[name].std(ddof=0)) for name in per_seed}
+    return figures | {"queries_connected": float(connected.mean()), "seeds": float(len(results))}
+
+
+_NOTHING = (float("nan"), float("nan"), 0, 0.0)

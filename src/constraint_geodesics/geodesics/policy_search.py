@@ -1,0 +1,269 @@
+"""Policy search of geodesics (eqs. 13-15): PPO over random ends, then a batch of roll-outs for each query.
+
+PPO comes from stable-baselines3; what leaves this module is a small actor network in safetensors.
+"""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import joblib
+import numpy as np
+import torch
+from jaxtyping import Float
+from safetensors.torch import load_file, save_file
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecMonitor
+from torch import Tensor, nn
+
+from constraint_geodesics.geodesics.environment import (
+    COEFFICIENT_SCALE,
+    CurveStates,
+    CurveVecEnv,
+    EpisodeSettings,
+    advance,
+    begin,
+    observation_size,
+    observe,
+)
+from constraint_geodesics.geodesics.problem import Ends, Geodesic, GeodesicProblem
+from constraint_geodesics.params import GeodesicParams, PpoParams
+
+MOST_CHECKED = 40
+"""Candidates given to the exact check at most: those behind them are no shorter and mostly alike."""
+
+Report = Callable[[int, dict[str, float]], None]
+Accept = Callable[[Float[np.ndarray, "p"]], bool]
+
+
+class Actor(nn.Module):
+    """The policy alone: observation → mean action, with one standard deviation an action."""
+
+    def __init__(self, observation: int, hidden: tuple[int, ...], actions: int) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        width = observation
+        for size in hidden:
+            layers += [nn.Linear(width, size), nn.Tanh()]
+            width = size
+        self.body = nn.Sequential(*layers)
+        self.mean = nn.Linear(width, actions)
+        self.log_std = nn.Parameter(torch.zeros(actions))
+
+    def forward(self, observation: Float[Tensor, "B o"]) -> Float[Tensor, "B p"]:
+        """Mean actions."""
+        return self.mean(self.body(observation))
+
+    def act(
+        self, observation: Float[np.ndarray, "B o"], noise: Float[np.ndarray, "B p"]
+    ) -> Float[np.ndarray, "B p"]:
+        """Mean actions plus the given multiples of the standard deviation."""
+        with torch.no_grad():
+            mean = self(torch.from_numpy(observation)).numpy()
+            return mean + noise * self.log_std.exp().numpy()
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """An actor and its learning curve, one row a report."""
+
+    actor: Actor
+    curve: list[dict[str, float]]
+
+
+def episode_settings(params: GeodesicParams) -> EpisodeSettings:
+    """How episodes run."""
+    return EpisodeSettings(params.episode_steps, params.ppo.action_scale, params.reward)
+
+
+def train_policy(
+    problem: GeodesicProblem, params: GeodesicParams, seed: int, scratch: Path, report: Report
+) -> TrainedPolicy:
+    """Train one policy on random ends.
+
+    scratch: folder of the checkpoints; training interrupted at any time goes on from the last one and ends as if it
+    had never stopped.  report: called with (environment steps, figures) after every rollout.
+    """
+    torch.manual_seed(seed)
+    environment = CurveVecEnv(problem, episode_settings(params), params.environments, seed)
+    model = _ppo(environment, params, seed)
+    log = _Progress(environment, params, seed, scratch, report)
+    log.restore(model)
+    remaining = params.steps - model.num_timesteps
+    if remaining > 0:
+        # with reset_num_timesteps=False stable-baselines3 adds the steps already done to this total itself
+        model.learn(remaining, callback=log, reset_num_timesteps=False)
+        log.save()
+    actor = Actor(observation_size(problem), params.ppo.hidden, problem.curve.coefficients)
+    actor.load_state_dict(actor_weights(model.policy.state_dict()))
+    return TrainedPolicy(actor.eval().requires_grad_(False), log.rows)
+
+
+def search(
+    problem: GeodesicProblem, actor: Actor, params: GeodesicParams, ends: Ends, seed: int, accept: Accept
+) -> Geodesic:
+    """The shortest acceptable curve that a batch of roll-outs meets between one start and goal.
+
+    The first roll-out follows the policy's mean from the straight line, the others sample its actions, half of them
+    from random curves.  Every curve met counts, the straight line included, so policy search never returns a longer
+    curve than it began with.  accept: an exact check (collision, say) applied to the candidates, shortest first.
+    """
+    began = time.perf_counter()
+    rng = np.random.default_rng(seed)
+    count, size = params.rollouts, problem.curve.coefficients
+    phi = rng.normal(scale=COEFFICIENT_SCALE, size=(count, size))
+    phi[: (count + 1) // 2] = 0.0
+    noise = rng.normal(size=(params.episode_steps, count, size))
+    noise[:, 0] = 0.0
+    first = begin(problem, ends[np.zeros(count, dtype=int)], phi)
+    visited = follow(problem, actor, episode_settings(params), first, noise)
+    costs = np.concatenate([states.cost for states in visited])
+    coefficients = np.concatenate([states.phi for states in visited])
+    return _first_accepted(problem, ends, costs, coefficients, accept, began)
+
+
+def follow(
+    problem: GeodesicProblem, actor: Actor, settings: EpisodeSettings, states: CurveStates,
+    noise: Float[np.ndarray, "I B p"],
+) -> list[CurveStates]:  # fmt: skip
+    """The I + 1 states of B roll-outs; noise: multiples of the policy's standard deviation, 0 for its mean."""
+    visited = [states]
+    for step_noise in noise:
+        action = actor.act(observe(problem, settings, visited[-1]), step_noise)
+        visited.append(advance(problem, settings, visited[-1], action)[0])
+    return visited
+
+
+def _first_accepted(
+    problem: GeodesicProblem, ends: Ends, costs: np.ndarray, coefficients: np.ndarray, accept: Accept, began: float
+) -> Geodesic:
+    straight = problem.evaluate(np.zeros((1, coefficients.shape[1])), ends)
+    coefficients = np.concatenate([np.zeros((1, coefficients.shape[1])), coefficients])
+    costs = np.concatenate([straight.cost, costs])
+    order = np.argsort(costs, kind="stable")[:MOST_CHECKED]
+    exact = problem.evaluate(coefficients[order], ends[np.zeros(len(order), dtype=int)])
+    for row, feasible, length in zip(order, exact.feasible, exact.length, strict=True):
+        if feasible and accept(coefficients[row]):
+            return Geodesic(
+                "solved", coefficients[row], float(length), float(straight.length[0]), len(costs),
+                time.perf_counter() - began,
+            )  # fmt: skip
+    return Geodesic(
+        "not_found", coefficients[order[0]], float("nan"), float(straight.length[0]), len(costs),
+        time.perf_counter() - began,
+    )  # fmt: skip
+
+
+def save_policy(policy: TrainedPolicy, folder: Path, seed: int) -> None:
+    """Weights (safetensors) and layer sizes (JSON) of one seed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    actor = policy.actor
+    save_file(actor.state_dict(), folder / f"policy-{seed}.safetensors")
+    sizes = {
+        "observation": actor.body[0].in_features if len(actor.body) else actor.mean.in_features,
+        "hidden": [layer.out_features for layer in actor.body if isinstance(layer, nn.Linear)],
+        "actions": actor.mean.out_features,
+    }
+    (folder / f"policy-{seed}.json").write_text(json.dumps(sizes, sort_keys=True) + "\n")
+
+
+def load_policy(folder: Path, seed: int) -> Actor:
+    """Read what `save_policy` wrote."""
+    sizes = json.loads((folder / f"policy-{seed}.json").read_text())
+    actor = Actor(sizes["observation"], tuple(sizes["hidden"]), sizes["actions"])
+    actor.load_state_dict(load_file(folder / f"policy-{seed}.safetensors"))
+    return actor.eval().requires_grad_(False)
+
+
+def actor_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The actor's part of a stable-baselines3 policy, under this module's names."""
+    prefix = "mlp_extractor.policy_net."
+    weights = {f"body.{name.removeprefix(prefix)}": w for name, w in state.items() if name.startswith(prefix)}
+    weights |= {f"mean.{part}": state[f"action_net.{part}"] for part in ("weight", "bias")}
+    return {name: w.detach().clone() for name, w in (weights | {"log_std": state["log_std"]}).items()}
+
+
+def _ppo(environment: CurveVecEnv, params: GeodesicParams, seed: int) -> PPO:
+    ppo: PpoParams = params.ppo
+    return PPO(
+        "MlpPolicy", VecMonitor(environment), seed=seed, device="cpu", verbose=0, n_steps=ppo.rollout_steps,
+        batch_size=ppo.batch_size, n_epochs=ppo.epochs, gamma=ppo.gamma, gae_lambda=ppo.gae_lambda,
+        clip_range=ppo.clip, ent_coef=ppo.entropy,
+        learning_rate=lambda left: ppo.learning_rate_end + left * (ppo.learning_rate - ppo.learning_rate_end),
+        policy_kwargs={"net_arch": list(ppo.hidden), "log_std_init": -0.5},
+    )  # fmt: skip
+
+
+class _Progress(BaseCallback):
+    """Reports each rollout and keeps a checkpoint from which training goes on as if it had never stopped."""
+
+    def __init__(
+        self, environment: CurveVecEnv, params: GeodesicParams, seed: int, scratch: Path, report: Report
+    ) -> None:
+        super().__init__()
+        self.environment, self.every, self.report = environment, params.checkpoint_steps, report
+        # a checkpoint belongs to its inputs: with other data, parameters or seed it is not found
+        key = joblib.hash((environment.problem.fingerprint(), params.model_dump(), seed))
+        self.file = scratch / f"{key}.pt"
+        self.rows: list[dict[str, float]] = []
+        self._saved_at = 0
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps - self._saved_at >= self.every:
+            self.save()
+
+    def _on_rollout_end(self) -> None:
+        figures = self.environment.pop_figures()
+        self.rows.append({"steps": float(self.num_timesteps), **figures})
+        self.report(self.num_timesteps, figures)
+
+    def save(self) -> None:
+        """Called between an update and the next rollout, where all that is still to come depends on this state."""
+        environment, model = self.environment, self.model
+        states = environment.states
+        arrays = {name: value for name, value in vars(states).items() if name != "ends"}
+        content: dict[str, Any] = {
+            "policy": model.policy.state_dict(),
+            "optimiser": model.policy.optimizer.state_dict(),
+            "torch_rng": torch.get_rng_state(),
+            "numpy_rng": np.random.get_state()[1].tolist(),  # noqa: NPY002 - stable-baselines3 shuffles with it
+            "numpy_rng_place": np.random.get_state()[2],  # noqa: NPY002
+            "environment_rng": json.dumps(environment.rng.bit_generator.state),
+            "states": {name: torch.from_numpy(value) for name, value in arrays.items()},
+            "ends": {name: torch.from_numpy(value) for name, value in vars(states.ends).items()},
+            "returns": torch.from_numpy(environment.returns),
+            "steps": self.num_timesteps,
+            "rows": self.rows,
+        }
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        torch.save(content, self.file.with_suffix(".new"))
+        self.file.with_suffix(".new").replace(self.file)  # an interruption leaves the old or the new, never half
+        self._saved_at = self.num_timesteps
+
+    def restore(self, model: PPO) -> None:
+        """Put the last checkpoint, if there is one, back into the model and the environment."""
+        if not self.file.is_file():
+            return
+        content = torch.load(self.file, weights_only=True)
+        model.policy.load_state_dict(content["policy"])
+        model.policy.optimizer.load_state_dict(content["optimiser"])
+        torch.set_rng_state(content["torch_rng"])
+        place = ("MT19937", np.array(content["numpy_rng"], np.uint32), content["numpy_rng_place"], 0, 0.0)
+        np.random.set_state(place)  # noqa: NPY002
+        environment = self.environment
+        environment.rng.bit_generator.state = json.loads(content["environment_rng"])
+        ends = Ends(**{name: value.numpy() for name, value in content["ends"].items()})
+        arrays = {name: value.numpy() for name, value in content["states"].items()}
+        environment.states = CurveStates(ends=ends, **arrays)
+        environment.returns = content["returns"].numpy()
+        model.num_timesteps = self._saved_at = content["steps"]
+        model._last_obs = observe(environment.problem, environment.settings, environment.states)
+        model._last_episode_starts = (environment.states.step == 0)
+        self.rows = content["rows"]

@@ -1,0 +1,105 @@
+"""A trained manifold: the stochastic embedding f(z) = (μ(z), σ(z)), its pullback metric (eq. 5), and its files."""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from constraint_geodesics.geometry.manifold import pullback_metric
+from constraint_geodesics.learning.vae import JointVae
+
+PIECE = 512
+"""Points embedded at once: larger temporaries leave the cache and cost three times as much a point."""
+
+WEIGHTS, CARD = "weights.safetensors", "manifold.json"
+
+
+class ManifoldFileError(ValueError):
+    """A saved manifold that is missing, incomplete or altered; the message names the file."""
+
+
+@dataclass(frozen=True)
+class LearnedManifold:
+    """The latent space of a trained VAE as a Riemannian manifold.  Implements the Manifold protocol.
+
+    dim N latent dimensions; ambient_dim 2D: every joint's mean and standard deviation [rad].
+    """
+
+    vae: JointVae
+
+    @property
+    def dim(self) -> int:
+        """Latent dimension N."""
+        return self.vae.latent_dim
+
+    @property
+    def ambient_dim(self) -> int:
+        """2D: mean and standard deviation of each joint."""
+        return 2 * self.vae.dof
+
+    def embed(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch A"]:
+        """f(z) = (μ(z), σ(z)) [rad]."""
+        return torch.cat([self.vae.mean(z), self.vae.deviation(z)], dim=-1)
+
+    def metric(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch N N"]:
+        """M(z) = JμᵀJμ + JσᵀJσ, eq. 5."""
+        return pullback_metric(self.embed, z)
+
+    def encode(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch N"]:
+        """Posterior mean of joint configurations [rad]."""
+        with torch.no_grad():
+            return self.vae.encode(self.tensor(q))[0].numpy().astype(np.float64)
+
+    def decode(self, z: Float[np.ndarray, "*batch N"]) -> Float[np.ndarray, "*batch D"]:
+        """Decoder mean μ(z) [rad]."""
+        with torch.no_grad():
+            return self.vae.mean(self.tensor(z)).numpy().astype(np.float64)
+
+    def embed_points(self, z: Float[np.ndarray, "*batch N"]) -> Float[np.ndarray, "*batch A"]:
+        """f(z) of many points [rad], in pieces that stay in the processor's cache."""
+        with torch.no_grad():
+            pieces = self.tensor(z).reshape(-1, self.dim).split(PIECE)
+            return torch.cat([self.embed(piece) for piece in pieces]).numpy().reshape(*z.shape[:-1], -1)
+
+    def embed_joints(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch A"]:
+        """f of the encoded configurations: where a joint path lies on the manifold [rad]."""
+        with torch.no_grad():
+            return self.embed(self.vae.encode(self.tensor(q))[0]).numpy().astype(np.float64)
+
+    def tensor(self, values: np.ndarray) -> Tensor:
+        """An array in the network's own precision."""
+        return torch.as_tensor(values).to(self.vae.centre.dtype)
+
+    def save(self, folder: Path) -> None:
+        """Write weights (safetensors) and a card (JSON: sizes and the weights' SHA-256)."""
+        folder.mkdir(parents=True, exist_ok=True)
+        save_file(self.vae.state_dict(), folder / WEIGHTS)
+        card = {
+            "dof": self.vae.dof,
+            "latent_dim": self.dim,
+            "hidden": [layer.out_features for layer in self.vae.encoder.nonlinear if hasattr(layer, "out_features")][:-1],
+            "variance_centres": len(self.vae.precision.centres),
+            "sha256": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest(),
+        }
+        (folder / CARD).write_text(json.dumps(card, indent=2, sort_keys=True) + "\n")
+
+    @classmethod
+    def load(cls, folder: Path) -> "LearnedManifold":
+        """Read what `save` wrote.  Raises ManifoldFileError if a file is missing or its checksum differs."""
+        try:
+            card = json.loads((folder / CARD).read_text())
+            found = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+            if found != card["sha256"]:
+                raise ManifoldFileError(f"{folder / WEIGHTS}: altered since it was written (its checksum differs)")
+            vae = JointVae(card["dof"], card["latent_dim"], card["hidden"], card["variance_centres"])
+            vae.load_state_dict(load_file(folder / WEIGHTS))
+        except (OSError, KeyError, json.JSONDecodeError, SafetensorError, RuntimeError) as error:
+            raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None
+        return cls(vae.eval().requires_grad_(False))

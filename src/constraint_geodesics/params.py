@@ -1,0 +1,297 @@
+"""params.yaml as typed, frozen records: every field is checked before a stage does any work."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Share = Annotated[float, Field(gt=0, lt=1)]
+Count = Annotated[int, Field(ge=1)]
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+Vector3 = tuple[Finite, Finite, Finite]
+Bit = Literal[0, 1]
+
+
+class ParamsError(ValueError):
+    """params.yaml can't be used; the message is one line with the entry, its value and what is allowed."""
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RobotParams(_Record):
+    """Which robot: a URDF, its tool link, and limits tighter than the URDF's."""
+
+    urdf: str
+    tool_link: str
+    limits_rad: dict[str, tuple[Finite, Finite]] = {}
+
+
+class BoxParams(_Record):
+    """A fixed box of the workcell."""
+
+    centre_m: Vector3
+    size_m: tuple[Positive, Positive, Positive]
+    exempt_links: tuple[str, ...] = ()
+
+
+class BodyParams(_Record):
+    """A fixed body of the workcell read from a URDF."""
+
+    urdf: str
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    rpy_rad: Vector3 = (0.0, 0.0, 0.0)
+    exempt_links: tuple[str, ...] = ()
+
+
+class WorkcellParams(_Record):
+    """What surrounds the arm."""
+
+    boxes: dict[Name, BoxParams] = {}
+    urdfs: dict[Name, BodyParams] = {}
+
+
+class ComputeParams(_Record):
+    """Where parallel work runs."""
+
+    backend: Literal["loky", "dask"]
+    workers: Annotated[int, Field(ge=0)]
+    dask_address: str | None = None
+
+    @model_validator(mode="after")
+    def _address_given(self) -> "ComputeParams":
+        if self.backend == "dask" and not self.dask_address:
+            raise ValueError("dask_address is missing: backend 'dask' needs a scheduler's address")
+        return self
+
+
+class LabelParams(_Record):
+    """How many configurations are drawn and labelled."""
+
+    free_rows: Count
+    constrained_rows: Count
+    shard_rows: Count
+    seed: Seed
+
+
+class QueryParams(_Record):
+    """Start and goal pairs of each constraint."""
+
+    count: Count
+    seed: Seed
+
+
+class PoseParams(_Record):
+    """A tool pose in the base frame."""
+
+    position_m: Vector3
+    rpy_rad: Vector3
+
+
+class ConstraintParams(_Record):
+    """The constraint vector C of eq. 6 with tolerances and reference."""
+
+    description: str
+    axes: tuple[Bit, Bit, Bit, Bit, Bit, Bit]
+    tolerance: tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative]
+    reference: PoseParams | None
+
+    @model_validator(mode="after")
+    def _meant(self) -> "ConstraintParams":
+        for i, (held, tolerance) in enumerate(zip(self.axes, self.tolerance, strict=True)):
+            if tolerance and not held:
+                raise ValueError(f"tolerance[{i}]={tolerance}: must be 0 where the axis is free")
+        if any(self.axes) and self.reference is None:
+            raise ValueError("reference=null: a pose is needed to sample configurations that hold an axis")
+        return self
+
+
+class ManifoldParams(_Record):
+    """One learned manifold."""
+
+    latent_dim: Count
+    retract: bool
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
+    beta: NonNegative
+    epochs: Count
+    patience: Count
+    batch_size: Count
+    learning_rate: Positive
+    variance_centres: Count
+    variance_epochs: Count
+    sigma_max_rad: Positive
+    held_out: Share
+    seed: Seed
+
+
+class SubmanifoldParams(_Record):
+    """How a constraint's sub-manifold is drawn or sampled in the latent space."""
+
+    grid: Annotated[int, Field(ge=10)]
+    nodes: Annotated[int, Field(ge=10)]
+    neighbours: Count
+    edge_points: Annotated[int, Field(ge=2)]
+    resolution_m: Positive
+    resolution_rad: Positive
+
+
+class RewardParams(_Record):
+    """Eq. 15: r = K_L R_L + K_Δ R_Δ with R(x) = exp(−b exp(−c x))."""
+
+    form: Literal["corrected", "printed"]
+    b: Positive
+    c: Positive
+    length_weight: NonNegative
+    reduction_weight: NonNegative
+    inclusion_weight: NonNegative
+
+    @model_validator(mode="after")
+    def _bounded(self) -> "RewardParams":
+        total = self.length_weight + self.reduction_weight
+        if not 0 < total <= 1 + 1e-9:
+            raise ValueError(f"length_weight + reduction_weight = {total}: must lie in (0, 1], so that |r| ≤ 1")
+        return self
+
+
+class PpoParams(_Record):
+    """Proximal policy optimisation."""
+
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
+    learning_rate: Positive
+    learning_rate_end: Positive
+    gamma: Annotated[float, Field(gt=0, le=1)]
+    gae_lambda: Annotated[float, Field(gt=0, le=1)]
+    rollout_steps: Annotated[int, Field(ge=2)]
+    batch_size: Annotated[int, Field(ge=2)]
+    epochs: Count
+    clip: Share
+    entropy: NonNegative
+    action_scale: Positive
+
+
+class GeodesicParams(_Record):
+    """Policy search of geodesics."""
+
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    searched: tuple[Name, ...]
+    illustrated: tuple[Name, ...]
+    illustrated_constraints: tuple[Name, ...]
+    analytic_steps: Count
+    analytic: tuple[Literal["plane", "sphere"], ...]
+    degree: Annotated[int, Field(ge=2, le=9)]
+    nodes: Annotated[int, Field(ge=5)]
+    steps: Count
+    environments: Count
+    episode_steps: Count
+    reward: RewardParams
+    ppo: PpoParams
+    rollouts: Count
+    checkpoint_steps: Count
+
+
+class BenchmarkParams(_Record):
+    """The sampling-based planners."""
+
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    planners: Annotated[tuple[Literal["prm", "rrt_star", "birrt"], ...], Field(min_length=1)]
+    space: Literal["projected", "atlas", "tangent_bundle"]
+    budget_s: Positive
+    prm_iterations: Count
+    rrt_star_iterations: Count
+    birrt_iterations: Count
+    delta_rad: Positive
+    range_rad: Positive
+
+
+class JudgeParams(_Record):
+    """What makes a path valid."""
+
+    end_tolerance_rad: Positive
+    max_step_rad: Positive
+    violation_tolerance: Positive
+    spacing_rad: Positive
+
+
+class RecordingParams(_Record):
+    """Which paths are recorded for replay."""
+
+    queries: Annotated[int, Field(ge=0)]
+    frames: Annotated[int, Field(ge=2)]
+
+
+class TrackingParams(_Record):
+    """MLflow."""
+
+    experiment: Annotated[str, Field(min_length=1)]
+
+
+class Params(_Record):
+    """The whole of params.yaml."""
+
+    robot: RobotParams
+    workcell: WorkcellParams
+    compute: ComputeParams
+    labels: LabelParams
+    queries: QueryParams
+    constraints: Annotated[dict[Name, ConstraintParams], Field(min_length=1)]
+    manifolds: Annotated[dict[Name, ManifoldParams], Field(min_length=1)]
+    submanifold: SubmanifoldParams
+    geodesics: GeodesicParams
+    benchmark: BenchmarkParams
+    judge: JudgeParams
+    recording: RecordingParams
+    tracking: TrackingParams
+
+    @model_validator(mode="after")
+    def _names_exist(self) -> "Params":
+        if "free" not in self.constraints or any(self.constraints["free"].axes):
+            raise ValueError("constraints.free: must be there with all axes 0, the manifolds are trained on it")
+        geodesics = self.geodesics
+        for entry, names, known in (
+            ("searched", geodesics.searched, self.manifolds),
+            ("illustrated", geodesics.illustrated, self.manifolds),
+            ("illustrated_constraints", geodesics.illustrated_constraints, self.constraints),
+        ):
+            for name in names:
+                if name not in known:
+                    raise ValueError(f"geodesics.{entry}={name!r}: must be one of {sorted(known)}")
+        return self
+
+
+def load_params(path: Path = Path("params.yaml")) -> Params:
+    """Read and check params.yaml.
+
+    Raises ParamsError, one line: the file, the entry, its value and what is allowed.
+    """
+    try:
+        raw = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise ParamsError(f"{path}: {error.strerror}") from None
+    except yaml.YAMLError as error:
+        raise ParamsError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    try:
+        # in JSON's strict mode lists may become tuples, but neither "5" nor true becomes a number
+        return Params.model_validate_json(json.dumps(raw), strict=True)
+    except ValidationError as error:
+        raise ParamsError(f"{path}: {_one_line(error)}") from None
+
+
+def _one_line(error: ValidationError) -> str:
+    first = error.errors()[0]
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    where = ".".join(str(part) for part in first["loc"])
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "extra_forbidden":
+        return f"{where}={first['input']!r}: there is no such parameter{more}"
+    if first["type"] == "missing":
+        return f"{where} is missing{more}"
+    if first["type"] == "value_error":
+        return f"{where + ': ' if where else ''}{message}{more}"
+    return f"{where}={first['input']!r}: {message[0].lower()}{message[1:]}{more}"

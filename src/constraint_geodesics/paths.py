@@ -1,0 +1,51 @@
+"""Where the stages put things, relative to the checkout: data/ belongs to DVC's cache, reports/ to git."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The files of one checkout."""
+
+    root: Path = Path()
+
+    def joints(self, constraint: str) -> Path:
+        """Labelled joint configurations of one constraint (parquet)."""
+        return self.root / "data" / "joints" / constraint / "joints.parquet"
+
+    def queries(self, constraint: str) -> Path:
+        """Start and goal pairs of one constraint (CSV)."""
+        return self.root / "data" / "joints" / constraint / "queries.csv"
+
+    def manifold(self, manifold: str) -> Path:
+        """Folder of one learned manifold (safetensors and JSON)."""
+        return self.root / "data" / "manifolds" / manifold
+
+    def submanifold(self, manifold: str, constraint: str) -> Path:
+        """Folder of one constraint's sub-manifold in one latent space (npz and JSON)."""
+        return self.root / "data" / "submanifolds" / f"{manifold}-{constraint}"
+
+    def geodesics(self, manifold: str, constraint: str) -> Path:
+        """Folder of the policies and curves found (safetensors, npz, CSV)."""
+        return self.root / "data" / "geodesics" / f"{manifold}-{constraint}"
+
+    def analytic(self, manifold: str) -> Path:
+        """Folder of the policies and curves found on an analytic manifold."""
+        return self.root / "data" / "analytic" / manifold
+
+    def benchmark(self, constraint: str) -> Path:
+        """Folder of the sampled paths (npz)."""
+        return self.root / "data" / "benchmark" / constraint
+
+    def recordings(self, stage: str, item: str) -> Path:
+        """Folder of the Rerun recordings of one stage's item."""
+        return self.root / "data" / "recordings" / stage / item
+
+    def report(self, stage: str, item: str, suffix: str = "json") -> Path:
+        """A stage's committed metrics or table."""
+        return self.root / "reports" / stage / f"{item}.{suffix}"
+
+    def scratch(self, stage: str, item: str) -> Path:
+        """Checkpoints of unfinished work; never an output, so DVC leaves it alone."""
+        return self.root / ".geodesics" / stage / item

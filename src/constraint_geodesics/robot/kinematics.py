@@ -1,0 +1,214 @@
+"""A robot read from its URDF: limits, forward kinematics and Jacobian, batched and compiled.
+
+Nothing here knows how many joints there are; adding a robot adds data only.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.robot import kernels
+
+Joints = Float[np.ndarray, "*batch D"]
+
+
+class RobotError(ValueError):
+    """The robot description can't be used; the message names the file and what is wrong with it."""
+
+
+class Robot(Protocol):
+    """What the geometry, the constraints and the planners ask of a robot."""
+
+    @property
+    def dof(self) -> int:
+        """Number of joints D."""
+        ...
+
+    @property
+    def lower(self) -> Float[np.ndarray, "D"]:
+        """Lower joint limits [rad or m]."""
+        ...
+
+    @property
+    def upper(self) -> Float[np.ndarray, "D"]:
+        """Upper joint limits [rad or m]."""
+        ...
+
+    def forward(
+        self, q: Float[np.ndarray, "*batch D"]
+    ) -> tuple[Float[np.ndarray, "*batch 3"], Float[np.ndarray, "*batch 3 3"]]:
+        """Tool position [m] and rotation in the base frame."""
+        ...
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The serial chain from the root link to the tool link, as the compiled kernels take it (see kernels.py)."""
+
+    origins: Float[np.ndarray, "D 4 4"]
+    axes: Float[np.ndarray, "D 3"]
+    prismatic: np.ndarray
+    base: Float[np.ndarray, "4 4"]
+    tool: Float[np.ndarray, "4 4"]
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """The kernels' leading arguments, in their order."""
+        return self.origins, self.axes, self.prismatic, self.base, self.tool
+
+
+@dataclass(frozen=True)
+class SerialRobot:
+    """A serial arm: names, limits [rad or m, and per second] and its chain."""
+
+    name: str
+    urdf: Path
+    tool_link: str
+    joint_names: tuple[str, ...]
+    lower: Float[np.ndarray, "D"]
+    upper: Float[np.ndarray, "D"]
+    velocity: Float[np.ndarray, "D"]
+    chain: Chain
+
+    @property
+    def dof(self) -> int:
+        """Number of joints D."""
+        return len(self.joint_names)
+
+    def forward(
+        self, q: Float[np.ndarray, "*batch D"]
+    ) -> tuple[Float[np.ndarray, "*batch 3"], Float[np.ndarray, "*batch 3 3"]]:
+        """Tool position [m] and rotation in the base frame, of configurations q [rad]."""
+        flat = self._flat(q)
+        positions, rotations = np.empty((len(flat), 3)), np.empty((len(flat), 3, 3))
+        kernels.forward_batch(*self.chain.arrays, flat, positions, rotations)
+        return positions.reshape(*q.shape[:-1], 3), rotations.reshape(*q.shape[:-1], 3, 3)
+
+    def jacobian(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch 6 D"]:
+        """Geometric Jacobian in the base frame: three linear rows [m/rad], three angular rows."""
+        flat = self._flat(q)
+        jacobians = np.empty((len(flat), 6, self.dof))
+        kernels.jacobian_batch(*self.chain.arrays, flat, jacobians)
+        return jacobians.reshape(*q.shape[:-1], 6, self.dof)
+
+    def limit_distance(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch"]:
+        """Distance to the nearest joint limit [rad]; negative outside the limits."""
+        return np.minimum(q - self.lower, self.upper - q).min(axis=-1)
+
+    def sample(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count D"]:
+        """Configurations drawn uniformly within the limits."""
+        return rng.uniform(self.lower, self.upper, size=(count, self.dof))
+
+    def _flat(self, q: np.ndarray) -> np.ndarray:
+        if q.shape[-1] != self.dof:
+            raise RobotError(f"{self.name} has {self.dof} joints, but the configurations have {q.shape[-1]}")
+        return np.ascontiguousarray(q, dtype=np.float64).reshape(-1, self.dof)
+
+
+def load_robot(
+    urdf: Path, tool_link: str, tighter_limits: Mapping[str, tuple[float, float]] | None = None
+) -> SerialRobot:
+    """Read the chain from the URDF's root to `tool_link`.
+
+    tighter_limits: joint name → (lower, upper) [rad]; each must lie within the URDF's own limits.
+    Raises RobotError if the file or the link is missing, a movable joint has no limits, or a limit is not tighter.
+    """
+    if not urdf.is_file():
+        raise RobotError(f"{urdf}: no such URDF file")
+    root = ElementTree.parse(urdf).getroot()
+    parent_joint = {_attribute(j, "child", "link", urdf): j for j in root.findall("joint")}
+    if tool_link not in {link.get("name") for link in root.findall("link")}:
+        raise RobotError(f"{urdf}: there is no link {tool_link!r}")
+
+    path = []
+    link = tool_link
+    while link in parent_joint:
+        path.append(parent_joint[link])
+        link = _attribute(parent_joint[link], "parent", "link", urdf)
+    path.reverse()
+
+    tighter = dict(tighter_limits or {})
+    names, origins, axes, prismatic, lower, upper, velocity = [], [], [], [], [], [], []
+    pending = np.eye(4)
+    for joint in path:
+        pending = pending @ _origin(joint)
+        kind, name = joint.get("type"), joint.get("name", "")
+        if kind == "fixed":
+            continue
+        if kind not in ("revolute", "prismatic", "continuous"):
+            raise RobotError(f"{urdf}: joint {name!r} is of type {kind!r}, which a serial arm can't have")
+        low, high, speed = _limits(joint, urdf)
+        if name in tighter:
+            low, high = _tightened(name, (low, high), tighter.pop(name))
+        names.append(name)
+        origins.append(pending)
+        axes.append(_axis(joint))
+        prismatic.append(kind == "prismatic")
+        lower.append(low)
+        upper.append(high)
+        velocity.append(speed)
+        pending = np.eye(4)
+    if tighter:
+        raise RobotError(f"{urdf}: limits are given for {sorted(tighter)}, which are not joints of the chain {names}")
+    if not names:
+        raise RobotError(f"{urdf}: no movable joint leads to {tool_link!r}")
+    chain = Chain(np.array(origins), np.array(axes), np.array(prismatic), np.eye(4), pending)
+    return SerialRobot(
+        root.get("name", urdf.stem), urdf, tool_link, tuple(names),
+        np.array(lower), np.array(upper), np.array(velocity), chain,
+    )  # fmt: skip
+
+
+def rotation_from_rpy(rpy: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation of roll, pitch, yaw [rad] about the fixed x, y and z axes, in this order: Rz Ry Rx."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def _attribute(joint: ElementTree.Element, child: str, name: str, urdf: Path) -> str:
+    element = joint.find(child)
+    value = None if element is None else element.get(name)
+    if value is None:
+        raise RobotError(f"{urdf}: joint {joint.get('name')!r} has no <{child} {name}=…>")
+    return value
+
+
+def _origin(joint: ElementTree.Element) -> np.ndarray:
+    origin = joint.find("origin")
+    transform = np.eye(4)
+    if origin is not None:
+        transform[:3, :3] = rotation_from_rpy(np.array([float(x) for x in origin.get("rpy", "0 0 0").split()]))
+        transform[:3, 3] = [float(x) for x in origin.get("xyz", "0 0 0").split()]
+    return transform
+
+
+def _axis(joint: ElementTree.Element) -> np.ndarray:
+    element = joint.find("axis")
+    axis = np.array([float(x) for x in ("1 0 0" if element is None else element.get("xyz", "1 0 0")).split()])
+    return axis / np.linalg.norm(axis)
+
+
+def _limits(joint: ElementTree.Element, urdf: Path) -> tuple[float, float, float]:
+    limit = joint.find("limit")
+    if joint.get("type") == "continuous":
+        return -np.pi, np.pi, float(limit.get("velocity", "inf")) if limit is not None else np.inf
+    if limit is None or limit.get("lower") is None or limit.get("upper") is None:
+        raise RobotError(f"{urdf}: joint {joint.get('name')!r} has no limits")
+    return float(limit.get("lower", "")), float(limit.get("upper", "")), float(limit.get("velocity", "inf"))
+
+
+def _tightened(name: str, own: tuple[float, float], wanted: tuple[float, float]) -> tuple[float, float]:
+    if not own[0] <= wanted[0] < wanted[1] <= own[1]:
+        raise RobotError(f"limits of {name!r}: {list(wanted)} do not lie within the URDF's {list(own)}")
+    return wanted

@@ -1,0 +1,477 @@
+"""Rerun recordings: one file a path, with the robot moving, what the constraint says and the curve in latent space.
+
+The only importer of rerun.  A recording holds no wall-clock time, so that equal paths give equal recordings.
+"""
+
+import contextlib
+import math
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from jaxtyping import Float, Shaped
+from rerun.chunk import Chunk, RrdReader
+from rerun.urdf import UrdfTree
+
+from constraint_geodesics.constraints.vector import AXES, ConstraintManifold
+from constraint_geodesics.robot.bullet import Body, Box
+from constraint_geodesics.robot.kinematics import rotation_from_rpy
+
+APPLICATION = "constraint_geodesics"
+TIMELINE = "frame"
+LOOPBACK = "127.0.0.1"
+
+_ROOT_FRAME = "tf#/"  # Rerun's name for the frame of the root entity
+_START, _GOAL, _NOW, _TRACE = (0, 158, 115), (213, 94, 0), (0, 114, 178), (230, 159, 0)
+_BOX, _OUTSIDE, _INK, _PAPER = (150, 150, 150), (200, 200, 200), (30, 30, 30), (255, 255, 255)
+_PALETTE = ((86, 180, 233), (230, 159, 0), (204, 121, 167), (0, 114, 178), (240, 228, 66), _START, _GOAL)
+
+
+class RecordingError(ValueError):
+    """A path can't be recorded or a recording can't be read; the message names the file and what is wrong with it."""
+
+
+@dataclass(frozen=True)
+class LatentView:
+    """What the latent panel shows: the sub-manifold in one plane, and the curve on it.
+
+    values: integers are the components' indices (negative: in none), floats are values of the inclusion map.
+    """
+
+    points: Float[np.ndarray, "n 2"]
+    values: Shaped[np.ndarray, "n"]
+    curve: Float[np.ndarray, "T 2"]
+    axis_names: tuple[str, str]
+
+
+@dataclass(frozen=True)
+class PathRecord:
+    """One path and where it comes from; `text` is its status in markdown."""
+
+    planner: str
+    constraint: str
+    query: int
+    seed: int
+    joints: Float[np.ndarray, "T D"]
+    """Configurations along the path [rad or m], the latent curve's points in the same order."""
+    text: str
+    latent: LatentView | None = None
+
+    @property
+    def recording_id(self) -> str:
+        """The same for the same planner, constraint, query and seed."""
+        return f"{self.constraint}-query{self.query}-{self.planner}-seed{self.seed}"
+
+
+@dataclass(frozen=True)
+class RecordingSummary:
+    """What a recording holds, as read back from its file."""
+
+    application_id: str
+    recording_id: str
+    entity_paths: tuple[str, ...]
+    meshes: int
+    """Number of meshes: the robot's visual ones and those of the workcell's bodies."""
+    joints: Float[np.ndarray, "frames D"]
+    """Joint positions [rad or m] over the timeline."""
+    tool_ends: Float[np.ndarray, "2 3"]
+    """First and last point of the tool's trace in the base frame [m]."""
+    has_blueprint: bool
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """The path at `frames` points of equal joint arc length."""
+
+    joints: Float[np.ndarray, "frames D"]
+    tool: Float[np.ndarray, "frames 3"]
+    curve: Float[np.ndarray, "frames 2"] | None
+
+
+@dataclass(frozen=True)
+class _Series:
+    """One quantity that the constraint bounds, and its limit."""
+
+    name: str
+    unit: str
+    values: Float[np.ndarray, "frames"]
+    limit: float
+
+
+def record_path(
+    file: Path, path: PathRecord, manifold: ConstraintManifold, workcell: Sequence[Box | Body], *, frames: int
+) -> None:
+    """Write the recording of one path, its blueprint inside.
+
+    Raises RecordingError if the path is not one of the manifold's robot or a mesh of the robot or a body is missing.
+    """
+    sampled = _sample(path, manifold, frames)
+    series = _series(manifold, sampled.joints)
+    chunks = [
+        *_robot_chunks(manifold, sampled),
+        *(chunk for body in workcell for chunk in _workcell_chunks(body)),
+        *_tool_chunks(sampled),
+        *_series_chunks(series),
+        *_joint_chunks(manifold.robot.joint_names, sampled),
+        *_latent_chunks(path.latent, sampled),
+        _static("status", rr.TextDocument(path.text, media_type=rr.MediaType.MARKDOWN)),
+        _static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP),
+    ]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    # the properties would hold the time of writing
+    stream = rr.RecordingStream(APPLICATION, recording_id=path.recording_id, send_properties=False)
+    with stream:
+        stream.save(file, default_blueprint=_blueprint(path, sampled, series))
+        stream.send_recording_name(f"{path.constraint}, query {path.query}: {path.planner}, seed {path.seed}")
+        rr.send_chunks(chunks, recording=stream)
+
+
+def read_recording(file: Path) -> RecordingSummary:
+    """Read a recording back.
+
+    Raises RecordingError if it is not a recording of one path.
+    """
+    try:
+        reader = RrdReader(_existing(file))
+        stores = reader.recordings()
+        if len(stores) != 1:
+            raise RecordingError(f"{file}: holds {len(stores)} recordings, not one")
+        chunks = reader.stream().to_chunks()
+    except RuntimeError as error:
+        raise RecordingError(f"{file}: not a recording: {error}") from None
+    joints = _column(file, chunks, "/joints", "Scalars:scalars")
+    trace = _column(file, chunks, "/tool/trace", "LineStrips3D:strips")[0][0]
+    return RecordingSummary(
+        application_id=stores[0].application_id,
+        recording_id=stores[0].recording_id,
+        entity_paths=tuple(sorted({chunk.entity_path for chunk in chunks})),
+        meshes=sum(_has(chunk, "Asset3D:blob") for chunk in chunks),
+        joints=np.array(joints, dtype=float),
+        tool_ends=np.array([trace[0], trace[-1]], dtype=float),
+        has_blueprint=bool(reader.blueprints()),
+    )
+
+
+def same_recordings(a: Path, b: Path) -> bool:
+    """Whether two recordings hold the same data, in whatever order.
+
+    Raises RecordingError if a file is missing.
+    """
+    result = subprocess.run(
+        _rerun("rrd", "compare", "--unordered", str(_existing(a)), str(_existing(b))), capture_output=True, check=False
+    )
+    return result.returncode == 0
+
+
+def open_recordings(files: Sequence[Path], *, web: bool) -> int:
+    """Show recordings until the viewer is closed, in a window or (web) served to a browser on this machine alone.
+
+    Prints the address to open.  Returns the viewer's exit code.  Raises RecordingError if a file is missing.
+    """
+    shown = [str(_existing(file)) for file in files]
+    port, page = _free_port(9876), _free_port(9090)
+    # without --bind the viewer listens on every address, the window's one too
+    options = ["--bind", LOOPBACK, "--port", str(port)]
+    if web:
+        options += ["--serve-web", "--web-viewer-port", str(page)]
+        print(f"http://{LOOPBACK}:{page}?url=rerun%2Bhttp://{LOOPBACK}:{port}/proxy", flush=True)
+    else:
+        print(f"rerun+http://{LOOPBACK}:{port}/proxy", flush=True)
+    return subprocess.call(_rerun(*options, *shown))
+
+
+def _sample(path: PathRecord, manifold: ConstraintManifold, frames: int) -> _Frames:
+    joints = np.asarray(path.joints, dtype=float)
+    name, dof = path.recording_id, manifold.robot.dof
+    if joints.ndim != 2 or len(joints) < 2 or joints.shape[1] != dof:
+        raise RecordingError(f"{name}: joints of shape {joints.shape}: must be (T, {dof}) with T of 2 or more")
+    if not np.isfinite(joints).all():
+        raise RecordingError(f"{name}: joints that are not finite")
+    if frames < 2:
+        raise RecordingError(f"{name}: frames = {frames}: must be 2 or more")
+    if path.latent is not None and path.latent.curve.shape != (len(joints), 2):
+        raise RecordingError(f"{name}: latent curve of shape {path.latent.curve.shape}: must be {(len(joints), 2)}")
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(joints, axis=0), axis=1))])
+    at = np.linspace(0.0, length[-1], frames)
+    sampled = _interpolate(at, length, joints)
+    curve = None if path.latent is None else _interpolate(at, length, path.latent.curve)
+    return _Frames(sampled, manifold.robot.forward(sampled)[0], curve)
+
+
+def _interpolate(at: np.ndarray, length: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(at, length, column) for column in values.T], axis=1)
+
+
+def _robot_chunks(manifold: ConstraintManifold, sampled: _Frames) -> Iterator[Chunk]:
+    """The robot's visual geometry, its fixed joints, and its moving joints over the timeline."""
+    robot = manifold.robot
+    tree, geometry = _load_urdf(robot.urdf, "/robot", None)
+    yield from geometry
+    yield _static("transforms/base", rr.Transform3D(parent_frame=_ROOT_FRAME, child_frame=tree.root_link().name))
+    for joint in tree.joints():
+        entity = _entity("transforms", joint.name)
+        if joint.name in robot.joint_names:
+            values = sampled.joints[:, robot.joint_names.index(joint.name)]
+            yield _moving(entity, joint.compute_transform_columns(values.tolist(), clamp=False))
+        else:
+            yield _static(entity, joint.compute_transform(0.0, clamp=False))
+
+
+def _workcell_chunks(body: Box | Body) -> Iterator[Chunk]:
+    entity = _entity("workcell", body.name)
+    if isinstance(body, Box):
+        yield _static(
+            entity,
+            rr.Boxes3D(
+                centers=[body.centre], sizes=[body.size], colors=[_BOX], fill_mode="solid",
+                labels=[body.name], show_labels=False,
+            ),
+        )  # fmt: skip
+        return
+    tree, geometry = _load_urdf(body.urdf, entity, f"{body.name}/")
+    yield from geometry
+    yield _static(
+        _entity("transforms", body.name, "base"),
+        rr.Transform3D(
+            translation=body.position, mat3x3=rotation_from_rpy(np.array(body.rpy)),
+            parent_frame=_ROOT_FRAME, child_frame=f"{body.name}/{tree.root_link().name}",
+        ),
+    )  # fmt: skip
+    for joint in tree.joints():
+        yield _static(_entity("transforms", body.name, joint.name), joint.compute_transform(0.0, clamp=False))
+
+
+def _load_urdf(urdf: Path, entity: str, frame_prefix: str | None) -> tuple[UrdfTree, list[Chunk]]:
+    """The tree and the chunks of its visual geometry; collision hulls drawn over it would flicker."""
+    with _package_path(urdf):
+        tree = UrdfTree.from_file_path(urdf, frame_prefix=frame_prefix)
+        stream = tree.stream(include_joint_transforms=False)
+        chunks = [chunk.with_entity_path(f"{entity}{chunk.entity_path}") for chunk in stream]
+    chunks = [chunk for chunk in chunks if "/collision_geometries/" not in chunk.entity_path]
+    # Rerun only warns of a mesh that it can't find, and leaves its entity with a pose alone
+    placed = {chunk.entity_path for chunk in chunks if _has(chunk, "InstancePoses3D:translations")}
+    drawn = {chunk.entity_path for chunk in chunks if not _has(chunk, "InstancePoses3D:", "CoordinateFrame:")}
+    if missing := sorted(path.split("/visual_geometries/")[-1] for path in placed - drawn):
+        raise RecordingError(f"{urdf}: no mesh could be read for {', '.join(missing)}")
+    if not drawn:
+        raise RecordingError(f"{urdf}: has no visual geometry")
+    return tree, chunks
+
+
+@contextlib.contextmanager
+def _package_path(urdf: Path) -> Iterator[None]:
+    """Let Rerun look for package:// meshes in the folders above the URDF, as PyBullet does."""
+    name = "ROS_PACKAGE_PATH"
+    before = os.environ.get(name)
+    folders = [str(folder) for folder in urdf.resolve().parents]
+    os.environ[name] = os.pathsep.join(folders + ([before] if before else []))
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
+
+
+def _tool_chunks(sampled: _Frames) -> Iterator[Chunk]:
+    tool = sampled.tool
+    size = rr.Radius.ui_points
+    yield _static("tool/trace", rr.LineStrips3D([tool], colors=[_TRACE], radii=[size(2.0)]))
+    for name, point, colour in (("start", tool[0], _START), ("goal", tool[-1], _GOAL)):
+        yield _static(f"tool/{name}", rr.Points3D([point], colors=[colour], radii=[size(7.0)], labels=[name]))
+    yield _static("tool/position", rr.Points3D.from_fields(colors=[_NOW], radii=[size(5.0)]))
+    yield _moving("tool/position", rr.Points3D.columns(positions=tool))
+
+
+def _series(manifold: ConstraintManifold, joints: np.ndarray) -> list[_Series]:
+    """Held positions each by itself [mm]; held angles that share one tolerance together, as the constraint does."""
+    residual, tolerance = manifold.residual(joints), manifold.tolerance
+    series = [
+        _Series(AXES[i], "mm", 1e3 * abs(residual[:, i]), 1e3 * tolerance[i]) for i in range(3) if manifold.held[i]
+    ]
+    angles = [i for i in range(3, 6) if manifold.held[i]]
+    together = len({tolerance[i] for i in angles}) == 1
+    for group in [angles] if together else [[i] for i in angles]:
+        name = "tilt" if len(group) == 2 else " ".join(AXES[i] for i in group)
+        size = np.degrees(np.linalg.norm(residual[:, group], axis=1))
+        series.append(_Series(name, "deg", size, math.degrees(tolerance[group[0]])))
+    return series
+
+
+def _series_chunks(series: Sequence[_Series]) -> Iterator[Chunk]:
+    for one in series:
+        entity = _entity("constraint", one.unit, one.name)
+        names = [f"{one.name} [{one.unit}]", f"limit of {one.name} [{one.unit}]"]
+        yield _static(entity, rr.SeriesLines(names=names, colors=[_NOW, _GOAL], widths=[2.0, 1.0]))
+        yield _scalars(entity, np.stack([one.values, np.full_like(one.values, one.limit)], axis=1))
+
+
+def _joint_chunks(names: Sequence[str], sampled: _Frames) -> Iterator[Chunk]:
+    yield _static("joints", rr.SeriesLines(names=list(names), colors=_colours(np.arange(len(names)))))
+    yield _scalars("joints", sampled.joints)
+
+
+def _latent_chunks(latent: LatentView | None, sampled: _Frames) -> Iterator[Chunk]:
+    if latent is None or sampled.curve is None:
+        return
+    curve, size = _upright(sampled.curve), rr.Radius.ui_points
+    low, high = _latent_bounds(latent)
+    # discs that just cover a grid of this many points
+    spacing = math.sqrt(float(np.prod(high - low)) / max(len(latent.points), 1))
+    yield _static(
+        "latent/submanifold",
+        rr.Points2D(
+            _upright(latent.points), colors=_colours(latent.values), radii=[math.sqrt(0.5) * spacing], draw_order=0.0
+        ),
+    )
+    yield _static("latent/axes", _axes(low, high, latent.axis_names))
+    yield _static("latent/curve", rr.LineStrips2D([curve], colors=[_INK], radii=[size(2.0)], draw_order=20.0))
+    for name, point, colour in (("start", curve[0], _START), ("goal", curve[-1], _GOAL)):
+        marker = rr.Points2D([point], colors=[colour], radii=[size(7.0)], labels=[name], draw_order=30.0)
+        yield _static(f"latent/{name}", marker)
+    yield _static("latent/position", rr.Points2D.from_fields(colors=[_INK], radii=[size(5.0)], draw_order=40.0))
+    yield _moving("latent/position", rr.Points2D.columns(positions=curve))
+
+
+def _upright(points: np.ndarray) -> np.ndarray:
+    """Rerun's planes have their second axis pointing down."""
+    return np.stack([points[:, 0], -points[:, 1]], axis=1)
+
+
+def _axes(low: np.ndarray, high: np.ndarray, names: tuple[str, str]) -> Any:
+    corner = [[[low[0], low[1]], [high[0], low[1]]], [[low[0], low[1]], [low[0], high[1]]]]
+    strips = [_upright(np.array(line)) for line in corner]
+    return rr.LineStrips2D(
+        strips, colors=[_INK], radii=[rr.Radius.ui_points(1.0)], labels=list(names), show_labels=True, draw_order=10.0
+    )
+
+
+def _latent_bounds(latent: LatentView) -> tuple[np.ndarray, np.ndarray]:
+    shown = np.concatenate([latent.points, latent.curve])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    margin = 0.03 * max(float((high - low).max()), 1e-6)
+    return low - margin, high + margin
+
+
+def _colours(values: np.ndarray) -> np.ndarray:
+    """Colours that the colour-blind can tell apart: one a component for integers, a scale (dark is high) for floats."""
+    if np.issubdtype(values.dtype, np.integer):
+        palette = np.array([*_PALETTE, _OUTSIDE], dtype=np.uint8)
+        return palette[np.where(values < 0, len(_PALETTE), values % len(_PALETTE))]
+    finite = values[np.isfinite(values)]
+    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
+    scaled = np.nan_to_num((values - low) / max(high - low, 1e-12), nan=1.0, posinf=1.0, neginf=0.0)
+    return np.asarray(matplotlib.colormaps["cividis_r"](scaled, bytes=True))[:, :3]
+
+
+def _blueprint(path: PathRecord, sampled: _Frames, series: Sequence[_Series]) -> Any:
+    status = rrb.TextDocumentView(origin="status", name="Status")
+    right: list[Any] = [] if path.latent is None else [_latent_panel(path.latent)]
+    right += [_series_panel(unit, series) for unit in ("deg", "mm") if any(one.unit == unit for one in series)]
+    shares = [2.5 if isinstance(panel, rrb.Spatial2DView) else 1.0 for panel in right]
+    right.append(rrb.TimeSeriesView(origin="joints", name="Joint positions [rad or m]"))
+    shares.append(1.5)  # its legend names every joint
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(_scene_panel(sampled), status, row_shares=[3.0, 1.0]),
+            rrb.Vertical(*right, row_shares=shares),
+            column_shares=[3.0, 2.0],
+        ),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, fps=30.0, play_state="playing", loop_mode="all"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _scene_panel(sampled: _Frames) -> Any:
+    reach = float(np.linalg.norm(sampled.tool, axis=1).max())
+    eye = rrb.EyeControls3D(
+        position=(1.7 * reach, -1.7 * reach, 1.3 * reach), look_target=(0.0, 0.0, 0.4 * reach), eye_up=(0.0, 0.0, 1.0)
+    )
+    # a grid at z = 0 would flicker with the top of a table there
+    return rrb.Spatial3DView(
+        origin="/", name="Robot", contents=["+ /robot/**", "+ /workcell/**", "+ /tool/**", "+ /transforms/**"],
+        eye_controls=eye, line_grid=rrb.LineGrid3D(visible=False),
+    )  # fmt: skip
+
+
+def _series_panel(unit: str, series: Sequence[_Series]) -> Any:
+    shown = [one for one in series if one.unit == unit]
+    # a scale of at least one unit: an exactly held axis would otherwise show rounding errors only
+    top = 1.2 * max(1.0, *(max(one.limit, float(one.values.max())) for one in shown))
+    return rrb.TimeSeriesView(
+        origin=f"constraint/{unit}", name=f"Constraint residual [{unit}]", axis_y=rrb.ScalarAxis(range=(0.0, top))
+    )
+
+
+def _latent_panel(latent: LatentView) -> Any:
+    low, high = _latent_bounds(latent)
+    room = 0.1 * (high - low)  # for the axes' names
+    low, high = low - room, high + room
+    return rrb.Spatial2DView(
+        origin="latent", name=f"Latent space: {latent.axis_names[0]}, {latent.axis_names[1]}", background=_PAPER,
+        visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),
+    )  # fmt: skip
+
+
+def _entity(*parts: str) -> str:
+    return str(rr.new_entity_path(list(parts)))
+
+
+def _static(entity: str, archetype: Any) -> Chunk:
+    columns = [batch.partition([len(batch.as_arrow_array())]) for batch in archetype.as_component_batches()]
+    return Chunk.from_columns(entity, [], columns)
+
+
+def _moving(entity: str, columns: Any) -> Chunk:
+    frames = len(next(iter(columns)).as_arrow_array())
+    return Chunk.from_columns(entity, [rr.TimeColumn(TIMELINE, sequence=range(frames))], columns)
+
+
+def _scalars(entity: str, values: Float[np.ndarray, "frames k"]) -> Chunk:
+    return _moving(entity, rr.Scalars.columns(scalars=values))
+
+
+def _has(chunk: Chunk, *components: str) -> bool:
+    names = chunk.to_record_batch().schema.names
+    return any(name.startswith(component) for name in names for component in components)
+
+
+def _column(file: Path, chunks: Sequence[Chunk], entity: str, component: str) -> list[Any]:
+    """One component of one entity, row by row, as lists."""
+    for chunk in chunks:
+        if chunk.entity_path == entity and _has(chunk, component):
+            return list(chunk.to_record_batch().column(component).to_pylist())
+    raise RecordingError(f"{file}: has no {component} at {entity}: not a recording of a path")
+
+
+def _rerun(*arguments: str) -> list[str]:
+    # python -m rerun_cli would return 0 whatever the tool says
+    return [sys.executable, "-m", "rerun", *arguments]
+
+
+def _existing(file: Path) -> Path:
+    if not file.is_file():
+        raise RecordingError(f"{file}: no such recording")
+    return file
+
+
+def _free_port(preferred: int) -> int:
+    """The preferred port of this machine, or another if it is taken."""
+    for port in (preferred, 0):
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind((LOOPBACK, port))
+            return int(probe.getsockname()[1])
+    raise RecordingError("there is no free port on this machine")

@@ -1,0 +1,35 @@
+"""Stage: find the part of one learned manifold on which one constraint holds; the manifold is used as it is."""
+
+import sys
+
+from constraint_geodesics.cli import run_stage
+from constraint_geodesics.constraints.scene import Scene
+from constraint_geodesics.constraints.submanifold import extract, save_submanifold, submanifold_figures
+from constraint_geodesics.learning.dataset import read_joints
+from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.params import Params
+from constraint_geodesics.paths import Layout
+from constraint_geodesics.tracking.experiment import tracked_stage
+
+STAGE = "extract_submanifold"
+
+
+def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None:
+    """Write data/submanifolds/<manifold>-<constraint>/ and its figures."""
+    item = f"{manifold}-{constraint}"
+    sources = [layout.joints("free"), layout.joints(constraint)]
+    scene = Scene.from_params(params)
+    constrained = scene.manifold(params.constraints[constraint])
+    with tracked_stage(
+        STAGE, item, params.submanifold, sources, experiment=params.tracking.experiment, root=layout.root
+    ) as run, scene.world() as world:
+        chart = LearnedManifold.load(layout.manifold(manifold))
+        free, on_constraint = (read_joints(source).free_joints for source in sources)
+        found = extract(chart, constrained, free, on_constraint, world.free, params.submanifold)
+        save_submanifold(found, layout.submanifold(manifold, constraint))
+        figures = submanifold_figures(found, chart, constrained, free, on_constraint, params.submanifold)
+        run.report(figures, layout.report(STAGE, item))
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])

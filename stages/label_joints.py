@@ -1,0 +1,43 @@
+"""Stage: draw the configurations of one constraint, label them with PyBullet, and draw its queries."""
+
+import sys
+
+from constraint_geodesics.cli import run_stage
+from constraint_geodesics.compute import parallel_map
+from constraint_geodesics.constraints.scene import Scene
+from constraint_geodesics.learning.dataset import (
+    data_card,
+    draw_queries,
+    draw_shard,
+    shard_tasks,
+    write_joints,
+    write_queries,
+)
+from constraint_geodesics.params import Params
+from constraint_geodesics.paths import Layout
+from constraint_geodesics.tracking.experiment import tracked_stage
+
+STAGE = "label_joints"
+
+
+def main(params: Params, layout: Layout, constraint: str) -> None:
+    """Write data/joints/<constraint>/ and its data card."""
+    scene = Scene.from_params(params)
+    manifold = scene.manifold(params.constraints[constraint])
+    labels = params.labels
+    rows = labels.free_rows if constraint == "free" else labels.constrained_rows
+    settings = {"rows": rows, "labels": labels.model_dump(), "constraint": params.constraints[constraint].model_dump()}
+    with tracked_stage(
+        STAGE, constraint, settings, [], experiment=params.tracking.experiment, root=layout.root
+    ) as run:
+        tasks = shard_tasks(scene, manifold, constraint, rows, labels.shard_rows, labels.seed)
+        shards = parallel_map(draw_shard, tasks, params.compute, description=f"label {constraint}")
+        queries = draw_queries(scene, manifold, constraint, params.queries.count, params.queries.seed)
+        about = {"constraint": constraint, "robot": scene.robot.name, "seed": str(labels.seed), "rows": str(rows)}
+        write_joints(shards, layout.joints(constraint), about)
+        write_queries(queries, layout.queries(constraint))
+        run.report(data_card(shards), layout.report(STAGE, constraint))
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])

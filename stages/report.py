@@ -1,0 +1,25 @@
+"""Stage: the result table, the figures, and the page that opens offline."""
+
+import sys
+
+from constraint_geodesics.cli import run_stage
+from constraint_geodesics.evaluation.report import write_report
+from constraint_geodesics.params import Params
+from constraint_geodesics.paths import Layout
+from constraint_geodesics.tracking.experiment import tracked_stage
+
+STAGE = "report"
+
+
+def main(params: Params, layout: Layout) -> None:
+    """Write reports/table.csv, table.md, figures/ and index.html."""
+    sources = [layout.report("benchmark_planners", constraint, "csv") for constraint in params.constraints]
+    with tracked_stage(
+        STAGE, STAGE, params.judge, sources, experiment=params.tracking.experiment, root=layout.root
+    ) as run:
+        for figure in write_report(params, layout):
+            run.figure(figure)
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])

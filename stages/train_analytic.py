@@ -1,0 +1,46 @@
+"""Stage: policy search on a manifold whose distances are known (Fig. 3), one policy a seed."""
+
+import sys
+
+import numpy as np
+
+from constraint_geodesics.cli import run_stage
+from constraint_geodesics.compute import parallel_map
+from constraint_geodesics.evaluation.analytic_search import AnalyticTask, run_analytic
+from constraint_geodesics.evaluation.geodesic_search import write_table
+from constraint_geodesics.geodesics.policy_search import save_policy
+from constraint_geodesics.params import Params
+from constraint_geodesics.paths import Layout
+from constraint_geodesics.tracking.experiment import tracked_stage
+
+STAGE = "train_analytic"
+
+
+def main(params: Params, layout: Layout, manifold: str) -> None:
+    """Write data/analytic/<manifold>/, its learning curves and figures."""
+    settings = params.geodesics.model_copy(update={"steps": params.geodesics.analytic_steps})
+    with tracked_stage(
+        STAGE, manifold, settings, [], experiment=params.tracking.experiment, root=layout.root
+    ) as run:
+        tasks = [
+            AnalyticTask(
+                manifold, settings, seed, layout.scratch(STAGE, f"{manifold}-{seed}"),
+                run.child(f"seed {seed}", {"seed": seed}),
+            )
+            for seed in settings.seeds
+        ]  # fmt: skip
+        results = parallel_map(run_analytic, tasks, params.compute, description=f"policy search {manifold}")
+        run.summarise([result.figures() for result in results])
+        folder = layout.analytic(manifold)
+        for result in results:
+            save_policy(result.policy, folder, result.seed)
+        first = results[0]
+        np.savez_compressed(folder / "curves.npz", sampled=first.sampled, learned=first.learned)
+        learning = [{"seed": result.seed, **row} for result in results for row in result.policy.curve]
+        write_table(learning, layout.report(STAGE, f"{manifold}-learning", "csv"))
+        figures = {name: [result.figures()[name] for result in results] for name in first.figures()}
+        run.report(figures, layout.report(STAGE, manifold))
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])

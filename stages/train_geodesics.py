@@ -1,0 +1,65 @@
+"""Stage: train one policy a seed on one manifold under one constraint, and search the queries' geodesics with each."""
+
+import sys
+
+from constraint_geodesics.cli import run_stage
+from constraint_geodesics.compute import parallel_map
+from constraint_geodesics.constraints.scene import Scene
+from constraint_geodesics.constraints.submanifold import load_submanifold
+from constraint_geodesics.evaluation.geodesic_search import (
+    SeedTask,
+    connected_queries,
+    geodesic_figures,
+    geodesic_problem,
+    run_seed,
+    save_seeds,
+    straight_rows,
+    write_table,
+)
+from constraint_geodesics.learning.dataset import read_joints, read_queries
+from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.params import Params
+from constraint_geodesics.paths import Layout
+from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.replay import record_rows
+
+STAGE = "train_geodesics"
+
+
+def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None:
+    """Write data/geodesics/<manifold>-<constraint>/, its recordings, rows and figures."""
+    item, sources = f"{manifold}-{constraint}", [layout.joints(constraint), layout.queries(constraint)]
+    scene = Scene.from_params(params)
+    constrained = scene.manifold(params.constraints[constraint])
+    chart = LearnedManifold.load(layout.manifold(manifold))
+    problem = geodesic_problem(params, chart, constrained, read_joints(sources[0]).free_joints, manifold)
+    queries = read_queries(sources[1])
+    submanifold = load_submanifold(layout.submanifold(manifold, constraint))
+    with scene.world() as world:
+        connected = connected_queries(submanifold, problem, queries, world.free, params.submanifold)
+    with tracked_stage(
+        STAGE, item, params.geodesics, sources, experiment=params.tracking.experiment, root=layout.root
+    ) as run:
+        tasks = [
+            SeedTask(
+                problem, scene, params.geodesics, params.judge, manifold, queries, connected, seed,
+                layout.scratch(STAGE, f"{item}-{seed}"), run.child(f"seed {seed}", {"seed": seed}),
+            )
+            for seed in params.geodesics.seeds
+        ]  # fmt: skip
+        results = parallel_map(run_seed, tasks, params.compute, description=f"policy search {item}")
+        run.summarise([result.figures() for result in results])
+        save_seeds(results, queries, layout, STAGE, manifold, constraint)
+        rows, paths = straight_rows(tasks[0])
+        rows += [row for result in results for row in result.rows]
+        paths += [path for result in results for path in result.paths]
+        rows = record_rows(
+            layout.recordings(STAGE, item), rows, paths, constraint, chart, constrained, submanifold, scene.workcell,
+            params.recording,
+        )  # fmt: skip
+        write_table(rows, layout.report(STAGE, item, "csv"), manifold=manifold, constraint=constraint)
+        run.report(geodesic_figures(results, connected), layout.report(STAGE, item))
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])

@@ -1,0 +1,35 @@
+"""Stage: train one learned manifold on the collision-free configurations of no constraint."""
+
+import sys
+
+import pandas as pd
+
+from constraint_geodesics.cli import run_stage
+from constraint_geodesics.constraints.scene import robot_from
+from constraint_geodesics.learning.dataset import read_joints
+from constraint_geodesics.learning.training import train_manifold
+from constraint_geodesics.params import Params
+from constraint_geodesics.paths import Layout
+from constraint_geodesics.tracking.experiment import tracked_stage
+
+STAGE = "train_manifold"
+
+
+def main(params: Params, layout: Layout, manifold: str) -> None:
+    """Write data/manifolds/<manifold>/, its held-out figures and its learning curve."""
+    source = layout.joints("free")
+    settings = params.manifolds[manifold]
+    with tracked_stage(
+        STAGE, manifold, settings, [source], experiment=params.tracking.experiment, root=layout.root
+    ) as run:
+        joints = read_joints(source).free_joints
+        trained = train_manifold(
+            joints, robot_from(params.robot), settings, layout.scratch(STAGE, manifold), run.metric_logger()
+        )
+        trained.manifold.save(layout.manifold(manifold))
+        run.report({"rows": len(joints), **trained.metrics}, layout.report(STAGE, manifold))
+        pd.DataFrame(trained.history).to_csv(layout.report(STAGE, manifold, "csv"), index=False)
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])
