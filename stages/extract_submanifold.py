@@ -20,9 +20,12 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     sources = [layout.joints("free"), layout.joints(constraint)]
     scene = Scene.from_params(params)
     constrained = scene.manifold(params.constraints[constraint])
-    with tracked_stage(
-        STAGE, item, params.submanifold, sources, experiment=params.tracking.experiment, root=layout.root
-    ) as run, scene.world() as world:
+    with (
+        tracked_stage(
+            STAGE, item, params.submanifold, sources, experiment=params.tracking.experiment, root=layout.root
+        ) as run,
+        scene.world() as world,
+    ):
         chart = LearnedManifold.load(layout.manifold(manifold))
         free, on_constraint = (read_joints(source).free_joints for source in sources)
         found = extract(chart, constrained, free, on_constraint, world.free, params.submanifold)

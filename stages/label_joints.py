@@ -27,9 +27,7 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     labels = params.labels
     rows = labels.free_rows if constraint == "free" else labels.constrained_rows
     settings = {"rows": rows, "labels": labels.model_dump(), "constraint": params.constraints[constraint].model_dump()}
-    with tracked_stage(
-        STAGE, constraint, settings, [], experiment=params.tracking.experiment, root=layout.root
-    ) as run:
+    with tracked_stage(STAGE, constraint, settings, [], experiment=params.tracking.experiment, root=layout.root) as run:
         tasks = shard_tasks(scene, manifold, constraint, rows, labels.shard_rows, labels.seed)
         shards = parallel_map(draw_shard, tasks, params.compute, description=f"label {constraint}")
         queries = draw_queries(scene, manifold, constraint, params.queries.count, params.queries.seed)

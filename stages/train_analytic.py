@@ -1,5 +1,6 @@
 """Stage: policy search on a manifold whose distances are known (Fig. 3), one policy a seed."""
 
+import shutil
 import sys
 
 import numpy as np
@@ -19,9 +20,7 @@ STAGE = "train_analytic"
 def main(params: Params, layout: Layout, manifold: str) -> None:
     """Write data/analytic/<manifold>/, its learning curves and figures."""
     settings = params.geodesics.model_copy(update={"steps": params.geodesics.analytic_steps})
-    with tracked_stage(
-        STAGE, manifold, settings, [], experiment=params.tracking.experiment, root=layout.root
-    ) as run:
+    with tracked_stage(STAGE, manifold, settings, [], experiment=params.tracking.experiment, root=layout.root) as run:
         tasks = [
             AnalyticTask(
                 manifold, settings, seed, layout.scratch(STAGE, f"{manifold}-{seed}"),
@@ -40,6 +39,8 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
         write_table(learning, layout.report(STAGE, f"{manifold}-learning", "csv"))
         figures = {name: [result.figures()[name] for result in results] for name in first.figures()}
         run.report(figures, layout.report(STAGE, manifold))
+        for task in tasks:  # finished: the next run of this stage starts from nothing
+            shutil.rmtree(task.scratch, ignore_errors=True)
 
 
 if __name__ == "__main__":

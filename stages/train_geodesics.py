@@ -1,5 +1,6 @@
 """Stage: train one policy a seed on one manifold under one constraint, and search the queries' geodesics with each."""
 
+import shutil
 import sys
 
 from constraint_geodesics.cli import run_stage
@@ -59,6 +60,8 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         )  # fmt: skip
         write_table(rows, layout.report(STAGE, item, "csv"), manifold=manifold, constraint=constraint)
         run.report(geodesic_figures(results, connected), layout.report(STAGE, item))
+        for task in tasks:  # finished: the next run of this stage starts from nothing
+            shutil.rmtree(task.scratch, ignore_errors=True)
 
 
 if __name__ == "__main__":

@@ -117,3 +117,7 @@ def recordings_of(layout: Layout) -> list[Path]:
     """All recordings of this checkout, level cup and learned paths first."""
     found = (layout.root / "data" / "recordings").rglob("*.rrd")
     return sorted(found, key=lambda file: ("level_cup" not in str(file), "train_geodesics" not in str(file), str(file)))
+
+
+if __name__ == "__main__":
+    main()

@@ -8,7 +8,7 @@ import asyncio
 import os
 import reprlib
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+"""Read by the libraries that a task is the first to load."""
 DASK_CONNECT_S = 5
 DASK_WORKERS_S = 10
 
@@ -50,7 +51,7 @@ def parallel_map(
     """
     if not items:
         return []
-    task = _Task(function, description)
+    task = _Task(function, description or getattr(function, "__name__", "parallel work"))
     results: dict[int, Result] = {}
     with progress(description, len(items)) as advance, closing(_outcomes(task, items, settings)) as outcomes:
         for index, result in outcomes:
@@ -64,17 +65,18 @@ class _Task(Generic[Item, Result]):
     """What a worker runs: the function, under a name for its errors."""
 
     function: Callable[[Item], Result]
-    description: str
+    name: str
 
     def __call__(self, index: int, item: Item) -> tuple[int, Result]:
         try:
             return index, self.function(item)
         except Exception as error:
-            name = f"{self.description or self.function.__qualname__}, item {index} ({reprlib.repr(item)})"
-            raise ComputeError(f"{name}: {type(error).__name__}: {' '.join(str(error).split())}") from error
+            reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            raise ComputeError(f"{self.name}, item {index} ({reprlib.repr(item)}): {reason}") from error
 
     def in_worker(self, index: int, item: Item) -> tuple[int, Result]:
         # never undone: a Dask worker may run other tasks beside this one
+        os.environ.update(ONE_THREAD)
         threadpool_limits(1)
         _set_torch_threads(1)
         return self(index, item)
@@ -82,14 +84,14 @@ class _Task(Generic[Item, Result]):
 
 def _outcomes(
     task: _Task[Item, Result], items: Sequence[Item], settings: ComputeParams
-) -> Iterator[tuple[int, Result]]:
+) -> Generator[tuple[int, Result], None, None]:
     workers = min(settings.workers or joblib.cpu_count(), len(items))
     if settings.backend == "dask":
         return _on_dask(task, items, str(settings.dask_address))
     return _in_process(task, items) if workers == 1 else _on_loky(task, items, workers)
 
 
-def _in_process(task: _Task[Item, Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+def _in_process(task: _Task[Item, Result], items: Sequence[Item]) -> Generator[tuple[int, Result], None, None]:
     for index, item in enumerate(items):
         with _one_thread():
             outcome = task(index, item)
@@ -98,17 +100,18 @@ def _in_process(task: _Task[Item, Result], items: Sequence[Item]) -> Iterator[tu
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """What a worker process has by its environment, for a task inside this process."""
-    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    """What a worker process keeps, for one task inside this process."""
+    before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
     torch_threads = sys.modules["torch"].get_num_threads() if "torch" in sys.modules else None
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # for libraries that the task is the first to load
+    os.environ.update(ONE_THREAD)
     try:
         with threadpool_limits(1):
             _set_torch_threads(1)
             yield
     finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
+        for name in ONE_THREAD:
+            del os.environ[name]
+        os.environ.update(before)
         if torch_threads is not None:
             _set_torch_threads(torch_threads)
 
@@ -119,26 +122,37 @@ def _set_torch_threads(count: int) -> None:
         sys.modules["torch"].set_num_threads(count)
 
 
-def _on_loky(task: _Task[Item, Result], items: Sequence[Item], workers: int) -> Iterator[tuple[int, Result]]:
+def _on_loky(
+    task: _Task[Item, Result], items: Sequence[Item], workers: int
+) -> Generator[tuple[int, Result], None, None]:
+    calls = (joblib.delayed(task.in_worker)(index, item) for index, item in enumerate(items))
     # max_nbytes=None: joblib would hand large arrays over read-only, which the other backends don't
     with joblib.parallel_config(backend="loky", n_jobs=workers, inner_max_num_threads=1, max_nbytes=None):
+        outcomes: Any = joblib.Parallel(return_as="generator_unordered")(calls)
+    try:
+        with closing(outcomes):
+            yield from outcomes
+    except BrokenProcessPool as error:
+        raise ComputeError(f"{task.name}: a worker process died (killed, or out of memory)") from error
+
+
+def _on_dask(
+    task: _Task[Item, Result], items: Sequence[Item], address: str
+) -> Generator[tuple[int, Result], None, None]:
+    # not through joblib's own Dask backend: it waits for ever for a task whose worker died (joblib 1.6)
+    from distributed import CancelledError, KilledWorker, as_completed
+
+    with _dask_client(address) as client:
+        futures = client.map(task.in_worker, range(len(items)), items, pure=False)
         try:
-            yield from _run(task, items)
-        except BrokenProcessPool as error:
-            reason = "a worker process died (killed, or out of memory)"
-            raise ComputeError(f"{task.description or 'parallel work'}: {reason}") from error
-
-
-def _on_dask(task: _Task[Item, Result], items: Sequence[Item], address: str) -> Iterator[tuple[int, Result]]:
-    with _dask_client(address) as client, joblib.parallel_config(backend="dask", client=client):
-        yield from _run(task, items)
-
-
-def _run(task: _Task[Item, Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
-    calls = (joblib.delayed(task.in_worker)(index, item) for index, item in enumerate(items))
-    outcomes: Any = joblib.Parallel(return_as="generator_unordered")(calls)
-    with closing(outcomes):
-        yield from outcomes
+            for future in as_completed(futures, loop=client.loop):
+                yield future.result()
+        except KilledWorker as error:
+            raise ComputeError(f"{task.name}: Dask workers died (killed, or out of memory)") from error
+        except (CancelledError, OSError) as error:
+            raise ComputeError(f"{task.name}: lost the Dask scheduler at {address}") from error
+        finally:
+            client.cancel(futures)
 
 
 @contextmanager
@@ -146,14 +160,12 @@ def _dask_client(address: str) -> Iterator["Client"]:
     from distributed import Client
 
     _check_scheduler(address)
-    client = Client(address, timeout=DASK_CONNECT_S, set_as_default=False)
-    try:
-        client.wait_for_workers(1, timeout=DASK_WORKERS_S)
+    with Client(address, timeout=DASK_CONNECT_S, set_as_default=False) as client:
+        try:
+            client.wait_for_workers(1, timeout=DASK_WORKERS_S)
+        except TimeoutError as error:
+            raise ComputeError(f"compute.dask_address={address!r}: the scheduler has no workers") from error
         yield client
-    except TimeoutError as error:
-        raise ComputeError(f"compute.dask_address={address!r}: the scheduler has no workers") from error
-    finally:
-        client.close()
 
 
 def _check_scheduler(address: str) -> None:

@@ -216,6 +216,7 @@ class JudgeParams(_Record):
     end_tolerance_rad: Positive
     max_step_rad: Positive
     violation_tolerance: Positive
+    row_spacing_rad: Positive
     spacing_rad: Positive
 
 

@@ -31,7 +31,7 @@ EASY, HARD = 1, 4
 
 @pytest.fixture(scope="module")
 def xarm() -> SerialRobot:
-    limits = {name: (-3.5, 3.5) for name in ("joint1", "joint4", "joint6")}
+    limits = dict.fromkeys(("joint1", "joint4", "joint6"), (-3.5, 3.5))
     return load_robot(data_path() / "xarm/xarm6_robot.urdf", "link6", limits)
 
 
@@ -43,7 +43,8 @@ def world(xarm: SerialRobot) -> Iterator[World]:
 
 def ends(manifold: ConstraintManifold, is_free: Callable[[np.ndarray], bool], seed: int, count: int = 2) -> np.ndarray:
     """Random configurations that keep the constraint, the limits and their distance from collisions."""
-    rng, kept = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    kept: list[np.ndarray] = []
     while len(kept) < count:
         retracted = retract(manifold, manifold.robot.sample(1, rng))
         q = retracted.joints[0]
@@ -74,6 +75,36 @@ def test_path_keeps_the_cup_level_and_is_executable(name: PlannerName, world: Wo
     for seed in (EASY, HARD):
         asked = problem(world, LEVEL, seed)
         assert_sound(SamplingPlanner(name, SETTINGS).plan(asked, seed=0), asked, world)
+
+
+@pytest.mark.parametrize("name", ["prm", "birrt"])
+def test_every_path_is_executable_before_any_simplification(name: PlannerName, world: World) -> None:
+    planner = SamplingPlanner(name, SETTINGS, simplify=False)
+    for seed in (10, 29, 30):  # projection leaves the limits; a roadmap's edge can be walked in one direction only
+        asked = problem(world, LEVEL, seed)
+        assert_sound(planner.plan(asked, seed=0), asked, world)
+
+
+def test_long_steps_do_not_end_in_a_collision(world: World) -> None:
+    asked = problem(world, LEVEL, 37)
+    settings = SETTINGS.model_copy(update={"delta_rad": 0.3})
+    path = SamplingPlanner("birrt", settings, simplify=False).plan(asked, seed=0)
+    assert path.status == "solved"
+    assert world.free(path.joints).all()
+
+
+def test_walk_that_stalls_is_given_up(world: World) -> None:
+    asked = problem(world, LEVEL, HARD)
+    checks = 0
+
+    def is_free(q: np.ndarray) -> bool:
+        nonlocal checks
+        checks += 1
+        return world.is_free(q)
+
+    counted = PlanningProblem(asked.start, asked.goal, asked.manifold, is_free)
+    assert SamplingPlanner("birrt", SETTINGS).plan(counted, seed=0).status == "solved"
+    assert checks < 4500  # 2800; walking on into dead ends takes 7000
 
 
 @pytest.mark.parametrize("space", ["atlas", "tangent_bundle"])
@@ -153,13 +184,12 @@ def test_all_axes_held_leave_no_way(world: World) -> None:
 
 
 def test_relaxed_cup_uses_its_band_and_stays_in_it(world: World) -> None:
-    asked = problem(world, RELAXED, 5)
+    asked = problem(world, RELAXED, 10)
     # the atlas has no charts for a band: the projected space stands in
     path = SamplingPlanner("birrt", SETTINGS.model_copy(update={"space": "atlas"})).plan(asked, seed=0)
     assert_sound(path, asked, world)
     tilt = np.linalg.norm(asked.manifold.residual(path.joints)[:, 3:], axis=1)
-    assert np.radians(2) < tilt.min(initial=np.pi, where=tilt > np.radians(2))
-    assert tilt.max() <= np.radians(10) + 1e-4
+    assert np.radians(2) < tilt.max() <= np.radians(10) + 1e-4
 
 
 def test_free_motion_goes_around_a_pillar(xarm: SerialRobot) -> None:
@@ -169,8 +199,9 @@ def test_free_motion_goes_around_a_pillar(xarm: SerialRobot) -> None:
         straight = start + np.linspace(0, 1, 50)[:, None] * (goal - start)
         assert not world.free(straight).all()
         asked = PlanningProblem(start, goal, manifold, world.is_free)
+        settings = SETTINGS.model_copy(update={"rrt_star_iterations": 1500})
         for name in PLANNERS:
-            assert_sound(SamplingPlanner(name, SETTINGS).plan(asked, seed=0), asked, world)
+            assert_sound(SamplingPlanner(name, settings).plan(asked, seed=0), asked, world)
 
 
 def test_seven_joints_need_no_other_code() -> None:

@@ -74,3 +74,28 @@ def jump_excess(joints: Float[np.ndarray, "*batch T D"]) -> Float[np.ndarray, "*
     direct = np.linalg.norm(joints[..., -1, :] - joints[..., 0, :], axis=-1)
     allowed = 0.05 + 4.0 * direct / steps.shape[-1]
     return np.maximum(steps - allowed[..., None], 0.0).sum(axis=-1)
+
+
+def densify(joints: Float[np.ndarray, "T D"], spacing: float) -> Float[np.ndarray, "n D"]:
+    """Points along the straight lines between the given ones, at most `spacing` [rad] apart; the given ones stay."""
+    pieces = np.ceil(np.linalg.norm(np.diff(joints, axis=0), axis=-1) / spacing).astype(int).clip(1)
+    rows = np.repeat(np.arange(len(pieces)), pieces)
+    share = (np.arange(len(rows)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / pieces[rows]
+    inner = joints[rows] + share[:, None] * (joints[rows + 1] - joints[rows])
+    return np.concatenate([inner, joints[-1:]])
+
+
+def as_executed(
+    manifold: ConstraintManifold, joints: Float[np.ndarray, "T D"], spacing: float
+) -> Float[np.ndarray, "n D"]:
+    """A path's rows at most about `spacing` [rad] apart, the new ones on the constraint; the given ones stay.
+
+    Between its rows an arm moves in straight joint lines, so rows far apart leave the constraint however well each
+    of them keeps it.  A jump stays one: what lies between its sides retracts to one side or the other.
+    """
+    if len(joints) < 2:
+        return joints
+    dense = densify(joints, spacing)
+    refined = retract(manifold, dense).joints
+    refined[0], refined[-1] = joints[0], joints[-1]
+    return refined

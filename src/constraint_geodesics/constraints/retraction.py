@@ -47,6 +47,4 @@ def retract(
         joints, settings.accuracy, settings.iterations, settings.largest_step, worst,
     )  # fmt: skip
     batch = q.shape[:-1]
-    return Retracted(
-        joints.reshape(q.shape), worst.reshape(batch), (worst <= settings.accuracy).reshape(batch)
-    )
+    return Retracted(joints.reshape(q.shape), worst.reshape(batch), (worst <= settings.accuracy).reshape(batch))

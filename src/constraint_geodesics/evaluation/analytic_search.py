@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 
 from constraint_geodesics.evaluation.geodesic_search import SeedLog
-from constraint_geodesics.geodesics.environment import COEFFICIENT_SCALE, begin
+from constraint_geodesics.geodesics.environment import begin
 from constraint_geodesics.geodesics.policy_search import TrainedPolicy, episode_settings, follow, train_policy
-from constraint_geodesics.geodesics.problem import ChartProblem, Ends
+from constraint_geodesics.geodesics.problem import ChartProblem, Ends, repeated
 from constraint_geodesics.geometry.analytic import Plane, Sphere
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.params import GeodesicParams
@@ -22,7 +22,7 @@ DRAWN_ROLLOUTS = 12
 DRAWN = 65
 """Points of a drawn curve."""
 
-MANIFOLDS = {
+MANIFOLDS: dict[str, tuple[Plane | Sphere, tuple[float, float], tuple[float, float]]] = {
     "plane": (Plane(), (-1.5, -1.5), (1.5, 1.5)),
     "sphere": (Sphere(), (-1.0, -1.2), (1.0, 1.2)),
 }
@@ -79,7 +79,7 @@ def run_analytic(task: AnalyticTask) -> AnalyticResult:
     rng = np.random.default_rng(PAIRS_SEED)
     settings, size = episode_settings(task.params), problem.curve.coefficients
     ends = problem.sample_ends(PAIRS, rng)
-    first = begin(problem, ends, rng.normal(scale=COEFFICIENT_SCALE, size=(PAIRS, size)))
+    first = begin(problem, ends, problem.sample_curves(ends, rng))
     visited = follow(problem, policy.actor, settings, first, np.zeros((task.params.episode_steps, PAIRS, size)))
     lengths = np.array([states.length for states in visited])
     best = visited[int(lengths[:, 0].argmin())].phi[:1]
@@ -96,7 +96,8 @@ def _sampled(
 ) -> Float[np.ndarray, "n T 2"]:
     """Curves that sampled roll-outs between the first pair of ends meet."""
     size = problem.curve.coefficients
-    first = begin(problem, ends[np.zeros(DRAWN_ROLLOUTS, int)], rng.normal(size=(DRAWN_ROLLOUTS, size)))
+    pair = repeated(ends, DRAWN_ROLLOUTS)
+    first = begin(problem, pair, problem.sample_curves(pair, rng))
     noise = rng.normal(size=(task.params.episode_steps, DRAWN_ROLLOUTS, size))
     visited = follow(problem, policy.actor, episode_settings(task.params), first, noise)
     return np.concatenate([_points(problem, states.phi, ends) for states in visited])
@@ -105,5 +106,5 @@ def _sampled(
 def _points(problem: ChartProblem, phi: Float[np.ndarray, "n p"], ends: Ends) -> Float[np.ndarray, "n T 2"]:
     """Points of curves between the first pair of ends."""
     t = torch.linspace(0.0, 1.0, DRAWN, dtype=torch.float64)
-    arrays = (torch.from_numpy(x) for x in (phi, ends.z_start[:1], ends.z_goal[:1]))
-    return problem.curve.evaluate(*arrays, t)[0].numpy()
+    free, start, goal = (torch.from_numpy(x) for x in (phi, ends.z_start[:1], ends.z_goal[:1]))
+    return problem.curve.evaluate(free, start, goal, t)[0].numpy()

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.constraints.submanifold import GraphSubmanifold, Submanifold, component_of
-from constraint_geodesics.evaluation.metrics import Free, PathMeasures, measure_path
 from constraint_geodesics.constraints.vector import ConstraintManifold
+from constraint_geodesics.evaluation.metrics import Free, PathMeasures, measure_path
 from constraint_geodesics.geodesics.policy_search import TrainedPolicy, save_policy, search, train_policy
 from constraint_geodesics.geodesics.problem import Ends, Geodesic, LearnedProblem
 from constraint_geodesics.geometry.curves import PinnedPolynomial
@@ -83,7 +83,7 @@ def run_seed(task: SeedTask) -> SeedResult:
                 found = search(task.problem, policy.actor, task.params, ends, task.seed, accept)
             else:
                 found = Geodesic("not_connected", np.zeros(task.problem.curve.coefficients), *_NOTHING)
-            row, path = measured(task, query, found, ends, world.free)
+            row, path = measured(task, found, ends, world.free)
             rows.append({"planner": PLANNER, "query": query, "seed": task.seed, **row})
             paths.append(path)
             coefficients.append(found.phi)
@@ -99,7 +99,7 @@ def straight_rows(task: SeedTask) -> tuple[list[dict[str, Any]], list[Float[np.n
             ends = query_ends(task.problem, task.queries, query)
             costs = task.problem.evaluate(phi[None], ends)
             found = Geodesic("solved", phi, float(costs.length[0]), float(costs.length[0]), 1, float("nan"))
-            row, path = measured(task, query, found, ends, world.free)
+            row, path = measured(task, found, ends, world.free)
             rows.append({"planner": STRAIGHT, "query": query, "seed": 0, **row})
             paths.append(path)
     return rows, paths
@@ -108,7 +108,7 @@ def straight_rows(task: SeedTask) -> tuple[list[dict[str, Any]], list[Float[np.n
 def connected_queries(
     submanifold: Submanifold, problem: LearnedProblem, queries: Queries, free: Free, params: SubmanifoldParams
 ) -> Bool[np.ndarray, "Q"]:
-    """Which queries have both ends in one component; a drawn plane (two dimensions) says nothing about its exact set."""
+    """Which queries have both ends in one component; a drawn latent plane says nothing about the exact set."""
     if not isinstance(submanifold, GraphSubmanifold):
         return np.ones(len(queries), dtype=bool)
 
@@ -126,9 +126,7 @@ def geodesic_problem(
     geodesics = params.geodesics
     curve = PinnedPolynomial(chart.dim, geodesics.degree)
     retract = params.manifolds[name].retract
-    return LearnedProblem(
-        chart, manifold, curve, joints, geodesics.nodes, retract, geodesics.reward.inclusion_weight
-    )
+    return LearnedProblem(chart, manifold, curve, joints, geodesics.nodes, retract, geodesics.reward.inclusion_weight)
 
 
 def query_ends(problem: LearnedProblem, queries: Queries, query: int) -> Ends:
@@ -142,7 +140,7 @@ def exact_check(task: SeedTask, ends: Ends, free: Free) -> Callable[[np.ndarray]
     def accept(phi: np.ndarray) -> bool:
         if not task.problem.retract:
             return True
-        path = task.problem.path(phi, ends, task.judge.spacing_rad)
+        path = task.problem.path(phi, ends, task.judge.row_spacing_rad)
         return judged(task, path, ends, free).valid
 
     return accept
@@ -155,11 +153,11 @@ def judged(task: SeedTask, path: np.ndarray, ends: Ends, free: Free) -> PathMeas
 
 
 def measured(
-    task: SeedTask, query: int, found: Geodesic, ends: Ends, free: Free
+    task: SeedTask, found: Geodesic, ends: Ends, free: Free
 ) -> tuple[dict[str, Any], Float[np.ndarray, "T D"]]:
     """A result as a row of the table, and its joint path (empty where nothing was found)."""
     empty = np.zeros((0, ends.q_start.shape[1]))
-    path = task.problem.path(found.phi, ends, task.judge.spacing_rad) if found.status == "solved" else empty
+    path = task.problem.path(found.phi, ends, task.judge.row_spacing_rad) if found.status == "solved" else empty
     row = {"status": found.status, "time_s": found.time_s, "evaluations": found.evaluations}
     return row | judged(task, path, ends, free).row(), path
 

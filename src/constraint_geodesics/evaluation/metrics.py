@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from constraint_geodesics.constraints.lift import densify
 from constraint_geodesics.constraints.vector import ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import JudgeParams
@@ -52,8 +53,10 @@ def measure_path(
     if not np.isfinite(joints).all():
         return _unmeasured("not finite", charts)
     dense = densify(joints, judge.spacing_rad)
-    inclusion = manifold.inclusion(dense)
-    largest_m, largest_rad = float(inclusion[:, :3].max()), float(manifold_angle(manifold, dense))
+    # halfway between two points on the constraint a straight line is furthest from it
+    checked = np.concatenate([dense, 0.5 * (dense[1:] + dense[:-1])])
+    largest_m = float(manifold.inclusion(checked)[:, :3].max())
+    largest_rad = manifold_angle(manifold, checked)
     steps = np.linalg.norm(np.diff(joints, axis=0), axis=-1)
     position = manifold.robot.forward(dense)[0]
     ends_off = max(np.abs(joints[0] - start).max(), np.abs(joints[-1] - goal).max())
@@ -88,15 +91,6 @@ def manifold_angle(manifold: ConstraintManifold, q: Float[np.ndarray, "n D"]) ->
     if len(set(manifold.tolerance[3:][manifold.held[3:]])) == 1:
         return float(np.linalg.norm(angles, axis=-1).max())
     return float(angles.max())
-
-
-def densify(joints: Float[np.ndarray, "T D"], spacing: float) -> Float[np.ndarray, "n D"]:
-    """Points along the straight lines between the given ones, at most `spacing` [rad] apart; the given ones stay."""
-    pieces = np.ceil(np.linalg.norm(np.diff(joints, axis=0), axis=-1) / spacing).astype(int).clip(1)
-    rows = np.repeat(np.arange(len(pieces)), pieces)
-    share = (np.arange(len(rows)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / pieces[rows]
-    inner = joints[rows] + share[:, None] * (joints[rows + 1] - joints[rows])
-    return np.concatenate([inner, joints[-1:]])
 
 
 def polyline_length(points: Float[np.ndarray, "T A"]) -> float:

@@ -17,9 +17,6 @@ from stable_baselines3.common.vec_env import VecEnv
 from constraint_geodesics.geodesics.problem import Ends, GeodesicProblem
 from constraint_geodesics.params import RewardParams
 
-COEFFICIENT_SCALE = 1.0
-"""Standard deviation of the random coefficients that half of the episodes start from."""
-
 
 @dataclass(frozen=True)
 class EpisodeSettings:
@@ -70,8 +67,7 @@ def begin(problem: GeodesicProblem, ends: Ends, phi: Float[np.ndarray, "B p"]) -
 def draw_episodes(problem: GeodesicProblem, count: int, rng: np.random.Generator) -> CurveStates:
     """Episodes on random ends; every other one starts from a random curve, so that bad ones are met as well."""
     ends = problem.sample_ends(count, rng)
-    phi = rng.normal(scale=COEFFICIENT_SCALE, size=(count, problem.curve.coefficients))
-    phi *= rng.integers(2, size=(count, 1))
+    phi = problem.sample_curves(ends, rng) * rng.integers(2, size=(count, 1))
     return begin(problem, ends, phi)
 
 
@@ -115,7 +111,7 @@ def gompertz(x: Float[np.ndarray, "*batch"], b: float, c: float) -> Float[np.nda
     return np.exp(-b * np.exp(np.clip(-c * x, -50.0, 50.0)))
 
 
-def observe(problem: GeodesicProblem, settings: EpisodeSettings, states: CurveStates) -> Float[np.ndarray, "B o"]:
+def observe(settings: EpisodeSettings, states: CurveStates) -> Float[np.ndarray, "B o"]:
     """What the policy sees: coefficients, both ends, saving against the straight line, best saving, time left."""
     scale = np.maximum(states.straight_cost, 1e-9)
     columns = [
@@ -164,7 +160,7 @@ class CurveVecEnv(VecEnv):
         self._reset_seeds()
         self.states = draw_episodes(self.problem, self.num_envs, self.rng)
         self.returns[:] = 0.0
-        return observe(self.problem, self.settings, self.states)
+        return observe(self.settings, self.states)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions for `step_wait`."""
@@ -176,7 +172,7 @@ class CurveVecEnv(VecEnv):
         self.returns += reward
         done = self.states.step >= self.settings.steps
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        observation = observe(self.problem, self.settings, self.states)
+        observation = observe(self.settings, self.states)
         if done.any():
             rows = np.flatnonzero(done)
             for row in rows:
@@ -185,11 +181,11 @@ class CurveVecEnv(VecEnv):
             self.episode_returns += self.returns[rows].tolist()
             self.returns[rows] = 0.0
             self.states = self.states.replaced(rows, draw_episodes(self.problem, len(rows), self.rng))
-            observation = observe(self.problem, self.settings, self.states)
+            observation = observe(self.settings, self.states)
         return observation, reward.astype(np.float32), done, infos
 
     def pop_figures(self) -> dict[str, float]:
-        """Means over the episodes finished since the last call: saving of the best curve against the straight, return."""
+        """Means over the episodes finished since the last call: the best curve's saving over the straight, return."""
         figures = {
             "saving": float(np.mean(self.savings)) if self.savings else 0.0,
             "return": float(np.mean(self.episode_returns)) if self.episode_returns else 0.0,
@@ -204,7 +200,7 @@ class CurveVecEnv(VecEnv):
         """The same attribute for every curve."""
         return [getattr(self, attr_name, None) for _ in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:  # noqa: ARG002
         """One attribute for all curves."""
         setattr(self, attr_name, value)
 
@@ -212,7 +208,7 @@ class CurveVecEnv(VecEnv):
         """Call a method once for each curve named."""
         return [getattr(self, method_name)(*method_args, **method_kwargs) for _ in self._get_indices(indices)]
 
-    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None) -> list[bool]:  # noqa: ARG002
         """No copy is wrapped by itself."""
         return [False for _ in self._get_indices(indices)]
 
@@ -225,16 +221,16 @@ class CurveEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_space, self.action_space = _spaces(problem)
         self.states: CurveStates | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:  # noqa: ARG002
         """A fresh episode."""
         super().reset(seed=seed)
         self.states = draw_episodes(self.problem, 1, self.np_random)
-        return observe(self.problem, self.settings, self.states)[0], {}
+        return observe(self.settings, self.states)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """One change of the curve; episodes are only ever truncated."""
         if self.states is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         self.states, reward = advance(self.problem, self.settings, self.states, np.asarray(action, np.float64)[None])
-        observation = observe(self.problem, self.settings, self.states)[0]
+        observation = observe(self.settings, self.states)[0]
         return observation, float(reward[0]), False, bool(self.states.step[0] >= self.settings.steps), {}

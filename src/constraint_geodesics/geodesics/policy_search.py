@@ -21,7 +21,6 @@ from stable_baselines3.common.vec_env import VecMonitor
 from torch import Tensor, nn
 
 from constraint_geodesics.geodesics.environment import (
-    COEFFICIENT_SCALE,
     CurveStates,
     CurveVecEnv,
     EpisodeSettings,
@@ -30,9 +29,11 @@ from constraint_geodesics.geodesics.environment import (
     observation_size,
     observe,
 )
-from constraint_geodesics.geodesics.problem import Ends, Geodesic, GeodesicProblem
+from constraint_geodesics.geodesics.problem import Ends, Geodesic, GeodesicProblem, repeated
 from constraint_geodesics.params import GeodesicParams, PpoParams
 
+DRAWN_A_START = 16
+"""Random curves drawn for each of those that roll-outs start from."""
 MOST_CHECKED = 40
 """Candidates given to the exact check at most: those behind them are no shorter and mostly alike."""
 
@@ -58,9 +59,7 @@ class Actor(nn.Module):
         """Mean actions."""
         return self.mean(self.body(observation))
 
-    def act(
-        self, observation: Float[np.ndarray, "B o"], noise: Float[np.ndarray, "B p"]
-    ) -> Float[np.ndarray, "B p"]:
+    def act(self, observation: Float[np.ndarray, "B o"], noise: Float[np.ndarray, "B p"]) -> Float[np.ndarray, "B p"]:
         """Mean actions plus the given multiples of the standard deviation."""
         with torch.no_grad():
             mean = self(torch.from_numpy(observation)).numpy()
@@ -109,21 +108,28 @@ def search(
     """The shortest acceptable curve that a batch of roll-outs meets between one start and goal.
 
     The first roll-out follows the policy's mean from the straight line, the others sample its actions, half of them
-    from random curves.  Every curve met counts, the straight line included, so policy search never returns a longer
-    curve than it began with.  accept: an exact check (collision, say) applied to the candidates, shortest first.
+    from the cheapest of many random curves.  Every curve met counts, the straight line included, so policy search
+    never returns a longer curve than it began with.
+    accept: an exact check (collision, say) applied to the candidates, shortest first.
     """
     began = time.perf_counter()
     rng = np.random.default_rng(seed)
     count, size = params.rollouts, problem.curve.coefficients
-    phi = rng.normal(scale=COEFFICIENT_SCALE, size=(count, size))
-    phi[: (count + 1) // 2] = 0.0
+    phi = _starts(problem, ends, count // 2, rng)
+    phi = np.concatenate([np.zeros((count - len(phi), size)), phi])
     noise = rng.normal(size=(params.episode_steps, count, size))
     noise[:, 0] = 0.0
-    first = begin(problem, ends[np.zeros(count, dtype=int)], phi)
-    visited = follow(problem, actor, episode_settings(params), first, noise)
+    visited = follow(problem, actor, episode_settings(params), begin(problem, repeated(ends, count), phi), noise)
     costs = np.concatenate([states.cost for states in visited])
     coefficients = np.concatenate([states.phi for states in visited])
     return _first_accepted(problem, ends, costs, coefficients, accept, began)
+
+
+def _starts(problem: GeodesicProblem, ends: Ends, count: int, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
+    """The cheapest of many random curves: in one batch they cost next to nothing."""
+    drawn = problem.sample_curves(repeated(ends, DRAWN_A_START * count), rng)
+    costs = problem.evaluate(drawn, repeated(ends, len(drawn)))
+    return drawn[np.argsort(costs.cost, kind="stable")[:count]]
 
 
 def follow(
@@ -133,7 +139,7 @@ def follow(
     """The I + 1 states of B roll-outs; noise: multiples of the policy's standard deviation, 0 for its mean."""
     visited = [states]
     for step_noise in noise:
-        action = actor.act(observe(problem, settings, visited[-1]), step_noise)
+        action = actor.act(observe(settings, visited[-1]), step_noise)
         visited.append(advance(problem, settings, visited[-1], action)[0])
     return visited
 
@@ -145,7 +151,7 @@ def _first_accepted(
     coefficients = np.concatenate([np.zeros((1, coefficients.shape[1])), coefficients])
     costs = np.concatenate([straight.cost, costs])
     order = np.argsort(costs, kind="stable")[:MOST_CHECKED]
-    exact = problem.evaluate(coefficients[order], ends[np.zeros(len(order), dtype=int)])
+    exact = problem.evaluate(coefficients[order], repeated(ends, len(order)))
     for row, feasible, length in zip(order, exact.feasible, exact.length, strict=True):
         if feasible and accept(coefficients[row]):
             return Geodesic(
@@ -227,14 +233,15 @@ class _Progress(BaseCallback):
     def save(self) -> None:
         """Called between an update and the next rollout, where all that is still to come depends on this state."""
         environment, model = self.environment, self.model
+        _, words, place, *_ = np.random.get_state(legacy=True)  # noqa: NPY002 - stable-baselines3 shuffles with it
         states = environment.states
         arrays = {name: value for name, value in vars(states).items() if name != "ends"}
         content: dict[str, Any] = {
             "policy": model.policy.state_dict(),
             "optimiser": model.policy.optimizer.state_dict(),
             "torch_rng": torch.get_rng_state(),
-            "numpy_rng": np.random.get_state()[1].tolist(),  # noqa: NPY002 - stable-baselines3 shuffles with it
-            "numpy_rng_place": np.random.get_state()[2],  # noqa: NPY002
+            "numpy_rng": np.asarray(words).tolist(),
+            "numpy_rng_place": place,
             "environment_rng": json.dumps(environment.rng.bit_generator.state),
             "states": {name: torch.from_numpy(value) for name, value in arrays.items()},
             "ends": {name: torch.from_numpy(value) for name, value in vars(states.ends).items()},
@@ -264,6 +271,6 @@ class _Progress(BaseCallback):
         environment.states = CurveStates(ends=ends, **arrays)
         environment.returns = content["returns"].numpy()
         model.num_timesteps = self._saved_at = content["steps"]
-        model._last_obs = observe(environment.problem, environment.settings, environment.states)
-        model._last_episode_starts = (environment.states.step == 0)
+        model._last_obs = observe(environment.settings, environment.states)
+        model._last_episode_starts = environment.states.step == 0
         self.rows = content["rows"]

@@ -1,6 +1,6 @@
 """What a geodesic solver is asked and what it answers: ends, the cost of curves between them, the result."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import joblib
@@ -43,6 +43,11 @@ class Ends:
         return Ends(*copies)
 
 
+def repeated(ends: Ends, count: int) -> Ends:
+    """The first of the ends, `count` times."""
+    return ends[np.zeros(count, dtype=int)]
+
+
 @dataclass(frozen=True)
 class Costs:
     """Length of B curves, their cost (the length and what is wrong with them), and which are curves one could use."""
@@ -66,6 +71,10 @@ class GeodesicProblem(Protocol):
 
     def sample_ends(self, count: int, rng: np.random.Generator) -> Ends:
         """Ends to train on."""
+        ...
+
+    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
+        """Coefficients of one random curve between each of the given ends."""
         ...
 
     def fingerprint(self) -> str:
@@ -101,14 +110,19 @@ class ChartProblem:
 
     def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
         """The cost is the length."""
-        arrays = [torch.from_numpy(np.asarray(x, np.float64)) for x in (phi, ends.z_start, ends.z_goal)]
-        length = curve_length(self.manifold, self.curve, *arrays, Quadrature.gauss_legendre(self.nodes)).numpy()
+        free, start, goal = (torch.from_numpy(np.asarray(x, np.float64)) for x in (phi, ends.z_start, ends.z_goal))
+        rule = Quadrature.gauss_legendre(self.nodes)
+        length = curve_length(self.manifold, self.curve, free, start, goal, rule).numpy()
         return Costs(length, length, np.ones(len(length), dtype=bool))
 
     def sample_ends(self, count: int, rng: np.random.Generator) -> Ends:
         """Uniform in the box."""
         start, goal = (rng.uniform(self.low, self.high, (count, len(self.low))) for _ in range(2))
         return Ends(start, goal, start, goal)
+
+    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
+        """Normal coefficients."""
+        return rng.normal(size=(len(ends), self.curve.coefficients))
 
     def fingerprint(self) -> str:
         """Of manifold, curve family, box and rule."""
@@ -132,7 +146,7 @@ class LearnedProblem:
     nodes: int
     retract: bool
     inclusion_weight: float
-    retraction: Retraction = Retraction(accuracy=1e-4, iterations=6)
+    retraction: Retraction = field(default_factory=lambda: Retraction(accuracy=1e-4, iterations=6))
 
     def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
         """Length and cost; a curve is feasible if it has no jump, stays within the limits and, retracted, converged."""
@@ -182,6 +196,17 @@ class LearnedProblem:
         """Pairs of configurations of the constraint's data."""
         rows = rng.integers(len(self.joints), size=(2, count))
         return self.ends(self.joints[rows[0]], self.joints[rows[1]])
+
+    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
+        """Curves bent towards random configurations of the constraint's data: where a straight line changes its
+        branch, the way round leads past some of them.
+        """
+        past = self.chart.encode(self.joints[rng.integers(len(self.joints), size=len(ends))])
+        share = rng.uniform(size=(len(ends), 1))
+        bend = share * (past - 0.5 * (ends.z_start + ends.z_goal))
+        phi = rng.normal(scale=0.1, size=(len(ends), self.curve.dim, self.curve.degree - 1))
+        phi[..., 0] += 4.0 * bend  # the first basis function t (1 − t) is 1/4 halfway
+        return phi.reshape(len(ends), -1)
 
     def fingerprint(self) -> str:
         """Of the networks, robot, constraint, data and settings."""

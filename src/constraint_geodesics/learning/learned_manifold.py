@@ -69,13 +69,13 @@ class LearnedManifold:
             return torch.cat([self.embed(piece) for piece in pieces]).numpy().reshape(*z.shape[:-1], -1)
 
     def embed_joints(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch A"]:
-        """f of the encoded configurations: where a joint path lies on the manifold [rad]."""
+        """The embedding of encoded configurations: where a joint path lies on the manifold [rad]."""
         with torch.no_grad():
             return self.embed(self.vae.encode(self.tensor(q))[0]).numpy().astype(np.float64)
 
     def tensor(self, values: np.ndarray) -> Tensor:
         """An array in the network's own precision."""
-        return torch.as_tensor(values).to(self.vae.centre.dtype)
+        return torch.tensor(values, dtype=self.vae.centre.dtype)
 
     def save(self, folder: Path) -> None:
         """Write weights (safetensors) and a card (JSON: sizes and the weights' SHA-256)."""
@@ -84,7 +84,9 @@ class LearnedManifold:
         card = {
             "dof": self.vae.dof,
             "latent_dim": self.dim,
-            "hidden": [layer.out_features for layer in self.vae.encoder.nonlinear if hasattr(layer, "out_features")][:-1],
+            "hidden": [layer.out_features for layer in self.vae.encoder.nonlinear if hasattr(layer, "out_features")][
+                :-1
+            ],
             "variance_centres": len(self.vae.precision.centres),
             "sha256": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest(),
         }

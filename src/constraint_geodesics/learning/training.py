@@ -89,7 +89,7 @@ class _History(Callback):
         self.phase, self.first, self.report = phase, first, report
         self.rows: list[dict[str, float]] = []
 
-    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:  # noqa: ARG002
         if trainer.sanity_checking:
             return
         figures = {f"{self.phase}_{name}": float(value) for name, value in trainer.callback_metrics.items()}

@@ -80,9 +80,7 @@ def forward_batch(origins, axes, prismatic, base, tool, q, positions, rotations)
     joint_origins = np.empty((q.shape[1], 3))
     joint_axes = np.empty((q.shape[1], 3))
     for b in range(q.shape[0]):
-        pose_of(
-            origins, axes, prismatic, base, tool, q[b], positions[b], rotations[b], joint_origins, joint_axes
-        )
+        pose_of(origins, axes, prismatic, base, tool, q[b], positions[b], rotations[b], joint_origins, joint_axes)
 
 
 @njit(**_COMPILE)

@@ -40,9 +40,14 @@ def record_rows(
     return named
 
 
-def latent_view(
-    submanifold: Submanifold, chart: LearnedManifold, joints: Float[np.ndarray, "T D"]
-) -> LatentView:
+def save_paths(rows: Sequence[Mapping[str, Any]], paths: Sequence[Float[np.ndarray, "T D"]], folder: Path) -> None:
+    """All joint paths [rad] of a table in one npz, named <planner>-<query>-<seed>."""
+    folder.mkdir(parents=True, exist_ok=True)
+    named = {f"{row['planner']}-{row['query']}-{row['seed']}": path for row, path in zip(rows, paths, strict=True)}
+    np.savez_compressed(folder / "paths.npz", **named)  # type: ignore[arg-type]
+
+
+def latent_view(submanifold: Submanifold, chart: LearnedManifold, joints: Float[np.ndarray, "T D"]) -> LatentView:
     """The sub-manifold and an encoded path: the latent plane itself, or its first two principal axes."""
     curve = chart.encode(joints)
     if isinstance(submanifold, GridSubmanifold):

@@ -1,0 +1,111 @@
+"""The whole pipeline on small parameters, in a copy of this checkout: `python tests/pipeline/smoke.py FOLDER`."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+
+SMALL: dict[str, Any] = {
+    "labels": {"free_rows": 6000, "constrained_rows": 1500, "shard_rows": 1500},
+    "queries": {"count": 3},
+    "manifolds": {
+        "paper": {"epochs": 3, "variance_epochs": 2, "variance_centres": 32},
+        "planner": {"epochs": 6, "variance_epochs": 2, "variance_centres": 64},
+    },
+    "submanifold": {"grid": 40, "nodes": 300},
+    "geodesics": {
+        "seeds": [0, 1],
+        "steps": 2560,
+        "analytic_steps": 2560,
+        "analytic": ["plane"],
+        "environments": 64,
+        "illustrated_constraints": ["level_cup"],
+        "rollouts": 8,
+        "checkpoint_steps": 1000,
+        "ppo": {"batch_size": 320},
+    },
+    "benchmark": {"seeds": [0], "rrt_star_iterations": 100, "prm_iterations": 100},
+}
+CONSTRAINTS = ("free", "level_cup")
+
+
+def copy_checkout(folder: Path) -> None:
+    """A clone of the files as they are now, uncommitted ones included, without any result."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+    ).stdout.decode()
+    for name in filter(None, listed.split("\0")):
+        source = ROOT / name
+        if source.is_file() and not name.startswith(("reports/", "dvc.lock")):
+            target = folder / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(source, target)
+    for command in (
+        ["git", "init", "-q"],
+        ["git", "add", "-A"],
+        ["git", "-c", "user.name=smoke", "-c", "user.email=smoke@localhost", "commit", "-q", "-m", "smoke"],
+    ):
+        subprocess.run(command, cwd=folder, check=True)
+
+
+def shrink_params(folder: Path) -> None:
+    """Small parameters and two constraints in the copy's params.yaml."""
+    file = folder / "params.yaml"
+    params = yaml.safe_load(file.read_text())
+    params["constraints"] = {name: params["constraints"][name] for name in CONSTRAINTS}
+    _overlay(params, SMALL)
+    file.write_text(yaml.safe_dump(params, sort_keys=False))
+
+
+def _overlay(params: dict[str, Any], changes: dict[str, Any]) -> None:
+    for name, value in changes.items():
+        if isinstance(value, dict):
+            _overlay(params[name], value)
+        else:
+            params[name] = value
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """The copy's own source before the installed one, this environment's programs first, no store from outside."""
+    variables = {k: v for k, v in os.environ.items() if k != "MLFLOW_TRACKING_URI"}
+    path = os.pathsep.join([str(Path(sys.executable).parent), variables.get("PATH", "")])
+    return variables | {"PYTHONPATH": str(folder / "src"), "PATH": path}
+
+
+def dvc(folder: Path, *arguments: str, capture: bool = True) -> subprocess.CompletedProcess[str]:
+    """One dvc command in the copy."""
+    command = [sys.executable, "-m", "dvc", *arguments]
+    return subprocess.run(command, cwd=folder, env=environment(folder), capture_output=capture, text=True, check=False)
+
+
+def main(folder: Path) -> int:
+    """Run everything once and print the result table."""
+    began = time.monotonic()
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    copy_checkout(folder)
+    shrink_params(folder)
+    code = dvc(folder, "repro", capture=False).returncode
+    if code == 0:
+        subprocess.run(
+            [sys.executable, "-m", "constraint_geodesics.cli", "results"],
+            cwd=folder,
+            env=environment(folder),
+            check=True,
+        )
+        print(f"\nThe whole pipeline on small parameters took {time.monotonic() - began:.0f} s; see {folder}")
+    return code
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(Path(sys.argv[1]).resolve()))
