@@ -17,7 +17,9 @@ from threadpoolctl import threadpool_info
 
 from constraint_geodesics import compute
 from constraint_geodesics.compute import ComputeError, parallel_map
-from constraint_geodesics.params import ComputeParams
+from constraint_geodesics.constraints.scene import Scene
+from constraint_geodesics.learning.dataset import draw_shard, shard_tasks
+from constraint_geodesics.params import ComputeParams, Params
 
 TWO = ComputeParams(backend="loky", workers=2)
 ONE = ComputeParams(backend="loky", workers=1)
@@ -54,14 +56,27 @@ def overwrite(values: np.ndarray) -> float:
     return float(values.sum())
 
 
+def stop(process: subprocess.Popen[bytes]) -> int:
+    process.terminate()
+    try:
+        return process.wait(20)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        raise
+
+
 @pytest.fixture(scope="module")
 def dask(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ComputeParams]:
     """A real scheduler with two workers, on loopback; they must stop in order when asked to."""
     folder = tmp_path_factory.mktemp("dask")
     file, command = folder / "scheduler.json", [sys.executable, "-m", "dask"]
     loopback = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    environment["DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES"] = "0"
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    environment |= {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+    environment |= {
+        "OMP_NUM_THREADS": "2",
+        "OPENBLAS_NUM_THREADS": "2",
+    }  # workers that someone started with other ideas
     with (folder / "log.txt").open("w") as log:
         options = {"stdout": log, "stderr": log, "env": environment, "cwd": folder}
         scheduler = subprocess.Popen([*command, "scheduler", "--port", "0", *loopback], **options)
@@ -73,9 +88,8 @@ def dask(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ComputeParams]:
                 time.sleep(0.05)
             yield ComputeParams(backend="dask", workers=0, dask_address=json.loads(file.read_text())["address"])
         finally:
-            for process in (*workers, scheduler):
-                process.terminate()
-            codes = [process.wait(20) for process in (*workers, scheduler)]
+            # workers first: one that is told to stop by its scheduler and by a signal at once may hang
+            codes = [stop(process) for process in (*workers, scheduler)]
     assert set(codes) <= {0, DEAD}, (folder / "log.txt").read_text()
 
 
@@ -93,6 +107,13 @@ def test_dask_loky_and_this_process_give_the_same_bits(dask: ComputeParams) -> N
     expected = parallel_map(products, SEEDS, ONE)
     assert parallel_map(products, SEEDS, TWO) == expected
     assert parallel_map(products, SEEDS, dask) == expected
+
+
+def test_a_stages_own_tasks_run_on_dask_as_on_loky(dask: ComputeParams, scene: Scene, params: Params) -> None:
+    manifold = scene.manifold(params.constraints["level_cup"])
+    tasks = shard_tasks(scene, manifold, "level_cup", 200, 100, 1)
+    for ours, theirs in zip(parallel_map(draw_shard, tasks, TWO), parallel_map(draw_shard, tasks, dask), strict=True):
+        assert ours.frame.equals(theirs.frame)
 
 
 def test_dask_leaves_nothing_behind(dask: ComputeParams) -> None:

@@ -47,7 +47,7 @@ class PlannedPath:
     time_s: float
     """Wall-clock time from the problem to these configurations."""
     iterations: int
-    """How often the planner's own loop ran."""
+    """How often the planner's own loop ran; for a roadmap, its samples."""
 
 
 class PathPlanner(Protocol):

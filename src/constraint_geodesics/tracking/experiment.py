@@ -213,10 +213,10 @@ def ui_command(root: Path, port: int) -> list[str]:
         raise TrackingError(f"MLFLOW_TRACKING_URI={uri}: this server shows its runs itself, open it in a browser")
     database = _sqlite_file(uri)
     artifacts = _artifact_folder(database) if database else root.resolve() / "mlartifacts"
-    return [
-        "env", "MLFLOW_DISABLE_TELEMETRY=true", sys.executable, "-m", "mlflow", "server", "--backend-store-uri", uri,
-        "--artifacts-destination", str(artifacts), "--host", "127.0.0.1", "--port", str(port), "--workers", "1",
-    ]  # fmt: skip
+    # the job runner serves language models; without it the dashboard starts and stops in half the time
+    quiet = ["env", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false"]
+    server = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
+    return [*quiet, *server, "--backend-store-uri", uri, "--artifacts-destination", str(artifacts)]
 
 
 def _mlflow() -> ModuleType:

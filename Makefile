@@ -1,0 +1,54 @@
+# The environment's programs first, so that `python` and `dvc` in the stages are its own.
+export PATH := $(CURDIR)/.venv/bin:$(PATH)
+export OMP_NUM_THREADS := 1
+PYTHON ?= python3.11
+FILE ?=
+
+.PHONY: help env repro smoke test lint format results ui replay clean
+
+help:  ## list the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 10
+
+.venv/installed: requirements.lock pyproject.toml
+	@command -v $(PYTHON) >/dev/null || { echo "error: Python 3.11 is needed (PyBullet has no wheels for later ones); set PYTHON=..."; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { echo "error: $(PYTHON) is not Python 3.11, which PyBullet's wheels need"; exit 1; }
+	$(PYTHON) -m venv .venv
+	.venv/bin/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	.venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	.venv/bin/python -m pip check
+	@touch $@
+
+env: .venv/installed  ## make .venv with every pinned package
+
+repro: env  ## run all stages that are out of date, then print the results
+	geodesics params
+	dvc repro
+	geodesics results
+
+smoke: env  ## the same pipeline on small parameters, in a copy of this checkout
+	python tests/pipeline/smoke.py .geodesics/smoke
+
+test: env  ## run the tests, the whole pipeline on small parameters among them
+	python -m pytest -n 2 --dist loadgroup
+
+lint: env  ## format, lint, types, import directions
+	ruff format --check .
+	ruff check .
+	mypy
+	lint-imports
+
+format: env  ## format and mend what can be mended
+	ruff format .
+	ruff check --fix .
+
+results: env  ## print the result table
+	geodesics results
+
+ui: env  ## MLflow's dashboard, on this machine only
+	geodesics ui
+
+replay: env  ## replay a path in Rerun: make replay FILE=data/recordings/...
+	geodesics replay $(FILE)
+
+clean:  ## remove unfinished work, not results
+	rm -rf .geodesics

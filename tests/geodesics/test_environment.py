@@ -1,0 +1,105 @@
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as check_gymnasium
+from stable_baselines3.common.env_checker import check_env as check_stable_baselines
+
+from constraint_geodesics.evaluation.analytic_search import analytic_problem
+from constraint_geodesics.geodesics.environment import (
+    CurveEnv,
+    CurveVecEnv,
+    EpisodeSettings,
+    advance,
+    begin,
+    gompertz,
+    observe,
+    rewards,
+)
+
+
+@pytest.fixture(scope="module")
+def problem(params):
+    return analytic_problem("sphere", params.geodesics)
+
+
+@pytest.fixture(scope="module")
+def settings(params):
+    return EpisodeSettings(5, 0.25, params.geodesics.reward)
+
+
+def test_gompertz_rises_from_nought_to_one() -> None:
+    x = np.linspace(-0.3, 2, 9)
+    values = gompertz(x, 3.0, 8.0)
+    assert (np.diff(values) > 0).all()
+    assert gompertz(np.zeros(1), 3.0, 8.0)[0] == pytest.approx(np.exp(-3.0))
+    assert np.isfinite(gompertz(np.array([-1e6, 1e6]), 3.0, 8.0)).all()
+
+
+def test_the_corrected_reward_pays_for_short_curves_the_printed_one_for_long(params) -> None:
+    straight, before = np.full(3, 2.0), np.full(3, 2.0)
+    after = np.array([1.0, 1.5, 1.9])
+    corrected = rewards(params.geodesics.reward, before, after, straight)
+    assert (np.diff(corrected) < 0).all()
+    assert (np.abs(corrected) <= 1).all()
+    by_length = params.geodesics.reward.model_copy(
+        update={"form": "printed", "length_weight": 1.0, "reduction_weight": 0.0, "c": 1.0}
+    )
+    assert (np.diff(rewards(by_length, before, after, straight)) > 0).all()
+
+
+def test_a_longer_curve_earns_no_reduction(params) -> None:
+    only_reduction = params.geodesics.reward.model_copy(update={"length_weight": 0.0, "reduction_weight": 1.0})
+    reward = rewards(only_reduction, np.array([1.0, 1.0]), np.array([1.1, 0.9]), np.ones(2))
+    assert reward[0] == 0.0
+    assert reward[1] > 0.0
+
+
+def test_one_curve_and_many_give_the_same(problem, settings) -> None:
+    rng = np.random.default_rng(0)
+    ends = problem.sample_ends(7, rng)
+    phi, action = problem.sample_curves(ends, rng), rng.uniform(-1, 1, (7, problem.curve.coefficients))
+    states, reward = advance(problem, settings, begin(problem, ends, phi), action)
+    for i in range(7):
+        one = np.array([i])
+        single, single_reward = advance(problem, settings, begin(problem, ends[one], phi[one]), action[one])
+        np.testing.assert_allclose(single_reward, reward[one], rtol=1e-12)
+        np.testing.assert_allclose(observe(settings, single), observe(settings, states)[one], rtol=1e-6)
+
+
+def test_the_single_environment_passes_both_checkers(problem, settings) -> None:
+    check_gymnasium(CurveEnv(problem, settings), skip_render_check=True)
+    check_stable_baselines(CurveEnv(problem, settings))
+
+
+def test_episodes_end_by_time_and_restart(problem, settings) -> None:
+    environment = CurveVecEnv(problem, settings, 4, seed=0)
+    environment.reset()
+    zero = np.zeros((4, problem.curve.coefficients))
+    for step in range(settings.steps):
+        before = environment.states
+        observation, _, done, infos = environment.step(zero)
+        assert done.all() == (step == settings.steps - 1)
+    assert all(info["TimeLimit.truncated"] for info in infos)
+    last = advance(problem, settings, before, zero)[0]
+    np.testing.assert_array_equal(infos[2]["terminal_observation"], observe(settings, last)[2])
+    assert (environment.states.step == 0).all()
+    assert not np.array_equal(observation[2], infos[2]["terminal_observation"])
+
+
+def test_the_seed_decides(problem, settings) -> None:
+    def first(seed):
+        environment = CurveVecEnv(problem, settings, 3, seed=9)
+        environment.seed(seed)
+        return environment.reset()
+
+    np.testing.assert_array_equal(first(1), first(1))
+    assert not np.array_equal(first(1), first(2))
+
+
+def test_the_best_curve_is_never_worse_than_the_straight_one(problem, settings) -> None:
+    rng = np.random.default_rng(3)
+    ends = problem.sample_ends(50, rng)
+    states = begin(problem, ends, problem.sample_curves(ends, rng))
+    for _ in range(4):
+        states, _ = advance(problem, settings, states, rng.uniform(-1, 1, states.phi.shape))
+        assert (states.best_cost <= states.straight_cost).all()
+        np.testing.assert_allclose(problem.evaluate(states.best_phi, ends).cost, states.best_cost, rtol=1e-12)

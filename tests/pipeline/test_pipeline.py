@@ -1,0 +1,149 @@
+"""The whole pipeline, from the first configuration to the report, and what it promises about running again."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from mlflow.tracking import MlflowClient
+
+from constraint_geodesics.tracking.recording import read_recording, same_recordings
+from tests.pipeline import smoke
+
+pytestmark = [pytest.mark.xdist_group("pipeline"), pytest.mark.timeout(600)]
+
+LEARNED = "data/recordings/train_geodesics/planner-level_cup/query0-learned_geodesic-seed0.rrd"
+
+
+def stages_to_run(folder: Path) -> set[str]:
+    """Names of the stages that `dvc repro` would run now."""
+    result = smoke.dvc(folder, "status", "--json")
+    return set(yaml.safe_load(result.stdout))
+
+
+def test_a_second_run_has_nothing_to_do(finished: Path) -> None:
+    assert stages_to_run(finished) == set()
+    began = time.monotonic()
+    result = smoke.dvc(finished, "repro")
+    assert time.monotonic() - began < 10
+    assert result.returncode == 0
+    assert "Running stage" not in result.stdout
+
+
+def test_every_query_keeps_its_row(finished: Path) -> None:
+    learned = pd.read_csv(finished / "reports/train_geodesics/planner-level_cup.csv")
+    sampled = pd.read_csv(finished / "reports/benchmark_planners/level_cup.csv")
+    assert len(learned) == 3 * 2 + 3
+    assert len(sampled) == 3 * 3
+    for table in (learned, sampled):
+        valid = table[table["valid"]]
+        assert len(valid) > 0
+        assert (valid["max_violation_rad"] <= 1e-4).all()
+        assert (valid["length_rad"] > 0).all()
+        assert valid.filter(like="latent_length").notna().all().all()
+
+
+def test_the_report_opens_offline(finished: Path) -> None:
+    page = (finished / "reports/index.html").read_text()
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert 'src="http' not in page
+    for name in ("fig2_analytic_submanifolds", "fig3_plane_search", "fig4a_latent_metric", "fig4c_geodesics"):
+        assert (finished / f"reports/figures/{name}.png").stat().st_size > 5000
+    assert "learned geodesic" in (finished / "reports/table.md").read_text()
+
+
+def test_recordings_replay_the_path(finished: Path) -> None:
+    table = pd.read_csv(finished / "reports/train_geodesics/planner-level_cup.csv")
+    row = table[(table["planner"] == "learned_geodesic") & (table["query"] == 0) & (table["seed"] == 0)].iloc[0]
+    assert row["recording"] == LEARNED
+    summary = read_recording(finished / LEARNED)
+    queries = pd.read_csv(finished / "data/joints/level_cup/queries.csv")
+    np.testing.assert_allclose(summary.joints[0], queries.filter(like="start_").iloc[0], atol=1e-9)
+    np.testing.assert_allclose(summary.joints[-1], queries.filter(like="goal_").iloc[0], atol=1e-9)
+    assert summary.meshes >= 7
+    assert summary.has_blueprint
+
+
+def test_runs_are_grouped_in_mlflow(finished: Path) -> None:
+    client = MlflowClient(f"sqlite:///{finished / 'mlflow.db'}")
+    experiment = client.get_experiment_by_name("constraint_geodesics")
+    runs = client.search_runs([experiment.experiment_id], max_results=1000)
+    parents = {run.info.run_name: run for run in runs if "mlflow.parentRunId" not in run.data.tags}
+    assert len(parents) == len([run for run in runs if "mlflow.parentRunId" not in run.data.tags])
+    parent = parents["train_geodesics planner-level_cup"]
+    children = [run for run in runs if run.data.tags.get("mlflow.parentRunId") == parent.info.run_id]
+    assert len(children) == 2
+    assert "seeds/success_mean" in parent.data.metrics
+    assert parent.data.tags["dvc.stage"] == "train_geodesics@planner-level_cup"
+    assert {run.info.status for run in runs} == {"FINISHED"}
+
+
+def test_the_same_seeds_give_the_same_figures_and_recordings(finished: Path) -> None:
+    before = {name: (finished / name).read_bytes() for name in (
+        "reports/train_geodesics/planner-level_cup.csv", "reports/train_geodesics/planner-level_cup.json",
+        "reports/benchmark_planners/level_cup.csv", LEARNED,
+    )}  # fmt: skip
+    # run by hand, the stages leave DVC's record of what is up to date alone
+    for script in (["train_geodesics.py", "planner", "level_cup"], ["benchmark_planners.py", "level_cup"]):
+        command = [sys.executable, f"stages/{script[0]}", *script[1:]]
+        subprocess.run(command, cwd=finished, env=smoke.environment(finished), check=True, capture_output=True)
+    for name in before:
+        if name.endswith(".csv"):
+            old, new = (
+                pd.read_csv(file).drop(columns="time_s") for file in (_kept(finished, before[name]), finished / name)
+            )
+            pd.testing.assert_frame_equal(old, new, rtol=0, atol=1e-6)
+    assert (finished / "reports/train_geodesics/planner-level_cup.json").read_bytes() == before[
+        "reports/train_geodesics/planner-level_cup.json"
+    ]
+    assert same_recordings(_kept(finished, before[LEARNED], ".rrd"), finished / LEARNED)
+    for name, content in before.items():
+        (finished / name).write_bytes(content)
+
+
+def _kept(folder: Path, content: bytes, suffix: str = ".csv") -> Path:
+    file = folder / ".geodesics" / f"kept{suffix}"
+    file.write_bytes(content)
+    return file
+
+
+def test_a_tolerance_reruns_its_constraint_only(finished: Path) -> None:
+    file = finished / "params.yaml"
+    kept = file.read_text()
+    params = yaml.safe_load(kept)
+    params["constraints"]["level_cup"]["tolerance"] = [0, 0, 0, 0.05, 0.05, 0]
+    file.write_text(yaml.safe_dump(params, sort_keys=False))
+    changed = stages_to_run(finished)
+    file.write_text(kept)
+    assert changed == {
+        "label_joints@level_cup", "extract_submanifold@paper-level_cup", "extract_submanifold@planner-level_cup",
+        "train_geodesics@planner-level_cup", "train_paper_geodesics@paper-level_cup", "benchmark_planners@level_cup",
+        "report",
+    }  # fmt: skip
+
+
+def test_a_new_constraint_reruns_nothing_else(finished: Path) -> None:
+    file = finished / "params.yaml"
+    kept = file.read_text()
+    params = yaml.safe_load(kept)
+    params["constraints"]["upright"] = {**params["constraints"]["level_cup"], "description": "another"}
+    file.write_text(yaml.safe_dump(params, sort_keys=False))
+    changed = stages_to_run(finished)
+    file.write_text(kept)
+    assert changed == {
+        "label_joints@upright", "extract_submanifold@paper-upright", "extract_submanifold@planner-upright",
+        "train_geodesics@planner-upright", "benchmark_planners@upright", "report",
+    }  # fmt: skip
+
+
+def test_a_comment_in_the_report_retrains_nothing(finished: Path) -> None:
+    file = finished / "stages" / "report.py"
+    kept = file.read_text()
+    file.write_text(kept + "# a comment\n")
+    changed = stages_to_run(finished)
+    file.write_text(kept)
+    assert changed == {"report"}

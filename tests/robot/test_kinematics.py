@@ -1,0 +1,78 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from constraint_geodesics.constraints.scene import Scene
+from constraint_geodesics.robot.bullet import data_path
+from constraint_geodesics.robot.kinematics import RobotError, load_robot, rotation_from_rpy
+
+ROBOTS = ["scene", "kuka_scene"]
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_poses_agree_with_pybullet(name: str, request: pytest.FixtureRequest) -> None:
+    scene: Scene = request.getfixturevalue(name)
+    q = scene.robot.sample(200, np.random.default_rng(0))
+    with scene.world() as world:
+        labels = world.label(q)
+    position, rotation = scene.robot.forward(q)
+    np.testing.assert_allclose(position, labels.position, atol=2e-6)
+    for quaternion, matrix in zip(labels.quaternion, rotation, strict=True):
+        x, y, z, w = quaternion
+        np.testing.assert_allclose(matrix[2, 2], 1 - 2 * (x * x + y * y), atol=2e-5)
+        np.testing.assert_allclose(matrix[1, 0], 2 * (x * y + z * w), atol=2e-5)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_jacobian_is_the_poses_derivative(name: str, request: pytest.FixtureRequest) -> None:
+    robot = request.getfixturevalue(name).robot
+    q = robot.sample(20, np.random.default_rng(1))
+    jacobian, (_, rotation), step = robot.jacobian(q), robot.forward(q), 1e-6
+    for joint in range(robot.dof):
+        shift = step * np.eye(robot.dof)[joint]
+        (ahead, turned_ahead), (behind, turned_behind) = robot.forward(q + shift), robot.forward(q - shift)
+        np.testing.assert_allclose(jacobian[:, :3, joint], (ahead - behind) / (2 * step), atol=1e-8)
+        spin = (turned_ahead - turned_behind) / (2 * step) @ rotation.transpose(0, 2, 1)
+        np.testing.assert_allclose(jacobian[:, 5, joint], spin[:, 1, 0], atol=1e-8)
+        np.testing.assert_allclose(jacobian[:, 3, joint], spin[:, 2, 1], atol=1e-8)
+
+
+def test_any_batch_shape(xarm) -> None:
+    q = xarm.sample(6, np.random.default_rng(2))
+    position, rotation = xarm.forward(q.reshape(2, 3, 6))
+    assert position.shape == (2, 3, 3)
+    assert rotation.shape == (2, 3, 3, 3)
+    np.testing.assert_array_equal(position.reshape(6, 3), xarm.forward(q)[0])
+    assert xarm.jacobian(q[0]).shape == (6, 6)
+
+
+def test_limits_are_the_tighter_ones(xarm) -> None:
+    np.testing.assert_allclose(xarm.upper, [3.5, 2.0944, 0.19198, 3.5, np.pi, 3.5], atol=1e-9)
+    assert xarm.limit_distance(xarm.upper) == 0
+    assert xarm.limit_distance(xarm.upper + 0.25) == pytest.approx(-0.25)
+
+
+def test_rpy_turns_about_the_fixed_axes() -> None:
+    quarter = rotation_from_rpy(np.array([np.pi / 2, 0.0, np.pi / 2]))
+    np.testing.assert_allclose(quarter @ [0, 1, 0], [0, 0, 1], atol=1e-15)
+    np.testing.assert_allclose(quarter @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("urdf", "link", "limits", "message"),
+    [
+        ("nowhere.urdf", "link6", {}, "no such URDF"),
+        ("xarm/xarm6_robot.urdf", "link9", {}, "no link 'link9'"),
+        ("xarm/xarm6_robot.urdf", "link6", {"joint9": (0, 1)}, "joint9"),
+        ("xarm/xarm6_robot.urdf", "link6", {"joint2": (-9, 1)}, "joint2"),
+    ],
+)
+def test_a_bad_description_is_named(urdf: str, link: str, limits: dict, message: str) -> None:
+    with pytest.raises(RobotError, match=message):
+        load_robot(data_path() / Path(urdf), link, limits)
+
+
+def test_wrong_number_of_joints(xarm) -> None:
+    with pytest.raises(RobotError, match="6 joints"):
+        xarm.forward(np.zeros((3, 7)))

@@ -1,0 +1,348 @@
+"""Runs as they lie in a real store, read back with MLflow's own client."""
+
+import hashlib
+import json
+import math
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.parse
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from mlflow import MlflowClient
+from mlflow.entities import Run
+
+from constraint_geodesics.compute import parallel_map
+from constraint_geodesics.params import ComputeParams, ConstraintParams, PoseParams
+from constraint_geodesics.tracking.experiment import (
+    ChildRun,
+    TrackingError,
+    dvc_md5,
+    tracked_stage,
+    tracking_uri,
+    ui_command,
+)
+
+TWO = ComputeParams(backend="loky", workers=2)
+
+
+def git(root: Path, *arguments: str) -> str:
+    identity = ["-c", "user.name=test", "-c", "user.email=test@example.com"]
+    return subprocess.run(
+        ["git", "-C", str(root), *identity, *arguments], check=True, capture_output=True, text=True
+    ).stdout.strip()
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A committed checkout; its store is made by the first test."""
+    folder = tmp_path_factory.mktemp("checkout")
+    (folder / ".gitignore").write_text("mlflow.db*\nmlartifacts/\ndata/\n")
+    (folder / "data").mkdir()
+    (folder / "data" / "joints.csv").write_text("1,2\n")
+    git(folder, "init", "--quiet")
+    git(folder, "add", ".")
+    git(folder, "commit", "--quiet", "-m", "start")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def own_store(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.delenv("DVC_STAGE", raising=False)
+
+
+def runs_of(uri: str, experiment: str) -> dict[str, Run]:
+    """All runs of one experiment by name."""
+    client = MlflowClient(uri)
+    found = client.get_experiment_by_name(experiment)
+    assert found is not None
+    return {run.info.run_name: run for run in client.search_runs([found.experiment_id])}
+
+
+def work(task: tuple[ChildRun, int]) -> dict[str, float]:
+    child, seed = task
+    with child as run:
+        for step in range(3):
+            run.log(step, {"loss": seed + 1 / (1 + step), "broken": math.nan})
+    return {"length": float(seed)}
+
+
+def test_a_stage_is_a_parent_its_seeds_are_children(root: Path) -> None:
+    reference = PoseParams(position_m=(0.4, 0, 0.3), rpy_rad=(0, 0, 0))
+    held = ConstraintParams(description="level", axes=(0, 0, 0, 1, 1, 0), tolerance=(0,) * 6, reference=reference)
+    params = {"seeds": [1, 3], "constraint": held, "long": "x" * 7000, **{f"p{i}": i for i in range(150)}}
+    with tracked_stage(
+        "train", "planner-cup", params, [], experiment="tree", root=root, tags={"constraint": "cup"}
+    ) as stage:
+        tasks = [(stage.child(f"seed {seed}", {"seed": seed}), seed) for seed in (1, 3)]
+        stage.summarise(parallel_map(work, tasks, TWO))
+    runs = runs_of(tracking_uri(root), "tree")
+    assert set(runs) == {"train planner-cup", "planner-cup seed 1", "planner-cup seed 3"}
+    parent, child = runs["train planner-cup"], runs["planner-cup seed 3"]
+
+    assert parent.info.run_id == stage.run_id
+    assert {run.info.status for run in runs.values()} == {"FINISHED"}
+    assert parent.data.params["constraint.axes"] == "[0, 0, 0, 1, 1, 0]"
+    assert parent.data.params["p149"] == "149"
+    assert parent.data.params["long"] == "x" * 5999 + "…"
+    tags = {"stage": "train", "item": "planner-cup", "constraint": "cup", "git_dirty": "false"}
+    tags["git_commit"] = git(root, "rev-parse", "HEAD")
+    assert parent.data.tags.items() >= tags.items()
+    assert parent.data.metrics == {"seeds/length_mean": 2.0, "seeds/length_std": 1.0, "seeds/length_count": 2.0}
+
+    assert child.data.tags.items() >= {**tags, "mlflow.parentRunId": stage.run_id}.items()
+    assert child.data.params == {"seed": "3"}
+    history = MlflowClient(tracking_uri(root)).get_metric_history(child.info.run_id, "loss")
+    assert [(point.step, point.value) for point in history] == [(0, 4.0), (1, 3.5), (2, 3 + 1 / 3)]
+    assert child.data.metrics == {"loss": 3 + 1 / 3, "final/length": 3.0}
+
+
+def test_figures_that_some_seeds_lack_are_counted(root: Path) -> None:
+    with tracked_stage("train", "gaps", {}, [], experiment="gaps", root=root) as stage:
+        tasks = [(stage.child(f"seed {seed}", {}), seed) for seed in (1, 2, 3)]
+        parallel_map(work, tasks, TWO)
+        stage.summarise([{"a": 1.0, "b": math.nan}, {"a": math.nan, "b": math.nan}, {"a": 3.0, "b": math.inf}])
+    metrics = runs_of(tracking_uri(root), "gaps")["train gaps"].data.metrics
+    assert metrics == {"seeds/a_mean": 2.0, "seeds/a_std": 1.0, "seeds/a_count": 2.0, "seeds/b_count": 0.0}
+
+
+def test_the_json_report_and_the_store_hold_the_same_numbers(root: Path, tmp_path: Path) -> None:
+    figures = {
+        "rows": np.int64(3),
+        "length": {"mean": 1 / 3, "std": np.float32(0.5), "worst": math.nan},
+        "curve": np.array([1.0, math.inf]),
+        "name": "größer",
+        "zero": -0.0,
+        "valid": True,
+    }
+    with tracked_stage("label", "cup", {}, [], experiment="report", root=root) as stage:
+        stage.report(figures, tmp_path / "new" / "cup.json")
+        stage.report(dict(reversed(figures.items())), tmp_path / "again.json")
+        stage.metric_logger()(7, {"epoch_loss": 0.5})
+    text = (tmp_path / "new" / "cup.json").read_text("utf-8")
+    assert json.loads(text) == {
+        "curve": [1.0, None], "length": {"mean": 0.333333333, "std": 0.5, "worst": None}, "name": "größer", "rows": 3,
+        "valid": True, "zero": 0.0,
+    }  # fmt: skip
+    assert "-0" not in text
+    assert (tmp_path / "again.json").read_text("utf-8") == text
+    mirrored = {"length/mean": 0.333333333, "length/std": 0.5, "rows": 3, "valid": 1, "zero": 0, "epoch_loss": 0.5}
+    assert runs_of(tracking_uri(root), "report")["label cup"].data.metrics == mirrored
+
+
+def test_sources_that_differ_make_a_run_dirty_but_reports_do_not(root: Path) -> None:
+    def dirty() -> str:
+        with tracked_stage("label", "cup", {}, [], experiment="dirty", root=root) as stage:
+            pass
+        return str(MlflowClient(stage.tracking_uri).get_run(stage.run_id).data.tags["git_dirty"])
+
+    (root / "reports").mkdir()
+    (root / "reports" / "cup.json").write_text("{}")
+    assert dirty() == "false"
+    (root / "stray.py").write_text("")
+    assert dirty() == "true"
+    (root / "stray.py").unlink()
+
+
+@pytest.mark.parametrize(("error", "status"), [(ValueError("no"), "FAILED"), (KeyboardInterrupt(), "KILLED")])
+def test_a_stage_that_fails_says_so_and_ends_its_children(root: Path, error: BaseException, status: str) -> None:
+    def stage() -> None:
+        with tracked_stage("train", "cup", {}, [], experiment=status, root=root) as run:
+            run.child("abandoned", {}).__enter__()
+            raise error
+
+    with pytest.raises(type(error)):
+        stage()
+    runs = runs_of(tracking_uri(root), status)
+    statuses = {name: run.info.status for name, run in runs.items()}
+    assert statuses == {"train cup": status, "cup abandoned": status}
+
+
+def test_a_child_that_fails_says_so_and_its_name_is_new(root: Path) -> None:
+    with tracked_stage("train", "cup", {}, [], experiment="child", root=root) as stage:
+        child = stage.child("seed 1", {})
+        with pytest.raises(ValueError, match="seed 1"):
+            stage.child("seed 1", {})
+        with pytest.raises(ZeroDivisionError), child:
+            raise ZeroDivisionError
+    statuses = {name: run.info.status for name, run in runs_of(tracking_uri(root), "child").items()}
+    assert statuses == {"train cup": "FINISHED", "cup seed 1": "FAILED"}
+
+
+def first_run(task: tuple[Path, int]) -> str:
+    root, number = task
+    stage = tracked_stage("train", f"item{number}", {}, [], experiment="fresh", root=root)
+    with stage as run, run.child("seed 1", {"seed": 1}) as child:
+        child.log(1, {"loss": 1.0})
+    return run.run_id
+
+
+def test_processes_may_make_the_store_at_once(tmp_path: Path) -> None:
+    settings = ComputeParams(backend="loky", workers=4)
+    run_ids = parallel_map(first_run, [(tmp_path, number) for number in range(4)], settings)
+    runs = runs_of(tracking_uri(tmp_path), "fresh")
+    assert {runs[f"train item{number}"].info.run_id for number in range(4)} == set(run_ids)
+    assert len(runs) == 8
+    assert {run.info.status for run in runs.values()} == {"FINISHED"}
+
+
+def test_the_named_store_is_used(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "sqlite:///elsewhere/runs.db")
+    assert tracking_uri(root) == f"sqlite:///{tmp_path}/elsewhere/runs.db"
+    with tracked_stage("label", "cup", {}, [], experiment="named", root=root) as stage:
+        stage.figure(root / "data" / "joints.csv")
+    monkeypatch.delenv("MLFLOW_TRACKING_URI")
+    assert set(runs_of(f"sqlite:///{tmp_path}/elsewhere/runs.db", "named")) == {"label cup"}
+    kept = tmp_path / "elsewhere" / "mlartifacts" / "named" / stage.run_id / "artifacts" / "figures" / "joints.csv"
+    assert kept.read_text() == "1,2\n"
+    assert MlflowClient(tracking_uri(root)).get_experiment_by_name("named") is None
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "http://user:secret@127.0.0.1:9",
+        "sqlite:////proc/nowhere/runs.db",
+        "sqlite:///{folder}/not_a_database.db",
+        "file:///tmp/mlruns",
+        "nonsense://runs",
+    ],
+)
+def test_a_store_that_fails_stops_the_stage_at_once_in_one_line(
+    uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "not_a_database.db").write_text("text " * 1000)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", uri.format(folder=tmp_path))
+    start = time.monotonic()
+    with (
+        pytest.raises(TrackingError) as caught,
+        tracked_stage("label", "cup", {}, [], experiment="none", root=tmp_path),
+    ):
+        pytest.fail("the body must not start")
+    assert time.monotonic() - start < 4
+    assert "\n" not in str(caught.value)
+    assert uri.format(folder=tmp_path).rpartition("@")[2] in str(caught.value)
+    assert "secret" not in str(caught.value)
+    assert "MLFLOW_HTTP_REQUEST_MAX_RETRIES" not in os.environ
+
+
+def test_a_missing_input_stops_the_stage_before_it_has_a_run(root: Path) -> None:
+    with (
+        pytest.raises(TrackingError, match=r"label cup: its input .*absent\.csv does not exist"),
+        tracked_stage("label", "cup", {}, [root / "absent.csv"], experiment="missing", root=root),
+    ):
+        pytest.fail("the body must not start")
+    assert MlflowClient(tracking_uri(root)).get_experiment_by_name("missing") is None
+
+
+PIPELINE: dict[str, Any] = {
+    "stages": {
+        "draw": {
+            "cmd": "mkdir -p data/joints/sub && echo 1 > data/joints/a.csv && echo 2 > data/joints/sub/b.csv"
+            " && echo 3 > data/card.json",
+            "outs": ["data/joints", "data/card.json"],
+        },
+        "train": {
+            "matrix": {"item": ["cup"]},
+            "cmd": f"{sys.executable} train.py",
+            "deps": ["data/joints", "data/card.json"],
+        },
+    }
+}
+TRAIN = """
+from pathlib import Path
+from constraint_geodesics.tracking.experiment import tracked_stage
+
+inputs = [Path("data/joints"), Path("data/joints/a.csv"), Path("data/card.json")]
+with tracked_stage("train", "cup", {}, inputs, experiment="dvc", root=Path()) as run:
+    run.report({"loss": 1}, Path("report.json"))
+"""
+
+
+def test_inputs_are_linked_by_dvcs_own_md5_and_nothing_is_printed(tmp_path: Path) -> None:
+    (tmp_path / "dvc.yaml").write_text(yaml.safe_dump(PIPELINE))
+    (tmp_path / "train.py").write_text(TRAIN)
+    options: dict[str, Any] = {"cwd": tmp_path, "check": True, "capture_output": True, "text": True}
+    dvc = [sys.executable, "-m", "dvc"]
+    subprocess.run([*dvc, "init", "--no-scm", "--quiet"], **options)
+    shown = subprocess.run([*dvc, "repro", "--no-commit"], **options)
+    assert "mlflow" not in (shown.stdout + shown.stderr).lower()
+    lock = yaml.safe_load((tmp_path / "dvc.lock").read_text())
+    md5 = {out["path"]: out["md5"] for out in lock["stages"]["draw"]["outs"]}
+    run = runs_of(tracking_uri(tmp_path), "dvc")["train cup"]
+    assert run.data.tags["dvc_stage"] == "train@cup"
+    assert {entry.dataset.name: entry.dataset.digest for entry in run.inputs.dataset_inputs} == {
+        **md5,
+        "data/joints/a.csv": hashlib.md5(b"1\n").hexdigest(),
+    }
+    assert md5["data/joints"].endswith(".dir")
+    (tmp_path / "data" / "joints" / "sub" / "b.csv").write_text("changed")
+    assert dvc_md5(tmp_path / "data" / "joints") != md5["data/joints"]
+
+
+@contextmanager
+def dashboard(root: Path) -> Iterator[str]:
+    """The server of ui_command on a free port."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = ui_command(root, port)
+    assert command[command.index("--host") + 1] == "127.0.0.1"
+    log = (root / "server.log").open("w")
+    server = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+    try:
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline and server.poll() is None:
+            try:
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/health")
+                break
+            except OSError:
+                time.sleep(0.1)
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        server.terminate()
+        server.wait(20)
+        log.close()
+
+
+def test_a_moved_checkout_keeps_its_figures_and_a_server_can_be_the_store(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with tracked_stage("report", "all", {}, [], experiment="moved", root=root) as stage:
+        stage.figure(root / "data" / "joints.csv")
+    moved = tmp_path / "moved"
+    shutil.copytree(root, moved)
+    shutil.rmtree(root / "mlartifacts")
+    with dashboard(moved) as address:
+        query = urllib.parse.urlencode({"run_id": stage.run_id, "path": "figures/joints.csv"})
+        assert urllib.request.urlopen(f"{address}/get-artifact?{query}").read() == b"1,2\n"
+
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", address)
+        capfd.readouterr()
+        with tracked_stage("train", "cup", {}, [], experiment="served", root=root) as stage:
+            child = stage.child("seed 1", {})
+            with child:
+                child.artifact(root / "data" / "joints.csv")
+        assert capfd.readouterr() == ("", "")
+        with pytest.raises(TrackingError, match=address):
+            ui_command(root, 5000)
+    uri = f"sqlite:///{moved}/mlflow.db"
+    served = runs_of(uri, "served")
+    assert {name: run.info.status for name, run in served.items()} == {
+        "train cup": "FINISHED",
+        "cup seed 1": "FINISHED",
+    }
+    (kept,) = (moved / "mlartifacts").rglob(f"{child.run_id}/artifacts/joints.csv")
+    assert kept.read_text() == "1,2\n"
