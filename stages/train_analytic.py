@@ -17,28 +17,28 @@ from constraint_geodesics.tracking.experiment import tracked_stage
 STAGE = "train_analytic"
 
 
-def main(params: Params, layout: Layout, manifold: str) -> None:
-    """Write data/analytic/<manifold>/, its learning curves and figures."""
+def main(params: Params, layout: Layout, analytic: str) -> None:
+    """Write data/analytic/<analytic>/, its learning curves and figures."""
     settings = params.geodesics.model_copy(update={"steps": params.geodesics.analytic_steps})
-    with tracked_stage(STAGE, manifold, settings, [], experiment=params.tracking.experiment, root=layout.root) as run:
+    with tracked_stage(STAGE, analytic, settings, [], experiment=params.tracking.experiment, root=layout.root) as run:
         tasks = [
             AnalyticTask(
-                manifold, settings, seed, layout.scratch(STAGE, f"{manifold}-{seed}"),
+                analytic, settings, seed, layout.scratch(STAGE, f"{analytic}-{seed}"),
                 run.child(f"seed {seed}", {"seed": seed}),
             )
             for seed in settings.seeds
         ]  # fmt: skip
-        results = parallel_map(run_analytic, tasks, params.compute, description=f"policy search {manifold}")
+        results = parallel_map(run_analytic, tasks, params.compute, description=f"policy search {analytic}")
         run.summarise([result.figures() for result in results])
-        folder = layout.analytic(manifold)
+        folder = layout.analytic(analytic)
         for result in results:
             save_policy(result.policy, folder, result.seed)
         first = results[0]
         np.savez_compressed(folder / "curves.npz", sampled=first.sampled, learned=first.learned)
         learning = [{"seed": result.seed, **row} for result in results for row in result.policy.curve]
-        write_table(learning, layout.report(STAGE, f"{manifold}-learning", "csv"))
+        write_table(learning, layout.report(STAGE, f"{analytic}-learning", "csv"))
         figures = {name: [result.figures()[name] for result in results] for name in first.figures()}
-        run.report(figures, layout.report(STAGE, manifold))
+        run.report(figures, layout.report(STAGE, analytic))
         for task in tasks:  # finished: the next run of this stage starts from nothing
             shutil.rmtree(task.scratch, ignore_errors=True)
 

@@ -37,13 +37,13 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     queries = read_queries(sources[1])
     submanifold = load_submanifold(layout.submanifold(manifold, constraint))
     with scene.world() as world:
-        connected = connected_queries(submanifold, problem, queries, world.free, params.submanifold)
+        connected, connection_s = connected_queries(submanifold, problem, queries, world.free, params.submanifold)
     with tracked_stage(
         STAGE, item, params.geodesics, sources, experiment=params.tracking.experiment, root=layout.root
     ) as run:
         tasks = [
             SeedTask(
-                problem, scene, params.geodesics, params.judge, manifold, queries, connected, seed,
+                problem, scene, params.geodesics, params.judge, manifold, queries, connected, connection_s, seed,
                 layout.scratch(STAGE, f"{item}-{seed}"), run.child(f"seed {seed}", {"seed": seed}),
             )
             for seed in params.geodesics.seeds

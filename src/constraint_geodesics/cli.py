@@ -1,5 +1,6 @@
 """The command `geodesics`, and how a stage starts."""
 
+import inspect
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -34,7 +35,7 @@ def run_stage(stage: Callable[..., None], arguments: Sequence[str]) -> None:
     """
     try:
         params = load_params()
-        _check_names(params, arguments)
+        _check_names(params, stage, arguments)
         stage(params, Layout(), *arguments)
     except (ValueError, OSError, RuntimeError) as error:
         if os.environ.get("GEODESICS_TRACEBACK"):
@@ -42,11 +43,19 @@ def run_stage(stage: Callable[..., None], arguments: Sequence[str]) -> None:
         raise SystemExit(_complain(error)) from None
 
 
-def _check_names(params: Params, arguments: Sequence[str]) -> None:
-    known = [*params.manifolds, *params.constraints, *params.geodesics.analytic]
-    for name in arguments:
-        if name not in known:
-            raise ParamsError(f"params.yaml: there is no {name!r}: must be one of {known}")
+def _check_names(params: Params, stage: Callable[..., None], arguments: Sequence[str]) -> None:
+    """Each argument must be a name of the kind that the stage's own parameter is called after."""
+    kinds = list(inspect.signature(stage).parameters)[2:]
+    if len(kinds) != len(arguments):
+        raise ParamsError(f"this stage takes {len(kinds)} names ({', '.join(kinds)}), not {len(arguments)}")
+    names: dict[str, list[str]] = {
+        "constraint": list(params.constraints),
+        "manifold": list(params.manifolds),
+        "analytic": list(params.geodesics.analytic),
+    }
+    for kind, name in zip(kinds, arguments, strict=True):
+        if name not in names[kind]:
+            raise ParamsError(f"params.yaml: there is no {kind} {name!r}: must be one of {names[kind]}")
 
 
 def _complain(error: Exception) -> int:
@@ -114,9 +123,9 @@ def ui(port: Annotated[int, typer.Option(help="Port on 127.0.0.1.", min=1, max=6
 
 
 def recordings_of(layout: Layout) -> list[Path]:
-    """All recordings of this checkout, level cup and learned paths first."""
+    """All recordings of this checkout, learned paths that keep a cup level first."""
     found = (layout.root / "data" / "recordings").rglob("*.rrd")
-    return sorted(found, key=lambda file: ("level_cup" not in str(file), "train_geodesics" not in str(file), str(file)))
+    return sorted(found, key=lambda file: ("planner-level_cup/query0-learned" not in file.as_posix(), file.as_posix()))
 
 
 if __name__ == "__main__":

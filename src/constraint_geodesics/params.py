@@ -180,7 +180,7 @@ class GeodesicParams(_Record):
     """Policy search of geodesics."""
 
     seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
-    searched: tuple[Name, ...]
+    searched: Annotated[tuple[Name, ...], Field(min_length=1)]
     illustrated: tuple[Name, ...]
     illustrated_constraints: tuple[Name, ...]
     analytic_steps: Count
@@ -279,7 +279,7 @@ def load_params(path: Path = Path("params.yaml")) -> Params:
         raise ParamsError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
     try:
         # in JSON's strict mode lists may become tuples, but neither "5" nor true becomes a number
-        return Params.model_validate_json(json.dumps(raw), strict=True)
+        return Params.model_validate_json(json.dumps(raw, default=str), strict=True)
     except ValidationError as error:
         raise ParamsError(f"{path}: {_one_line(error)}") from None
 

@@ -87,6 +87,7 @@ def searched_rows(manifold, constraint):
             )
             recording = file if query == 0 else ""
             rows.append(path_row("learned_geodesic", query, seed, 3.0 + 0.5 * seed, recording=recording, **options))
+            rows.append(path_row("random_curves", query, seed, 3.8, **options))
     return rows
 
 

@@ -13,17 +13,17 @@ import yaml
 ROOT = Path(__file__).resolve().parents[2]
 
 SMALL: dict[str, Any] = {
-    "labels": {"free_rows": 6000, "constrained_rows": 1500, "shard_rows": 1500},
+    "labels": {"free_rows": 4000, "constrained_rows": 1000, "shard_rows": 1000},
     "queries": {"count": 3},
     "manifolds": {
-        "paper": {"epochs": 3, "variance_epochs": 2, "variance_centres": 32},
-        "planner": {"epochs": 6, "variance_epochs": 2, "variance_centres": 64},
+        "paper": {"epochs": 3, "variance_epochs": 1, "variance_centres": 32, "batch_size": 128},
+        "planner": {"epochs": 5, "variance_epochs": 1, "variance_centres": 64, "batch_size": 128},
     },
-    "submanifold": {"grid": 40, "nodes": 300},
+    "submanifold": {"grid": 40, "nodes": 250},
     "geodesics": {
         "seeds": [0, 1],
-        "steps": 2560,
-        "analytic_steps": 2560,
+        "steps": 1920,
+        "analytic_steps": 1920,
         "analytic": ["plane"],
         "environments": 64,
         "illustrated_constraints": ["level_cup"],
@@ -31,9 +31,10 @@ SMALL: dict[str, Any] = {
         "checkpoint_steps": 1000,
         "ppo": {"batch_size": 320},
     },
-    "benchmark": {"seeds": [0], "rrt_star_iterations": 100, "prm_iterations": 100},
+    "benchmark": {"seeds": [0], "rrt_star_iterations": 40, "prm_iterations": 50},
 }
 CONSTRAINTS = ("free", "level_cup")
+MARK = ".smoke"
 
 
 def copy_checkout(folder: Path) -> None:
@@ -91,8 +92,13 @@ def dvc(folder: Path, *arguments: str, capture: bool = True) -> subprocess.Compl
 def main(folder: Path) -> int:
     """Run everything once and print the result table."""
     began = time.monotonic()
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
+    if folder.exists() and any(folder.iterdir()):
+        if not (folder / MARK).is_file():
+            print(f"error: {folder}: not empty, and not a folder that an earlier run made", file=sys.stderr)
+            return 2
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / MARK).touch()
     copy_checkout(folder)
     shrink_params(folder)
     code = dvc(folder, "repro", capture=False).returncode

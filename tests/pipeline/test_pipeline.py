@@ -37,7 +37,7 @@ def test_a_second_run_has_nothing_to_do(finished: Path) -> None:
 def test_every_query_keeps_its_row(finished: Path) -> None:
     learned = pd.read_csv(finished / "reports/train_geodesics/planner-level_cup.csv")
     sampled = pd.read_csv(finished / "reports/benchmark_planners/level_cup.csv")
-    assert len(learned) == 3 * 2 + 3
+    assert len(learned) == 2 * 3 * 2 + 3
     assert len(sampled) == 3 * 3
     for table in (learned, sampled):
         valid = table[table["valid"]]
@@ -78,7 +78,7 @@ def test_runs_are_grouped_in_mlflow(finished: Path) -> None:
     children = [run for run in runs if run.data.tags.get("mlflow.parentRunId") == parent.info.run_id]
     assert len(children) == 2
     assert "seeds/success_mean" in parent.data.metrics
-    assert parent.data.tags["dvc.stage"] == "train_geodesics@planner-level_cup"
+    assert parent.data.tags["dvc_stage"] == "train_geodesics@planner-level_cup"
     assert {run.info.status for run in runs} == {"FINISHED"}
 
 

@@ -64,6 +64,7 @@ PLANNERS = {
     "rrt_star": PlannerStyle("RRT*", SKY, "^"),
     "birrt": PlannerStyle("BiRRT", BLUE, "v"),
     "straight_latent_line": PlannerStyle("straight latent line", BLACK, "D"),
+    "random_curves": PlannerStyle("random curves", GREY, "P"),
     "learned_geodesic": PlannerStyle("learned geodesic", ORANGE, "o"),
 }
 """The planners of a table, in the order they are shown."""
@@ -313,7 +314,7 @@ def planner_comparison(table: pd.DataFrame) -> Figure:
         rows = table[table["planner"] == planner].set_index("constraint").reindex(constraints)
         y = np.arange(len(constraints)) + 0.78 * (k / max(len(planners) - 1, 1) - 0.5)
         style = PLANNERS[planner]
-        success.barh(y, rows["success"], height=0.15, color=style.colour, label=style.label)
+        success.barh(y, rows["success"], height=0.13, color=style.colour, label=style.label)
         _median_to_p95(length, y, rows["over_best_median"], rows["over_best_p95"], style)
         _median_to_p95(time, y, rows["time_median_s"], rows["time_p95_s"], style)
     success.set(xlim=(0, 1), xlabel="valid paths")

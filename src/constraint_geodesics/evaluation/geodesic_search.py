@@ -1,5 +1,6 @@
 """One seed of policy search, from training to measured paths: the task that the seeds of a stage run in parallel."""
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -14,7 +15,13 @@ from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.constraints.submanifold import GraphSubmanifold, Submanifold, component_of
 from constraint_geodesics.constraints.vector import ConstraintManifold
 from constraint_geodesics.evaluation.metrics import Free, PathMeasures, measure_path
-from constraint_geodesics.geodesics.policy_search import TrainedPolicy, save_policy, search, train_policy
+from constraint_geodesics.geodesics.policy_search import (
+    TrainedPolicy,
+    save_policy,
+    search,
+    search_at_random,
+    train_policy,
+)
 from constraint_geodesics.geodesics.problem import Ends, Geodesic, LearnedProblem
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.dataset import Queries
@@ -22,7 +29,7 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import GeodesicParams, JudgeParams, Params, SubmanifoldParams
 from constraint_geodesics.paths import Layout
 
-PLANNER, STRAIGHT = "learned_geodesic", "straight_latent_line"
+PLANNER, RANDOM, STRAIGHT = "learned_geodesic", "random_curves", "straight_latent_line"
 
 
 class SeedLog(Protocol):
@@ -44,6 +51,8 @@ class SeedTask:
     chart_name: str
     queries: Queries
     connected: Bool[np.ndarray, "Q"]
+    connection_s: Float[np.ndarray, "Q"]
+    """What the answer in `connected` took; part of every query's planning time."""
     seed: int
     scratch: Path
     run: AbstractContextManager[SeedLog]
@@ -51,7 +60,9 @@ class SeedTask:
 
 @dataclass(frozen=True)
 class SeedResult:
-    """A trained policy, one row and one joint path a query, and the coefficients found (Q, p)."""
+    """A trained policy, rows and joint paths (each query's with the policy, then without), and the coefficients that
+    the policy found (Q, p).
+    """
 
     seed: int
     policy: TrainedPolicy
@@ -61,17 +72,18 @@ class SeedResult:
 
     def figures(self) -> dict[str, float]:
         """What is compared between seeds."""
-        valid = [row for row in self.rows if row["valid"]]
-        lengths = [row["length_rad"] for row in valid]
+        learned, random = ([row for row in self.rows if row["planner"] == name] for name in (PLANNER, RANDOM))
+        lengths = [row["length_rad"] for row in learned if row["valid"]]
         return {
-            "success": len(valid) / len(self.rows),
+            "success": float(np.mean([row["valid"] for row in learned])),
+            "success_at_random": float(np.mean([row["valid"] for row in random])),
             "length_median_rad": float(np.median(lengths)) if lengths else float("nan"),
             "final_saving": self.policy.curve[-1]["saving"] if self.policy.curve else float("nan"),
         }
 
 
 def run_seed(task: SeedTask) -> SeedResult:
-    """Train one policy, then search every query's geodesic with it and measure what was found."""
+    """Train one policy, search every query's geodesic with it and, as a control, without it; measure what was found."""
     with task.run as run:
         policy = train_policy(task.problem, task.params, task.seed, task.scratch, run.log)
     rows, paths, coefficients = [], [], []
@@ -79,14 +91,19 @@ def run_seed(task: SeedTask) -> SeedResult:
         for query in range(len(task.queries)):
             ends = query_ends(task.problem, task.queries, query)
             accept = exact_check(task, ends, world.free)
-            if task.connected[query]:
-                found = search(task.problem, policy.actor, task.params, ends, task.seed, accept)
-            else:
-                found = Geodesic("not_connected", np.zeros(task.problem.curve.coefficients), *_NOTHING)
-            row, path = measured(task, found, ends, world.free)
-            rows.append({"planner": PLANNER, "query": query, "seed": task.seed, **row})
-            paths.append(path)
-            coefficients.append(found.phi)
+            for planner in (PLANNER, RANDOM):
+                if not task.connected[query]:
+                    found = Geodesic("not_connected", np.zeros(task.problem.curve.coefficients), *_NOTHING)
+                elif planner == PLANNER:
+                    found = search(task.problem, policy.actor, task.params, ends, task.seed, accept)
+                else:
+                    found = search_at_random(task.problem, task.params, ends, task.seed, accept)
+                row, path = measured(task, found, ends, world.free)
+                row["time_s"] += task.connection_s[query]
+                rows.append({"planner": planner, "query": query, "seed": task.seed, **row})
+                paths.append(path)
+                if planner == PLANNER:
+                    coefficients.append(found.phi)
     return SeedResult(task.seed, policy, rows, paths, np.array(coefficients))
 
 
@@ -107,16 +124,20 @@ def straight_rows(task: SeedTask) -> tuple[list[dict[str, Any]], list[Float[np.n
 
 def connected_queries(
     submanifold: Submanifold, problem: LearnedProblem, queries: Queries, free: Free, params: SubmanifoldParams
-) -> Bool[np.ndarray, "Q"]:
-    """Which queries have both ends in one component; a drawn latent plane says nothing about the exact set."""
+) -> tuple[Bool[np.ndarray, "Q"], Float[np.ndarray, "Q"]]:
+    """Which queries have both ends in one component, as far as the sampled graph knows, and the time each took [s].
+
+    A drawn latent plane says nothing about the exact set; an end that no edge reaches counts as connected.
+    """
     if not isinstance(submanifold, GraphSubmanifold):
-        return np.ones(len(queries), dtype=bool)
-
-    def component(q: np.ndarray) -> int:
-        return component_of(submanifold, problem.chart, problem.manifold, q, free, params)
-
-    pairs = [(component(a), component(b)) for a, b in zip(queries.starts, queries.goals, strict=True)]
-    return np.array([a == b or min(a, b) < 0 for a, b in pairs])
+        return np.ones(len(queries), dtype=bool), np.zeros(len(queries))
+    connected, seconds = [], []
+    for pair in zip(queries.starts, queries.goals, strict=True):
+        began = time.perf_counter()
+        a, b = (component_of(submanifold, problem.chart, problem.manifold, q, free, params) for q in pair)
+        connected.append(a == b or min(a, b) < 0)
+        seconds.append(time.perf_counter() - began)
+    return np.array(connected), np.array(seconds)
 
 
 def geodesic_problem(

@@ -14,7 +14,7 @@ import pandas as pd
 import pandera.pandas as pandera
 
 from constraint_geodesics.evaluation.figures import PLANNERS
-from constraint_geodesics.evaluation.statistics import BESIDE, Counted, summarise
+from constraint_geodesics.evaluation.statistics import BESIDE, RANDOM, STRAIGHT, Counted, summarise
 from constraint_geodesics.params import Params
 from constraint_geodesics.paths import Layout
 
@@ -130,7 +130,7 @@ def findings(params: Params, table: pd.DataFrame, manifolds: Mapping[str, Mappin
     told = [
         _told_of(params, str(name), rows, manifolds[str(name)]) for name, rows in table.groupby("manifold", sort=False)
     ]
-    sampled = table[~table["planner"].isin([LEARNED, BESIDE])].drop_duplicates(["constraint", "planner"])
+    sampled = table[~table["planner"].isin([LEARNED, *BESIDE])].drop_duplicates(["constraint", "planner"])
     refused = ", ".join(
         f"{PLANNERS[str(name)].label} {_share(rows, 'refused')}"
         for name, rows in sampled.groupby("planner", sort=False)
@@ -148,9 +148,15 @@ def findings(params: Params, table: pd.DataFrame, manifolds: Mapping[str, Mappin
 
 def _told_of(params: Params, manifold: str, rows: pd.DataFrame, held_out: Mapping[str, float]) -> Finding:
     settings = params.manifolds[manifold]
-    learned, straight = (rows[rows["planner"] == name].set_index("constraint") for name in (LEARNED, BESIDE))
-    sampled = rows[~rows["planner"].isin([LEARNED, BESIDE])]
-    how = "curves retracted onto the constraint" if settings.retract else "curves only decoded, as in the paper"
+    learned, straight, random = (
+        rows[rows["planner"] == name].set_index("constraint") for name in (LEARNED, STRAIGHT, RANDOM)
+    )
+    sampled = rows[~rows["planner"].isin([LEARNED, *BESIDE])]
+    how = (
+        "curves retracted onto the constraint"
+        if settings.retract
+        else "curves decoded and their ends corrected, nothing retracted"
+    )
     shares = ", ".join(f"{name} {share:.0%}" for name, share in learned["success"].items())
     others = ", ".join(
         f"{PLANNERS[str(name)].label} {_share(group, 'success')}"
@@ -167,13 +173,16 @@ def _told_of(params: Params, manifold: str, rows: pd.DataFrame, held_out: Mappin
             _shortest_under(rows),
             f"The decoder reproduces unseen poses to {short(held_out['joint_error_mean_deg'])}° a joint (mean) "
             f"and {short(held_out['tool_error_median_mm'])} mm at the tool (median).",
+            f"Without a policy, as many random curves as the search meets, chosen by the same rule, give "
+            f"{_share(random, 'success')}.",
+            f"No connection in the sampled graph, and so no search: {_share(learned, 'not_connected')} of the queries.",
         ],
     )
 
 
 def _shortest_under(rows: pd.DataFrame) -> str:
     """Under which constraints the learned geodesic is the shortest, in the mean over the common queries."""
-    comparable = rows[rows["planner"] != BESIDE].dropna(subset=["latent_mean"])
+    comparable = rows[~rows["planner"].isin(BESIDE)].dropna(subset=["latent_mean"])
     shortest = comparable.loc[comparable.groupby("constraint", sort=False)["latent_mean"].idxmin()]
     won = shortest.loc[shortest["planner"] == LEARNED, "constraint"].tolist()
     lost = [

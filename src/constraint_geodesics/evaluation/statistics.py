@@ -10,8 +10,10 @@ from jaxtyping import Float
 Counted = Literal["valid", "found"]
 """Whose lengths count: those of the paths that the judge accepts, or of all that a planner returned."""
 
-BESIDE = "straight_latent_line"
-"""Shown beside the planners, and no planner itself: what it can't do must not decide which queries are compared."""
+STRAIGHT, RANDOM = "straight_latent_line", "random_curves"
+BESIDE = (STRAIGHT, RANDOM)
+"""Shown beside the planners to tell what policy search adds: what they can't do must not decide which queries are
+compared."""
 
 
 def summarise(paths: pd.DataFrame, latent: str, counted: Counted = "valid") -> pd.DataFrame:
@@ -27,7 +29,7 @@ def summarise(paths: pd.DataFrame, latent: str, counted: Counted = "valid") -> p
     """
     counts = paths["valid"] if counted == "valid" else paths["length_rad"].notna()
     kept = paths[counts]
-    common = common_queries(kept[kept["planner"] != BESIDE])
+    common = common_queries(kept[~kept["planner"].isin(BESIDE)])
     over_best = kept["length_rad"] / kept.groupby("query")["length_rad"].transform("min")
     rows = []
     for planner, group in paths.groupby("planner", sort=False):

@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from stable_baselines3.common.vec_env import VecEnv
 
 from constraint_geodesics.geodesics.problem import Ends, GeodesicProblem
@@ -29,14 +29,15 @@ class EpisodeSettings:
 
 @dataclass(frozen=True)
 class CurveStates:
-    """B curves under way: coefficients, ends, length and cost now, cost of the straight line, steps taken,
-    and the cheapest curve met so far.
+    """B curves under way: coefficients, ends, length, cost and feasibility now, cost of the straight line, steps
+    taken, and the cheapest curve met so far.
     """
 
     phi: Float[np.ndarray, "B p"]
     ends: Ends
     length: Float[np.ndarray, "B"]
     cost: Float[np.ndarray, "B"]
+    feasible: Bool[np.ndarray, "B"]
     straight_cost: Float[np.ndarray, "B"]
     step: Int[np.ndarray, "B"]
     best_phi: Float[np.ndarray, "B p"]
@@ -59,7 +60,7 @@ def begin(problem: GeodesicProblem, ends: Ends, phi: Float[np.ndarray, "B p"]) -
     now, straight = problem.evaluate(phi, ends), problem.evaluate(np.zeros_like(phi), ends)
     better = now.cost < straight.cost
     return CurveStates(
-        phi, ends, now.length, now.cost, straight.cost, np.zeros(len(phi), dtype=np.int64),
+        phi, ends, now.length, now.cost, now.feasible, straight.cost, np.zeros(len(phi), dtype=np.int64),
         np.where(better[:, None], phi, 0.0), np.minimum(now.cost, straight.cost),
     )  # fmt: skip
 
@@ -80,7 +81,7 @@ def advance(
     reward = rewards(settings.reward, states.cost, costs.cost, states.straight_cost)
     better = costs.cost < states.best_cost
     moved = replace(
-        states, phi=phi, length=costs.length, cost=costs.cost, step=states.step + 1,
+        states, phi=phi, length=costs.length, cost=costs.cost, feasible=costs.feasible, step=states.step + 1,
         best_phi=np.where(better[:, None], phi, states.best_phi), best_cost=np.minimum(states.best_cost, costs.cost),
     )  # fmt: skip
     return moved, reward

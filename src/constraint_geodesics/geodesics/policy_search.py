@@ -13,7 +13,7 @@ from typing import Any
 import joblib
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from safetensors.torch import load_file, save_file
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -29,7 +29,7 @@ from constraint_geodesics.geodesics.environment import (
     observation_size,
     observe,
 )
-from constraint_geodesics.geodesics.problem import Ends, Geodesic, GeodesicProblem, repeated
+from constraint_geodesics.geodesics.problem import Costs, Ends, Geodesic, GeodesicProblem, repeated
 from constraint_geodesics.params import GeodesicParams, PpoParams
 
 DRAWN_A_START = 16
@@ -108,28 +108,41 @@ def search(
     """The shortest acceptable curve that a batch of roll-outs meets between one start and goal.
 
     The first roll-out follows the policy's mean from the straight line, the others sample its actions, half of them
-    from the cheapest of many random curves.  Every curve met counts, the straight line included, so policy search
-    never returns a longer curve than it began with.
-    accept: an exact check (collision, say) applied to the candidates, shortest first.
+    from the cheapest of many random curves.  Every curve met counts, the straight line and the random ones included.
+    accept: an exact check (collision, say) applied to the feasible candidates, shortest first.
     """
     began = time.perf_counter()
     rng = np.random.default_rng(seed)
     count, size = params.rollouts, problem.curve.coefficients
-    phi = _starts(problem, ends, count // 2, rng)
-    phi = np.concatenate([np.zeros((count - len(phi), size)), phi])
+    drawn, costs = _random_curves(problem, ends, DRAWN_A_START * (count // 2), rng)
+    starts = drawn[np.argsort(costs.cost, kind="stable")[: count // 2]]
+    phi = np.concatenate([np.zeros((count - len(starts), size)), starts])
     noise = rng.normal(size=(params.episode_steps, count, size))
     noise[:, 0] = 0.0
     visited = follow(problem, actor, episode_settings(params), begin(problem, repeated(ends, count), phi), noise)
-    costs = np.concatenate([states.cost for states in visited])
-    coefficients = np.concatenate([states.phi for states in visited])
-    return _first_accepted(problem, ends, costs, coefficients, accept, began)
+    coefficients = np.concatenate([drawn, *(states.phi for states in visited)])
+    cost = np.concatenate([costs.cost, *(states.cost for states in visited)])
+    feasible = np.concatenate([costs.feasible, *(states.feasible for states in visited)])
+    return _first_accepted(problem, ends, coefficients, cost, feasible, accept, began)
 
 
-def _starts(problem: GeodesicProblem, ends: Ends, count: int, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
-    """The cheapest of many random curves: in one batch they cost next to nothing."""
-    drawn = problem.sample_curves(repeated(ends, DRAWN_A_START * count), rng)
-    costs = problem.evaluate(drawn, repeated(ends, len(drawn)))
-    return drawn[np.argsort(costs.cost, kind="stable")[:count]]
+def search_at_random(
+    problem: GeodesicProblem, params: GeodesicParams, ends: Ends, seed: int, accept: Accept
+) -> Geodesic:
+    """The control of `search`: as many curves, all drawn at random and none by a policy, chosen by the same rule."""
+    began = time.perf_counter()
+    number = DRAWN_A_START * (params.rollouts // 2) + (params.episode_steps + 1) * params.rollouts
+    drawn, costs = _random_curves(problem, ends, number, np.random.default_rng(seed))
+    return _first_accepted(problem, ends, drawn, costs.cost, costs.feasible, accept, began)
+
+
+def _random_curves(
+    problem: GeodesicProblem, ends: Ends, count: int, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "B p"], Costs]:
+    """Many random curves and their costs: in one batch they cost next to nothing."""
+    many = repeated(ends, count)
+    drawn = problem.sample_curves(many, rng)
+    return drawn, problem.evaluate(drawn, many)
 
 
 def follow(
@@ -145,21 +158,27 @@ def follow(
 
 
 def _first_accepted(
-    problem: GeodesicProblem, ends: Ends, costs: np.ndarray, coefficients: np.ndarray, accept: Accept, began: float
-) -> Geodesic:
-    straight = problem.evaluate(np.zeros((1, coefficients.shape[1])), ends)
-    coefficients = np.concatenate([np.zeros((1, coefficients.shape[1])), coefficients])
-    costs = np.concatenate([straight.cost, costs])
-    order = np.argsort(costs, kind="stable")[:MOST_CHECKED]
-    exact = problem.evaluate(coefficients[order], repeated(ends, len(order)))
-    for row, feasible, length in zip(order, exact.feasible, exact.length, strict=True):
-        if feasible and accept(coefficients[row]):
+    problem: GeodesicProblem, ends: Ends, coefficients: Float[np.ndarray, "B p"], cost: Float[np.ndarray, "B"],
+    feasible: Bool[np.ndarray, "B"], accept: Accept, began: float,
+) -> Geodesic:  # fmt: skip
+    """The cheapest feasible candidate that passes the exact check, the straight line among them."""
+    zero = np.zeros((1, coefficients.shape[1]))
+    straight = problem.evaluate(zero, ends)
+    coefficients = np.concatenate([zero, coefficients])
+    cost, feasible = np.concatenate([straight.cost, cost]), np.concatenate([straight.feasible, feasible])
+    order = np.argsort(cost, kind="stable")
+    candidates = order[feasible[order]][:MOST_CHECKED]
+    if feasible[0] and 0 not in candidates:
+        candidates = np.append(candidates, 0)
+    for row in candidates:
+        if accept(coefficients[row]):
+            length = problem.evaluate(coefficients[row][None], ends).length
             return Geodesic(
-                "solved", coefficients[row], float(length), float(straight.length[0]), len(costs),
+                "solved", coefficients[row], float(length[0]), float(straight.length[0]), len(cost),
                 time.perf_counter() - began,
             )  # fmt: skip
     return Geodesic(
-        "not_found", coefficients[order[0]], float("nan"), float(straight.length[0]), len(costs),
+        "not_found", coefficients[order[0]], float("nan"), float(straight.length[0]), len(cost),
         time.perf_counter() - began,
     )  # fmt: skip
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from constraint_geodesics.constraints.lift import correct_and_retract, jump_excess
+from constraint_geodesics.constraints.lift import as_executed, correct_and_retract, densify, jump_excess
 from constraint_geodesics.constraints.retraction import Retraction
 from constraint_geodesics.constraints.vector import ConstraintManifold
 from constraint_geodesics.geometry.curves import PinnedPolynomial
@@ -84,7 +84,7 @@ class GeodesicProblem(Protocol):
 
 @dataclass(frozen=True)
 class Geodesic:
-    """The best curve found for one query.
+    """The best curve found for one query, its length and that of the straight line, curves evaluated, time [s].
 
     status: "solved", "not_found" (every curve tried jumps, collides or leaves the limits), "not_connected" (start
     and goal lie in different components of the sub-manifold).
@@ -177,15 +177,19 @@ class LearnedProblem:
         return self.curve.evaluate(*arrays)[0].numpy()
 
     def path(self, phi: Float[np.ndarray, "p"], ends: Ends, spacing: float) -> Float[np.ndarray, "T D"]:
-        """The joint path of one curve, points at most `spacing` [rad] apart unless the curve has a jump."""
+        """The joint path of one curve, rows about `spacing` [rad] apart unless the curve has a jump.
+
+        The curve itself is evaluated until its points are 0.1 rad apart; the rows between them are drawn as those of
+        any other planner's path.
+        """
         exact = Retraction() if self.retract else None
         points = 65
         while True:
             t = np.linspace(0.0, 1.0, points)
             decoded = self.chart.decode(self.latent_points(phi[None], ends, t))
             joints = correct_and_retract(self.manifold, decoded, t, ends.q_start, ends.q_goal, exact).joints[0]
-            if np.linalg.norm(np.diff(joints, axis=0), axis=-1).max() <= spacing or points > 2000:
-                return joints
+            if np.linalg.norm(np.diff(joints, axis=0), axis=-1).max() <= 0.1 or points > 1000:
+                return as_executed(self.manifold, joints, spacing) if self.retract else densify(joints, spacing)
             points = 2 * points - 1
 
     def ends(self, start: Float[np.ndarray, "B D"], goal: Float[np.ndarray, "B D"]) -> Ends:
