@@ -4,10 +4,10 @@ export OMP_NUM_THREADS := 1
 PYTHON ?= python3.11
 FILE ?=
 
-.PHONY: help env repro smoke test lint format results ui replay clean
+.PHONY: help env repro smoke bench-geometry test lint format results ui replay clean
 
 help:  ## list the targets
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 10
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
 
 .venv/installed: requirements.lock pyproject.toml
 	@command -v $(PYTHON) >/dev/null || { echo "error: Python 3.11 is needed (PyBullet has no wheels for later ones); set PYTHON=..."; exit 1; }
@@ -27,6 +27,10 @@ repro: env  ## run all stages that are out of date, then print the results
 
 smoke: env  ## the same pipeline on small parameters, in a copy of this checkout
 	python tests/pipeline/smoke.py .geodesics/smoke
+
+bench-geometry: env  ## time the geometry core again, after whatever it needs; writes reports/geometry.json
+	dvc repro benchmark_geometry
+	dvc repro --single-item --force benchmark_geometry
 
 test: env  ## run the tests, the whole pipeline on small parameters among them
 	python -m pytest -n 2 --dist loadgroup

@@ -7,7 +7,12 @@ import numpy as np
 
 from constraint_geodesics.cli import run_stage
 from constraint_geodesics.compute import parallel_map
-from constraint_geodesics.evaluation.analytic_search import AnalyticTask, run_analytic
+from constraint_geodesics.evaluation.analytic_search import (
+    MANIFOLDS,
+    AnalyticTask,
+    curve_family,
+    run_analytic,
+)
 from constraint_geodesics.evaluation.geodesic_search import write_table
 from constraint_geodesics.geodesics.policy_search import save_policy
 from constraint_geodesics.params import Params
@@ -23,7 +28,8 @@ def main(params: Params, layout: Layout, analytic: str) -> None:
     with tracked_stage(STAGE, analytic, settings, [], experiment=params.tracking.experiment, root=layout.root) as run:
         tasks = [
             AnalyticTask(
-                analytic, settings, seed, layout.scratch(STAGE, f"{analytic}-{seed}"),
+                analytic, curve_family(MANIFOLDS[analytic].manifold.dim, settings), settings, seed,
+                layout.scratch(STAGE, f"{analytic}-{seed}"),
                 run.child(f"seed {seed}", {"seed": seed}),
             )
             for seed in settings.seeds

@@ -1,11 +1,16 @@
 """Robots and scenes that many tests share; everything is real, small and read only."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from constraint_geodesics.constraints.scene import Scene
+from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
+from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.learning.training import train_manifold
 from constraint_geodesics.params import Params, load_params
 from constraint_geodesics.robot.bullet import Box, data_path
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
@@ -42,3 +47,21 @@ def kuka() -> SerialRobot:
 def kuka_scene(kuka: SerialRobot) -> Scene:
     table = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1), ("lbr_iiwa_link_0",))
     return Scene(kuka, (table,))
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A small learned manifold and the free configurations it was trained on."""
+
+    manifold: LearnedManifold
+    joints: np.ndarray
+
+
+@pytest.fixture(scope="session")
+def trained(scene: Scene, params: Params, tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    frame = draw_shard(ShardTask(scene, scene.manifold(params.constraints["free"]), 4000, (1,))).frame
+    joints = joints_of(frame)[free_rows(frame)]
+    small = params.manifolds["planner"].model_copy(update={"epochs": 4, "variance_epochs": 2, "variance_centres": 64})
+    folder = tmp_path_factory.mktemp("manifold")
+    chart = train_manifold(joints, scene.robot, small, folder, lambda *_: None, progress=False).manifold
+    return Trained(chart, joints)

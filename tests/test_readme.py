@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+import pytest
 import yaml
 from ruamel.yaml import YAML
 
@@ -17,6 +18,23 @@ def between(marker: str) -> str:
 
 def test_the_result_table_is_the_reports() -> None:
     assert between("results") == (ROOT / "reports" / "table.md").read_text().strip()
+
+
+def test_the_geometry_table_is_the_reports() -> None:
+    assert between("geometry") == (ROOT / "reports" / "geometry.md").read_text().strip()
+
+
+@pytest.mark.parametrize("example", re.findall(r"```python\n(.*?)```", README, re.S), ids=("constraint", "manifold"))
+def test_every_example_runs(example, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(ROOT)
+    exec(compile(example, "README.md", "exec"), {"__name__": "example"})
+    printed = capsys.readouterr().out.split()
+    if "GradientSolver" in example:
+        status, length, straight = printed[0], float(printed[1]), float(printed[2])
+        assert status == "converged"
+        assert 2.0 < length < 0.9 * straight, "round the hill, not over it"
+    else:
+        assert 0 <= float(printed[0]) < 1e-9
 
 
 def test_every_figure_and_linked_file_is_in_the_repository() -> None:

@@ -184,9 +184,10 @@ class GeodesicParams(_Record):
     illustrated: tuple[Name, ...]
     illustrated_constraints: tuple[Name, ...]
     analytic_steps: Count
-    analytic: tuple[Literal["plane", "sphere"], ...]
+    analytic: tuple[Literal["plane", "sphere", "torus"], ...]
+    ablated_segments: tuple[Annotated[int, Field(ge=2)], ...]
     degree: Annotated[int, Field(ge=2, le=9)]
-    nodes: Annotated[int, Field(ge=5)]
+    length_degree: Annotated[int, Field(ge=4, multiple_of=4)]
     steps: Count
     environments: Count
     episode_steps: Count
@@ -194,6 +195,16 @@ class GeodesicParams(_Record):
     ppo: PpoParams
     rollouts: Count
     checkpoint_steps: Count
+
+
+class GeometryParams(_Record):
+    """Benchmark and ablation of the geometry core."""
+
+    rounds: Count
+    batch: Count
+    checked: Count
+    graph_points: Annotated[int, Field(ge=20)]
+    pairs: Count
 
 
 class BenchmarkParams(_Record):
@@ -245,6 +256,7 @@ class Params(_Record):
     manifolds: Annotated[dict[Name, ManifoldParams], Field(min_length=1)]
     submanifold: SubmanifoldParams
     geodesics: GeodesicParams
+    geometry: GeometryParams
     benchmark: BenchmarkParams
     judge: JudgeParams
     recording: RecordingParams

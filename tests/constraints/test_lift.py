@@ -15,10 +15,10 @@ def test_dense_points_keep_the_given_ones_and_the_spacing() -> None:
 
 def test_a_jump_is_what_no_continuous_curve_needs() -> None:
     line = np.linspace([0.0, 0.0], [2.0, 0.0], 11)
-    assert jump_excess(line) == 0.0
+    assert jump_excess(line, np.linspace(0, 1, len(line))) == 0.0
     broken = line.copy()
     broken[5:] += [0.0, 3.0]
-    assert jump_excess(broken) > 1.0
+    assert jump_excess(broken, np.linspace(0, 1, len(broken))) > 1.0
 
 
 def test_executed_rows_are_on_the_constraint(scene, params) -> None:

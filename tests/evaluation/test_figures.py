@@ -245,6 +245,36 @@ def test_histograms_show_every_column_but_quaternions_and_say_what_is_held():
     assert [label.get_text() for label in figure.axes[1].get_xticklabels()] == ["1.571"]
 
 
+def test_rules_are_drawn_against_their_cost():
+    rows = [
+        {"rule": rule, "points": n, "microseconds": n, "error_p95": 1 / n, "error_max": 2 / n}
+        for rule in figures.RULES
+        for n in (8, 4)
+    ]
+    axes = figures.length_rules(pd.DataFrame(rows), 1e-3).axes[0]
+    for line in axes.lines[:3]:
+        assert line.get_xdata().tolist() == [4, 8], "in the order of the points"
+        assert line.get_ydata().tolist() == [1 / 4, 1 / 8]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == [
+        label for label, _, _ in figures.RULES.values()
+    ]
+
+
+def test_an_ablation_without_collisions_says_none():
+    searched = {"plane": {"corrected_reward": [1.001, 1.002], "printed_reward": [1.05, 1.06]}}
+    learned = {
+        "flat": {
+            name: {"collision_free": None} for name in ("with_variance", "without_variance", "straight_latent_line")
+        }
+    }
+    figure = figures.ablation(searched, {"plane": {"polynomial": 1.001, "spline_2": 1.0}}, learned)
+    search, reach, variance = figure.axes
+    offsets = np.concatenate([marks.get_offsets() for marks in search.collections])
+    np.testing.assert_allclose(sorted(offsets[:, 1]), [0.001, 0.002, 0.05, 0.06])
+    assert [bar.get_height() for bar in reach.patches] == pytest.approx([0.001, 1e-8])
+    assert {text.get_text() for text in variance.texts} == {"none"}
+
+
 @pytest.mark.parametrize(
     "draw",
     [

@@ -34,6 +34,40 @@ from constraint_geodesics.paths import Layout
 CONSTRAINTS, SEEDS, QUERIES = ("free", "level_cup", "slide"), (0, 1), 3
 HELD_OUT = {"joint_error_mean_deg": 12.5, "tool_error_median_mm": 233.0, "deviation_median_deg": 1.0}
 
+ABLATED = {
+    "policy_search": {"printed_reward": {"mean_ratio": [1.02, 1.04]}, "spline_2": {"mean_ratio": [1.01, 1.01]}},
+    "gradient": {"polynomial": {"mean_ratio": 1.0002}, "spline_2": {"mean_ratio": 1.00001}},
+}
+UNVARIED = {
+    **{name: {"mean_ratio_to_best": 1.0} for name in ("polynomial", "spline_2")},
+    **{name: {"collision_free": share, "pairs": 5.0}
+       for name, share in (("with_variance", 0.8), ("without_variance", 0.4), ("straight_latent_line", None))},
+}  # fmt: skip
+RATES = {"batch": 4096, "per_second": 50000.0, "naive_per_second": 200.0, "ratio_to_naive": 250.0}
+STEPS = {
+    "environments": 256,
+    "steps_per_second": 20000.0,
+    "dummy_vec_env_steps_per_second": 800.0,
+    "ratio_to_dummy_vec_env": 25.0,
+}
+GEOMETRY = {
+    "manifold": "planner", "constraint": "level_cup", "machine": {"processor": "a processor"},
+    "curve_length": {
+        **RATES, "per_second_by_batch": {"1": 1000.0},
+        "error": {"median": 1e-7, "p95": 1e-5, "max": 4e-4, "curves": 512, "reference_points": 2000},
+    },
+    "curve_length_retracted": RATES, "environment": STEPS, "environment_retracted": STEPS,
+    "solvers": {"plane": {"gradient": {"mean_ratio": 1.0, "milliseconds": 2.0}}},
+    "policy_search": {
+        "plane": {"mean_ratio": [1.001, 1.003], "first_mean_ratio": [1.25, 1.25], "domain": "|x|, |y| ≤ 1.5"},
+    },
+}  # fmt: skip
+QUADRATURE = [
+    {"rule": rule, "points": n, "microseconds": n * cost, "error_p95": 10.0**-n, "error_max": 3 * 10.0**-n}
+    for rule, cost in (("chords", 1.0), ("gauss_legendre", 4.0), ("collocation", 1.1))
+    for n in (3, 5, 7)
+]
+
 HISTORY = [
     *({"epoch": e, "mean_loss": 1.0 / (e + 1), "mean_held_out_loss": 1.1 / (e + 1)} for e in range(4)),
     *({"epoch": e, "variance_loss": -e, "variance_held_out_loss": 0.5 - e} for e in range(4, 6)),
@@ -146,6 +180,11 @@ def run(tmp_path_factory):
         layout.analytic("plane") / "curves.npz", sampled=np.stack([t * [1.0, k] for k in (1, 2)]), learned=t * [1, 1]
     )
     write_json(layout.report("train_analytic", "plane"), {"mean_ratio": [1.001, 1.003]})
+    write_json(layout.report("ablate_analytic", "plane"), ABLATED)
+    for name in params.manifolds:
+        write_json(layout.report("ablate_manifold", name), UNVARIED)
+    write_json(layout.root / "reports" / "geometry.json", GEOMETRY)
+    write_csv(layout.report("benchmark_geometry", "quadrature", "csv"), QUADRATURE)
     write_csv(layout.report("benchmark_planners", "removed", "csv"), sampled_rows())
     return params, layout
 
@@ -196,10 +235,21 @@ def test_the_page_is_well_formed_small_and_asks_the_network_for_nothing(page, wr
 def test_every_figure_of_the_paper_has_its_counterpart(written):
     names = [file.stem for file in written]
     assert all(file.is_file() and file.stat().st_size < 150_000 for file in written)
-    for expected in ("fig2_analytic_submanifolds", "fig3_plane_search", "fig4a_latent_metric", "fig4b_submanifolds",
-                     "fig4c_geodesics", "metric_growth",
-        "training_curves", "comparison_planner", "submanifolds_planner",
-                     "learning_curves", *(f"data_{name}" for name in CONSTRAINTS)):  # fmt: skip
+    for expected in (
+        "length_rules",
+        "ablation",
+        "fig2_analytic_submanifolds",
+        "fig3_plane_search",
+        "fig4a_latent_metric",
+        "fig4b_submanifolds",
+        "fig4c_geodesics",
+        "metric_growth",
+        "training_curves",
+        "comparison_planner",
+        "submanifolds_planner",
+        "learning_curves",
+        *(f"data_{name}" for name in CONSTRAINTS),
+    ):  # fmt: skip
         assert expected in names
 
 
@@ -317,6 +367,10 @@ def test_drawn_curves_are_those_of_the_seeds_that_found_one(run, tmp_path):
         "reports/label_joints/level_cup.json",
         "data/submanifolds/planner-free/submanifold.json",
         "data/analytic/plane/curves.npz",
+        "reports/geometry.json",
+        "reports/ablate_analytic/plane.json",
+        "reports/ablate_manifold/paper.json",
+        "reports/benchmark_geometry/quadrature.csv",
         "data/joints/free/joints.parquet",
     ],
 )
@@ -365,6 +419,21 @@ def test_a_metrics_file_that_is_not_json_is_named(run):
             write_report(params, layout)
     finally:
         file.write_text(original)
+
+
+def test_the_page_says_what_the_geometry_core_reaches(page):
+    assert "50,000 lengths a second in batches of 4096, 250 times" in page
+    assert "plane: 0.20% against 3.00%" in page, "the reward as printed beside the corrected one"
+    assert "paper: 80% with it, 40% without" in page
+    assert "one thread of a processor" in page
+
+
+def test_the_geometry_table_says_what_its_metrics_say(run, written):
+    table = (run[1].root / "reports" / "geometry.md").read_text()
+    rows = [[cell.strip() for cell in re.split(r"(?<!\\\\)\|", line)[1:-1]] for line in table.splitlines() if line]
+    assert rows[2] == ["curve lengths, batches of 4096", "50,000", "200", "250"]
+    assert rows[5][0] == "environment steps, PPO included, retracted onto level_cup"
+    assert rows[-1][:4] == ["plane", "1.250", "1.0030", "1.00000"]
 
 
 def test_only_what_params_ask_for_was_searched():

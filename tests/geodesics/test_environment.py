@@ -3,7 +3,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env as check_gymnasium
 from stable_baselines3.common.env_checker import check_env as check_stable_baselines
 
-from constraint_geodesics.evaluation.analytic_search import analytic_problem
+from constraint_geodesics.evaluation.analytic_search import analytic_problem, curve_family
 from constraint_geodesics.geodesics.environment import (
     CurveEnv,
     CurveVecEnv,
@@ -13,12 +13,15 @@ from constraint_geodesics.geodesics.environment import (
     gompertz,
     observe,
     rewards,
+    scalar_environments,
 )
+from constraint_geodesics.geodesics.problem import Ends
+from constraint_geodesics.geometry.curves import PinnedPolynomial
 
 
 @pytest.fixture(scope="module")
 def problem(params):
-    return analytic_problem("sphere", params.geodesics)
+    return analytic_problem("sphere", curve_family(2, params.geodesics))
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +106,31 @@ def test_the_best_curve_is_never_worse_than_the_straight_one(problem, settings) 
         states, _ = advance(problem, settings, states, rng.uniform(-1, 1, states.phi.shape))
         assert (states.best_cost <= states.straight_cost).all()
         np.testing.assert_allclose(problem.evaluate(states.best_phi, ends).cost, states.best_cost, rtol=1e-12)
+
+
+def test_a_near_and_a_far_pair_look_alike(settings) -> None:
+    problem = analytic_problem("plane", PinnedPolynomial(2, 3))
+    start = np.zeros((2, 2))
+    ends = Ends(*2 * (start, np.array([[1.0, 0.0], [0.01, 0.0]])))
+    phi = np.tile([0.3, -0.2, 0.1, 0.4], (2, 1)) * ends.distance[:, None]
+    states, reward = advance(problem, settings, begin(problem, ends, phi), np.tile([0.5, -1.0, 0.2, 0.1], (2, 1)))
+    far, near = observe(settings, states)
+    assert reward[0] == pytest.approx(reward[1], rel=1e-9)
+    coefficients = problem.curve.coefficients
+    np.testing.assert_allclose(far[:coefficients], near[:coefficients], rtol=1e-5)
+    np.testing.assert_allclose(far[-3:], near[-3:], rtol=1e-5)
+
+
+def test_scalar_environments_step_like_the_batched_one(problem, settings) -> None:
+    batched, scalar = (
+        CurveVecEnv(problem, settings, 3, seed=0),
+        scalar_environments(lambda: CurveEnv(problem, settings), 3),
+    )
+    batched.reset(), scalar.reset()
+    for row, environment in enumerate(scalar.envs):
+        assert isinstance(environment, CurveEnv)
+        one = np.array([row])
+        environment.states = begin(problem, batched.states.ends[one], batched.states.phi[one])
+    actions = np.random.default_rng(0).uniform(-1, 1, (3, problem.curve.coefficients)).astype(np.float32)
+    for ours, theirs in zip(batched.step(actions)[:2], scalar.step(actions)[:2], strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5)

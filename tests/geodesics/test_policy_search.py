@@ -5,7 +5,12 @@ import numpy as np
 import pytest
 import torch
 
-from constraint_geodesics.evaluation.analytic_search import AnalyticTask, analytic_problem, run_analytic
+from constraint_geodesics.evaluation.analytic_search import (
+    AnalyticTask,
+    analytic_problem,
+    curve_family,
+    run_analytic,
+)
 from constraint_geodesics.geodesics.policy_search import load_policy, save_policy, search, train_policy
 
 
@@ -27,19 +32,19 @@ def ignore(step, figures) -> None:
 
 
 def test_policy_search_straightens_curves_in_the_plane(params, tmp_path: Path) -> None:
-    settings = params.geodesics.model_copy(update={"steps": 40000})
-    result = run_analytic(AnalyticTask("plane", settings, 0, tmp_path, nullcontext(Quiet())))
+    settings = params.geodesics.model_copy(update={"steps": 60000})
+    result = run_analytic(AnalyticTask("plane", curve_family(2, settings), settings, 0, tmp_path, nullcontext(Quiet())))
     figures = result.figures()
     assert (result.ratio >= 1 - 1e-9).all()
-    assert figures["first_mean_ratio"] > 1.3
-    assert figures["mean_ratio"] < 1.06
+    assert figures["first_mean_ratio"] > 1.2
+    assert figures["mean_ratio"] < 1.01
     exact = np.linalg.norm(result.learned[-1] - result.learned[0])
     drawn = np.linalg.norm(np.diff(result.learned, axis=0), axis=1).sum()
     assert exact <= drawn < 1.1 * exact
 
 
 def test_the_same_seed_gives_the_same_policy(small, tmp_path: Path) -> None:
-    problem = analytic_problem("plane", small)
+    problem = analytic_problem("plane", curve_family(2, small))
     first, again, other = (
         train_policy(problem, small, seed, tmp_path / folder, ignore).actor.state_dict()
         for seed, folder in ((0, "a"), (0, "b"), (1, "c"))
@@ -49,7 +54,7 @@ def test_the_same_seed_gives_the_same_policy(small, tmp_path: Path) -> None:
 
 
 def test_interrupted_training_ends_as_if_it_had_never_stopped(small, tmp_path: Path) -> None:
-    problem = analytic_problem("plane", small)
+    problem = analytic_problem("plane", curve_family(2, small))
     whole = train_policy(problem, small, 0, tmp_path / "whole", ignore)
 
     def interrupt(step, figures) -> None:
@@ -67,7 +72,7 @@ def test_interrupted_training_ends_as_if_it_had_never_stopped(small, tmp_path: P
 
 
 def test_a_checkpoint_of_other_parameters_is_not_used(small, tmp_path: Path) -> None:
-    problem = analytic_problem("plane", small)
+    problem = analytic_problem("plane", curve_family(2, small))
     train_policy(problem, small, 0, tmp_path, ignore)
     steps = []
     changed = small.model_copy(update={"episode_steps": 5})
@@ -76,7 +81,7 @@ def test_a_checkpoint_of_other_parameters_is_not_used(small, tmp_path: Path) -> 
 
 
 def test_a_saved_policy_acts_the_same(small, tmp_path: Path) -> None:
-    problem = analytic_problem("sphere", small)
+    problem = analytic_problem("sphere", curve_family(2, small))
     policy = train_policy(problem, small, 0, tmp_path, ignore)
     save_policy(policy, tmp_path, 0)
     ends = problem.sample_ends(1, np.random.default_rng(0))
@@ -84,12 +89,12 @@ def test_a_saved_policy_acts_the_same(small, tmp_path: Path) -> None:
         search(problem, actor, small, ends, 3, lambda phi: True) for actor in (policy.actor, load_policy(tmp_path, 0))
     )
     np.testing.assert_array_equal(found.phi, again.phi)
-    assert found.status == "solved"
+    assert found.found
     assert found.length <= found.straight_length + 1e-12
 
 
 def test_what_the_exact_check_refuses_is_not_returned(small, tmp_path: Path) -> None:
-    problem = analytic_problem("sphere", small)
+    problem = analytic_problem("sphere", curve_family(2, small))
     policy = train_policy(problem, small, 0, tmp_path, ignore)
     ends = problem.sample_ends(1, np.random.default_rng(0))
     nothing = search(problem, policy.actor, small, ends, 3, lambda phi: False)

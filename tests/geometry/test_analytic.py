@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
-from constraint_geodesics.geometry.manifold import GeometryError, NonFiniteError
+from constraint_geodesics.geometry.manifold import GeometryError, MeasuredManifold, NonFiniteError, PeriodicManifold
 
 PI = math.pi
 
@@ -89,6 +89,48 @@ def test_tube_angle_wraps(angle, wrapped):
     assert math.sin(Torus().tube_angle(point(1.0, angle)).item()) == pytest.approx(math.sin(wrapped), abs=1e-14)
 
 
+@pytest.mark.parametrize(
+    ("a", "b", "distance"),
+    [
+        ((0.3, -0.5), (0.3, 2.0), 2.5),  # along a meridian
+        ((0.3, -2.5), (0.3, 2.0), 2 * PI - 4.5),  # through the inner equator
+        ((0, PI), (2.5, -PI), 2.5),  # along the inner equator
+        ((-3, PI), (3, PI), 2 * PI - 6),
+        ((0, 0), (1.8, 0), 5.4),  # along the outer equator, short of the conjugate point at 1.81
+        ((1, 2), (1 - 2 * PI, 2 + 4 * PI), 0),
+    ],
+)
+def test_torus_distance(a, b, distance):
+    for scale in (1.0, 5.0):
+        found = Torus(2.0 * scale, scale).distance(point(*a), point(*b)).item()
+        assert found == pytest.approx(scale * distance, abs=1e-14 * scale)
+
+
+def test_torus_distance_broadcasts_and_keeps_the_type():
+    a, b = torch.zeros(3, 1, 2), torch.tensor([[0.0, 1.0], [0.0, -2.0]])
+    found = Torus().distance(a, b)
+    torch.testing.assert_close(found, torch.tensor([[1.0, 2.0]]).expand(3, 2))
+    assert Torus().distance(a.double(), b).dtype == torch.float64
+    assert Torus().distance(torch.zeros(0, 2), torch.zeros(2)).shape == (0,)
+    assert Torus().distance(torch.zeros(2), torch.tensor([0, 1])).shape == ()
+
+
+@pytest.mark.parametrize("manifold", [Sphere(2.0), Torus()])
+def test_a_whole_period_leads_back_to_the_same_point(manifold):
+    assert isinstance(manifold, PeriodicManifold)
+    assert isinstance(manifold, MeasuredManifold)
+    z = point(0.3, -0.7)
+    for k, period in enumerate(manifold.periods):
+        if not math.isfinite(period):
+            continue
+        shift = torch.zeros(2, dtype=torch.float64)
+        shift[k] = period
+        torch.testing.assert_close(manifold.embed(z + shift), manifold.embed(z), rtol=0, atol=1e-14)
+        assert not torch.allclose(manifold.embed(z + shift / 2), manifold.embed(z), atol=0.1)
+    assert Sphere().periods == (math.inf, 2 * PI)
+    assert Torus().periods == (2 * PI, 2 * PI)
+
+
 @pytest.mark.parametrize("radius", [0.0, -1.0, math.inf, math.nan])
 def test_radii_must_be_positive(radius):
     for make in (lambda: Sphere(radius), lambda: Torus(radius, 1.0), lambda: Torus(1.0, radius)):
@@ -110,7 +152,7 @@ def test_points_of_another_dimension_are_refused(manifold):
             function(torch.zeros(4, 3))
 
 
-@pytest.mark.parametrize("manifold", [Plane(2), Sphere()])
+@pytest.mark.parametrize("manifold", [Plane(2), Sphere(), Torus()])
 def test_distance_of_a_point_that_is_not_finite_is_refused(manifold):
     with pytest.raises(NonFiniteError, match=r"b\[1, 0\] = nan"):
         manifold.distance(point(0, 0), torch.tensor([[0.0, 0.0], [math.nan, math.inf]]))

@@ -29,8 +29,10 @@ SMALL: dict[str, Any] = {
         "illustrated_constraints": ["level_cup"],
         "rollouts": 8,
         "checkpoint_steps": 1000,
+        "ablated_segments": [2],
         "ppo": {"batch_size": 320},
     },
+    "geometry": {"rounds": 1, "batch": 256, "checked": 32, "graph_points": 200, "pairs": 4},
     "benchmark": {"seeds": [0], "rrt_star_iterations": 40, "prm_iterations": 50},
 }
 CONSTRAINTS = ("free", "level_cup")

@@ -11,7 +11,7 @@ from numba import njit
 
 from constraint_geodesics.robot.kernels import geometric_jacobian, pose_of
 
-_COMPILE = {"cache": True, "fastmath": False, "nogil": True}
+_COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 _SMALL = 1e-9
 
 

@@ -65,15 +65,15 @@ def correct_and_retract(
     return Lifted(result.joints, result.violation)
 
 
-def jump_excess(joints: Float[np.ndarray, "*batch T D"]) -> Float[np.ndarray, "*batch"]:
+def jump_excess(joints: Float[np.ndarray, "*batch T D"], t: Float[np.ndarray, "T"]) -> Float[np.ndarray, "*batch"]:
     """How far a curve's steps exceed what a continuous one needs [rad]; more than 0 where it changes its branch.
 
-    Needed is at most four times an even step from end to end, and 0.05 rad.
+    t: rising times of the points, 0 to 1.  Needed is at most four times an even pace from end to end, and 0.05 rad.
     """
     steps = np.linalg.norm(np.diff(joints, axis=-2), axis=-1)
     direct = np.linalg.norm(joints[..., -1, :] - joints[..., 0, :], axis=-1)
-    allowed = 0.05 + 4.0 * direct / steps.shape[-1]
-    return np.maximum(steps - allowed[..., None], 0.0).sum(axis=-1)
+    allowed = 0.05 + 4.0 * direct[..., None] * np.diff(t)
+    return np.maximum(steps - allowed, 0.0).sum(axis=-1)
 
 
 def densify(joints: Float[np.ndarray, "T D"], spacing: float) -> Float[np.ndarray, "n D"]:

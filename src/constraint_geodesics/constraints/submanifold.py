@@ -100,7 +100,7 @@ def check_edges(
     t = np.linspace(0.0, 1.0, points)
     first, last = chart.encode(starts)[:, None], chart.encode(goals)[:, None]
     lifted = lift(chart, manifold, (1 - t[:, None]) * first + t[:, None] * last, t, starts, goals, Retraction())
-    holds = (jump_excess(lifted.joints) == 0) & (lifted.violation.max(axis=-1) <= Retraction().accuracy)
+    holds = (jump_excess(lifted.joints, t) == 0) & (lifted.violation.max(axis=-1) <= Retraction().accuracy)
     holds &= manifold.robot.limit_distance(lifted.joints).min(axis=-1) >= 0
     inner = lifted.joints[holds, 1:-1]
     holds[holds] = free(inner.reshape(-1, starts.shape[1])).reshape(inner.shape[:2]).all(axis=1)

@@ -11,9 +11,10 @@ from jaxtyping import Float
 from constraint_geodesics.evaluation.geodesic_search import SeedLog
 from constraint_geodesics.geodesics.environment import begin
 from constraint_geodesics.geodesics.policy_search import TrainedPolicy, episode_settings, follow, train_policy
-from constraint_geodesics.geodesics.problem import ChartProblem, Ends, repeated
-from constraint_geodesics.geometry.analytic import Plane, Sphere
-from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.geodesics.problem import Box, ChartProblem, Ends, repeated
+from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
+from constraint_geodesics.geometry.curves import CurveFamily, PinnedPolynomial, PinnedSpline
+from constraint_geodesics.geometry.manifold import MeasuredManifold
 from constraint_geodesics.params import GeodesicParams
 
 PAIRS = 100
@@ -22,18 +23,31 @@ DRAWN_ROLLOUTS = 12
 DRAWN = 65
 """Points of a drawn curve."""
 
-MANIFOLDS: dict[str, tuple[Plane | Sphere, tuple[float, float], tuple[float, float]]] = {
-    "plane": (Plane(), (-1.5, -1.5), (1.5, 1.5)),
-    "sphere": (Sphere(), (-1.0, -1.2), (1.0, 1.2)),
+
+@dataclass(frozen=True)
+class Member:
+    """A manifold with a known answer, the box of its chart that ends are drawn from, and what the box is, in words."""
+
+    manifold: MeasuredManifold
+    box: Box
+    domain: str
+
+
+MANIFOLDS = {
+    "plane": Member(Plane(), Box((-1.5, -1.5), (1.5, 1.5)), "|x|, |y| ≤ 1.5"),
+    "sphere": Member(Sphere(), Box((-1.2, -1.4), (1.2, 1.4)), "|elevation| ≤ 1.2 rad, |azimuth| ≤ 1.4 rad"),
+    "torus": Member(
+        Torus(), Box((-1.2, -1.2), (1.2, 1.2)), "R = 2, r = 1, |ring angle| ≤ 1.2 rad, |tube angle| ≤ 1.2 rad"
+    ),
 }
-"""Manifold and the box of its chart that ends are drawn from: Cartesian, and elevation and azimuth [rad]."""
 
 
 @dataclass(frozen=True)
 class AnalyticTask:
-    """One seed on one analytic manifold."""
+    """One seed on one analytic manifold, with one curve family."""
 
     name: str
+    curve: CurveFamily
     params: GeodesicParams
     seed: int
     scratch: Path
@@ -57,15 +71,29 @@ class AnalyticResult:
 
     def figures(self) -> dict[str, float]:
         """What is compared between seeds."""
-        return {"mean_ratio": float(self.ratio.mean()), "first_mean_ratio": float(self.first_ratio.mean())}
+        return {
+            "mean_ratio": float(self.ratio.mean()),
+            "p95_ratio": float(np.quantile(self.ratio, 0.95)),
+            "first_mean_ratio": float(self.first_ratio.mean()),
+        }
 
 
-def analytic_problem(name: str, params: GeodesicParams) -> ChartProblem:
+def curve_family(dim: int, params: GeodesicParams, segments: int = 0) -> CurveFamily:
+    """The polynomials that params.yaml names, or C² splines of some segments."""
+    return PinnedSpline(dim, segments) if segments else PinnedPolynomial(dim, params.degree)
+
+
+def analytic_problem(name: str, curve: CurveFamily) -> ChartProblem:
     """Geodesics on an analytic manifold by name."""
-    manifold, low, high = MANIFOLDS[name]
-    return ChartProblem(
-        manifold, PinnedPolynomial(manifold.dim, params.degree), np.array(low), np.array(high), params.nodes
-    )
+    member = MANIFOLDS[name]
+    return ChartProblem(member.manifold, curve, member.box)
+
+
+def unseen_pairs(name: str, problem: ChartProblem) -> tuple[Ends, Float[np.ndarray, "P"]]:
+    """The pairs that every solver is compared on, and their exact distances."""
+    ends = problem.sample_ends(PAIRS, np.random.default_rng(PAIRS_SEED))
+    start, goal = torch.from_numpy(ends.z_start), torch.from_numpy(ends.z_goal)
+    return ends, MANIFOLDS[name].manifold.distance(start, goal).numpy()
 
 
 def run_analytic(task: AnalyticTask) -> AnalyticResult:
@@ -73,18 +101,16 @@ def run_analytic(task: AnalyticTask) -> AnalyticResult:
 
     The straight line is no start here: in the plane it is the answer.
     """
-    problem = analytic_problem(task.name, task.params)
+    problem = analytic_problem(task.name, task.curve)
     with task.run as run:
         policy = train_policy(problem, task.params, task.seed, task.scratch, run.log)
-    rng = np.random.default_rng(PAIRS_SEED)
+    ends, exact = unseen_pairs(task.name, problem)
+    rng = np.random.default_rng(PAIRS_SEED + 1)
     settings, size = episode_settings(task.params), problem.curve.coefficients
-    ends = problem.sample_ends(PAIRS, rng)
     first = begin(problem, ends, problem.sample_curves(ends, rng))
     visited = follow(problem, policy.actor, settings, first, np.zeros((task.params.episode_steps, PAIRS, size)))
     lengths = np.array([states.length for states in visited])
     best = visited[int(lengths[:, 0].argmin())].phi[:1]
-    manifold = MANIFOLDS[task.name][0]
-    exact = manifold.distance(torch.from_numpy(ends.z_start), torch.from_numpy(ends.z_goal)).numpy()
     return AnalyticResult(
         task.seed, policy, lengths[0] / exact, lengths.min(axis=0) / exact,
         _sampled(problem, policy, task, ends, rng), _points(problem, best, ends)[0],

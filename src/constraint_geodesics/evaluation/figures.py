@@ -24,8 +24,8 @@ from PIL import Image
 
 from constraint_geodesics.constraints.submanifold import GraphSubmanifold, GridSubmanifold
 from constraint_geodesics.geometry.analytic import Sphere, Torus
-from constraint_geodesics.geometry.graph import components_on_grid
-from constraint_geodesics.geometry.manifold import Manifold, pullback_metric
+from constraint_geodesics.geometry.level_sets import LevelSet
+from constraint_geodesics.geometry.manifold import pullback_metric
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 
 DPI = 120
@@ -93,8 +93,10 @@ def analytic_submanifolds() -> Figure:
     sphere, torus = Sphere(), Torus()
     around, along = np.linspace(-np.pi, np.pi, 121), np.linspace(-np.pi / 2, np.pi / 2, 61)
     figure = Figure(figsize=(7.6, 5.6), layout="constrained")
-    _surface_row(figure, 0, sphere, (along, around), sphere.elevation, ELEVATION, (False, True), "sphere, elevation")
-    _surface_row(figure, 1, torus, (around, around), torus.tube_angle, TUBE_ANGLE, (True, True), "torus, tube angle")
+    elevation = LevelSet(sphere, 0, (ELEVATION,), HALF_WIDTH)
+    tube_angle = LevelSet(torus, 1, (TUBE_ANGLE, -TUBE_ANGLE), HALF_WIDTH)
+    _surface_row(figure, 0, elevation, (along, around), sphere.elevation, "sphere, elevation")
+    _surface_row(figure, 1, tube_angle, (around, around), torus.tube_angle, "torus, tube angle")
     return _tidied(figure)
 
 
@@ -302,6 +304,101 @@ def learning_curves(panels: Mapping[str, Mapping[str, pd.DataFrame]]) -> Figure:
     return _tidied(figure)
 
 
+RULES = {
+    "chords": ("chords", GREY, "s"),
+    "gauss_legendre": ("Gauss-Legendre on J γ̇", BLUE, "^"),
+    "collocation": ("collocation (the default)", ORANGE, "o"),
+}
+"""Rules of a curve's length: label, colour and marker."""
+
+VARIANTS = {
+    "corrected_reward": ("corrected reward, cubic", ORANGE),
+    "printed_reward": ("reward as printed", BLUE),
+    "spline_2": ("2 segments", SKY),
+    "spline_4": ("4 segments", PURPLE),
+}
+"""Variants of policy search where the answer is known: label and colour; others are grey."""
+
+
+def length_rules(table: pd.DataFrame, tolerance: float) -> Figure:
+    """Error of a curve's length against what it costs, for every rule: 95th percentile, and up to the worst curve.
+
+    table: rows of `quadrature_rows`.  tolerance: the error that is asked for by default.
+    """
+    figure = Figure(figsize=(6.2, 4.0), layout="constrained")
+    axes = figure.add_subplot()
+    for rule, (label, colour, marker) in RULES.items():
+        rows = table[table["rule"] == rule].sort_values("points")
+        axes.plot(rows["microseconds"], rows["error_p95"], color=colour, marker=marker, markersize=4, label=label)
+        axes.fill_between(
+            rows["microseconds"], rows["error_p95"], rows["error_max"], color=colour, alpha=0.15, linewidth=0
+        )
+    axes.axhline(tolerance, color=BLACK, linewidth=0.8, linestyle=":")
+    axes.text(0.01, tolerance * 1.15, "default tolerance", fontsize=8, transform=axes.get_yaxis_transform())
+    axes.set(xscale="log", yscale="log", xlabel="cost of a curve [µs]", ylabel="relative error, p95 to worst")
+    _legend(axes, loc="lower left")
+    return _tidied(figure)
+
+
+def ablation(
+    searched: Mapping[str, Mapping[str, Sequence[float]]], reached: Mapping[str, Mapping[str, float]],
+    metrics: Mapping[str, Mapping[str, Mapping[str, float]]],
+) -> Figure:  # fmt: skip
+    """What each choice is worth: excess length of policy search and of each curve family, and the variance term.
+
+    searched: manifold → variant → ratio of every seed.  reached: manifold → family → ratio of its best curves.
+    metrics: learned manifold → variant → figures of its geodesics.
+    """
+    figure = Figure(figsize=(9.6, 3.5), layout="constrained")
+    search, reach, variance = _row_of_axes(figure, 3)
+    _draw_searched(search, searched)
+    families = list(dict.fromkeys(name for ratios in reached.values() for name in ratios))
+    for k, family in enumerate(families):
+        excess = [max(ratios.get(family, np.nan) - 1, 1e-8) for ratios in reached.values()]
+        x = np.arange(len(reached)) + 0.8 * ((k + 0.5) / len(families) - 0.5)
+        colour = VARIANTS.get(family, ("", ORANGE))[1]
+        reach.bar(x, excess, width=0.7 / len(families), color=colour, label=family.replace("spline_", "segments: "))
+    reach.set(yscale="log", ylim=(1e-8, None), ylabel="best curve / exact − 1")
+    reach.set_xticks(range(len(reached)), list(reached))
+    reach.set_title("what a family can reach")
+    _legend(reach, loc="upper left")
+    _draw_variance(variance, metrics)
+    return _tidied(figure)
+
+
+def _draw_searched(axes: Axes, searched: Mapping[str, Mapping[str, Sequence[float]]]) -> None:
+    variants = list(dict.fromkeys(name for ratios in searched.values() for name in ratios))
+    for k, variant in enumerate(variants):
+        label, colour = VARIANTS.get(variant, (variant.replace("_", " "), GREY))
+        for place, ratios in enumerate(searched.values()):
+            values = np.maximum(np.array(ratios.get(variant, [])) - 1, 1e-6)
+            x = place + 0.8 * ((k + 0.5) / len(variants) - 0.5)
+            axes.scatter(np.full(len(values), x), values, s=12, color=colour, label=label if place == 0 else None)
+    axes.axhline(0.01, color=BLACK, linewidth=0.8, linestyle=":")
+    axes.set(yscale="log", ylabel="learned path / exact − 1")
+    axes.set_xticks(range(len(searched)), list(searched))
+    axes.set_title("policy search, one mark a seed")
+    _legend(axes, loc="lower right")
+
+
+def _draw_variance(axes: Axes, metrics: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
+    shown = {
+        "with_variance": ("with", ORANGE),
+        "without_variance": ("without", BLUE),
+        "straight_latent_line": ("line", GREY),
+    }
+    for k, (variant, (label, colour)) in enumerate(shown.items()):
+        x = np.arange(len(metrics)) + 0.8 * ((k + 0.5) / len(shown) - 0.5)
+        share = [figures[variant]["collision_free"] for figures in metrics.values()]
+        bars = axes.bar(x, [value or 0.0 for value in share], width=0.24, color=colour, label=label)
+        axes.bar_label(bars, ["none" if value is None else f"{value:.0%}" for value in share], fontsize=7)
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    axes.set(ylim=(0, 1), ylabel="geodesics free of collision")
+    axes.set_xticks(range(len(metrics)), list(metrics))
+    axes.set_title("variance term of eq. 5")
+    _legend(axes, loc="upper left", ncols=3)
+
+
 def planner_comparison(table: pd.DataFrame) -> Figure:
     """Success, length over the shortest known, and time of every planner under every constraint.
 
@@ -353,27 +450,25 @@ def data_histograms(card: Mapping[str, Any], units: Callable[[str], str]) -> Fig
 
 
 def _surface_row(
-    figure: Figure, row: int, manifold: Manifold, lines: tuple[np.ndarray, np.ndarray],
-    function: Callable[[torch.Tensor], torch.Tensor], level: float, wrap: tuple[bool, bool], name: str,
+    figure: Figure, row: int, held: LevelSet, lines: tuple[np.ndarray, np.ndarray],
+    function: Callable[[torch.Tensor], torch.Tensor], name: str,
 ) -> None:  # fmt: skip
     """A surface coloured by a function of the chart, and beside it the components of a level set, as in the paper:
     one sign of the level on the sphere, both on the torus.
 
-    lines: of the chart's grid, along both axes; wrap: which of them close.
+    lines: of the chart's grid, along both axes.
     """
-    corners = manifold.embed(_on_grid(lines)).numpy()
-    values = function(_on_grid([(line[1:] + line[:-1]) / 2 for line in lines])).numpy()
-    both_signs = all(wrap)
-    distance = np.abs((np.abs(values) if both_signs else values) - level)
-    labels = components_on_grid(distance <= HALF_WIDTH, wrap)
-    count = int(labels.max()) + 1
+    corners = held.manifold.embed(_on_grid(lines)).numpy()
+    middles = _on_grid([(line[1:] + line[:-1]) / 2 for line in lines])
+    values, labels = function(middles).numpy(), held.component_of(middles).numpy()
+    count, level = len(held.components()), abs(held.levels[0])
     shown = ScalarMappable(cmap="viridis")
     shown.set_array(np.degrees(values))
     left = _surface(figure, 2 * row + 1, corners, shown.to_rgba(np.degrees(values)))
     right = _surface(figure, 2 * row + 2, corners, _component_colours(labels))
     left.set_title(f"{name} [°]")
     figure.colorbar(shown, ax=left, shrink=0.7, location="left").ax.tick_params(labelsize=8)
-    sign = "±" if both_signs else ""
+    sign = "±" if len(held.levels) > 1 else ""
     right.set_title(f"{name} = {sign}{np.degrees(level):.0f}°: {count} {_plural('component', count)}")
 
 

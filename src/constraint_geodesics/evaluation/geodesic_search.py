@@ -93,7 +93,7 @@ def run_seed(task: SeedTask) -> SeedResult:
             accept = exact_check(task, ends, world.free)
             for planner in (PLANNER, RANDOM):
                 if not task.connected[query]:
-                    found = Geodesic("not_connected", np.zeros(task.problem.curve.coefficients), *_NOTHING)
+                    found = Geodesic.nothing("not_connected", task.problem.curve, ends.z_start[0], ends.z_goal[0])
                 elif planner == PLANNER:
                     found = search(task.problem, policy.actor, task.params, ends, task.seed, accept)
                 else:
@@ -114,8 +114,10 @@ def straight_rows(task: SeedTask) -> tuple[list[dict[str, Any]], list[Float[np.n
     with task.scene.world() as world:
         for query in range(len(task.queries)):
             ends = query_ends(task.problem, task.queries, query)
-            costs = task.problem.evaluate(phi[None], ends)
-            found = Geodesic("solved", phi, float(costs.length[0]), float(costs.length[0]), 1, float("nan"))
+            length = float(task.problem.evaluate(phi[None], ends).length[0])
+            found = Geodesic(
+                "converged", task.problem.curve, phi, ends.z_start[0], ends.z_goal[0], length, length, 0, 1, np.nan
+            )
             row, path = measured(task, found, ends, world.free)
             rows.append({"planner": STRAIGHT, "query": query, "seed": 0, **row})
             paths.append(path)
@@ -146,8 +148,8 @@ def geodesic_problem(
     """The problem that params.yaml describes on the learned manifold `name`."""
     geodesics = params.geodesics
     curve = PinnedPolynomial(chart.dim, geodesics.degree)
-    retract = params.manifolds[name].retract
-    return LearnedProblem(chart, manifold, curve, joints, geodesics.nodes, retract, geodesics.reward.inclusion_weight)
+    retract, weight = params.manifolds[name].retract, geodesics.reward.inclusion_weight
+    return LearnedProblem(chart, manifold, curve, joints, geodesics.length_degree, retract, weight)
 
 
 def query_ends(problem: LearnedProblem, queries: Queries, query: int) -> Ends:
@@ -178,8 +180,9 @@ def measured(
 ) -> tuple[dict[str, Any], Float[np.ndarray, "T D"]]:
     """A result as a row of the table, and its joint path (empty where nothing was found)."""
     empty = np.zeros((0, ends.q_start.shape[1]))
-    path = task.problem.path(found.phi, ends, task.judge.row_spacing_rad) if found.status == "solved" else empty
-    row = {"status": found.status, "time_s": found.time_s, "evaluations": found.evaluations}
+    path = task.problem.path(found.phi, ends, task.judge.row_spacing_rad) if found.found else empty
+    status = "solved" if found.found else found.status
+    row = {"status": status, "time_s": found.time_s, "evaluations": found.evaluations}
     return row | judged(task, path, ends, free).row(), path
 
 
@@ -212,6 +215,3 @@ def geodesic_figures(results: Sequence[SeedResult], connected: Bool[np.ndarray, 
     figures = {f"{name}_mean": float(per_seed[name].mean()) for name in per_seed}
     figures |= {f"{name}_std": float(per_seed[name].std(ddof=0)) for name in per_seed}
     return figures | {"queries_connected": float(connected.mean()), "seeds": float(len(results))}
-
-
-_NOTHING = (float("nan"), float("nan"), 0, 0.0)

@@ -114,6 +114,36 @@ def result_table(layout: Layout) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def geometry_table(layout: Layout) -> str:
+    """What the geometry core reaches, as Markdown, from reports/geometry.json."""
+    geometry = read_metrics(layout.root / "reports" / "geometry.json")
+    constraint = geometry["constraint"]
+    rates: list[Sequence[str]] = [(f"on `{geometry['manifold']}`, a second", "here", "the usual way", "ratio")]
+    for suffix, told in (("", ""), ("_retracted", f", retracted onto {constraint}")):
+        lengths, steps = geometry[f"curve_length{suffix}"], geometry[f"environment{suffix}"]
+        rates += [
+            (
+                f"curve lengths, batches of {lengths['batch']}{told}", f"{lengths['per_second']:,.0f}",
+                f"{lengths['naive_per_second']:,.0f}", f"{lengths['ratio_to_naive']:.0f}",
+            ),
+            (
+                f"environment steps, PPO included{told}", f"{steps['steps_per_second']:,.0f}",
+                f"{steps['dummy_vec_env_steps_per_second']:,.0f}", f"{steps['ratio_to_dummy_vec_env']:.0f}",
+            ),
+        ]  # fmt: skip
+    found: list[Sequence[str]] = [
+        ("length over exact distance, mean", "random curve", "policy (worst seed)", "gradient", "domain of the pairs")
+    ]
+    for name, searched in geometry["policy_search"].items():
+        found.append(
+            (
+                name, f"{np.mean(searched['first_mean_ratio']):.3f}", f"{max(searched['mean_ratio']):.4f}",
+                f"{geometry['solvers'][name]['gradient']['mean_ratio']:.5f}", searched["domain"].replace("|", "\\|"),
+            )
+        )  # fmt: skip
+    return f"{_markdown(rates)}\n\n{_markdown(found)}\n"
+
+
 @dataclass(frozen=True)
 class Finding:
     """What the table says of one thing, good and bad, in sentences."""

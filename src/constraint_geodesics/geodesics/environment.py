@@ -4,7 +4,7 @@ The pure functions at the top hold the whole of it; `CurveVecEnv` only keeps the
 `CurveEnv` is one copy of it with the usual interface.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,9 +12,9 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from jaxtyping import Bool, Float, Int
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from constraint_geodesics.geodesics.problem import Ends, GeodesicProblem
+from constraint_geodesics.geodesics.problem import Costs, Ends, GeodesicProblem
 from constraint_geodesics.params import RewardParams
 
 
@@ -29,8 +29,8 @@ class EpisodeSettings:
 
 @dataclass(frozen=True)
 class CurveStates:
-    """B curves under way: coefficients, ends, length, cost and feasibility now, cost of the straight line, steps
-    taken, and the cheapest curve met so far.
+    """B curves under way: coefficients (in the chart's unit), ends, length, cost and feasibility now, cost of the
+    straight line, steps taken, and the cheapest curve met so far.
     """
 
     phi: Float[np.ndarray, "B p"]
@@ -57,7 +57,12 @@ class CurveStates:
 
 def begin(problem: GeodesicProblem, ends: Ends, phi: Float[np.ndarray, "B p"]) -> CurveStates:
     """First states of B episodes."""
-    now, straight = problem.evaluate(phi, ends), problem.evaluate(np.zeros_like(phi), ends)
+    straight = problem.evaluate(np.zeros_like(phi), ends)
+    bent = np.flatnonzero(phi.any(axis=1))
+    now = Costs(straight.length.copy(), straight.cost.copy(), straight.feasible.copy())
+    if len(bent):
+        costs = problem.evaluate(phi[bent], ends[bent])
+        now.length[bent], now.cost[bent], now.feasible[bent] = costs.length, costs.cost, costs.feasible
     better = now.cost < straight.cost
     return CurveStates(
         phi, ends, now.length, now.cost, now.feasible, straight.cost, np.zeros(len(phi), dtype=np.int64),
@@ -75,8 +80,12 @@ def draw_episodes(problem: GeodesicProblem, count: int, rng: np.random.Generator
 def advance(
     problem: GeodesicProblem, settings: EpisodeSettings, states: CurveStates, actions: Float[np.ndarray, "B p"]
 ) -> tuple[CurveStates, Float[np.ndarray, "B"]]:
-    """One step of B episodes: new states and rewards (eq. 15)."""
-    phi = states.phi + settings.action_scale * np.clip(actions, -1.0, 1.0)
+    """One step of B episodes: new states and rewards (eq. 15).
+
+    An action of 1 changes a coefficient by `action_scale` times the distance of the ends: a near pair needs as fine a
+    bend, in proportion, as a far one, and the policy sees all of them at one scale.
+    """
+    phi = states.phi + settings.action_scale * states.ends.distance[:, None] * np.clip(actions, -1.0, 1.0)
     costs = problem.evaluate(phi, states.ends)
     reward = rewards(settings.reward, states.cost, costs.cost, states.straight_cost)
     better = costs.cost < states.best_cost
@@ -113,10 +122,12 @@ def gompertz(x: Float[np.ndarray, "*batch"], b: float, c: float) -> Float[np.nda
 
 
 def observe(settings: EpisodeSettings, states: CurveStates) -> Float[np.ndarray, "B o"]:
-    """What the policy sees: coefficients, both ends, saving against the straight line, best saving, time left."""
+    """What the policy sees: coefficients in units of the ends' distance, both ends, saving against the straight line,
+    best saving, time left.
+    """
     scale = np.maximum(states.straight_cost, 1e-9)
     columns = [
-        states.phi,
+        states.phi / states.ends.distance[:, None],
         states.ends.z_start,
         states.ends.z_goal,
         np.clip(states.cost / scale - 1.0, -2.0, 2.0)[:, None],
@@ -235,3 +246,8 @@ class CurveEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.states, reward = advance(self.problem, self.settings, self.states, np.asarray(action, np.float64)[None])
         observation = observe(self.settings, self.states)[0]
         return observation, float(reward[0]), False, bool(self.states.step[0] >= self.settings.steps), {}
+
+
+def scalar_environments(make: Callable[[], gymnasium.Env], count: int) -> VecEnv:
+    """One scalar environment a copy, stepped one after another: the usual way, and the measure of `CurveVecEnv`."""
+    return DummyVecEnv([make] * count)

@@ -5,7 +5,7 @@ PPO comes from stable-baselines3; what leaves this module is a small actor netwo
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,12 @@ from typing import Any
 import joblib
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from safetensors.torch import load_file, save_file
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecMonitor
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch import Tensor, nn
 
 from constraint_geodesics.geodesics.environment import (
@@ -29,7 +30,17 @@ from constraint_geodesics.geodesics.environment import (
     observation_size,
     observe,
 )
-from constraint_geodesics.geodesics.problem import Costs, Ends, Geodesic, GeodesicProblem, repeated
+from constraint_geodesics.geodesics.problem import (
+    ChartProblem,
+    Costs,
+    Ends,
+    Geodesic,
+    GeodesicProblem,
+    Status,
+    repeated,
+)
+from constraint_geodesics.geodesics.solver import to_nearest_images
+from constraint_geodesics.geometry.manifold import GeometryError
 from constraint_geodesics.params import GeodesicParams, PpoParams
 
 DRAWN_A_START = 16
@@ -89,7 +100,7 @@ def train_policy(
     """
     torch.manual_seed(seed)
     environment = CurveVecEnv(problem, episode_settings(params), params.environments, seed)
-    model = _ppo(environment, params, seed)
+    model = ppo_model(environment, params, seed)
     log = _Progress(environment, params, seed, scratch, report)
     log.restore(model)
     remaining = params.steps - model.num_timesteps
@@ -100,6 +111,27 @@ def train_policy(
     actor = Actor(observation_size(problem), params.ppo.hidden, problem.curve.coefficients)
     actor.load_state_dict(actor_weights(model.policy.state_dict()))
     return TrainedPolicy(actor.eval().requires_grad_(False), log.rows)
+
+
+@dataclass(frozen=True)
+class PolicySolver:
+    """Policy search as a solver: roll-outs of a trained policy for every query, the same seed for each."""
+
+    actor: Actor
+    params: GeodesicParams
+    seed: int = 0
+
+    def solve(self, problem: ChartProblem, ends: Ends) -> list[Geodesic]:
+        """The shortest curve that `search` meets between each start and the nearest image of its goal.
+
+        Raises GeometryError if the policy was trained for another family or dimension.
+        """
+        wanted, trained = problem.curve.coefficients, self.actor.mean.out_features
+        if wanted != trained:
+            raise GeometryError(f"the policy changes {trained} coefficients: must be those of the curve, {wanted}")
+        near = to_nearest_images(problem, ends)
+        rows = [near[np.array([row])] for row in range(len(ends))]
+        return [search(problem, self.actor, self.params, row, self.seed, lambda _: True) for row in rows]
 
 
 def search(
@@ -114,16 +146,14 @@ def search(
     began = time.perf_counter()
     rng = np.random.default_rng(seed)
     count, size = params.rollouts, problem.curve.coefficients
-    drawn, costs = _random_curves(problem, ends, DRAWN_A_START * (count // 2), rng)
-    starts = drawn[np.argsort(costs.cost, kind="stable")[: count // 2]]
+    drawn = _random_curves(problem, ends, DRAWN_A_START * (count // 2), rng)
+    starts = drawn.phi[np.argsort(drawn.costs.cost, kind="stable")[: count // 2]]
     phi = np.concatenate([np.zeros((count - len(starts), size)), starts])
     noise = rng.normal(size=(params.episode_steps, count, size))
     noise[:, 0] = 0.0
     visited = follow(problem, actor, episode_settings(params), begin(problem, repeated(ends, count), phi), noise)
-    coefficients = np.concatenate([drawn, *(states.phi for states in visited)])
-    cost = np.concatenate([costs.cost, *(states.cost for states in visited)])
-    feasible = np.concatenate([costs.feasible, *(states.feasible for states in visited)])
-    return _first_accepted(problem, ends, coefficients, cost, feasible, accept, began)
+    met = [_Curves(states.phi, Costs(states.length, states.cost, states.feasible)) for states in visited]
+    return _first_accepted(problem, ends, [drawn, *met], accept, began)
 
 
 def search_at_random(
@@ -132,17 +162,23 @@ def search_at_random(
     """The control of `search`: as many curves, all drawn at random and none by a policy, chosen by the same rule."""
     began = time.perf_counter()
     number = DRAWN_A_START * (params.rollouts // 2) + (params.episode_steps + 1) * params.rollouts
-    drawn, costs = _random_curves(problem, ends, number, np.random.default_rng(seed))
-    return _first_accepted(problem, ends, drawn, costs.cost, costs.feasible, accept, began)
+    drawn = _random_curves(problem, ends, number, np.random.default_rng(seed))
+    return _first_accepted(problem, ends, [drawn], accept, began)
 
 
-def _random_curves(
-    problem: GeodesicProblem, ends: Ends, count: int, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "B p"], Costs]:
+@dataclass(frozen=True)
+class _Curves:
+    """Candidates of one query that were measured together: one step of the search."""
+
+    phi: Float[np.ndarray, "B p"]
+    costs: Costs
+
+
+def _random_curves(problem: GeodesicProblem, ends: Ends, count: int, rng: np.random.Generator) -> _Curves:
     """Many random curves and their costs: in one batch they cost next to nothing."""
     many = repeated(ends, count)
     drawn = problem.sample_curves(many, rng)
-    return drawn, problem.evaluate(drawn, many)
+    return _Curves(drawn, problem.evaluate(drawn, many))
 
 
 def follow(
@@ -158,28 +194,32 @@ def follow(
 
 
 def _first_accepted(
-    problem: GeodesicProblem, ends: Ends, coefficients: Float[np.ndarray, "B p"], cost: Float[np.ndarray, "B"],
-    feasible: Bool[np.ndarray, "B"], accept: Accept, began: float,
-) -> Geodesic:  # fmt: skip
-    """The cheapest feasible candidate that passes the exact check, the straight line among them."""
-    zero = np.zeros((1, coefficients.shape[1]))
+    problem: GeodesicProblem, ends: Ends, steps: Sequence[_Curves], accept: Accept, began: float
+) -> Geodesic:
+    """The cheapest feasible candidate that passes the exact check, the straight line among them.
+
+    It has not converged if the last of several steps met it: another one might shorten it further.
+    """
+    zero = np.zeros((1, problem.curve.coefficients))
     straight = problem.evaluate(zero, ends)
-    coefficients = np.concatenate([zero, coefficients])
-    cost, feasible = np.concatenate([straight.cost, cost]), np.concatenate([straight.feasible, feasible])
+    phi = np.concatenate([zero, *(step.phi for step in steps)])
+    cost = np.concatenate([straight.cost, *(step.costs.cost for step in steps)])
+    feasible = np.concatenate([straight.feasible, *(step.costs.feasible for step in steps)])
     order = np.argsort(cost, kind="stable")
     candidates = order[feasible[order]][:MOST_CHECKED]
     if feasible[0] and 0 not in candidates:
         candidates = np.append(candidates, 0)
-    for row in candidates:
-        if accept(coefficients[row]):
-            length = problem.evaluate(coefficients[row][None], ends).length
-            return Geodesic(
-                "solved", coefficients[row], float(length[0]), float(straight.length[0]), len(cost),
-                time.perf_counter() - began,
-            )  # fmt: skip
+    row = next((int(row) for row in candidates if accept(phi[row])), None)
+    if row is None:
+        status: Status = "not_found"
+        row, length = int(order[0]), float("nan")
+    else:
+        late = len(steps) > 1 and row >= len(phi) - len(steps[-1].phi)
+        status = "iteration_limit" if late else "converged"
+        length = float(problem.evaluate(phi[row][None], ends).length[0])
     return Geodesic(
-        "not_found", coefficients[order[0]], float("nan"), float(straight.length[0]), len(cost),
-        time.perf_counter() - began,
+        status, problem.curve, phi[row], ends.z_start[0], ends.z_goal[0], length, float(straight.length[0]),
+        len(steps), len(phi), time.perf_counter() - began,
     )  # fmt: skip
 
 
@@ -212,15 +252,18 @@ def actor_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: w.detach().clone() for name, w in (weights | {"log_std": state["log_std"]}).items()}
 
 
-def _ppo(environment: CurveVecEnv, params: GeodesicParams, seed: int) -> PPO:
+def ppo_model(environment: VecEnv, params: GeodesicParams, seed: int) -> PPO:
+    """PPO as params.yaml describes it, before its first step."""
     ppo: PpoParams = params.ppo
-    return PPO(
+    model = PPO(
         "MlpPolicy", VecMonitor(environment), seed=seed, device="cpu", verbose=0, n_steps=ppo.rollout_steps,
         batch_size=ppo.batch_size, n_epochs=ppo.epochs, gamma=ppo.gamma, gae_lambda=ppo.gae_lambda,
         clip_range=ppo.clip, ent_coef=ppo.entropy,
         learning_rate=lambda left: ppo.learning_rate_end + left * (ppo.learning_rate - ppo.learning_rate_end),
         policy_kwargs={"net_arch": list(ppo.hidden), "log_std_init": -0.5},
     )  # fmt: skip
+    model.set_logger(Logger(None, []))  # its own would leave a folder in /tmp for every training
+    return model
 
 
 class _Progress(BaseCallback):

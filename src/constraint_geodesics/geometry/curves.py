@@ -1,14 +1,21 @@
-"""Curves in a chart that start and end exactly where they must (eqs. 9-11)."""
+"""Curves in a chart that start and end exactly where they must (eqs. 9-11).
+
+Every family is the straight line between the ends plus a basis that vanishes there,
+γ_φ(t) = (1 − t) start + t goal + Σ_k φ_{n,k} b_k(t), so φ = 0 is the straight line and no φ moves an end.
+"""
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cache
 from typing import Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from constraint_geodesics.geometry.manifold import GeometryError
+from constraint_geodesics.geometry.manifold import GeometryError, require_finite
 
 
 class CurveError(GeometryError):
@@ -17,7 +24,10 @@ class CurveError(GeometryError):
 
 @runtime_checkable
 class CurveFamily(Protocol):
-    """All curves γ_φ in N dimensions between two given ends, one for each vector of free numbers φ."""
+    """All curves γ_φ in N dimensions between two given ends, one for each vector of free numbers φ.
+
+    A new family is a subclass of PinnedFamily, which has everything but the basis.
+    """
 
     @property
     def dim(self) -> int:
@@ -25,8 +35,18 @@ class CurveFamily(Protocol):
         ...
 
     @property
+    def functions(self) -> int:
+        """Number m of basis functions, the same for every dimension."""
+        ...
+
+    @property
     def coefficients(self) -> int:
-        """Number p of free numbers in φ; φ = 0 is the straight line in the chart."""
+        """Number p = N m of free numbers in φ; φ = 0 is the straight line in the chart."""
+        ...
+
+    @property
+    def breaks(self) -> tuple[float, ...]:
+        """Rising times from 0 to 1 between which the curves are polynomials; at the inner ones they are C² only."""
         ...
 
     def evaluate(
@@ -34,14 +54,196 @@ class CurveFamily(Protocol):
         phi: Float[Tensor, "*#batch p"],
         start: Float[Tensor, "*#batch N"],
         goal: Float[Tensor, "*#batch N"],
-        t: Float[Tensor, "T"],
+        t: Float[Tensor, "*#batch T"],
     ) -> tuple[Float[Tensor, "*batch T N"], Float[Tensor, "*batch T N"]]:
-        """Points γ(t) and velocities γ̇(t) at times t in [0, 1]; γ(0) = start and γ(1) = goal to the bit."""
+        """Points γ(t) and velocities γ̇(t) at times t in [0, 1]; γ(0) = start and γ(1) = goal to the bit.
+
+        t: (T,) for all curves, or a row of times for each of them.
+        """
+        ...
+
+    def acceleration(
+        self,
+        phi: Float[Tensor, "*#batch p"],
+        start: Float[Tensor, "*#batch N"],
+        goal: Float[Tensor, "*#batch N"],
+        t: Float[Tensor, "*#batch T"],
+    ) -> Float[Tensor, "*batch T N"]:
+        """Second derivatives γ̈(t) in the chart."""
+        ...
+
+    def basis(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
+        """Basis functions b_k(t), zero to the bit at t = 0 and t = 1."""
+        ...
+
+    def basis_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
+        """Derivatives ḃ_k(t)."""
+        ...
+
+    def from_basis(
+        self,
+        phi: Float[Tensor, "*#batch p"],
+        start: Float[Tensor, "*#batch N"],
+        goal: Float[Tensor, "*#batch N"],
+        t: Float[Tensor, "*#batch T"],
+        basis: Float[Tensor, "*#batch T m"],
+        derivative: Float[Tensor, "*#batch T m"],
+    ) -> tuple[Float[Tensor, "*batch T N"], Float[Tensor, "*batch T N"]]:
+        """`evaluate` for callers that keep b_k(t) and ḃ_k(t) of the same times for many curves."""
+        ...
+
+    def fit(self, points: Float[Tensor, "*batch T N"], t: Float[Tensor, "T"]) -> Float[Tensor, "*batch p"]:
+        """Coefficients of the curves nearest to sampled ones whose first and last points are the ends."""
         ...
 
 
+class PinnedFamily(ABC):
+    """What all families share, given a basis: γ_φ(t) = (1 − t) start + t goal + Σ_k φ_{n,k} b_k(t).
+
+    φ holds the m numbers of the first dimension, then those of the next.
+    """
+
+    dim: int
+
+    @property
+    @abstractmethod
+    def functions(self) -> int:
+        """Number m of basis functions."""
+
+    @property
+    @abstractmethod
+    def breaks(self) -> tuple[float, ...]:
+        """Rising times from 0 to 1 between which the basis is polynomial."""
+
+    @abstractmethod
+    def basis(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
+        """Basis functions b_k(t), zero to the bit at t = 0 and t = 1."""
+
+    @abstractmethod
+    def basis_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
+        """Derivatives ḃ_k(t)."""
+
+    @abstractmethod
+    def basis_second_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
+        """Second derivatives b̈_k(t)."""
+
+    @property
+    def coefficients(self) -> int:
+        """Number of free numbers, p = N m."""
+        return self.dim * self.functions
+
+    def evaluate(
+        self,
+        phi: Float[Tensor, "*#batch p"],
+        start: Float[Tensor, "*#batch N"],
+        goal: Float[Tensor, "*#batch N"],
+        t: Float[Tensor, "*#batch T"],
+    ) -> tuple[Float[Tensor, "*batch T N"], Float[Tensor, "*batch T N"]]:
+        """Points γ(t) and velocities γ̇(t); t is (T,) for all curves, or has a row for each.
+
+        Batches of phi, start and goal broadcast, and t to theirs.  Raises CurveError on a wrong shape.
+        """
+        return self.from_basis(phi, start, goal, t, self.basis(t), self.basis_derivative(t))
+
+    def from_basis(
+        self,
+        phi: Float[Tensor, "*#batch p"],
+        start: Float[Tensor, "*#batch N"],
+        goal: Float[Tensor, "*#batch N"],
+        t: Float[Tensor, "*#batch T"],
+        basis: Float[Tensor, "*#batch T m"],
+        derivative: Float[Tensor, "*#batch T m"],
+    ) -> tuple[Float[Tensor, "*batch T N"], Float[Tensor, "*batch T N"]]:
+        """Points and velocities from `basis(t)` and `basis_derivative(t)`, which a caller may keep.
+
+        Raises CurveError on a wrong shape.
+        """
+        self._check(phi, start, goal)
+        if t.ndim != 1:
+            self._batch(t, phi, start, goal)
+        for name, values in (("basis", basis), ("derivative", derivative)):
+            if values.shape != (*t.shape, self.functions):
+                raise CurveError(f"{name} has shape {tuple(values.shape)}: must be {(*t.shape, self.functions)}")
+        start, goal, time = start[..., None, :], goal[..., None, :], t[..., None]
+        # Weighting both ends, not start + t (goal − start), is what makes the goal exact in floating point.
+        points = (1 - time) * start + time * goal + self._bend(phi, basis)
+        velocities = (goal - start) + self._bend(phi, derivative)
+        return points, velocities
+
+    def acceleration(
+        self,
+        phi: Float[Tensor, "*#batch p"],
+        start: Float[Tensor, "*#batch N"],
+        goal: Float[Tensor, "*#batch N"],
+        t: Float[Tensor, "*#batch T"],
+    ) -> Float[Tensor, "*batch T N"]:
+        """Second derivatives γ̈(t) in the chart; the ends only give them their batch.  Raises as `evaluate` does."""
+        self._check(phi, start, goal)
+        batch = self._batch(t, phi, start, goal)
+        bend = self._bend(phi, self.basis_second_derivative(t))
+        return bend.expand(*batch, t.shape[-1], self.dim)
+
+    def fit(self, points: Float[Tensor, "*batch T N"], t: Float[Tensor, "T"]) -> Float[Tensor, "*batch p"]:
+        """Coefficients of the curves nearest to sampled ones, by least squares over the samples, all of equal weight.
+
+        The first and last points are the ends, t[0] = 0 and t[-1] = 1.  Members of the family come back as they were.
+        Raises CurveError on a wrong shape, other first and last times, or times too few or too close to tell the
+        basis functions apart; NonFiniteError with the place of the first entry that is not finite.
+        """
+        self._check_samples(points, t)
+        time = t.to(points)
+        # One pseudo-inverse serves the whole batch.
+        basis = self.basis(time)
+        self._require_full_rank(basis)
+        line = (1 - time)[:, None] * points[..., :1, :] + time[:, None] * points[..., -1:, :]
+        free = torch.linalg.pinv(basis) @ (points - line)
+        return free.mT.reshape(*points.shape[:-2], self.coefficients)
+
+    def _by_dimension(self, phi: Tensor) -> Tensor:
+        return phi.reshape(*phi.shape[:-1], self.dim, self.functions)
+
+    def _bend(self, phi: Tensor, basis: Tensor) -> Tensor:
+        return (self._by_dimension(phi) @ basis.mT).mT
+
+    def _check(self, phi: Tensor, start: Tensor, goal: Tensor) -> None:
+        for name, value, size in (
+            ("phi", phi, self.coefficients),
+            ("start", start, self.dim),
+            ("goal", goal, self.dim),
+        ):
+            if value.ndim == 0 or value.shape[-1] != size:
+                raise CurveError(
+                    f"{name} has shape {tuple(value.shape)}: its last axis must have {size} entries ({self})"
+                )
+
+    def _batch(self, t: Tensor, phi: Tensor, start: Tensor, goal: Tensor) -> tuple[int, ...]:
+        """The curves' batch, which rows of times must not enlarge: times in a column are a mistake."""
+        batch = tuple(torch.broadcast_shapes(phi.shape[:-1], start.shape[:-1], goal.shape[:-1]))
+        sizes = zip(reversed(t.shape[:-1]), reversed(batch), strict=False)
+        if not 1 <= t.ndim <= len(batch) + 1 or any(rows not in (1, size) for rows, size in sizes):
+            raise CurveError(f"t has shape {tuple(t.shape)}: must be (T,), or (*batch, T) for curves of batch {batch}")
+        return batch
+
+    def _check_samples(self, points: Tensor, t: Tensor) -> None:
+        if t.ndim != 1 or points.ndim < 2 or points.shape[-2:] != (len(t), self.dim):
+            shapes = f"points has shape {tuple(points.shape)} and t {tuple(t.shape)}"
+            raise CurveError(f"{shapes}: must be (*batch, T, {self.dim}) and (T,)")
+        needed = self.functions + 2
+        if len(t) < needed:
+            raise CurveError(f"points has {len(t)} points a curve: must be at least {needed} ({self})")
+        require_finite(points, "points")
+        require_finite(t, "t")
+        if (float(t[0]), float(t[-1])) != (0.0, 1.0):
+            raise CurveError(f"t runs from {float(t[0])} to {float(t[-1])}: must run from 0 to 1")
+
+    def _require_full_rank(self, basis: Tensor) -> None:
+        rank = int(torch.linalg.matrix_rank(basis)) if self.functions else 0
+        if rank < self.functions:
+            raise CurveError(f"t tells {rank} basis functions apart: must tell all {self.functions} ({self})")
+
+
 @dataclass(frozen=True)
-class PinnedPolynomial:
+class PinnedPolynomial(PinnedFamily):
     """Polynomials of degree K in N dimensions with both ends given, eqs. 9-11, in a well-conditioned basis:
 
     γ(t) = (1 − t) start + t goal + Σ_k φ_{n,k} b_k(t),  b_k(t) = t (1 − t) P*_k(t),  k = 0 … K − 2,
@@ -57,45 +259,33 @@ class PinnedPolynomial:
     degree: int = 3
 
     def __post_init__(self) -> None:
-        for name, value in (("dim", self.dim), ("degree", self.degree)):
-            if value < 1:
-                raise CurveError(f"{name} = {value}: must be at least 1")
+        _require_at_least_one(dim=self.dim, degree=self.degree)
 
     @property
-    def coefficients(self) -> int:
-        """Number of free numbers, p = N (K − 1)."""
-        return self.dim * (self.degree - 1)
+    def functions(self) -> int:
+        """K − 1."""
+        return self.degree - 1
 
-    def evaluate(
-        self,
-        phi: Float[Tensor, "*#batch p"],
-        start: Float[Tensor, "*#batch N"],
-        goal: Float[Tensor, "*#batch N"],
-        t: Float[Tensor, "T"],
-    ) -> tuple[Float[Tensor, "*batch T N"], Float[Tensor, "*batch T N"]]:
-        """Points γ(t) and velocities γ̇(t).
-
-        Batches of phi, start and goal broadcast.  Raises CurveError on a wrong shape.
-        """
-        self._check(phi, start, goal)
-        if t.ndim != 1:
-            raise CurveError(f"t has shape {tuple(t.shape)}: must be (T,)")
-        free = self._by_dimension(phi)
-        start, goal, time = start[..., None, :], goal[..., None, :], t[:, None]
-        # Weighting both ends, not start + t (goal − start), is what makes the goal exact in floating point.
-        points = (1 - time) * start + time * goal + (free @ self.basis(t).mT).mT
-        velocities = (goal - start) + (free @ self.basis_derivative(t).mT).mT
-        return points, velocities
+    @property
+    def breaks(self) -> tuple[float, ...]:
+        """0 and 1: one piece."""
+        return (0.0, 1.0)
 
     def basis(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times {self.degree}-1"]:
         """Basis b_k(t) = t (1 − t) P*_k(t), zero at t = 0 and t = 1."""
-        legendre, _ = _shifted_legendre(t, self.degree - 1)
+        legendre, _ = shifted_legendre(t, self.functions)
         return (t * (1 - t))[..., None] * legendre
 
     def basis_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times {self.degree}-1"]:
         """Derivatives ḃ_k(t) = (1 − 2t) P*_k(t) + t (1 − t) Ṗ*_k(t)."""
-        legendre, derivative = _shifted_legendre(t, self.degree - 1)
+        legendre, derivative = shifted_legendre(t, self.functions)
         return (1 - 2 * t)[..., None] * legendre + (t * (1 - t))[..., None] * derivative
+
+    def basis_second_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times {self.degree}-1"]:
+        """Second derivatives b̈_k(t) = (1 − 2t) Ṗ*_k(t) − (k² + k + 2) P*_k(t), by Legendre's differential equation."""
+        legendre, derivative = shifted_legendre(t, self.functions)
+        k = torch.arange(self.functions, dtype=t.dtype, device=t.device)
+        return (1 - 2 * t)[..., None] * derivative - (k * k + k + 2) * legendre
 
     def to_monomial(
         self, phi: Float[Tensor, "*#batch p"], start: Float[Tensor, "*#batch N"], goal: Float[Tensor, "*#batch N"]
@@ -108,24 +298,59 @@ class PinnedPolynomial:
         straight = torch.cat([start.expand_as(line), line, line.new_zeros(*line.shape[:-1], self.degree - 1)], dim=-1)
         return straight + bent
 
-    def _by_dimension(self, phi: Tensor) -> Tensor:
-        return phi.reshape(*phi.shape[:-1], self.dim, self.degree - 1)
 
-    def _check(self, phi: Tensor, start: Tensor, goal: Tensor) -> None:
-        for name, value, size in (
-            ("phi", phi, self.coefficients),
-            ("start", start, self.dim),
-            ("goal", goal, self.dim),
-        ):
-            if value.ndim == 0 or value.shape[-1] != size:
-                raise CurveError(
-                    f"{name} has shape {tuple(value.shape)}: its last axis must have {size} entries "
-                    f"(dim {self.dim}, degree {self.degree})"
-                )
+@dataclass(frozen=True)
+class PinnedSpline(PinnedFamily):
+    """Cubic C² splines on S equal pieces in N dimensions with both ends given.
+
+    The basis is that of the clamped cubic B-splines (de Boor, A Practical Guide to Splines, ch. IX), S + 3 in number;
+    the first and last, which alone are not zero at the ends, give way to the straight line.  One piece spans the
+    cubics of PinnedPolynomial(N, 3).  A coefficient acts on four pieces at most.
+    φ holds the S + 1 numbers of the first dimension, then those of the next: N (S + 1) in all.
+
+    dim: N, at least 1.  segments: S, at least 1.  Raises CurveError otherwise.
+    """
+
+    dim: int
+    segments: int = 4
+
+    def __post_init__(self) -> None:
+        _require_at_least_one(dim=self.dim, segments=self.segments)
+
+    @property
+    def functions(self) -> int:
+        """S + 1."""
+        return self.segments + 1
+
+    @property
+    def breaks(self) -> tuple[float, ...]:
+        """Knots 0, 1/S … 1; the third derivative jumps at the inner ones."""
+        return tuple(k / self.segments for k in range(self.segments + 1))
+
+    def basis(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times {self.segments}+1"]:
+        """Inner B-splines b_k(t), zero at t = 0 and t = 1."""
+        return self._derivative(t, 0)
+
+    def basis_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times {self.segments}+1"]:
+        """Derivatives ḃ_k(t), quadratic on each piece."""
+        return self._derivative(t, 1)
+
+    def basis_second_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times {self.segments}+1"]:
+        """Second derivatives b̈_k(t), linear on each piece."""
+        return self._derivative(t, 2)
+
+    def _derivative(self, t: Tensor, order: int) -> Tensor:
+        scaled = t * self.segments
+        piece = scaled.detach().long().clamp(0, self.segments - 1)
+        ordinates = torch.from_numpy(_bezier_ordinates(self.segments, order)).to(t)
+        # In Bernstein form the zeros at both ends, and the values that pieces share, are exact.
+        return (_bernstein(scaled - piece, 3 - order)[..., None] * ordinates[piece]).sum(-2)
 
 
-def _shifted_legendre(t: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """P*_k(t) = P_k(2t − 1) and derivatives to t for k < count, (*times, count) each, by Bonnet's recurrence."""
+def shifted_legendre(
+    t: Float[Tensor, "*times"], count: int
+) -> tuple[Float[Tensor, "*times {count}"], Float[Tensor, "*times {count}"]]:
+    """P*_k(t) = P_k(2t − 1) and derivatives to t for k < count, by Bonnet's recurrence."""
     x = 2 * t - 1
     values, slopes = [torch.ones_like(t), x], [torch.zeros_like(t), torch.ones_like(t)]
     for k in range(1, count - 1):
@@ -144,3 +369,42 @@ def _basis_in_powers(degree: int) -> Tensor:
         for j, (lower, higher) in enumerate(zip([*legendre, 0], [0, *legendre], strict=True)):
             rows[k, j + 1] = lower - higher
     return rows
+
+
+def _bernstein(u: Tensor, degree: int) -> Tensor:
+    """Bernstein polynomials of u in [0, 1], (*times, degree + 1)."""
+    values = [math.comb(degree, j) * u**j * (1 - u) ** (degree - j) for j in range(degree + 1)]
+    return torch.stack(values, dim=-1)
+
+
+@cache
+def _bezier_ordinates(segments: int, order: int) -> Float[np.ndarray, "S d m"]:
+    """Bézier ordinates (S, 4 − order, S + 1) of the inner B-splines' derivatives to t, on each piece.
+
+    Ordinate j of the piece [k, k + 1] is the blossom at 3 − j times k and j times k + 1 (Ramshaw, Blossoms are polar
+    forms, 1989), in units of the pieces.  Each derivative of a Bézier curve of degree d is d times its differences.
+    """
+    ordinates = np.array(
+        [[_blossom(segments, k, [k] * (3 - j) + [k + 1] * j) for j in range(4)] for k in range(segments)]
+    )
+    for degree in range(3, 3 - order, -1):
+        ordinates = segments * degree * np.diff(ordinates, axis=1)
+    return np.ascontiguousarray(ordinates[..., 1:-1])
+
+
+def _blossom(segments: int, piece: int, arguments: list[int]) -> Float[np.ndarray, "S+3"]:
+    """Blossom at three arguments of every cubic B-spline on one piece, by de Boor's algorithm."""
+    knots = [0, 0, 0, *range(segments + 1), segments, segments, segments]
+    control = list(np.eye(segments + 3)[piece : piece + 4])
+    for r, x in enumerate(arguments, start=1):
+        for j in range(3, r - 1, -1):
+            left, right = knots[piece + j], knots[piece + j + 4 - r]
+            share = (x - left) / (right - left)
+            control[j] = (1 - share) * control[j - 1] + share * control[j]
+    return control[3]
+
+
+def _require_at_least_one(**values: int) -> None:
+    for name, value in values.items():
+        if value < 1:
+            raise CurveError(f"{name} = {value}: must be at least 1")

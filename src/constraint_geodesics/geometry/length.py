@@ -1,6 +1,15 @@
-"""Length and energy of curves on a manifold (eq. 2), batched and differentiable."""
+"""Length and energy of curves on a manifold (eq. 2), batched and differentiable, with an error estimate.
 
+The default rule embeds a curve at few Chebyshev points and differentiates the polynomial through them: one pass of the
+embedding a point, where a forward product costs four, at the accuracy of Gauss-Legendre with as many nodes
+(`make bench-geometry` measures both).  The points of the rule of half the degree are among them, so the error
+estimate costs no further point, and only curves whose estimate is too large are measured again with twice as many.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -8,7 +17,22 @@ from jaxtyping import Float
 from torch import Tensor
 
 from constraint_geodesics.geometry.curves import CurveFamily
-from constraint_geodesics.geometry.manifold import GeometryError, Manifold, require_finite
+from constraint_geodesics.geometry.manifold import EmbeddedManifold, GeometryError, Manifold, require_finite
+
+TOLERANCE = 1e-3
+"""Relative error of a length by default."""
+DEGREES = (8, 16, 32, 64)
+"""Degrees of the interpolating polynomial that are tried in turn on every piece of a curve."""
+SAFETY = 2.0
+"""Error estimate over the difference of a length to that by half the degree."""
+ACCIDENT = 32.0
+"""What a piecewise curve's change of length from a quarter of the degree to half counts less than that to the whole:
+with many pieces two rules now and then agree by accident, three hardly ever.
+"""
+BLOCK = 4096
+"""Points embedded at once: the temporaries of many more leave the processor's cache."""
+
+Breaks = tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,15 +43,68 @@ class Quadrature:
     weights: Float[Tensor, "Q"]
 
     @classmethod
-    def gauss_legendre(cls, count: int) -> "Quadrature":
-        """Gauss-Legendre rule with `count` nodes: exact for polynomials of degree 2 count − 1.
+    def gauss_legendre(cls, count: int, breaks: Breaks = (0.0, 1.0)) -> "Quadrature":
+        """Gauss-Legendre rule with `count` nodes between every two breaks: exact there up to degree 2 count − 1.
 
-        Raises GeometryError if count is below 1.
+        Raises GeometryError if count is below 1 or the breaks do not rise from 0 to 1.
         """
         if count < 1:
             raise GeometryError(f"count = {count}: a quadrature rule needs at least one node")
+        _require_breaks(breaks)
         x, w = np.polynomial.legendre.leggauss(count)
-        return cls(torch.from_numpy((x + 1) / 2), torch.from_numpy(w / 2))
+        nodes = [low + (high - low) * (x + 1) / 2 for low, high in _pieces(breaks)]
+        weights = [(high - low) * w / 2 for low, high in _pieces(breaks)]
+        return cls(torch.from_numpy(np.concatenate(nodes)), torch.from_numpy(np.concatenate(weights)))
+
+
+@dataclass(frozen=True, eq=False)
+class Collocation:
+    """Lengths from values at the Chebyshev-Lobatto points of every piece of a curve, both ends included.
+
+    times: (S,) the points.  derivative: (Q, S) takes values there to the slopes of the polynomials through them, at
+    the nodes of a Gauss-Legendre rule with `weights` (Q,); twice as many nodes as the degree, since the norm of a
+    polynomial is not one.  own_weights: (S,) Clenshaw-Curtis weights of the points themselves, for integrands that
+    need no derivative.  half: the rule of half the degree, on every other point; None for an odd degree.
+    """
+
+    degree: int
+    times: Float[Tensor, "S"]
+    derivative: Float[Tensor, "Q S"]
+    weights: Float[Tensor, "Q"]
+    own_weights: Float[Tensor, "S"]
+    half: "Collocation | None"
+
+    @classmethod
+    def chebyshev(cls, degree: int, breaks: Breaks = (0.0, 1.0)) -> "Collocation":
+        """Polynomials of the given degree between every two breaks.
+
+        Raises GeometryError if the degree is below 2 or the breaks do not rise from 0 to 1.
+        """
+        if degree < 2:
+            raise GeometryError(f"degree = {degree}: must be at least 2")
+        _require_breaks(breaks)
+        half = cls.chebyshev(degree // 2, breaks) if degree % 2 == 0 and degree >= 4 else None
+        times, derivative, weights, own = (torch.from_numpy(values) for values in _collocation(degree, breaks))
+        return cls(degree, times, derivative, weights, own, half)
+
+    def slopes(self, values: Float[Tensor, "*batch S A"]) -> Float[Tensor, "*batch Q A"]:
+        """Slopes at the Gauss-Legendre nodes of the polynomials through values at `times`."""
+        return self.derivative.to(values) @ values
+
+    def length(self, values: Float[Tensor, "*batch S A"]) -> Float[Tensor, "*batch"]:
+        """Length of the curve through embedded points at `times`, in their unit."""
+        return torch.linalg.vector_norm(self.slopes(values), dim=-1) @ self.weights.to(values)
+
+
+LengthRule = Quadrature | Collocation
+
+
+@dataclass(frozen=True)
+class LengthEstimate:
+    """Lengths and their estimated absolute errors (*batch,), in the unit of the embedding."""
+
+    length: Float[Tensor, "*batch"]
+    error: Float[Tensor, "*batch"]
 
 
 def curve_length(
@@ -36,17 +113,61 @@ def curve_length(
     phi: Float[Tensor, "*#batch p"],
     start: Float[Tensor, "*#batch N"],
     goal: Float[Tensor, "*#batch N"],
-    rule: Quadrature,
+    rule: LengthRule | None = None,
+    tolerance: float = TOLERANCE,
 ) -> Float[Tensor, "*batch"]:
-    """Length of curves on a manifold, eq. 2: L = ∫₀¹ √(γ̇ᵀ M(γ) γ̇) dt = ∫₀¹ ‖J_f(γ) γ̇‖ dt.
+    """Length of curves on a manifold, eq. 2: L = ∫₀¹ √(γ̇ᵀ M(γ) γ̇) dt = ∫₀¹ ‖d f(γ)/dt‖ dt.
 
-    In the unit of the embedding.  The error falls exponentially with the nodes while the speed stays above zero,
-    and like 1/nodes² where a curve turns back on itself.  Differentiable in phi, start and goal.
-    Raises NonFiniteError with the place of the first entry of phi, start or goal that is not finite, GeometryError
-    if the curves and the manifold differ in dimension, CurveError on a wrong shape.
+    In the unit of the embedding.  Without a rule the estimated relative error is brought below `tolerance`, as
+    `estimate_length` does; with one it is whatever the rule gives.  Differentiable in phi, start and goal.
+    Raises NonFiniteError with the place of the first entry of phi, start, goal or of the length that is not finite (a
+    curve that leaves the metric's domain, or overflows), GeometryError if the curves and the manifold differ in
+    dimension, CurveError on a wrong shape.
     """
-    velocities = _embedded_velocities(manifold, curve, phi, start, goal, rule)
-    return torch.linalg.vector_norm(velocities, dim=-1) @ rule.weights.to(velocities)
+    if rule is None:
+        length = estimate_length(manifold, curve, phi, start, goal, tolerance).length
+    else:
+        _check(manifold, curve, phi, start, goal)
+        length = length_function(manifold, curve, rule)(phi, start, goal)
+    require_finite(length, "length")
+    return length
+
+
+def estimate_length(
+    manifold: Manifold,
+    curve: CurveFamily,
+    phi: Float[Tensor, "*#batch p"],
+    start: Float[Tensor, "*#batch N"],
+    goal: Float[Tensor, "*#batch N"],
+    tolerance: float = TOLERANCE,
+) -> LengthEstimate:
+    """Lengths whose estimated relative error is below `tolerance`, and the estimate.
+
+    The estimate is twice the change from the rule of half the degree, so the length of a smooth curve is better by
+    orders.  It is no bound: where a curve turns back on itself both rules may err alike, and about one such curve in a
+    hundred misses the tolerance; on a grid with walls or rough values, whose metric has kinks, far more do.  Curves
+    that no degree resolves keep the last length, and their estimate says so.  An embedding in single precision adds
+    its rounding: about 1e-7 of its values, which between ends 1e-4 apart is a thousandth of the length.
+    Length and estimate are inf where a curve meets points at which the metric is not finite.
+    Raises as `curve_length` does, and GeometryError unless tolerance is positive.
+    """
+    if not tolerance > 0:
+        raise GeometryError(f"tolerance = {tolerance}: must be positive")
+    _check(manifold, curve, phi, start, goal)
+    batch = torch.broadcast_shapes(phi.shape[:-1], start.shape[:-1], goal.shape[:-1])
+    flat = [
+        values.expand(*batch, values.shape[-1]).reshape(batch.numel(), values.shape[-1])
+        for values in (phi, start, goal)
+    ]
+    ladder = rules(tuple(curve.breaks))
+    length, error = _measured(manifold, curve, flat, ladder[0])
+    for rule in ladder[1:]:
+        rows = torch.nonzero((error > tolerance * length) & length.isfinite()).squeeze(-1)
+        if not len(rows):
+            break
+        finer, left = _measured(manifold, curve, [values[rows] for values in flat], rule)
+        length, error = length.index_copy(0, rows, finer), error.index_copy(0, rows, left)
+    return LengthEstimate(length.reshape(batch), error.reshape(batch))
 
 
 def curve_energy(
@@ -55,14 +176,56 @@ def curve_energy(
     phi: Float[Tensor, "*#batch p"],
     start: Float[Tensor, "*#batch N"],
     goal: Float[Tensor, "*#batch N"],
-    rule: Quadrature,
+    rule: LengthRule | None = None,
 ) -> Float[Tensor, "*batch"]:
     """Energy of curves on a manifold: E = ∫₀¹ γ̇ᵀ M(γ) γ̇ dt ≥ L², equal at constant speed only.
 
-    In the square of the embedding's unit.  Smooth where the length is not; raises as `curve_length` does.
+    In the square of the embedding's unit.  Smooth where the length is not; degree 16 for a curve of one piece by
+    default.  Raises as `curve_length` does.
     """
-    velocities = _embedded_velocities(manifold, curve, phi, start, goal, rule)
-    return velocities.square().sum(-1) @ rule.weights.to(velocities)
+    _check(manifold, curve, phi, start, goal)
+    return energy_function(manifold, curve, rule or rules(tuple(curve.breaks))[1])(phi, start, goal)
+
+
+def energy_function(
+    manifold: Manifold, curve: CurveFamily, rule: LengthRule
+) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
+    """The function (phi, start, goal) → `curve_energy`, free of checks, so that torch.func can transform it."""
+
+    def energy(phi: Tensor, start: Tensor, goal: Tensor) -> Tensor:
+        squares, weights = _squared_speeds(manifold, curve, phi, start, goal, rule)
+        return (squares @ weights.to(squares)).to(phi)
+
+    return energy
+
+
+def length_function(
+    manifold: Manifold, curve: CurveFamily, rule: LengthRule
+) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
+    """The function (phi, start, goal) → `curve_length`, free of checks, so that torch.func can transform it."""
+
+    def length(phi: Tensor, start: Tensor, goal: Tensor) -> Tensor:
+        squares, weights = _squared_speeds(manifold, curve, phi, start, goal, rule)
+        return (_root(squares) @ weights.to(squares)).to(phi)
+
+    return length
+
+
+def curve_speeds(
+    manifold: Manifold,
+    curve: CurveFamily,
+    phi: Float[Tensor, "*#batch p"],
+    start: Float[Tensor, "*#batch N"],
+    goal: Float[Tensor, "*#batch N"],
+    t: Float[Tensor, "T"] | Float[Tensor, "*batch T"],
+) -> Float[Tensor, "*batch T"]:
+    """Speed √(γ̇ᵀ M(γ) γ̇) of curves at times t, shared or one row a curve, in the unit of length.
+
+    One forward product J_f(γ) γ̇ a point where there is an embedding f, never its Jacobian.  Raises as `curve_length`
+    does.
+    """
+    _check(manifold, curve, phi, start, goal)
+    return _root(_squares_at(manifold, curve, phi, start, goal, t)).to(phi)
 
 
 def chord_length(points: Float[Tensor, "*batch T A"]) -> Float[Tensor, "*batch"]:
@@ -77,14 +240,112 @@ def chord_length(points: Float[Tensor, "*batch T A"]) -> Float[Tensor, "*batch"]
     return torch.linalg.vector_norm(points.diff(dim=-2), dim=-1).sum(-1)
 
 
-def _embedded_velocities(
-    manifold: Manifold, curve: CurveFamily, phi: Tensor, start: Tensor, goal: Tensor, rule: Quadrature
-) -> Tensor:
-    """J_f(γ) γ̇ at the nodes of the rule (*batch, Q, A): one forward-mode product a node, never the full Jacobian."""
+@cache
+def rules(breaks: Breaks = (0.0, 1.0)) -> tuple[Collocation, ...]:
+    """The rules tried in turn on curves with these breaks."""
+    return tuple(Collocation.chebyshev(degree, breaks) for degree in DEGREES)
+
+
+def _measured(
+    manifold: Manifold, curve: CurveFamily, flat: Sequence[Tensor], rule: Collocation
+) -> tuple[Tensor, Tensor]:
+    """Length by a rule and its error estimate, from the same points: the difference to the rule of half the degree."""
+    (phi, start, goal), half = flat, rule.half
+    assert half is not None
+    assert half.half is not None
+    if isinstance(manifold, EmbeddedManifold):
+        values = _embedded(manifold, curve.evaluate(phi, start, goal, rule.times.to(phi))[0])
+        lengths = [part.length(values[:, ::step]) for part, step in ((rule, 1), (half, 2), (half.half, 4))]
+    else:
+        speeds = _root(_squares_at(manifold, curve, phi, start, goal, rule.times))
+        nested = ((rule, 1), (half, 2), (half.half, 4))
+        lengths = [speeds[:, ::step] @ part.own_weights.to(speeds) for part, step in nested]
+    length, coarse, coarsest = (part.to(phi) for part in lengths)
+    length = torch.where(length.isfinite(), length, torch.inf)
+    error = SAFETY * (length - coarse).abs()
+    if len(curve.breaks) > 2:
+        error = torch.maximum(error, (coarse - coarsest).abs() / ACCIDENT)
+    return length, torch.where(error.isfinite(), error, torch.inf)
+
+
+def _check(manifold: Manifold, curve: CurveFamily, phi: Tensor, start: Tensor, goal: Tensor) -> None:
     for name, values in (("phi", phi), ("start", start), ("goal", goal)):
         require_finite(values, name)
     if curve.dim != manifold.dim:
         raise GeometryError(f"the curve has dim {curve.dim}: must be that of the manifold, {manifold.dim}")
-    points, velocities = curve.evaluate(phi, start, goal, rule.nodes.to(phi))
-    embedded: Tensor = torch.func.jvp(manifold.embed, (points,), (velocities,))[1]
-    return embedded
+
+
+def _squared_speeds(
+    manifold: Manifold, curve: CurveFamily, phi: Tensor, start: Tensor, goal: Tensor, rule: LengthRule
+) -> tuple[Tensor, Tensor]:
+    """γ̇ᵀ M(γ) γ̇ (*batch, Q) at the nodes of a rule, and the nodes' weights."""
+    if isinstance(rule, Quadrature):
+        return _squares_at(manifold, curve, phi, start, goal, rule.nodes), rule.weights
+    if not isinstance(manifold, EmbeddedManifold):
+        return _squares_at(manifold, curve, phi, start, goal, rule.times), rule.own_weights
+    points, _ = curve.evaluate(phi, start, goal, rule.times.to(phi))
+    return rule.slopes(_embedded(manifold, points)).square().sum(-1), rule.weights
+
+
+def _squares_at(manifold: Manifold, curve: CurveFamily, phi: Tensor, start: Tensor, goal: Tensor, t: Tensor) -> Tensor:
+    """γ̇ᵀ M(γ) γ̇ (*batch, T) at times t."""
+    points, velocities = curve.evaluate(phi, start, goal, t.to(phi))
+    if not isinstance(manifold, EmbeddedManifold):
+        return (velocities * (manifold.metric(points).to(velocities) @ velocities[..., None])[..., 0]).sum(-1)
+    blocks = zip(_blocks(points), _blocks(velocities), strict=True)
+    products = torch.cat([torch.func.jvp(manifold.embed, (z,), (v,))[1] for z, v in blocks])
+    return products.square().sum(-1).reshape(points.shape[:-1])
+
+
+def _embedded(manifold: EmbeddedManifold, points: Float[Tensor, "*batch S N"]) -> Float[Tensor, "*batch S A"]:
+    values = torch.cat([manifold.embed(block) for block in _blocks(points)])
+    return values.reshape(*points.shape[:-1], values.shape[-1])
+
+
+def _blocks(points: Float[Tensor, "*batch N"]) -> tuple[Tensor, ...]:
+    return points.reshape(-1, points.shape[-1]).split(BLOCK)
+
+
+def _root(squares: Tensor) -> Tensor:
+    """Square roots, with slope 0 at 0: a curve that stands still must not give NaN gradients.
+
+    What is no square, NaN or below zero, becomes NaN and is noticed; it must not pass for standing still.
+    """
+    moving = squares != 0
+    return torch.where(moving, torch.where(moving, squares, 1.0).sqrt(), 0.0)
+
+
+def _require_breaks(breaks: Breaks) -> None:
+    if len(breaks) < 2 or (breaks[0], breaks[-1]) != (0.0, 1.0) or not (np.diff(breaks) > 0).all():
+        raise GeometryError(f"breaks = {breaks}: must rise from 0 to 1")
+
+
+def _pieces(breaks: Breaks) -> list[tuple[float, float]]:
+    return list(pairwise(breaks))
+
+
+def _collocation(degree: int, breaks: Breaks) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Arrays of a Collocation; neighbouring pieces share the point between them."""
+    chebyshev = np.polynomial.chebyshev
+    x = -np.cos(np.pi * np.arange(degree + 1) / degree)
+    gauss, weights = np.polynomial.legendre.leggauss(2 * degree)
+    to_coefficients = np.linalg.inv(chebyshev.chebvander(x, degree))
+    slopes = np.stack([chebyshev.chebval(gauss, chebyshev.chebder(unit)) for unit in np.eye(degree + 1)], axis=1)
+    derivative = slopes @ to_coefficients
+    # ∫ T_k over [−1, 1] is 2 / (1 − k²) for even k and 0 for odd k
+    k = np.arange(degree + 1)
+    own = np.where(k % 2 == 0, 2.0 / (1.0 - np.square(k) + (k == 1)), 0.0) @ to_coefficients
+    count, span = len(breaks) - 1, degree
+    times, own_weights = np.empty(count * span + 1), np.zeros(count * span + 1)
+    rows = np.zeros((count * len(gauss), count * span + 1))
+    all_weights = np.empty(count * len(gauss))
+    for piece, (low, high) in enumerate(_pieces(breaks)):
+        points = slice(piece * span, (piece + 1) * span + 1)
+        nodes = slice(piece * len(gauss), (piece + 1) * len(gauss))
+        half = (high - low) / 2
+        times[points] = low + half * (x + 1)
+        own_weights[points] += half * own
+        rows[nodes, points] = derivative / half
+        all_weights[nodes] = half * weights
+    times[0], times[-1] = 0.0, 1.0
+    return times, rows, all_weights, own_weights

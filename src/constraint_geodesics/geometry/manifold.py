@@ -1,10 +1,10 @@
-"""What a manifold is to the rest of the project: a chart, its embedding, and the metric the embedding induces."""
+"""What a manifold is to the rest of the project: a chart with a metric, and what some manifolds have beside it."""
 
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 Embedding = Callable[[Tensor], Tensor]
@@ -30,18 +30,42 @@ class NonFiniteError(GeometryError):
         return f"{self.what}[{place}] = {self.value}: must be finite"
 
 
+class OutsideError(GeometryError):
+    """A point lies where the manifold isn't: beyond its grid, or in a blocked cell.
+
+    what: name of the array.  index: place of the first such point in it.  point: its coordinates.
+    """
+
+    def __init__(self, what: str, index: tuple[int, ...], point: tuple[float, ...]) -> None:
+        super().__init__(what, index, point)
+        self.what, self.index, self.point = what, index, point
+
+    def __str__(self) -> str:
+        place = f"[{', '.join(str(i) for i in self.index)}]" if self.index else ""
+        return f"{self.what}{place} = {list(self.point)}: lies outside the manifold or in a blocked cell"
+
+
 @runtime_checkable
 class Manifold(Protocol):
-    """A manifold of dimension N in one chart, embedded into R^A.
+    """A manifold of dimension N in one chart.  These two members are all that lengths and solvers need.
 
-    Both functions take any batch shape.  A new manifold is one class with these four members; where no closed
-    form of the metric is known, `metric` returns `pullback_metric(self.embed, z)`.
+    Where the manifold is embedded, add `ambient_dim` and `embed` (EmbeddedManifold): lengths then need no metric at
+    all, and `metric` may return `pullback_metric(self.embed, z)`.
     """
 
     @property
     def dim(self) -> int:
         """Dimension N of the chart."""
         ...
+
+    def metric(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch N N"]:
+        """The metric M(z), symmetric and positive, for any batch shape."""
+        ...
+
+
+@runtime_checkable
+class EmbeddedManifold(Manifold, Protocol):
+    """A manifold embedded into R^A, with the metric M = JᵀJ that the embedding's Jacobian J induces."""
 
     @property
     def ambient_dim(self) -> int:
@@ -52,8 +76,32 @@ class Manifold(Protocol):
         """The embedding f(z).  It acts on each point by itself and is differentiable in forward mode."""
         ...
 
-    def metric(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch N N"]:
-        """The metric M(z) = JᵀJ with the Jacobian J of the embedding, symmetric and positive."""
+
+@runtime_checkable
+class MeasuredManifold(Manifold, Protocol):
+    """A manifold whose geodesic distance is known: the oracle of the solvers."""
+
+    def distance(self, a: Float[Tensor, "*#batch N"], b: Float[Tensor, "*#batch N"]) -> Float[Tensor, "*batch"]:
+        """Length of the shortest curve between two points."""
+        ...
+
+
+@runtime_checkable
+class PeriodicManifold(Manifold, Protocol):
+    """A manifold whose chart repeats: z and z + k period are one point for every whole k."""
+
+    @property
+    def periods(self) -> tuple[float, ...]:
+        """Period of each of the N coordinates, inf where it does not repeat."""
+        ...
+
+
+@runtime_checkable
+class BoundedManifold(Manifold, Protocol):
+    """A manifold that does not fill its chart."""
+
+    def contains(self, z: Float[Tensor, "*batch N"]) -> Bool[Tensor, "*batch"]:
+        """Whether each point belongs to the manifold."""
         ...
 
 
@@ -85,3 +133,18 @@ def require_dim(points: Float[Tensor, "..."], dim: int, what: str) -> None:
     """Raise GeometryError unless the last axis of `points`, called `what` in the message, has `dim` entries."""
     if points.ndim == 0 or points.shape[-1] != dim:
         raise GeometryError(f"{what} has shape {tuple(points.shape)}: its last axis must have {dim} entries")
+
+
+def require_inside(manifold: Manifold, points: Float[Tensor, "*batch N"], what: str) -> None:
+    """Raise unless `points`, called `what` in the message, are points of the manifold.
+
+    Raises GeometryError on a wrong last axis, NonFiniteError with the first entry that is not finite, OutsideError
+    with the first point a BoundedManifold does not contain.
+    """
+    require_dim(points, manifold.dim, what)
+    require_finite(points, what)
+    if isinstance(manifold, BoundedManifold):
+        outside = ~manifold.contains(points)
+        if outside.any():
+            index = tuple(int(i) for i in torch.nonzero(outside)[0])
+            raise OutsideError(what, index, tuple(float(x) for x in points[index]))

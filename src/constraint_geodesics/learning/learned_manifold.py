@@ -1,5 +1,6 @@
 """A trained manifold: the stochastic embedding f(z) = (μ(z), σ(z)), its pullback metric (eq. 5), and its files."""
 
+import copy
 import hashlib
 import json
 from dataclasses import dataclass
@@ -15,8 +16,8 @@ from torch import Tensor
 from constraint_geodesics.geometry.manifold import pullback_metric
 from constraint_geodesics.learning.vae import JointVae
 
-PIECE = 512
-"""Points embedded at once: larger temporaries leave the cache and cost three times as much a point."""
+PIECE = 1024
+"""Points embedded at once: the temporaries of many more leave the processor's cache."""
 
 WEIGHTS, CARD = "weights.safetensors", "manifold.json"
 
@@ -45,7 +46,8 @@ class LearnedManifold:
         return 2 * self.vae.dof
 
     def embed(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch A"]:
-        """f(z) = (μ(z), σ(z)) [rad]."""
+        """f(z) = (μ(z), σ(z)) [rad], in the network's own precision."""
+        z = z.to(self.vae.centre.dtype)
         return torch.cat([self.vae.mean(z), self.vae.deviation(z)], dim=-1)
 
     def metric(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch N N"]:
@@ -72,6 +74,10 @@ class LearnedManifold:
         """The embedding of encoded configurations: where a joint path lies on the manifold [rad]."""
         with torch.no_grad():
             return self.embed(self.vae.encode(self.tensor(q))[0]).numpy().astype(np.float64)
+
+    def double(self) -> "LearnedManifold":
+        """The same manifold with its network in double precision, for references."""
+        return LearnedManifold(copy.deepcopy(self.vae).double())
 
     def tensor(self, values: np.ndarray) -> Tensor:
         """An array in the network's own precision."""

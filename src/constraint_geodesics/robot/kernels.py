@@ -9,7 +9,7 @@ frame to this joint's frame at zero, `axes` (D, 3) the joint axis in that frame,
 import numpy as np
 from numba import njit
 
-_COMPILE = {"cache": True, "fastmath": False, "nogil": True}
+_COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 
 
 @njit(**_COMPILE)

@@ -1,0 +1,126 @@
+"""The driver of every geodesic solver: checks the ends, answers what needs no search, hands on the rest."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+
+from constraint_geodesics.geodesics.problem import ChartProblem, Ends, Geodesic, GeodesicSolver, Status
+from constraint_geodesics.geometry.length import estimate_length
+from constraint_geodesics.geometry.manifold import Manifold, PeriodicManifold
+
+LENGTH_TOLERANCE = 1e-6
+"""Relative error aimed at for the lengths that candidates are ranked by and results carry."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Curves that compete for queries: which query (C,), coefficients, and the ends in the chart.
+
+    Several rows may serve one query, with different images of its goal.
+    """
+
+    query: Int[np.ndarray, "C"]
+    phi: Float[np.ndarray, "C p"]
+    start: Float[np.ndarray, "C N"]
+    goal: Float[np.ndarray, "C N"]
+
+    def ends(self) -> Ends:
+        """The ends of every curve."""
+        return Ends(self.start, self.goal, self.start, self.goal)
+
+    @classmethod
+    def join(cls, parts: Sequence["Candidates"]) -> "Candidates":
+        """All rows of several."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+
+def geodesics_between(
+    solver: GeodesicSolver, problem: ChartProblem, start: Float[np.ndarray, "B N"], goal: Float[np.ndarray, "B N"]
+) -> list[Geodesic]:
+    """Geodesics between B starts and goals in the chart, by any solver, one record each.
+
+    Ends that are one point of the manifold give a curve of length 0.  Raises GeometryError on a wrong shape,
+    NonFiniteError or OutsideError with the first end that is no point of the manifold.
+    """
+    ends = problem.ends(start, goal)
+    same = np.logical_not(nearest_image(problem.manifold, ends.z_goal - ends.z_start).any(axis=1))
+    found = iter(solver.solve(problem, ends[np.flatnonzero(~same)]) if not same.all() else [])
+    zero = np.zeros(problem.curve.coefficients)
+    return [
+        Geodesic("converged", problem.curve, zero, ends.z_start[row], ends.z_start[row], 0.0, 0.0, 0, 0, 0.0)
+        if same[row]
+        else next(found)
+        for row in range(len(ends))
+    ]
+
+
+def nearest_image(manifold: Manifold, offset: Float[np.ndarray, "m N"]) -> Float[np.ndarray, "m N"]:
+    """Offsets between points of the chart, with every periodic coordinate taken the shorter way round."""
+    period = _periods(manifold)
+    finite = np.isfinite(period)
+    turned = offset.copy()
+    turned[:, finite] -= period[finite] * np.round(offset[:, finite] / period[finite])
+    return turned
+
+
+def to_nearest_images(problem: ChartProblem, ends: Ends) -> Ends:
+    """The same ends with the image of each goal that lies nearest to its start in the chart."""
+    goal = ends.z_start + nearest_image(problem.manifold, ends.z_goal - ends.z_start)
+    # an image no turn away is the goal itself: keep its bits
+    goal = np.where(np.abs(goal - ends.z_goal) < 1e-9, ends.z_goal, goal)
+    return Ends(ends.z_start, goal, ends.q_start, ends.q_goal)
+
+
+def goal_images(problem: ChartProblem, ends: Ends) -> tuple[Int[np.ndarray, "C"], Float[np.ndarray, "C N"]]:
+    """Images of the goals worth a try, and the query each belongs to: both ways round each periodic coordinate."""
+    period = _periods(problem.manifold)
+    near = to_nearest_images(problem, ends).z_goal
+    other = np.where(near >= ends.z_start, -1.0, 1.0) * np.where(np.isfinite(period), period, 0.0)
+    choices = product(*([0, 1] if np.isfinite(p) else [0] for p in period))
+    goals = np.stack([near + np.array(choice) * other for choice in choices], axis=1)
+    goals = np.where(np.abs(goals - ends.z_goal[:, None]) < 1e-9, ends.z_goal[:, None], goals)
+    return np.repeat(np.arange(len(ends)), goals.shape[1]), goals.reshape(-1, goals.shape[-1])
+
+
+def shortest_of(
+    problem: ChartProblem, ends: Ends, candidates: Candidates, converged: Bool[np.ndarray, "C"], iterations: int,
+    evaluations: int, time_s: float,
+) -> list[Geodesic]:  # fmt: skip
+    """The shortest curve of each query that stays on the manifold; "not_found" where there is none.
+
+    iterations and evaluations: of the whole batch; each record carries its query's share of the evaluations and time.
+    """
+    length = _lengths(problem, candidates.phi, candidates.ends())
+    length = np.where(problem.stays_inside(candidates.phi, candidates.ends()), length, np.inf)
+    straight = _lengths(problem, np.zeros((len(ends), problem.curve.coefficients)), to_nearest_images(problem, ends))
+    # of curves that are alike to within their accuracy one that has converged is the answer
+    rank = length * np.where(converged, 1.0, 1.0 + LENGTH_TOLERANCE)
+    results = []
+    for query in range(len(ends)):
+        rows = np.flatnonzero(candidates.query == query)
+        best = rows[np.argmin(rank[rows])]
+        status: Status = "converged" if converged[best] else "iteration_limit"
+        if not np.isfinite(length[best]):
+            status = "not_found"
+        results.append(
+            Geodesic(
+                status, problem.curve, candidates.phi[best], candidates.start[best], candidates.goal[best],
+                float(length[best]) if status != "not_found" else float("nan"), float(straight[query]), iterations,
+                evaluations * len(rows) // len(length), time_s / len(ends),
+            )
+        )  # fmt: skip
+    return results
+
+
+def _lengths(problem: ChartProblem, phi: Float[np.ndarray, "C p"], ends: Ends) -> Float[np.ndarray, "C"]:
+    free, start, goal = (torch.from_numpy(values) for values in (phi, ends.z_start, ends.z_goal))
+    with torch.no_grad():
+        return estimate_length(problem.manifold, problem.curve, free, start, goal, LENGTH_TOLERANCE).length.numpy()
+
+
+def _periods(manifold: Manifold) -> Float[np.ndarray, "N"]:
+    return np.array(manifold.periods) if isinstance(manifold, PeriodicManifold) else np.full(manifold.dim, np.inf)

@@ -1,0 +1,33 @@
+"""Stage: geodesics on a learned manifold with other curve families, and without the variance term of its metric."""
+
+import sys
+
+from constraint_geodesics.cli import run_stage
+from constraint_geodesics.constraints.scene import Scene
+from constraint_geodesics.evaluation.ablation import LearnedAblation
+from constraint_geodesics.learning.dataset import read_joints
+from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.params import Params
+from constraint_geodesics.paths import Layout
+from constraint_geodesics.tracking.experiment import tracked_stage
+
+STAGE = "ablate_manifold"
+
+
+def main(params: Params, layout: Layout, manifold: str) -> None:
+    """Write reports/ablate_manifold/<manifold>.json."""
+    source = layout.joints("free")
+    with (
+        tracked_stage(
+            STAGE, manifold, params.geodesics, [source], experiment=params.tracking.experiment, root=layout.root
+        ) as run,
+        Scene.from_params(params).world() as world,
+    ):
+        chart = LearnedManifold.load(layout.manifold(manifold))
+        joints = read_joints(source).free_joints
+        ablation = LearnedAblation(chart, joints, params.geodesics, params.geometry.pairs, world.free)
+        run.report(ablation.figures(), layout.report(STAGE, manifold))
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])
