@@ -14,7 +14,9 @@ from torch import Tensor
 
 from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
 from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.geometry.grid import GridManifold
 from constraint_geodesics.geometry.length import Quadrature, chord_length, curve_energy, curve_length
+from constraint_geodesics.geometry.level_sets import LevelSet
 from constraint_geodesics.geometry.manifold import EmbeddedManifold, MeasuredManifold, pullback_metric
 
 BATCHES = ((), (3,), (2, 4))
@@ -53,6 +55,8 @@ MEMBERS = {
     "large_sphere": Member(Sphere(7.0), (-1.4, -math.pi), (1.4, math.pi)),
     "torus": Member(Torus(2.0, 1.0), (-math.pi, -math.pi), (math.pi, math.pi)),
     "thin_torus": Member(Torus(3.0, 0.2), (-math.pi, -math.pi), (math.pi, math.pi)),
+    "parallel": Member(LevelSet(Sphere(), 0, (0.7,)).components()[0], (-math.pi,), (math.pi,)),
+    "meridian_of_torus": Member(LevelSet(Torus(), 0, (0.4,)).components()[0], (-math.pi,), (math.pi,)),
     "user": Member(Graph(), (-2.0, -2.0, -2.0), (2.0, 2.0, 2.0)),
 }
 DISTANCES = [name for name in MEMBERS if isinstance(MEMBERS[name].manifold, MeasuredManifold)]
@@ -133,6 +137,19 @@ def test_metric_is_symmetric_and_positive(name, batch, data):
     metric = MEMBERS[name].manifold.metric(draw_points(data, MEMBERS[name], batch))
     torch.testing.assert_close(metric, metric.mT, rtol=1e-14, atol=0)
     assert (torch.linalg.eigvalsh(metric) > 1e-3).all()
+
+
+@every_batch
+@law
+def test_metric_of_any_grid_is_symmetric_and_positive(batch, data):
+    values = torch.exp(data.draw(tensors((4, 5), -5.0, 5.0)))
+    blocked = data.draw(arrays(np.bool_, (4, 5))) & ~np.eye(4, 5, dtype=bool)
+    grid = GridManifold(values, (-1.0, 0.0), (2.0, 1.0), torch.from_numpy(blocked))
+    metric = grid.metric(data.draw(tensors((*batch, 2), -3.0, 3.0)))
+    assert metric.shape == (*batch, 2, 2)
+    assert torch.equal(metric, metric.mT)
+    assert (torch.linalg.eigvalsh(metric) > 1e-3).all()
+    assert torch.isfinite(metric).all()
 
 
 @every_distance
