@@ -29,7 +29,7 @@ SMALL: dict[str, Any] = {
         "illustrated_constraints": ["level_cup"],
         "rollouts": 8,
         "checkpoint_steps": 1000,
-        "ablated_segments": [2],
+        "ablated_segments": [],
         "ppo": {"batch_size": 320},
     },
     "geometry": {"rounds": 1, "batch": 256, "checked": 32, "graph_points": 200, "pairs": 4},
