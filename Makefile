@@ -29,7 +29,7 @@ smoke: env  ## the same pipeline on small parameters, in a copy of this checkout
 	python tests/pipeline/smoke.py .geodesics/smoke
 
 bench-geometry: env  ## time the geometry core again, after whatever it needs; writes reports/geometry.json
-	dvc repro benchmark_geometry
+	dvc repro label_joints train_manifold train_analytic
 	dvc repro --single-item --force benchmark_geometry
 
 test: env  ## run the tests, the whole pipeline on small parameters among them
