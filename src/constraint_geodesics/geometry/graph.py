@@ -8,7 +8,7 @@ from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
-from constraint_geodesics.geometry.manifold import GeometryError, NonFiniteError
+from constraint_geodesics.geometry.errors import GeometryError, NonFiniteError
 
 Edges = Int[np.ndarray, "m 2"]
 OUTSIDE = -1

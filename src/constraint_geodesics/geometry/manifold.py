@@ -7,42 +7,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from constraint_geodesics.geometry.errors import GeometryError, NonFiniteError, OutsideError
+
+__all__ = [
+    "BoundedManifold", "EmbeddedManifold", "GeometryError", "Manifold", "MeasuredManifold", "NonFiniteError",
+    "OutsideError", "PeriodicManifold", "pullback_metric", "require_dim", "require_finite", "require_inside",
+]  # fmt: skip
+
 Embedding = Callable[[Tensor], Tensor]
-
-
-class GeometryError(ValueError):
-    """The input has no geometric meaning; the message names it, its value and what is allowed."""
-
-
-class NonFiniteError(GeometryError):
-    """An entry is NaN or infinite.
-
-    what: name of the array.  index: place of the first such entry in it.  value: the entry.
-    """
-
-    def __init__(self, what: str, index: tuple[int, ...], value: float) -> None:
-        # The bare arguments go to the base class because an exception is copied between processes from them.
-        super().__init__(what, index, value)
-        self.what, self.index, self.value = what, index, value
-
-    def __str__(self) -> str:
-        place = ", ".join(str(i) for i in self.index)
-        return f"{self.what}[{place}] = {self.value}: must be finite"
-
-
-class OutsideError(GeometryError):
-    """A point lies where the manifold isn't: beyond its grid, or in a blocked cell.
-
-    what: name of the array.  index: place of the first such point in it.  point: its coordinates.
-    """
-
-    def __init__(self, what: str, index: tuple[int, ...], point: tuple[float, ...]) -> None:
-        super().__init__(what, index, point)
-        self.what, self.index, self.point = what, index, point
-
-    def __str__(self) -> str:
-        place = f"[{', '.join(str(i) for i in self.index)}]" if self.index else ""
-        return f"{self.what}{place} = {list(self.point)}: lies outside the manifold or in a blocked cell"
 
 
 @runtime_checkable
