@@ -1,6 +1,6 @@
 """PyBullet as the judge: tool poses, self-collision and collision with the workcell of given configurations.
 
-The only importer of pybullet.  Every world is a physics client of its own in DIRECT mode; nothing is simulated.
+The only importer of pybullet.  Every world is a physics client of its own in DIRECT mode; nothing is simulated here.
 """
 
 import contextlib
@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -53,6 +53,46 @@ class Labels:
     workcell_collision: Bool[np.ndarray, "n"]
 
 
+@dataclass(frozen=True)
+class LoadedLink:
+    """One link of the chain to the tool as PyBullet holds it, with the joint that carries it.
+
+    A link's pose is that of its inertial frame.  At joint value 0 the joint lies at `joint_position` [m] in the
+    parent's inertial frame, and `quaternion` (x, y, z, w) turns this link's inertial frame into the parent's.
+    """
+
+    name: str
+    kind: str
+    """revolute, prismatic, fixed, or another of PyBullet's joint types."""
+    column: int | None
+    """Which entry of a configuration moves the joint; None for none."""
+    axis: tuple[float, float, float]
+    """Of the joint, in this link's inertial frame."""
+    joint_position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+    inertial_position: tuple[float, float, float]
+    """Of the inertial frame in the link's own frame, whose origin is the joint [m]."""
+    inertial_quaternion: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class LoadedChain:
+    """PyBullet's model from the base to the tool: the pose of the base's inertial frame [m], then each link."""
+
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+    links: tuple[LoadedLink, ...]
+
+
+@dataclass(frozen=True)
+class LinkHull:
+    """Corners of one link's collision shapes (n, 3) [m] in the frame that joint `joint` carries; -1: the base's."""
+
+    link: str
+    joint: int
+    points: Float[np.ndarray, "n 3"]
+
+
 def data_path() -> Path:
     """Folder of the robots and meshes that ship with PyBullet."""
     with _quiet():
@@ -87,6 +127,9 @@ class World:
         self._joints = [joint_index[name] for name in robot.joint_names]
         self._tool = self._link_index[robot.tool_link]
         self._exempt = {self._add(body): self._links(body) for body in fixed}
+        for body, links in self._exempt.items():
+            for link in links:  # a pair that may touch need not be examined again and again
+                pybullet.setCollisionFilterPair(self._body, body, link, -1, 0, physicsClientId=self._client)
 
     def __enter__(self) -> Self:
         return self
@@ -124,6 +167,61 @@ class World:
     def free(self, q: Float[np.ndarray, "n D"]) -> Bool[np.ndarray, "n"]:
         """Which configurations touch neither themselves nor the workcell."""
         return np.array([self.is_free(row) for row in q], dtype=bool)
+
+    def first_collision(self, q: Float[np.ndarray, "n D"]) -> int | None:
+        """Index of the first configuration that is not free; None where all are."""
+        for index, values in enumerate(np.asarray(q, float)[:, :, None].tolist()):
+            self._bullet.resetJointStatesMultiDof(self._body, self._joints, values, physicsClientId=self._client)
+            if any(self._collisions()):
+                return index
+        return None
+
+    def loaded_chain(self) -> LoadedChain:
+        """The chain from the base to the tool, as PyBullet understood the URDF."""
+        bullet, body, client = self._bullet, self._body, self._client
+        kinds = {bullet.JOINT_REVOLUTE: "revolute", bullet.JOINT_PRISMATIC: "prismatic", bullet.JOINT_FIXED: "fixed"}
+        links: list[LoadedLink] = []
+        link = self._tool
+        while link >= 0:
+            info = bullet.getJointInfo(body, link, physicsClientId=client)
+            dynamics = bullet.getDynamicsInfo(body, link, physicsClientId=client)
+            x, y, z, w = info[15]  # it turns the parent's coordinates into this link's: the inverse is recorded
+            links.append(
+                LoadedLink(
+                    info[12].decode(), kinds.get(info[2], f"PyBullet's type {info[2]}"),
+                    self._joints.index(link) if link in self._joints else None,
+                    info[13], info[14], (-x, -y, -z, w), dynamics[3], dynamics[4],
+                )
+            )  # fmt: skip
+            link = info[16]
+        position, quaternion = bullet.getBasePositionAndOrientation(body, physicsClientId=client)
+        return LoadedChain(position, quaternion, tuple(reversed(links)))
+
+    def hulls(self) -> list[LinkHull]:
+        """The collision shapes of all links that have one."""
+        bullet, body, client = self._bullet, self._body, self._client
+        self._place(np.zeros(self.robot.dof))
+        frames = _joint_frames(self.robot)
+        found = []
+        for link, index in sorted(self._link_index.items(), key=lambda item: item[1]):
+            points = np.array(bullet.getMeshData(body, index, physicsClientId=client)[1]).reshape(-1, 3)
+            if not len(points) or index < 0:
+                continue
+            state = bullet.getLinkState(body, index, computeForwardKinematics=1, physicsClientId=client)
+            rotation = np.array(bullet.getMatrixFromQuaternion(state[1])).reshape(3, 3)
+            joint = self._carrier(index)
+            pose = np.linalg.inv(frames[joint]) if joint >= 0 else np.eye(4)
+            in_base = points @ rotation.T + state[0]
+            found.append(LinkHull(link, joint, in_base @ pose[:3, :3].T + pose[:3, 3]))
+        return found
+
+    def _carrier(self, link: int) -> int:
+        """Which joint of the chain moves a link last; -1 for none."""
+        while link >= 0:
+            if link in self._joints:
+                return self._joints.index(link)
+            link = self._bullet.getJointInfo(self._body, link, physicsClientId=self._client)[16]
+        return -1
 
     def _place(self, q: np.ndarray) -> None:
         self._bullet.resetJointStatesMultiDof(
@@ -164,6 +262,31 @@ class World:
         if unknown:
             raise ValueError(f"workcell {body.name!r}: {unknown} are not links of {self.robot.name}")
         return frozenset(self._link_index[name] for name in body.exempt_links)
+
+
+def _joint_frames(robot: SerialRobot) -> list[Float[np.ndarray, "4 4"]]:
+    """The frame of each joint in the base frame, all joints at 0."""
+    frames = [robot.chain.base]
+    for origin in robot.chain.origins:
+        frames.append(frames[-1] @ origin)
+    return frames[1:]
+
+
+@dataclass(frozen=True)
+class Physics:
+    """A world's PyBullet module and client, with the indices of its robot, for what simulates instead of judging."""
+
+    bullet: Any
+    client: int
+    body: int
+    joints: tuple[int, ...]
+    tool: int
+    fixed: tuple[int, ...]
+
+
+def physics(world: World) -> Physics:
+    """What simulating in a world takes; the world is no judge afterwards, and closing it ends the simulation."""
+    return Physics(world._bullet, world._client, world._body, tuple(world._joints), world._tool, tuple(world._exempt))
 
 
 @contextlib.contextmanager

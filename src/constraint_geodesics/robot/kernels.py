@@ -111,3 +111,15 @@ def jacobian_batch(origins, axes, prismatic, base, tool, q, jacobians):  # type:
     for b in range(q.shape[0]):
         pose_of(origins, axes, prismatic, base, tool, q[b], position, rotation, joint_origins, joint_axes)
         geometric_jacobian(prismatic, position, joint_origins, joint_axes, jacobians[b])
+
+
+@njit(**_COMPILE)
+def skeleton_batch(origins, axes, prismatic, base, tool, q, points):  # type: ignore[no-untyped-def]
+    """Base, joint origins and tool of q (B, D) into points (B, D + 2, 3)."""
+    rotation = np.empty((3, 3))
+    joint_axes = np.empty((q.shape[1], 3))
+    for b in range(q.shape[0]):
+        points[b, 0] = base[:3, 3]
+        pose_of(
+            origins, axes, prismatic, base, tool, q[b], points[b, q.shape[1] + 1], rotation, points[b, 1:-1], joint_axes
+        )

@@ -96,6 +96,13 @@ class SerialRobot:
         kernels.jacobian_batch(*self.chain.arrays, flat, jacobians)
         return jacobians.reshape(*q.shape[:-1], 6, self.dof)
 
+    def skeleton(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch n 3"]:
+        """Base, joint origins and tool of configurations [m], to draw the arm by: n = D + 2 points."""
+        flat = self._flat(q)
+        points = np.empty((len(flat), self.dof + 2, 3))
+        kernels.skeleton_batch(*self.chain.arrays, flat, points)
+        return points.reshape(*q.shape[:-1], self.dof + 2, 3)
+
     def limit_distance(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch"]:
         """Distance to the nearest joint limit [rad]; negative outside the limits."""
         return np.minimum(q - self.lower, self.upper - q).min(axis=-1)
