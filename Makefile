@@ -3,8 +3,10 @@ export PATH := $(CURDIR)/.venv/bin:$(PATH)
 export OMP_NUM_THREADS := 1
 PYTHON ?= python3.11
 FILE ?=
+FIRST_START = 1.329923 -0.584036 -3.766650 -2.008429 0.728803 -2.581396
+FIRST_GOAL = 1.071549 -0.217480 -1.682647 -2.906655 -0.337949 1.348704
 
-.PHONY: help env repro smoke bench-geometry test lint format results ui replay clean
+.PHONY: help env plan repro smoke bench-geometry test lint format results ui replay clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
@@ -19,6 +21,13 @@ help:  ## list the targets
 	@touch $@
 
 env: .venv/installed  ## make .venv with every pinned package
+
+plan: env  ## plan one path that keeps a cup level, at once: CSV, picture and recording in first_path/
+	geodesics plan --constraint level_cup \
+	  --start "$(FIRST_START)" --goal "$(FIRST_GOAL)" \
+	  --out first_path/path.csv --picture first_path/path.png --record first_path/path.rrd
+	geodesics check first_path/path.csv
+	@echo "Look at first_path/path.png, or replay it: make replay FILE=first_path/path.rrd"
 
 repro: env  ## run all stages that are out of date, then print the results
 	geodesics params

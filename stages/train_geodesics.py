@@ -38,15 +38,14 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     submanifold = load_submanifold(layout.submanifold(manifold, constraint))
     with scene.world() as world:
         connected, connection_s = connected_queries(submanifold, problem, queries, world.free, params.submanifold)
-    with tracked_stage(
-        STAGE, item, params.geodesics, sources, experiment=params.tracking.experiment, root=layout.root
-    ) as run:
+    settings = params.policy_settings(separate=True) if problem.retract else params.geodesics
+    with tracked_stage(STAGE, item, settings, sources, experiment=params.tracking.experiment, root=layout.root) as run:
         tasks = [
             SeedTask(
-                problem, scene, params.geodesics, params.judge, manifold, queries, connected, connection_s, seed,
+                problem, scene, settings, params.judge, manifold, queries, connected, connection_s, seed,
                 layout.scratch(STAGE, f"{item}-{seed}"), run.child(f"seed {seed}", {"seed": seed}),
             )
-            for seed in params.geodesics.seeds
+            for seed in settings.seeds
         ]  # fmt: skip
         results = parallel_map(run_seed, tasks, params.compute, description=f"policy search {item}")
         run.summarise([result.figures() for result in results])

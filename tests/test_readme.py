@@ -24,12 +24,19 @@ def test_the_geometry_table_is_the_reports() -> None:
     assert between("geometry") == (ROOT / "reports" / "geometry.md").read_text().strip()
 
 
-@pytest.mark.parametrize("example", re.findall(r"```python\n(.*?)```", README, re.S), ids=("constraint", "manifold"))
-def test_every_example_runs(example, monkeypatch, capsys) -> None:
-    monkeypatch.chdir(ROOT)
+EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.S)
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=("plan", "constraint", "manifold"))
+def test_every_example_runs(example, monkeypatch, capsys, tmp_path) -> None:
+    monkeypatch.chdir(tmp_path if "Planner" in example else ROOT)
     exec(compile(example, "README.md", "exec"), {"__name__": "example"})
     printed = capsys.readouterr().out.split()
-    if "GradientSolver" in example:
+    if "Planner" in example:
+        assert printed[0] == "solved"
+        assert (tmp_path / "path.csv").is_file()
+        assert (tmp_path / "path.rrd").is_file()
+    elif "GradientSolver" in example:
         status, length, straight = printed[0], float(printed[1]), float(printed[2])
         assert status == "converged"
         assert 2.0 < length < 0.9 * straight, "round the hill, not over it"

@@ -1,6 +1,7 @@
 """The command `geodesics`, and how a stage starts."""
 
 import inspect
+import json
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -13,6 +14,7 @@ from constraint_geodesics.params import Params, ParamsError, load_params
 from constraint_geodesics.paths import Layout
 
 WRONG_USAGE = 2
+NO_PATH = 3
 
 app = typer.Typer(
     help="Shortest robot paths that keep a task constraint.", no_args_is_help=True, add_completion=True,
@@ -58,8 +60,10 @@ def _check_names(params: Params, stage: Callable[..., None], arguments: Sequence
             raise ParamsError(f"params.yaml: there is no {kind} {name!r}: must be one of {names[kind]}")
 
 
-def _complain(error: Exception) -> int:
+def _complain(error: Exception, code: int | None = None) -> int:
     print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+    if code is not None:
+        return code
     return WRONG_USAGE if isinstance(error, ParamsError) else 1
 
 
@@ -71,10 +75,95 @@ def check_params(file: Annotated[Path, typer.Argument(help="The file to check.")
 
 
 @app.command("constraints")
-def list_constraints() -> None:
-    """List the constraints of params.yaml."""
-    for name, constraint in load_params().constraints.items():
+def list_constraints(
+    planner: Annotated[str | None, typer.Option(help="Where the planner comes from, as for `plan`.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
+) -> None:
+    """List the constraints that `plan` knows by name."""
+    from constraint_geodesics.bundle import open_bundle
+
+    constraints = open_bundle(planner)[0].constraints
+    if as_json:
+        print(json.dumps({name: constraint.model_dump(mode="json") for name, constraint in constraints.items()}))
+        return
+    for name, constraint in constraints.items():
         print(f"{name:20s} {' '.join(map(str, constraint.axes))}  {constraint.description}")
+
+
+@app.command("plan", context_settings={"allow_extra_args": False})
+def plan(
+    start: Annotated[str, typer.Option(help='Start configuration: the joints in rad, as in "0.1 -0.5 …".')],
+    goal: Annotated[str, typer.Option(help="Goal configuration [rad].")],
+    constraint: Annotated[str, typer.Option(help="A name that `geodesics constraints` lists.")],
+    out: Annotated[Path | None, typer.Option(help="Write the path here, as CSV.")] = None,
+    record: Annotated[Path | None, typer.Option(help="Write a Rerun recording here.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw the path here, as PNG.")] = None,
+    planner: Annotated[
+        str | None,
+        typer.Option(help="A planner's folder or MLflow address; by default the pipeline's outputs or the package's."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the answer as one JSON object.")] = False,
+) -> None:
+    """Plan one path.  Exit code 0: solved; 2: wrong usage; 3: there is no path, and the line says why."""
+    from constraint_geodesics.bundle import BundleError
+    from constraint_geodesics.planner import Planner, PlannerError
+
+    try:
+        first, last = _joints(start, "--start"), _joints(goal, "--goal")
+        with Planner.load(planner) as loaded:
+            path = loaded.plan(first, last, constraint)
+            source = loaded.source
+    except (BundleError, PlannerError) as error:
+        raise SystemExit(_complain(error, WRONG_USAGE)) from None
+    print(f"planner: {source}", file=sys.stderr)
+    if path.status == "solved":
+        if out is not None:
+            path.save(out)
+        if record is not None:
+            path.record(record)
+        if picture is not None:
+            path.draw(picture)
+    print(json.dumps(path.summary()) if as_json else f"{path.status}: {path.explanation}")
+    raise SystemExit(0 if path.status == "solved" else NO_PATH)
+
+
+@app.command("check")
+def check(
+    file: Annotated[Path, typer.Argument(help="A path as CSV: a header, then one row of joints [rad] a line.")],
+    constraint: Annotated[
+        str | None, typer.Option(help="A name that `geodesics constraints` lists; by default what the file says.")
+    ] = None,
+    planner: Annotated[str | None, typer.Option(help="Where robot and workcell come from, as for `plan`.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the certificate as one JSON object.")] = False,
+) -> None:
+    """Certify anybody's path.  Exit code 0: it keeps every promise; 2: wrong usage; 3: it breaks the one named."""
+    from constraint_geodesics.bundle import BundleError
+    from constraint_geodesics.planner import PlannerError, check_path
+
+    try:
+        certificate = check_path(file, constraint, planner)
+    except (BundleError, PlannerError) as error:
+        raise SystemExit(_complain(error, WRONG_USAGE)) from None
+    broken = certificate.violation
+    if as_json:
+        print(json.dumps(certificate.summary()))
+    elif broken is None:
+        print(
+            f"valid: {certificate.length_rad:.3f} rad, at most {certificate.violation_bound:.1e} (rad, m) off the "
+            f"constraint anywhere, {certificate.collision_checks} configurations free of collision"
+        )
+    else:
+        print(f"{broken.kind}: {broken.message}")
+    raise SystemExit(0 if broken is None else NO_PATH)
+
+
+def _joints(text: str, option: str) -> list[float]:
+    from constraint_geodesics.planner import PlannerError
+
+    try:
+        return [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        raise PlannerError(f"{option} {text!r}: must be numbers [rad], with spaces or commas between them") from None
 
 
 @app.command("results")

@@ -174,6 +174,17 @@ class PpoParams(_Record):
     clip: Share
     entropy: NonNegative
     action_scale: Positive
+    descent_scale: Positive = 0.5
+
+
+class PolicyParams(_Record):
+    """Policies on a learned manifold whose curves are retracted; what is not here is as in `geodesics`."""
+
+    steps: Count
+    separate_steps: Count
+    episode_steps: Count
+    reward: RewardParams
+    ppo: PpoParams
 
 
 class GeodesicParams(_Record):
@@ -221,6 +232,45 @@ class BenchmarkParams(_Record):
     range_rad: Positive
 
 
+class PlannerParams(_Record):
+    """The planner that users call."""
+
+    segments: Annotated[int, Field(ge=4)]
+    iterations: Count
+    accuracy: Positive
+    largest_step_rad: Positive
+    clearance_m: NonNegative
+    collision_spacing_rad: Positive
+    acceleration_rad_s2: Positive
+    roadmap_nodes: Annotated[int, Field(ge=10)]
+    roadmap_neighbours: Count
+    seed: Seed
+
+
+class PlanBenchmarkParams(_Record):
+    """The planner, its parts and its peers on queries that no training saw."""
+
+    queries: Count
+    seed: Seed
+    constraint: Name
+    parts: Annotated[tuple[str, ...], Field(min_length=1)]
+    peers: tuple[Literal["prm", "rrt_star", "birrt"], ...]
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    starts: Count
+    batch: Count
+    unseen: dict[Name, ConstraintParams]
+
+
+class ExecutionParams(_Record):
+    """Timed paths followed by simulated position control, with a cup that may spill."""
+
+    queries: Count
+    seed: Seed
+    least_tilt_rad: Positive
+    spheres: Count
+    recorded: Annotated[int, Field(ge=0)]
+
+
 class JudgeParams(_Record):
     """What makes a path valid."""
 
@@ -257,15 +307,31 @@ class Params(_Record):
     submanifold: SubmanifoldParams
     geodesics: GeodesicParams
     geometry: GeometryParams
+    policies: PolicyParams
+    planner: PlannerParams
+    plans: PlanBenchmarkParams
+    execution: ExecutionParams
     benchmark: BenchmarkParams
     judge: JudgeParams
     recording: RecordingParams
     tracking: TrackingParams
 
+    def policy_settings(self, *, separate: bool = False) -> GeodesicParams:
+        """How policies are trained where curves are retracted: for all constraints together, or one for each."""
+        own = self.policies
+        steps = own.separate_steps if separate else own.steps
+        changed = {"steps": steps, "episode_steps": own.episode_steps, "reward": own.reward, "ppo": own.ppo}
+        return self.geodesics.model_copy(update=changed)
+
     @model_validator(mode="after")
     def _names_exist(self) -> "Params":
         if "free" not in self.constraints or any(self.constraints["free"].axes):
             raise ValueError("constraints.free: must be there with all axes 0, the manifolds are trained on it")
+        if self.plans.constraint not in self.constraints:
+            raise ValueError(f"plans.constraint={self.plans.constraint!r}: must be one of {sorted(self.constraints)}")
+        again = set(self.plans.unseen) & set(self.constraints)
+        if again:
+            raise ValueError(f"plans.unseen={sorted(again)}: these are among the constraints that are trained on")
         geodesics = self.geodesics
         for entry, names, known in (
             ("searched", geodesics.searched, self.manifolds),

@@ -30,6 +30,25 @@ class Layout:
         """Folder of the policies and curves found (safetensors, npz, CSV)."""
         return self.root / "data" / "geodesics" / f"{manifold}-{constraint}"
 
+    @property
+    def planner(self) -> Path:
+        """Folder of the planner's files (safetensors and JSON)."""
+        return self.root / "data" / "planner"
+
+    @property
+    def pretrained(self) -> Path:
+        """Their copy that travels with the package."""
+        return self.root / "src" / "constraint_geodesics" / "pretrained"
+
+    @property
+    def plans(self) -> Path:
+        """Folder of the planner's benchmark: queries (CSV) and paths (npz)."""
+        return self.root / "data" / "plans"
+
+    def policies(self, manifold: str) -> Path:
+        """Folder of the policies trained on all constraints together."""
+        return self.root / "data" / "policies" / manifold
+
     def analytic(self, manifold: str) -> Path:
         """Folder of the policies and curves found on an analytic manifold."""
         return self.root / "data" / "analytic" / manifold

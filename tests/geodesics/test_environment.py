@@ -4,17 +4,8 @@ from gymnasium.utils.env_checker import check_env as check_gymnasium
 from stable_baselines3.common.env_checker import check_env as check_stable_baselines
 
 from constraint_geodesics.evaluation.analytic_search import analytic_problem, curve_family
-from constraint_geodesics.geodesics.environment import (
-    CurveEnv,
-    CurveVecEnv,
-    EpisodeSettings,
-    advance,
-    begin,
-    gompertz,
-    observe,
-    rewards,
-    scalar_environments,
-)
+from constraint_geodesics.geodesics.environment import CurveEnv, CurveVecEnv, scalar_environments
+from constraint_geodesics.geodesics.episodes import EpisodeSettings, advance, begin, gompertz, observe, rewards
 from constraint_geodesics.geodesics.problem import Ends
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 

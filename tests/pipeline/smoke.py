@@ -33,6 +33,10 @@ SMALL: dict[str, Any] = {
         "ppo": {"batch_size": 320},
     },
     "geometry": {"rounds": 1, "batch": 256, "checked": 32, "graph_points": 200, "pairs": 4},
+    "policies": {"steps": 1920, "separate_steps": 1920, "ppo": {"batch_size": 320}},
+    "planner": {"roadmap_nodes": 200},
+    "plans": {"queries": 3, "seeds": [0], "peers": ["birrt"], "starts": 4, "batch": 4},
+    "execution": {"queries": 1, "spheres": 4},
     "benchmark": {"seeds": [0], "rrt_star_iterations": 40, "prm_iterations": 50},
 }
 CONSTRAINTS = ("free", "level_cup")
@@ -53,6 +57,10 @@ def copy_checkout(folder: Path) -> None:
             target = folder / name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(source, target)
+    for compiled in (ROOT / "src").rglob("*.nb[ic]"):  # the kernels need not be compiled again
+        target = folder / compiled.relative_to(ROOT)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(compiled, target)
     for command in (
         ["git", "init", "-q"],
         ["git", "add", "-A"],
@@ -66,6 +74,8 @@ def shrink_params(folder: Path) -> None:
     file = folder / "params.yaml"
     params = yaml.safe_load(file.read_text())
     params["constraints"] = {name: params["constraints"][name] for name in CONSTRAINTS}
+    unseen = params["plans"]["unseen"]
+    params["plans"]["unseen"] = {name: unseen[name] for name in list(unseen)[:1]}
     _overlay(params, SMALL)
     file.write_text(yaml.safe_dump(params, sort_keys=False))
 

@@ -188,9 +188,6 @@ def test_the_outermost_points_reach_nearly_as_far_as_all_of_them() -> None:
     assert short.max() < 0.1
 
 
-@pytest.mark.xfail(
-    strict=True, raises=(ValueError, AssertionError), reason="shapes that PyBullet has no mesh of are left out"
-)
 @pytest.mark.parametrize(
     "shapes",
     [('<sphere radius="0.06"/>',), ('<box size="0.06 0.08 0.2"/>',), (CYLINDER, '<box size="0.2 0.02 0.02"/>')],

@@ -117,7 +117,14 @@ class Certificate:
         """All of it as JSON takes it; what is not a number is None."""
         measures = {name: value for name, value in vars(self).items() if name != "violation"}
         known = {name: None if np.isnan(value) else value for name, value in measures.items()}
-        broken = None if self.violation is None else vars(self.violation)
+        broken = (
+            None
+            if self.violation is None
+            else {
+                name: None if isinstance(value, float) and np.isnan(value) else value
+                for name, value in vars(self.violation).items()
+            }
+        )
         return {"valid": self.valid, "violation": broken, **known}
 
 

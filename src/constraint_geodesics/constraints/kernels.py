@@ -16,34 +16,38 @@ _SMALL = 1e-9
 
 
 @njit(**_COMPILE)
-def _quaternion(e):  # type: ignore[no-untyped-def]
-    """Unit quaternion (w ≥ 0, x, y, z) of a rotation matrix, by Shepperd's branch with the largest component."""
-    q = np.empty(4)
-    trace = e[0, 0] + e[1, 1] + e[2, 2]
+def _quaternion(a, b):  # type: ignore[no-untyped-def]
+    """Unit quaternion (w ≥ 0, x, y, z) of the rotation E = A Bᵀ, by Shepperd's branch with the largest component."""
+    e00 = a[0, 0] * b[0, 0] + a[0, 1] * b[0, 1] + a[0, 2] * b[0, 2]
+    e01 = a[0, 0] * b[1, 0] + a[0, 1] * b[1, 1] + a[0, 2] * b[1, 2]
+    e02 = a[0, 0] * b[2, 0] + a[0, 1] * b[2, 1] + a[0, 2] * b[2, 2]
+    e10 = a[1, 0] * b[0, 0] + a[1, 1] * b[0, 1] + a[1, 2] * b[0, 2]
+    e11 = a[1, 0] * b[1, 0] + a[1, 1] * b[1, 1] + a[1, 2] * b[1, 2]
+    e12 = a[1, 0] * b[2, 0] + a[1, 1] * b[2, 1] + a[1, 2] * b[2, 2]
+    e20 = a[2, 0] * b[0, 0] + a[2, 1] * b[0, 1] + a[2, 2] * b[0, 2]
+    e21 = a[2, 0] * b[1, 0] + a[2, 1] * b[1, 1] + a[2, 2] * b[1, 2]
+    e22 = a[2, 0] * b[2, 0] + a[2, 1] * b[2, 1] + a[2, 2] * b[2, 2]
+    trace = e00 + e11 + e22
     if trace > 0.0:
         s = 2.0 * np.sqrt(trace + 1.0)
-        q[0], q[1] = 0.25 * s, (e[2, 1] - e[1, 2]) / s
-        q[2], q[3] = (e[0, 2] - e[2, 0]) / s, (e[1, 0] - e[0, 1]) / s
-    elif e[0, 0] >= e[1, 1] and e[0, 0] >= e[2, 2]:
-        s = 2.0 * np.sqrt(1.0 + e[0, 0] - e[1, 1] - e[2, 2])
-        q[0], q[1] = (e[2, 1] - e[1, 2]) / s, 0.25 * s
-        q[2], q[3] = (e[0, 1] + e[1, 0]) / s, (e[0, 2] + e[2, 0]) / s
-    elif e[1, 1] >= e[2, 2]:
-        s = 2.0 * np.sqrt(1.0 + e[1, 1] - e[0, 0] - e[2, 2])
-        q[0], q[1] = (e[0, 2] - e[2, 0]) / s, (e[0, 1] + e[1, 0]) / s
-        q[2], q[3] = 0.25 * s, (e[1, 2] + e[2, 1]) / s
+        w, x, y, z = 0.25 * s, (e21 - e12) / s, (e02 - e20) / s, (e10 - e01) / s
+    elif e00 >= e11 and e00 >= e22:
+        s = 2.0 * np.sqrt(1.0 + e00 - e11 - e22)
+        w, x, y, z = (e21 - e12) / s, 0.25 * s, (e01 + e10) / s, (e02 + e20) / s
+    elif e11 >= e22:
+        s = 2.0 * np.sqrt(1.0 + e11 - e00 - e22)
+        w, x, y, z = (e02 - e20) / s, (e01 + e10) / s, 0.25 * s, (e12 + e21) / s
     else:
-        s = 2.0 * np.sqrt(1.0 + e[2, 2] - e[0, 0] - e[1, 1])
-        q[0], q[1] = (e[1, 0] - e[0, 1]) / s, (e[0, 2] + e[2, 0]) / s
-        q[2], q[3] = (e[1, 2] + e[2, 1]) / s, 0.25 * s
-    if q[0] < 0.0:
-        q *= -1.0
-    return q
+        s = 2.0 * np.sqrt(1.0 + e22 - e00 - e11)
+        w, x, y, z = (e10 - e01) / s, (e02 + e20) / s, (e12 + e21) / s, 0.25 * s
+    if w < 0.0:
+        return -w, -x, -y, -z
+    return w, x, y, z
 
 
 @njit(**_COMPILE)
-def _swing(w, k, r, linear):  # type: ignore[no-untyped-def]
-    """Swing rotation vector into r (3,) from e_k to the unit vector w; derivative (3, 3) to ω, where ẇ = ω × w."""
+def _swing(w, k, residual, linear):  # type: ignore[no-untyped-def]
+    """Swing from e_k to the unit vector w into residual[3:], and its derivative (3, 3) to ω, where ẇ = ω × w."""
     i, j = (k + 1) % 3, (k + 2) % 3
     # e_k × w has the components (−w_j, w_i) along (e_i, e_j)
     si, sj, c = -w[j], w[i], w[k]
@@ -58,7 +62,7 @@ def _swing(w, k, r, linear):  # type: ignore[no-untyped-def]
         dg = 0.0
         if c < 0.0:
             si = _SMALL
-    r[i], r[j] = g * si, g * sj
+    residual[3 + i], residual[3 + j] = g * si, g * sj
     for a in range(3):
         # ω = e_a gives ẇ = e_a × w
         w0 = 0.0 if a == 0 else (w[2] if a == 1 else -w[1])
@@ -73,45 +77,38 @@ def _swing(w, k, r, linear):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def _rotation_vector(quaternion, linear):  # type: ignore[no-untyped-def]
-    """Rotation vector (3,) of a unit quaternion and the inverse left Jacobian of SO(3), its derivative to ω."""
-    x, y, z = quaternion[1], quaternion[2], quaternion[3]
+def _rotation_vector(quaternion, residual, linear):  # type: ignore[no-untyped-def]
+    """Rotation vector of a unit quaternion into residual[3:], and the inverse left Jacobian of SO(3), its derivative
+    to ω.
+    """
+    w, x, y, z = quaternion
     n = np.sqrt(x * x + y * y + z * z)
-    theta = 2.0 * np.arctan2(n, quaternion[0])
+    theta = 2.0 * np.arctan2(n, w)
     scale = theta / n if n > _SMALL else 2.0
-    r = np.array([x * scale, y * scale, z * scale])
+    r0, r1, r2 = x * scale, y * scale, z * scale
+    residual[3], residual[4], residual[5] = r0, r1, r2
     if theta > 1e-4:
         half = 0.5 * theta
         b = (1.0 - half * np.cos(half) / np.sin(half)) / (theta * theta)
     else:
         b = 1.0 / 12.0
-    square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
-    for a in range(3):
-        for k in range(3):
-            linear[a, k] = b * r[a] * r[k]
-        linear[a, a] += 1.0 - b * square
-    linear[0, 1] += 0.5 * r[2]
-    linear[0, 2] -= 0.5 * r[1]
-    linear[1, 0] -= 0.5 * r[2]
-    linear[1, 2] += 0.5 * r[0]
-    linear[2, 0] += 0.5 * r[1]
-    linear[2, 1] -= 0.5 * r[0]
-    return r
+    rest = 1.0 - b * (r0 * r0 + r1 * r1 + r2 * r2)
+    linear[0, 0], linear[0, 1], linear[0, 2] = rest + b * r0 * r0, b * r0 * r1 + 0.5 * r2, b * r0 * r2 - 0.5 * r1
+    linear[1, 0], linear[1, 1], linear[1, 2] = b * r1 * r0 - 0.5 * r2, rest + b * r1 * r1, b * r1 * r2 + 0.5 * r0
+    linear[2, 0], linear[2, 1], linear[2, 2] = b * r2 * r0 + 0.5 * r1, b * r2 * r1 - 0.5 * r0, rest + b * r2 * r2
 
 
 @njit(**_COMPILE)
-def _twist(quaternion, k, linear):  # type: ignore[no-untyped-def]
-    """Twist about e_k in component k of a (3,) vector, and its derivative to ω in row k of `linear`."""
-    r = np.zeros(3)
-    w, v = quaternion[0], quaternion[1:]
-    r[k] = 2.0 * np.arctan2(v[k], w)
-    square = max(w * w + v[k] * v[k], _SMALL)
-    i, j = (k + 1) % 3, (k + 2) % 3
+def _twist(quaternion, k, residual, linear):  # type: ignore[no-untyped-def]
+    """Twist about e_k into residual[3 + k], and its derivative to ω into row k of `linear`."""
+    w, i, j = quaternion[0], (k + 1) % 3, (k + 2) % 3
+    vk, vi, vj = quaternion[1 + k], quaternion[1 + i], quaternion[1 + j]
+    residual[3 + k] = 2.0 * np.arctan2(vk, w)
+    square = max(w * w + vk * vk, _SMALL)
     # q̇ = ½ ω ⊗ q, so ẇ = −½ ω·v and v̇_k = ½ (w ω_k + (ω × v)_k) with (ω × v)_k = ω_i v_j − ω_j v_i
-    linear[k, k] = (w * w + v[k] * v[k]) / square
-    linear[k, i] = (w * v[j] + v[k] * v[i]) / square
-    linear[k, j] = (-w * v[i] + v[k] * v[j]) / square
-    return r
+    linear[k, k] = (w * w + vk * vk) / square
+    linear[k, i] = (w * vj + vk * vi) / square
+    linear[k, j] = (-w * vi + vk * vj) / square
 
 
 @njit(**_COMPILE)
@@ -140,21 +137,17 @@ def residual_of(held, reference_position, reference_rotation, position, rotation
             rotation[1, 0] * v0 + rotation[1, 1] * v1 + rotation[1, 2] * v2,
             rotation[2, 0] * v0 + rotation[2, 1] * v1 + rotation[2, 2] * v2,
         )
-        _swing(w, free, residual[3:], linear)
+        _swing(w, free, residual, linear)
         return
-    e = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                e[i, j] += rotation[i, k] * reference_rotation[j, k]
+    quaternion = _quaternion(rotation, reference_rotation)
     if count == 3:
-        residual[3:] = _rotation_vector(_quaternion(e), linear)
-    else:
-        axis = 0
-        for i in range(3):
-            if held[3 + i]:
-                axis = i
-        residual[3:] = _twist(_quaternion(e), axis, linear)
+        _rotation_vector(quaternion, residual, linear)
+        return
+    axis = 0
+    for i in range(3):
+        if held[3 + i]:
+            axis = i
+    _twist(quaternion, axis, residual, linear)
 
 
 @njit(**_COMPILE)

@@ -19,10 +19,24 @@ class ConstraintError(ValueError):
 
 @dataclass(frozen=True)
 class Pose:
-    """A tool pose in the base frame: position (3,) [m] and rotation (3, 3)."""
+    """A tool pose in the base frame: position (3,) [m] and rotation (3, 3).
+
+    Raises ConstraintError if the numbers are not finite, too few or too many, or the rotation is none.
+    """
 
     position: Float[np.ndarray, "3"]
     rotation: Float[np.ndarray, "3 3"]
+
+    def __post_init__(self) -> None:
+        position, rotation = (np.array(values, dtype=np.float64) for values in (self.position, self.rotation))
+        if position.shape != (3,) or not np.isfinite(position).all():
+            raise ConstraintError(f"position = {self.position}: must be 3 finite numbers [m]")
+        if rotation.shape != (3, 3) or not np.isfinite(rotation).all():
+            raise ConstraintError(f"rotation has shape {rotation.shape}: must be (3, 3), finite")
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0.0:
+            raise ConstraintError(f"rotation = {rotation.tolist()}: must be orthonormal and right-handed")
+        object.__setattr__(self, "position", position)
+        object.__setattr__(self, "rotation", rotation)
 
     @classmethod
     def from_rpy(cls, position_m: Sequence[float], rpy_rad: Sequence[float]) -> Self:

@@ -10,7 +10,8 @@ from jaxtyping import Float
 
 from constraint_geodesics.evaluation.geodesic_search import SeedLog
 from constraint_geodesics.geodesics.environment import begin
-from constraint_geodesics.geodesics.policy_search import TrainedPolicy, episode_settings, follow, train_policy
+from constraint_geodesics.geodesics.episodes import episode_settings
+from constraint_geodesics.geodesics.policy_search import TrainedPolicy, follow, train_policy
 from constraint_geodesics.geodesics.problem import Box, ChartProblem, Ends, repeated
 from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
 from constraint_geodesics.geometry.curves import CurveFamily, PinnedPolynomial, PinnedSpline

@@ -11,10 +11,11 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
+from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.constraints.submanifold import GraphSubmanifold, Submanifold, component_of
 from constraint_geodesics.constraints.vector import ConstraintManifold
-from constraint_geodesics.evaluation.metrics import Free, PathMeasures, measure_path
+from constraint_geodesics.evaluation.metrics import Free, PathMeasures, judge_limits, measure_path
 from constraint_geodesics.geodesics.policy_search import (
     TrainedPolicy,
     save_policy,
@@ -22,7 +23,7 @@ from constraint_geodesics.geodesics.policy_search import (
     search_at_random,
     train_policy,
 )
-from constraint_geodesics.geodesics.problem import Ends, Geodesic, LearnedProblem
+from constraint_geodesics.geodesics.problem import Ends, Geodesic, LearnedProblem, ProblemSet
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.dataset import Queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
@@ -56,6 +57,8 @@ class SeedTask:
     seed: int
     scratch: Path
     run: AbstractContextManager[SeedLog]
+    policy: TrainedPolicy | None = None
+    """A policy trained before, on all constraints together for example; None trains one on this problem."""
 
 
 @dataclass(frozen=True)
@@ -82,15 +85,32 @@ class SeedResult:
         }
 
 
+@dataclass(frozen=True)
+class TrainingTask:
+    """One seed of a policy for several constraints; picklable."""
+
+    problem: ProblemSet
+    params: GeodesicParams
+    seed: int
+    scratch: Path
+    run: AbstractContextManager[SeedLog]
+
+
+def train_seed(task: TrainingTask) -> TrainedPolicy:
+    """Train one policy."""
+    with task.run as run:
+        return train_policy(task.problem, task.params, task.seed, task.scratch, run.log)
+
+
 def run_seed(task: SeedTask) -> SeedResult:
     """Train one policy, search every query's geodesic with it and, as a control, without it; measure what was found."""
     with task.run as run:
-        policy = train_policy(task.problem, task.params, task.seed, task.scratch, run.log)
+        policy = task.policy or train_policy(task.problem, task.params, task.seed, task.scratch, run.log)
     rows, paths, coefficients = [], [], []
-    with task.scene.world() as world:
+    with Certifier(task.scene, judge_limits(task.judge)) as certifier:
         for query in range(len(task.queries)):
             ends = query_ends(task.problem, task.queries, query)
-            accept = exact_check(task, ends, world.free)
+            accept = exact_check(task, ends, certifier)
             for planner in (PLANNER, RANDOM):
                 if not task.connected[query]:
                     found = Geodesic.nothing("not_connected", task.problem.curve, ends.z_start[0], ends.z_goal[0])
@@ -98,7 +118,7 @@ def run_seed(task: SeedTask) -> SeedResult:
                     found = search(task.problem, policy.actor, task.params, ends, task.seed, accept)
                 else:
                     found = search_at_random(task.problem, task.params, ends, task.seed, accept)
-                row, path = measured(task, found, ends, world.free)
+                row, path = measured(task, found, ends, certifier)
                 row["time_s"] += task.connection_s[query]
                 rows.append({"planner": planner, "query": query, "seed": task.seed, **row})
                 paths.append(path)
@@ -111,14 +131,14 @@ def straight_rows(task: SeedTask) -> tuple[list[dict[str, Any]], list[Float[np.n
     """The same rows and paths for the straight latent line, no policy: what policy search has to beat."""
     phi = np.zeros(task.problem.curve.coefficients)
     rows, paths = [], []
-    with task.scene.world() as world:
+    with Certifier(task.scene, judge_limits(task.judge)) as certifier:
         for query in range(len(task.queries)):
             ends = query_ends(task.problem, task.queries, query)
             length = float(task.problem.evaluate(phi[None], ends).length[0])
             found = Geodesic(
                 "converged", task.problem.curve, phi, ends.z_start[0], ends.z_goal[0], length, length, 0, 1, np.nan
             )
-            row, path = measured(task, found, ends, world.free)
+            row, path = measured(task, found, ends, certifier)
             rows.append({"planner": STRAIGHT, "query": query, "seed": 0, **row})
             paths.append(path)
     return rows, paths
@@ -152,38 +172,51 @@ def geodesic_problem(
     return LearnedProblem(chart, manifold, curve, joints, geodesics.length_degree, retract, weight)
 
 
+def shared_problem(
+    params: Params, chart: LearnedManifold, manifolds: Mapping[str, ConstraintManifold],
+    joints: Mapping[str, Float[np.ndarray, "n D"]], name: str,
+) -> ProblemSet:  # fmt: skip
+    """One problem of all the given constraints on the learned manifold `name`: what a single policy is trained on.
+
+    manifolds, joints: of each constraint, under the same names.
+    """
+    return ProblemSet(tuple(geodesic_problem(params, chart, manifolds[each], joints[each], name) for each in manifolds))
+
+
 def query_ends(problem: LearnedProblem, queries: Queries, query: int) -> Ends:
     """One query as ends of a batch of one."""
     return problem.ends(queries.starts[query][None], queries.goals[query][None])
 
 
-def exact_check(task: SeedTask, ends: Ends, free: Free) -> Callable[[np.ndarray], bool]:
+def exact_check(task: SeedTask, ends: Ends, certifier: Certifier) -> Callable[[np.ndarray], bool]:
     """The judge itself as the last check of a candidate; the paper's latent curves are taken as they come."""
 
     def accept(phi: np.ndarray) -> bool:
         if not task.problem.retract:
             return True
         path = task.problem.path(phi, ends, task.judge.row_spacing_rad)
-        return judged(task, path, ends, free).valid
+        return certifier.certify(path, task.problem.manifold.constraint, ends.q_start[0], ends.q_goal[0]).valid
 
     return accept
 
 
-def judged(task: SeedTask, path: np.ndarray, ends: Ends, free: Free) -> PathMeasures:
+def judged(task: SeedTask, path: np.ndarray, ends: Ends, certifier: Certifier) -> PathMeasures:
     """The path's measures, with the latent length on the manifold it was searched on."""
     charts = {task.chart_name: task.problem.chart}
-    return measure_path(path, ends.q_start[0], ends.q_goal[0], task.problem.manifold, charts, free, task.judge)
+    return measure_path(
+        path, ends.q_start[0], ends.q_goal[0], task.problem.manifold, charts, certifier, task.judge.spacing_rad
+    )
 
 
 def measured(
-    task: SeedTask, found: Geodesic, ends: Ends, free: Free
+    task: SeedTask, found: Geodesic, ends: Ends, certifier: Certifier
 ) -> tuple[dict[str, Any], Float[np.ndarray, "T D"]]:
     """A result as a row of the table, and its joint path (empty where nothing was found)."""
     empty = np.zeros((0, ends.q_start.shape[1]))
     path = task.problem.path(found.phi, ends, task.judge.row_spacing_rad) if found.found else empty
     status = "solved" if found.found else found.status
     row = {"status": status, "time_s": found.time_s, "evaluations": found.evaluations}
-    return row | judged(task, path, ends, free).row(), path
+    return row | judged(task, path, ends, certifier).row(), path
 
 
 def save_seeds(

@@ -28,9 +28,10 @@ from constraint_geodesics.evaluation.analytic_search import (
     unseen_pairs,
 )
 from constraint_geodesics.geodesics.environment import CurveEnv, CurveVecEnv, scalar_environments
+from constraint_geodesics.geodesics.episodes import episode_settings
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.graph_search import CombinedSolver, GraphSolver
-from constraint_geodesics.geodesics.policy_search import Actor, PolicySolver, episode_settings, ppo_model
+from constraint_geodesics.geodesics.policy_search import Actor, PolicySolver, ppo_model
 from constraint_geodesics.geodesics.problem import ChartProblem, Ends, GeodesicProblem, GeodesicSolver, LearnedProblem
 from constraint_geodesics.geodesics.solver import geodesics_between
 from constraint_geodesics.geometry.curves import CurveFamily

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.lift import as_executed
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.constraints.vector import ConstraintManifold
-from constraint_geodesics.evaluation.metrics import measure_path
+from constraint_geodesics.evaluation.metrics import judge_limits, measure_path
 from constraint_geodesics.learning.dataset import Queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import BenchmarkParams, JudgeParams
@@ -48,15 +49,15 @@ def run_planner(task: PlannerTask) -> PlannerResult:
         queries.starts, queries.goals, task.seed,
     )  # fmt: skip
     rows, paths = [], []
-    with scene.world() as world:
+    with Certifier(scene, judge_limits(task.judge)) as certifier:
         for query, path in enumerate(planned):
             began = time.perf_counter()
             joints = as_executed(task.manifold, path.joints, task.judge.row_spacing_rad)
             refining_s = time.perf_counter() - began
             paths.append(joints)
             measures = measure_path(
-                joints, queries.starts[query], queries.goals[query], task.manifold, task.charts, world.free,
-                task.judge,
+                joints, queries.starts[query], queries.goals[query], task.manifold, task.charts, certifier,
+                task.judge.spacing_rad,
             )  # fmt: skip
             found = {"status": path.status, "time_s": path.time_s + refining_s, "evaluations": path.iterations}
             rows.append({"planner": task.planner, "query": query, "seed": task.seed, **found, **measures.row()})

@@ -21,12 +21,13 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch import Tensor, nn
 
-from constraint_geodesics.geodesics.environment import (
+from constraint_geodesics.geodesics.environment import CurveVecEnv
+from constraint_geodesics.geodesics.episodes import (
     CurveStates,
-    CurveVecEnv,
     EpisodeSettings,
     advance,
     begin,
+    episode_settings,
     observation_size,
     observe,
 )
@@ -83,11 +84,6 @@ class TrainedPolicy:
 
     actor: Actor
     curve: list[dict[str, float]]
-
-
-def episode_settings(params: GeodesicParams) -> EpisodeSettings:
-    """How episodes run."""
-    return EpisodeSettings(params.episode_steps, params.ppo.action_scale, params.reward)
 
 
 def train_policy(

@@ -1,19 +1,21 @@
 """What a geodesic solver is asked and what it answers: ends, the cost of curves between them, the result."""
 
-from dataclasses import dataclass, field
-from functools import cache
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from typing import Any, Literal, Protocol
 
 import joblib
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from constraint_geodesics.constraints.lift import as_executed, correct_and_retract, densify, jump_excess
+from constraint_geodesics.constraints.lift import Lifted, as_executed, correct_and_retract, densify, jump_excess
 from constraint_geodesics.constraints.retraction import Retraction
 from constraint_geodesics.constraints.vector import ConstraintManifold
+from constraint_geodesics.geodesics.pull_kernels import tangential_pull
 from constraint_geodesics.geometry.curves import CurveFamily, PinnedPolynomial
-from constraint_geodesics.geometry.length import Collocation, estimate_length
+from constraint_geodesics.geometry.length import Collocation, Quadrature, estimate_length
 from constraint_geodesics.geometry.manifold import BoundedManifold, GeometryError, Manifold, require_inside
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 
@@ -25,6 +27,16 @@ INSIDE_POINTS = 1025
 """Points of a curve that are looked up to tell whether it stays inside a bounded manifold."""
 JUMP_WEIGHT = 2.0
 """Cost of a radian of a jump, beyond its length: a jump must never pay for a shorter curve."""
+SHOWN_NODES = 3
+"""Inner configurations of a curve that a policy sees."""
+PRIOR_POINTS = 256
+"""Latent points that the decoder's mean Jacobian is taken over."""
+LEAST_SINGULAR = 0.2
+"""Smallest singular value of the decoder's mean Jacobian that is inverted, as a share of the largest."""
+LONGEST_DESCENT = 0.5
+"""Longest step of the descent, in units of the ends' distance: at a jump the pull has no scale."""
+SEEN_TOLERANCE = 0.2
+"""Tolerance [rad or m] that a policy sees as 1."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +47,15 @@ class Ends:
     z_goal: Float[np.ndarray, "B N"]
     q_start: Float[np.ndarray, "B D"]
     q_goal: Float[np.ndarray, "B D"]
+    member: Int[np.ndarray, "B"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Which problem of a `ProblemSet` each pair belongs to; 0 unless given."""
+
+    def __post_init__(self) -> None:
+        if len(self.member) != len(self.z_start):
+            object.__setattr__(self, "member", np.zeros(len(self.z_start), dtype=np.int64))
 
     def __getitem__(self, rows: np.ndarray) -> "Ends":
-        return Ends(self.z_start[rows], self.z_goal[rows], self.q_start[rows], self.q_goal[rows])
+        return Ends(*(values[rows] for values in vars(self).values()))
 
     def __len__(self) -> int:
         return len(self.z_start)
@@ -69,6 +87,19 @@ class Costs:
     feasible: Bool[np.ndarray, "B"]
 
 
+@dataclass(frozen=True)
+class Look:
+    """What a policy sees of B curves beside their coefficients.
+
+    descent: the step that a preconditioned descent of the energy would take, in the chart's unit; no columns where a
+    problem has none.  features: numbers of order 1, the same in number for every problem of a class.
+    """
+
+    costs: Costs
+    descent: Float[np.ndarray, "B d"]
+    features: Float[np.ndarray, "B f"]
+
+
 class GeodesicProblem(Protocol):
     """Curves between any two ends of one manifold, and what they cost."""
 
@@ -79,6 +110,10 @@ class GeodesicProblem(Protocol):
 
     def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
         """Cost of the curves with coefficients phi."""
+        ...
+
+    def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:
+        """The same costs with what else a policy sees of these curves."""
         ...
 
     def sample_ends(self, count: int, rng: np.random.Generator) -> Ends:
@@ -193,6 +228,10 @@ class ChartProblem:
             length = estimate_length(self.manifold, self.curve, free, start, goal).length.numpy()
         return Costs(length, length, np.isfinite(length) & self.stays_inside(phi, ends))
 
+    def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:
+        """Costs alone."""
+        return Look(self.evaluate(phi, ends), np.zeros((len(phi), 0)), np.zeros((len(phi), 0)))
+
     def stays_inside(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Bool[np.ndarray, "B"]:
         """Whether all of INSIDE_POINTS points of each curve belong to the manifold."""
         if not isinstance(self.manifold, BoundedManifold):
@@ -265,23 +304,118 @@ class LearnedProblem:
 
         The cost holds the length's error estimate too: a curve must not look short because its length is not known.
         """
-        rule = _rule(self.degree)
-        t = rule.times.numpy()
-        embedded = self.chart.embed_points(self.latent_points(phi, ends, t))
+        decoded, deviation = self._decoded(phi, ends)
+        return self._costs(self._lifted(decoded, ends), decoded, deviation)
+
+    def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:
+        """Costs, descent and features; both describe the constraint by what it does to the curve.
+
+        descent: K⁻¹ ∫ (J̄⁺ P q̈) b_k dt in the chart, with P the projector on the tangent space of the constraint
+        (`tangential_pull`), J̄ the decoder's mean Jacobian and K_jk = ∫ ḃ_j ḃ_k dt.
+        features: whether the curve is not feasible; jumps, and what lies outside the limits, as the coefficients that
+        would follow them (2 p); their sizes and what the retraction left (3); configurations at SHOWN_NODES inner
+        times [π rad]; the constraint's axes (6) and tolerances (6) [SEEN_TOLERANCE].
+        Where curves are not retracted there are costs alone: what counts there is the whole embedding.
+        """
+        if not self.retract:
+            return Look(self.evaluate(phi, ends), np.zeros((len(phi), 0)), np.zeros((len(phi), 0)))
+        decoded, deviation = self._decoded(phi, ends)
+        lifted = self._lifted(decoded, ends)
+        constraint = np.broadcast_to(self._constraint, (len(phi), 12))
+        costs = self._costs(lifted, decoded, deviation)
+        return self._look(costs, lifted, self._pulls(lifted.joints), constraint, ends)
+
+    def _decoded(
+        self, phi: Float[np.ndarray, "B p"], ends: Ends
+    ) -> tuple[Float[np.ndarray, "B S D"], Float[np.ndarray, "B S D"]]:
+        """Decoder mean and deviation along the curves, at the times lengths are measured with [rad]."""
+        embedded = self.chart.embed_points(self.latent_points(phi, ends, _rule(self.degree).times.numpy()))
         dof = self.manifold.robot.dof
-        decoded, deviation = embedded[..., :dof].astype(np.float64), embedded[..., dof:]
-        retraction = self.retraction if self.retract else None
-        lifted = correct_and_retract(self.manifold, decoded, t, ends.q_start, ends.q_goal, retraction)
+        return embedded[..., :dof].astype(np.float64), embedded[..., dof:]
+
+    def _lifted(self, decoded: Float[np.ndarray, "B S D"], ends: Ends) -> Lifted:
+        t, retraction = _rule(self.degree).times.numpy(), self.retraction if self.retract else None
+        return correct_and_retract(self.manifold, decoded, t, ends.q_start, ends.q_goal, retraction)
+
+    def _costs(
+        self, lifted: Lifted, decoded: Float[np.ndarray, "B S D"], deviation: Float[np.ndarray, "B S D"]
+    ) -> Costs:
+        rule = _rule(self.degree)
         shape = np.concatenate([lifted.joints if self.retract else decoded, deviation], axis=-1, dtype=np.float32)
         length, error = _length_and_error(rule, shape)
         outside = -np.minimum(self.manifold.robot.limit_distance(lifted.joints), 0.0).sum(-1)
         if not self.retract:
             cost = (length + error) * (1.0 + self.inclusion_weight * self.manifold.violation(decoded).mean(-1))
             return Costs(length, cost + outside, outside == 0.0)
-        excess = jump_excess(lifted.joints, t)
+        excess = jump_excess(lifted.joints, rule.times.numpy())
         left = lifted.violation.max(axis=-1)
         cost = length + error + JUMP_WEIGHT * excess + outside + left
         return Costs(length, cost, (excess == 0.0) & (outside == 0.0) & (left <= 10 * self.retraction.accuracy))
+
+    def _pulls(self, joints: Float[np.ndarray, "B S D"]) -> Float[np.ndarray, "B S D"]:
+        manifold, robot = self.manifold, self.manifold.robot
+        pulls = np.empty_like(joints)
+        tangential_pull(
+            robot.chain.arrays, manifold.held, manifold.tolerance, *manifold.reference_arrays,
+            robot.lower, robot.upper, 2 * self.retraction.accuracy, _rule(self.degree).times.numpy(), joints, pulls,
+        )  # fmt: skip
+        return pulls
+
+    def _look(
+        self, costs: Costs, lifted: Lifted, pulls: Float[np.ndarray, "B S D"], constraint: Float[np.ndarray, "B 12"],
+        ends: Ends,
+    ) -> Look:  # fmt: skip
+        t, (basis, between) = _rule(self.degree).times.numpy(), self._bases
+        robot, joints, far = self.manifold.robot, lifted.joints, ends.distance[:, None]
+        descent = self._coefficients(pulls, basis)
+        size = np.linalg.norm(descent, axis=1, keepdims=True)
+        descent *= np.minimum(1.0, LONGEST_DESCENT * far / np.maximum(size, 1e-12))
+        steps = np.diff(joints, axis=1)
+        lengths = np.linalg.norm(steps, axis=-1)
+        excess = np.maximum(lengths - allowed_steps(joints, t), 0.0)
+        jump = self._coefficients(steps * (excess / np.maximum(lengths, 1e-12))[..., None], between) / far
+        over = np.maximum(joints - robot.upper, 0.0) + np.minimum(joints - robot.lower, 0.0)
+        outside = self._coefficients(over, basis) / far
+        sizes = np.stack([excess.sum(1), np.abs(over).sum((1, 2)), lifted.violation.max(1)], axis=1)
+        shown = joints[:, np.linspace(0, len(t) - 1, SHOWN_NODES + 2).round().astype(int)[1:-1]]
+        seen = (
+            ~costs.feasible[:, None], np.clip(jump, -3.0, 3.0), np.clip(outside, -3.0, 3.0), np.log1p(sizes),
+            shown.reshape(len(joints), -1) / np.pi, constraint,
+        )  # fmt: skip
+        return Look(costs, descent, np.concatenate(seen, axis=1))
+
+    def _coefficients(
+        self, joints: Float[np.ndarray, "B S D"], basis: Float[np.ndarray, "S m"]
+    ) -> Float[np.ndarray, "B p"]:
+        """Σ_s J̄⁺ q_s b_k(t_s), preconditioned by K⁻¹, as coefficients of the family."""
+        weights = basis @ self._stiffness
+        summed = (joints.transpose(0, 2, 1) @ weights).transpose(0, 2, 1) @ self._to_latent.T
+        return summed.transpose(0, 2, 1).reshape(len(joints), -1)
+
+    @cached_property
+    def _bases(self) -> tuple[Float[np.ndarray, "S m"], Float[np.ndarray, "S-1 m"]]:
+        """b_k at the times lengths are measured with, and halfway between them."""
+        t = _rule(self.degree).times
+        return self.curve.basis(t).numpy(), self.curve.basis(0.5 * (t[1:] + t[:-1])).numpy()
+
+    @cached_property
+    def _stiffness(self) -> Float[np.ndarray, "m m"]:
+        """K⁻¹."""
+        rule = Quadrature.gauss_legendre(10, self.curve.breaks)
+        slopes = self.curve.basis_derivative(rule.nodes)
+        return torch.linalg.inv(slopes.mT @ (rule.weights[:, None] * slopes)).numpy()
+
+    @cached_property
+    def _to_latent(self) -> Float[np.ndarray, "N D"]:
+        """J̄⁺: the decoder is so close to linear that one Jacobian serves."""
+        z = np.random.default_rng(0).normal(size=(PRIOR_POINTS, self.chart.dim))
+        jacobian = torch.func.vmap(torch.func.jacfwd(self.chart.vae.mean))(self.chart.tensor(z))
+        # directions that the decoder hardly answers to would take all of the step
+        return np.linalg.pinv(jacobian.mean(0).double().numpy(), rcond=LEAST_SINGULAR)
+
+    @cached_property
+    def _constraint(self) -> Float[np.ndarray, "12"]:
+        return np.concatenate([self.manifold.held, self.manifold.tolerance / SEEN_TOLERANCE])
 
     def latent_points(
         self, phi: Float[np.ndarray, "B p"], ends: Ends, t: Float[np.ndarray, "T"]
@@ -331,6 +465,85 @@ class LearnedProblem:
         settings = (self.curve, self.degree, self.retract, self.inclusion_weight, self.retraction)
         chain = self.manifold.robot.chain.arrays
         return str(joblib.hash((weights, chain, vars(self.manifold.constraint), self.joints, settings)))
+
+
+def allowed_steps(joints: Float[np.ndarray, "B S D"], t: Float[np.ndarray, "S"]) -> Float[np.ndarray, "B S-1"]:
+    """Longest steps [rad] of curves that do not jump, as `jump_excess` has them."""
+    direct = np.linalg.norm(joints[:, -1] - joints[:, 0], axis=-1)
+    return 0.05 + 4.0 * direct[:, None] * np.diff(t)
+
+
+@dataclass(frozen=True)
+class ProblemSet:
+    """Several constraints on one learned manifold as one problem: each pair of ends belongs to one member.
+
+    Rows are decoded and priced together; only the retraction and the pull go by members.
+    Raises GeometryError if the members differ in anything but the constraint and its data, or do not retract.
+    """
+
+    members: Sequence[LearnedProblem]
+
+    def __post_init__(self) -> None:
+        first = self.members[0]
+        for member in self.members:
+            same = replace(member, manifold=first.manifold, joints=first.joints) == first
+            if not (same and member.retract and member.manifold.robot is first.manifold.robot):
+                raise GeometryError(
+                    "members of a problem set differ in more than constraint and data, or do not retract"
+                )
+
+    @property
+    def curve(self) -> CurveFamily:
+        """The family of all members."""
+        return self.members[0].curve
+
+    def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
+        """Each row as its member measures it."""
+        first = self.members[0]
+        decoded, deviation = first._decoded(phi, ends)
+        return first._costs(self._lifted(decoded, ends), decoded, deviation)
+
+    def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:
+        """Each row as its member sees it."""
+        first = self.members[0]
+        decoded, deviation = first._decoded(phi, ends)
+        lifted = self._lifted(decoded, ends)
+        pulls = np.empty_like(decoded)
+        for member, rows in self._rows(ends):
+            pulls[rows] = member._pulls(lifted.joints[rows])
+        constraint = np.stack([member._constraint for member in self.members])[ends.member]
+        return first._look(first._costs(lifted, decoded, deviation), lifted, pulls, constraint, ends)
+
+    def _lifted(self, decoded: Float[np.ndarray, "B S D"], ends: Ends) -> Lifted:
+        lifted = Lifted(np.empty_like(decoded), np.empty(decoded.shape[:2]))
+        for member, rows in self._rows(ends):
+            part = member._lifted(decoded[rows], ends[rows])
+            lifted.joints[rows], lifted.violation[rows] = part.joints, part.violation
+        return lifted
+
+    def sample_ends(self, count: int, rng: np.random.Generator) -> Ends:
+        """Ends of members drawn evenly."""
+        chosen = rng.integers(len(self.members), size=count)
+        joints = np.empty((2, count, self.members[0].manifold.robot.dof))
+        for k, member in enumerate(self.members):
+            rows = np.flatnonzero(chosen == k)
+            joints[:, rows] = member.joints[rng.integers(len(member.joints), size=(2, len(rows)))]
+        return replace(self.members[0].ends(*joints), member=chosen)
+
+    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
+        """Each curve as its member draws it."""
+        phi = np.empty((len(ends), self.curve.coefficients))
+        for member, rows in self._rows(ends):
+            phi[rows] = member.sample_curves(ends[rows], rng)
+        return phi
+
+    def fingerprint(self) -> str:
+        """Of all members."""
+        return str(joblib.hash([member.fingerprint() for member in self.members]))
+
+    def _rows(self, ends: Ends) -> list[tuple[LearnedProblem, Int[np.ndarray, "b"]]]:
+        rows = [np.flatnonzero(ends.member == k) for k in range(len(self.members))]
+        return [(member, r) for member, r in zip(self.members, rows, strict=True) if len(r)]
 
 
 def bent_halfway(curve: CurveFamily, bend: Float[np.ndarray, "B N"]) -> Float[np.ndarray, "B p"]:

@@ -3,6 +3,8 @@
 import copy
 import hashlib
 import json
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,16 +16,11 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from constraint_geodesics.geometry.manifold import pullback_metric
+from constraint_geodesics.learning.files import CARD, WEIGHTS, ManifoldFileError
 from constraint_geodesics.learning.vae import JointVae
 
 PIECE = 1024
 """Points embedded at once: the temporaries of many more leave the processor's cache."""
-
-WEIGHTS, CARD = "weights.safetensors", "manifold.json"
-
-
-class ManifoldFileError(ValueError):
-    """A saved manifold that is missing, incomplete or altered; the message names the file."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +94,18 @@ class LearnedManifold:
             "sha256": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest(),
         }
         (folder / CARD).write_text(json.dumps(card, indent=2, sort_keys=True) + "\n")
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> "LearnedManifold":
+        """From the arrays of a network's state, whose shapes say how large it is."""
+        layers = sorted(
+            int(name.split(".")[2]) for name in arrays if re.fullmatch(r"encoder\.nonlinear\.\d+\.bias", name)
+        )
+        hidden = [len(arrays[f"encoder.nonlinear.{layer}.bias"]) for layer in layers[:-1]]
+        centres, latent_dim = arrays["precision.centres"].shape
+        vae = JointVae(len(arrays["centre"]), latent_dim, hidden, centres)
+        vae.load_state_dict({name: torch.from_numpy(np.array(values)) for name, values in arrays.items()})
+        return cls(vae.eval().requires_grad_(False))
 
     @classmethod
     def load(cls, folder: Path) -> "LearnedManifold":

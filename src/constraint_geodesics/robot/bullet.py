@@ -204,7 +204,8 @@ class World:
         frames = _joint_frames(self.robot)
         found = []
         for link, index in sorted(self._link_index.items(), key=lambda item: item[1]):
-            points = np.array(bullet.getMeshData(body, index, physicsClientId=client)[1]).reshape(-1, 3)
+            shapes = bullet.getCollisionShapeData(body, index, physicsClientId=client)
+            points = np.concatenate([np.empty((0, 3)), *(self._corners(index, shape) for shape in shapes)])
             if not len(points) or index < 0:
                 continue
             state = bullet.getLinkState(body, index, computeForwardKinematics=1, physicsClientId=client)
@@ -214,6 +215,32 @@ class World:
             in_base = points @ rotation.T + state[0]
             found.append(LinkHull(link, joint, in_base @ pose[:3, :3].T + pose[:3, 3]))
         return found
+
+    def _corners(self, link: int, shape: tuple) -> Float[np.ndarray, "n 3"]:
+        """Outermost points of one collision shape in the link's inertial frame; those of a round one are many."""
+        bullet = self._bullet
+        kind, size = shape[2], np.array(shape[3])
+        if kind == bullet.GEOM_MESH:
+            with _quiet():
+                mesh = bullet.getMeshData(self._body, link, physicsClientId=self._client)[1]
+            if mesh:  # of a link with one shape; it is in the inertial frame already
+                return np.array(mesh).reshape(-1, 3)
+            points = _mesh_vertices(Path(shape[4].decode())) * size
+        elif kind == bullet.GEOM_BOX:
+            points = 0.5 * size * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        elif kind == bullet.GEOM_SPHERE:
+            points = size[0] * _directions(96)
+        elif kind == bullet.GEOM_CYLINDER:
+            turn = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
+            rim = size[1] * np.stack([np.cos(turn), np.sin(turn), np.zeros(32)], axis=1)
+            points = np.concatenate([rim + np.array([0.0, 0.0, z]) for z in (-0.5 * size[0], 0.5 * size[0])])
+        elif kind == bullet.GEOM_CAPSULE:
+            ball = size[1] * _directions(96)
+            points = np.concatenate([ball + np.array([0.0, 0.0, z]) for z in (-0.5 * size[0], 0.5 * size[0])])
+        else:
+            return np.empty((0, 3))
+        rotation = np.array(bullet.getMatrixFromQuaternion(shape[6])).reshape(3, 3)
+        return points @ rotation.T + shape[5]
 
     def _carrier(self, link: int) -> int:
         """Which joint of the chain moves a link last; -1 for none."""
@@ -262,6 +289,22 @@ class World:
         if unknown:
             raise ValueError(f"workcell {body.name!r}: {unknown} are not links of {self.robot.name}")
         return frozenset(self._link_index[name] for name in body.exempt_links)
+
+
+def _mesh_vertices(file: Path) -> Float[np.ndarray, "n 3"]:
+    """Vertices of an OBJ file; none of another kind of file."""
+    if file.suffix.lower() != ".obj" or not file.is_file():
+        return np.empty((0, 3))
+    rows = [line.split()[1:4] for line in file.read_text(errors="replace").splitlines() if line.startswith("v ")]
+    return np.array(rows, float).reshape(-1, 3)
+
+
+def _directions(count: int) -> Float[np.ndarray, "count 3"]:
+    """Evenly spread unit vectors (Fibonacci's lattice)."""
+    k = np.arange(count) + 0.5
+    height, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + np.sqrt(5.0)) * k
+    width = np.sqrt(1.0 - height**2)
+    return np.stack([width * np.cos(turn), width * np.sin(turn), height], axis=1)
 
 
 def _joint_frames(robot: SerialRobot) -> list[Float[np.ndarray, "4 4"]]:

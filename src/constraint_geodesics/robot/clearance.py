@@ -62,6 +62,9 @@ def clearance_model(robot: SerialRobot, workcell: Sequence[Box | Body]) -> Clear
     with World(robot) as world:
         hulls = world.hulls()
     kept = [(hull.joint, outermost(hull.points)) for hull in hulls if hull.joint >= 0]
+    if not kept:
+        return no_clearance(robot.dof)
+    kept.sort(key=lambda link: link[0])
     exempt = np.zeros((len(boxes), robot.dof), bool)
     for b, box in enumerate(boxes):
         for hull in hulls:

@@ -18,6 +18,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
@@ -217,6 +218,23 @@ def ui_command(root: Path, port: int) -> list[str]:
     quiet = ["env", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false"]
     server = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
     return [*quiet, *server, "--backend-store-uri", uri, "--artifacts-destination", str(artifacts)]
+
+
+@contextmanager
+def fetch_artifacts(address: str, root: Path = Path()) -> Iterator[Path]:
+    """A folder with the files behind an MLflow address (models:/… or runs:/…), gone when the context ends.
+
+    Raises TrackingError if there is no such model or run, or the store can't be reached.
+    """
+    mlflow = _mlflow()
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            found = mlflow.artifacts.download_artifacts(
+                artifact_uri=address, dst_path=folder, tracking_uri=tracking_uri(root)
+            )
+        except (mlflow.exceptions.MlflowException, OSError) as error:
+            raise TrackingError(f"{address}: {' '.join(str(error).split())[:200]}") from None
+        yield Path(found)
 
 
 def _mlflow() -> ModuleType:

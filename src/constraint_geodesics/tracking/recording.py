@@ -1,6 +1,7 @@
 """Rerun recordings: one file a path, with the robot moving, what the constraint says and the curve in latent space.
 
-The only importer of rerun.  A recording holds no wall-clock time, so that equal paths give equal recordings.
+The only importer of rerun, with its second part, execution_recording.py, for which the functions further down without
+an underscore are there.  A recording holds no wall-clock time, so that equal paths give equal recordings.
 """
 
 import contextlib
@@ -24,7 +25,7 @@ from rerun.urdf import UrdfTree
 
 from constraint_geodesics.constraints.vector import AXES, ConstraintManifold
 from constraint_geodesics.robot.bullet import Body, Box
-from constraint_geodesics.robot.kinematics import rotation_from_rpy
+from constraint_geodesics.robot.kinematics import SerialRobot, rotation_from_rpy
 
 APPLICATION = "constraint_geodesics"
 TIMELINE = "frame"
@@ -89,12 +90,16 @@ class RecordingSummary:
 
 
 @dataclass(frozen=True)
-class _Frames:
-    """The path at `frames` points of equal joint arc length."""
+class Frames:
+    """A path as it is shown: joints [rad or m], tool in the base frame [m] and latent point of each frame.
+
+    time: the timeline, with one entry a frame.
+    """
 
     joints: Float[np.ndarray, "frames D"]
     tool: Float[np.ndarray, "frames 3"]
     curve: Float[np.ndarray, "frames 2"] | None
+    time: rr.TimeColumn
 
 
 @dataclass(frozen=True)
@@ -117,21 +122,27 @@ def record_path(
     sampled = _sample(path, manifold, frames)
     series = _series(manifold, sampled.joints)
     chunks = [
-        *_robot_chunks(manifold, sampled),
-        *(chunk for body in workcell for chunk in _workcell_chunks(body)),
-        *_tool_chunks(sampled),
-        *_series_chunks(series),
-        *_joint_chunks(manifold.robot.joint_names, sampled),
+        *robot_chunks(manifold.robot, sampled),
+        *(chunk for body in workcell for chunk in workcell_chunks(body)),
+        *tool_chunks(sampled),
+        *_series_chunks(series, sampled),
+        *joint_chunks(manifold.robot.joint_names, sampled),
         *_latent_chunks(path.latent, sampled),
-        _static("status", rr.TextDocument(path.text, media_type=rr.MediaType.MARKDOWN)),
-        _static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP),
+        static("status", rr.TextDocument(path.text, media_type=rr.MediaType.MARKDOWN)),
+        static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP),
     ]
+    name = f"{path.constraint}, query {path.query}: {path.planner}, seed {path.seed}"
+    write_recording(file, path.recording_id, name, chunks, _blueprint(path, sampled, series))
+
+
+def write_recording(file: Path, recording_id: str, name: str, chunks: Sequence[Chunk], blueprint: Any) -> None:
+    """Write chunks and a blueprint as one recording."""
     file.parent.mkdir(parents=True, exist_ok=True)
     # the properties would hold the time of writing
-    stream = rr.RecordingStream(APPLICATION, recording_id=path.recording_id, send_properties=False)
+    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
     with stream:
-        stream.save(file, default_blueprint=_blueprint(path, sampled, series))
-        stream.send_recording_name(f"{path.constraint}, query {path.query}: {path.planner}, seed {path.seed}")
+        stream.save(file, default_blueprint=blueprint)
+        stream.send_recording_name(name)
         rr.send_chunks(chunks, recording=stream)
 
 
@@ -189,7 +200,8 @@ def open_recordings(files: Sequence[Path], *, web: bool) -> int:
     return subprocess.call(_rerun(*options, *shown))
 
 
-def _sample(path: PathRecord, manifold: ConstraintManifold, frames: int) -> _Frames:
+def _sample(path: PathRecord, manifold: ConstraintManifold, frames: int) -> Frames:
+    """The path at points of equal joint arc length."""
     joints = np.asarray(path.joints, dtype=float)
     name, dof = path.recording_id, manifold.robot.dof
     if joints.ndim != 2 or len(joints) < 2 or joints.shape[1] != dof:
@@ -204,32 +216,36 @@ def _sample(path: PathRecord, manifold: ConstraintManifold, frames: int) -> _Fra
     at = np.linspace(0.0, length[-1], frames)
     sampled = _interpolate(at, length, joints)
     curve = None if path.latent is None else _interpolate(at, length, path.latent.curve)
-    return _Frames(sampled, manifold.robot.forward(sampled)[0], curve)
+    time = rr.TimeColumn(TIMELINE, sequence=range(frames))
+    return Frames(sampled, manifold.robot.forward(sampled)[0], curve, time)
 
 
 def _interpolate(at: np.ndarray, length: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(at, length, column) for column in values.T], axis=1)
 
 
-def _robot_chunks(manifold: ConstraintManifold, sampled: _Frames) -> Iterator[Chunk]:
-    """The robot's visual geometry, its fixed joints, and its moving joints over the timeline."""
-    robot = manifold.robot
+def robot_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
+    """The robot's visual geometry, its fixed joints, and its moving joints over the timeline.
+
+    Raises RecordingError if a mesh is missing.
+    """
     tree, geometry = _load_urdf(robot.urdf, "/robot", None)
     yield from geometry
-    yield _static("transforms/base", rr.Transform3D(parent_frame=_ROOT_FRAME, child_frame=tree.root_link().name))
+    yield static("transforms/base", rr.Transform3D(parent_frame=_ROOT_FRAME, child_frame=tree.root_link().name))
     for joint in tree.joints():
         entity = _entity("transforms", joint.name)
         if joint.name in robot.joint_names:
             values = sampled.joints[:, robot.joint_names.index(joint.name)]
-            yield _moving(entity, joint.compute_transform_columns(values.tolist(), clamp=False))
+            yield moving(entity, joint.compute_transform_columns(values.tolist(), clamp=False), sampled.time)
         else:
-            yield _static(entity, joint.compute_transform(0.0, clamp=False))
+            yield static(entity, joint.compute_transform(0.0, clamp=False))
 
 
-def _workcell_chunks(body: Box | Body) -> Iterator[Chunk]:
+def workcell_chunks(body: Box | Body) -> Iterator[Chunk]:
+    """A body of the workcell at its place.  Raises RecordingError if a mesh is missing."""
     entity = _entity("workcell", body.name)
     if isinstance(body, Box):
-        yield _static(
+        yield static(
             entity,
             rr.Boxes3D(
                 centers=[body.centre], sizes=[body.size], colors=[_BOX], fill_mode="solid",
@@ -239,7 +255,7 @@ def _workcell_chunks(body: Box | Body) -> Iterator[Chunk]:
         return
     tree, geometry = _load_urdf(body.urdf, entity, f"{body.name}/")
     yield from geometry
-    yield _static(
+    yield static(
         _entity("transforms", body.name, "base"),
         rr.Transform3D(
             translation=body.position, mat3x3=rotation_from_rpy(np.array(body.rpy)),
@@ -247,7 +263,7 @@ def _workcell_chunks(body: Box | Body) -> Iterator[Chunk]:
         ),
     )  # fmt: skip
     for joint in tree.joints():
-        yield _static(_entity("transforms", body.name, joint.name), joint.compute_transform(0.0, clamp=False))
+        yield static(_entity("transforms", body.name, joint.name), joint.compute_transform(0.0, clamp=False))
 
 
 def _load_urdf(urdf: Path, entity: str, frame_prefix: str | None) -> tuple[UrdfTree, list[Chunk]]:
@@ -283,14 +299,15 @@ def _package_path(urdf: Path) -> Iterator[None]:
             os.environ[name] = before
 
 
-def _tool_chunks(sampled: _Frames) -> Iterator[Chunk]:
+def tool_chunks(sampled: Frames) -> Iterator[Chunk]:
+    """The tool's trace with its ends, and where it is."""
     tool = sampled.tool
     size = rr.Radius.ui_points
-    yield _static("tool/trace", rr.LineStrips3D([tool], colors=[_TRACE], radii=[size(2.0)]))
+    yield static("tool/trace", rr.LineStrips3D([tool], colors=[_TRACE], radii=[size(2.0)]))
     for name, point, colour in (("start", tool[0], _START), ("goal", tool[-1], _GOAL)):
-        yield _static(f"tool/{name}", rr.Points3D([point], colors=[colour], radii=[size(7.0)], labels=[name]))
-    yield _static("tool/position", rr.Points3D.from_fields(colors=[_NOW], radii=[size(5.0)]))
-    yield _moving("tool/position", rr.Points3D.columns(positions=tool))
+        yield static(f"tool/{name}", rr.Points3D([point], colors=[colour], radii=[size(7.0)], labels=[name]))
+    yield static("tool/position", rr.Points3D.from_fields(colors=[_NOW], radii=[size(5.0)]))
+    yield moving("tool/position", rr.Points3D.columns(positions=tool), sampled.time)
 
 
 def _series(manifold: ConstraintManifold, joints: np.ndarray) -> list[_Series]:
@@ -308,39 +325,40 @@ def _series(manifold: ConstraintManifold, joints: np.ndarray) -> list[_Series]:
     return series
 
 
-def _series_chunks(series: Sequence[_Series]) -> Iterator[Chunk]:
+def _series_chunks(series: Sequence[_Series], sampled: Frames) -> Iterator[Chunk]:
     for one in series:
         entity = _entity("constraint", one.unit, one.name)
         names = [f"{one.name} [{one.unit}]", f"limit of {one.name} [{one.unit}]"]
-        yield _static(entity, rr.SeriesLines(names=names, colors=[_NOW, _GOAL], widths=[2.0, 1.0]))
-        yield _scalars(entity, np.stack([one.values, np.full_like(one.values, one.limit)], axis=1))
+        yield static(entity, rr.SeriesLines(names=names, colors=[_NOW, _GOAL], widths=[2.0, 1.0]))
+        yield scalars(entity, np.stack([one.values, np.full_like(one.values, one.limit)], axis=1), sampled.time)
 
 
-def _joint_chunks(names: Sequence[str], sampled: _Frames) -> Iterator[Chunk]:
-    yield _static("joints", rr.SeriesLines(names=list(names), colors=_colours(np.arange(len(names)))))
-    yield _scalars("joints", sampled.joints)
+def joint_chunks(names: Sequence[str], sampled: Frames) -> Iterator[Chunk]:
+    """Joint positions as series."""
+    yield static("joints", rr.SeriesLines(names=list(names), colors=colours(np.arange(len(names)))))
+    yield scalars("joints", sampled.joints, sampled.time)
 
 
-def _latent_chunks(latent: LatentView | None, sampled: _Frames) -> Iterator[Chunk]:
+def _latent_chunks(latent: LatentView | None, sampled: Frames) -> Iterator[Chunk]:
     if latent is None or sampled.curve is None:
         return
     curve, size = _upright(sampled.curve), rr.Radius.ui_points
     low, high = _latent_bounds(latent)
     # discs that just cover a grid of this many points
     spacing = math.sqrt(float(np.prod(high - low)) / max(len(latent.points), 1))
-    yield _static(
+    yield static(
         "latent/submanifold",
         rr.Points2D(
-            _upright(latent.points), colors=_colours(latent.values), radii=[math.sqrt(0.5) * spacing], draw_order=0.0
+            _upright(latent.points), colors=colours(latent.values), radii=[math.sqrt(0.5) * spacing], draw_order=0.0
         ),
     )
-    yield _static("latent/axes", _axes(low, high, latent.axis_names))
-    yield _static("latent/curve", rr.LineStrips2D([curve], colors=[_INK], radii=[size(2.0)], draw_order=20.0))
+    yield static("latent/axes", _axes(low, high, latent.axis_names))
+    yield static("latent/curve", rr.LineStrips2D([curve], colors=[_INK], radii=[size(2.0)], draw_order=20.0))
     for name, point, colour in (("start", curve[0], _START), ("goal", curve[-1], _GOAL)):
         marker = rr.Points2D([point], colors=[colour], radii=[size(7.0)], labels=[name], draw_order=30.0)
-        yield _static(f"latent/{name}", marker)
-    yield _static("latent/position", rr.Points2D.from_fields(colors=[_INK], radii=[size(5.0)], draw_order=40.0))
-    yield _moving("latent/position", rr.Points2D.columns(positions=curve))
+        yield static(f"latent/{name}", marker)
+    yield static("latent/position", rr.Points2D.from_fields(colors=[_INK], radii=[size(5.0)], draw_order=40.0))
+    yield moving("latent/position", rr.Points2D.columns(positions=curve), sampled.time)
 
 
 def _upright(points: np.ndarray) -> np.ndarray:
@@ -363,7 +381,7 @@ def _latent_bounds(latent: LatentView) -> tuple[np.ndarray, np.ndarray]:
     return low - margin, high + margin
 
 
-def _colours(values: np.ndarray) -> np.ndarray:
+def colours(values: np.ndarray) -> np.ndarray:
     """Colours that the colour-blind can tell apart: one a component for integers, a scale (dark is high) for floats."""
     if np.issubdtype(values.dtype, np.integer):
         palette = np.array([*_PALETTE, _OUTSIDE], dtype=np.uint8)
@@ -374,36 +392,40 @@ def _colours(values: np.ndarray) -> np.ndarray:
     return np.asarray(matplotlib.colormaps["cividis_r"](scaled, bytes=True))[:, :3]
 
 
-def _blueprint(path: PathRecord, sampled: _Frames, series: Sequence[_Series]) -> Any:
-    status = rrb.TextDocumentView(origin="status", name="Status")
+def _blueprint(path: PathRecord, sampled: Frames, series: Sequence[_Series]) -> Any:
     right: list[Any] = [] if path.latent is None else [_latent_panel(path.latent)]
     right += [_series_panel(unit, series) for unit in ("deg", "mm") if any(one.unit == unit for one in series)]
     shares = [2.5 if isinstance(panel, rrb.Spatial2DView) else 1.0 for panel in right]
     right.append(rrb.TimeSeriesView(origin="joints", name="Joint positions [rad or m]"))
     shares.append(1.5)  # its legend names every joint
+    time = rrb.TimePanel(state="collapsed", timeline=TIMELINE, fps=30.0, play_state="playing", loop_mode="all")
+    return arranged(scene_panel(sampled), rrb.Vertical(*right, row_shares=shares), time)
+
+
+def arranged(scene: Any, right: Any, time: Any) -> Any:
+    """The blueprint of a recording: the scene with the status below it, the other panels beside it."""
+    status = rrb.TextDocumentView(origin="status", name="Status")
     return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(_scene_panel(sampled), status, row_shares=[3.0, 1.0]),
-            rrb.Vertical(*right, row_shares=shares),
-            column_shares=[3.0, 2.0],
-        ),
+        rrb.Horizontal(rrb.Vertical(scene, status, row_shares=[3.0, 1.0]), right, column_shares=[3.0, 2.0]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, fps=30.0, play_state="playing", loop_mode="all"),
+        time,
         auto_views=False,
         auto_layout=False,
     )
 
 
-def _scene_panel(sampled: _Frames) -> Any:
+def scene_panel(sampled: Frames, *more: str) -> Any:
+    """The robot in its workcell with its tool's trace, and what lies below more entities."""
     reach = float(np.linalg.norm(sampled.tool, axis=1).max())
     eye = rrb.EyeControls3D(
         position=(1.7 * reach, -1.7 * reach, 1.3 * reach), look_target=(0.0, 0.0, 0.4 * reach), eye_up=(0.0, 0.0, 1.0)
     )
     # a grid at z = 0 would flicker with the top of a table there
     return rrb.Spatial3DView(
-        origin="/", name="Robot", contents=["+ /robot/**", "+ /workcell/**", "+ /tool/**", "+ /transforms/**"],
-        eye_controls=eye, line_grid=rrb.LineGrid3D(visible=False),
+        origin="/", name="Robot", eye_controls=eye,
+        contents=[f"+ /{entity}/**" for entity in ("robot", "workcell", "tool", "transforms", *more)],
+        line_grid=rrb.LineGrid3D(visible=False),
     )  # fmt: skip
 
 
@@ -430,18 +452,20 @@ def _entity(*parts: str) -> str:
     return str(rr.new_entity_path(list(parts)))
 
 
-def _static(entity: str, archetype: Any) -> Chunk:
+def static(entity: str, archetype: Any) -> Chunk:
+    """What an entity has all the time."""
     columns = [batch.partition([len(batch.as_arrow_array())]) for batch in archetype.as_component_batches()]
     return Chunk.from_columns(entity, [], columns)
 
 
-def _moving(entity: str, columns: Any) -> Chunk:
-    frames = len(next(iter(columns)).as_arrow_array())
-    return Chunk.from_columns(entity, [rr.TimeColumn(TIMELINE, sequence=range(frames))], columns)
+def moving(entity: str, columns: Any, time: rr.TimeColumn) -> Chunk:
+    """What an entity has at each frame."""
+    return Chunk.from_columns(entity, [time], columns)
 
 
-def _scalars(entity: str, values: Float[np.ndarray, "frames k"]) -> Chunk:
-    return _moving(entity, rr.Scalars.columns(scalars=values))
+def scalars(entity: str, values: Float[np.ndarray, "frames k"], time: rr.TimeColumn) -> Chunk:
+    """One or more numbers at each frame."""
+    return moving(entity, rr.Scalars.columns(scalars=values), time)
 
 
 def _has(chunk: Chunk, *components: str) -> bool:

@@ -1,0 +1,77 @@
+"""Proposals of trained policies for new queries, with numpy alone: no noise, no random curves, no learning library."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from safetensors.numpy import load_file
+
+from constraint_geodesics.geodesics.episodes import EpisodeSettings, advance, begin, observe
+from constraint_geodesics.geodesics.problem import Ends, GeodesicProblem
+
+
+@dataclass(frozen=True)
+class MeanPolicy:
+    """A policy's mean action as a plain network: tanh layers, then a linear one, on `episodes.observe`.
+
+    layers: weights (out, in) and biases (out,), in their order.
+    """
+
+    layers: tuple[tuple[Float[np.ndarray, "o i"], Float[np.ndarray, "o"]], ...]
+
+    def act(self, observation: Float[np.ndarray, "B o"]) -> Float[np.ndarray, "B p"]:
+        """Mean actions."""
+        hidden = observation
+        for weight, bias in self.layers[:-1]:
+            hidden = np.tanh(hidden @ weight.T + bias)
+        weight, bias = self.layers[-1]
+        return hidden @ weight.T + bias
+
+    @classmethod
+    def load(cls, folder: Path, seed: int) -> "MeanPolicy":
+        """Read what `policy_search.save_policy` wrote."""
+        return cls.from_arrays(load_file(folder / f"policy-{seed}.safetensors"))
+
+    @classmethod
+    def from_arrays(cls, weights: Mapping[str, np.ndarray]) -> "MeanPolicy":
+        """From the actor's state: body.0, body.2, … (a tanh stands between two) and mean."""
+        hidden = sum(name.startswith("body.") and name.endswith(".weight") for name in weights)
+        names = [f"body.{2 * k}" for k in range(hidden)] + ["mean"]
+        return cls(tuple((weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names))
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """The best curve that each of A policies met for each of B queries: feasible if any was, then the cheapest."""
+
+    phi: Float[np.ndarray, "A B p"]
+    cost: Float[np.ndarray, "A B"]
+    feasible: Bool[np.ndarray, "A B"]
+
+    def ranked(self, query: int) -> Float[np.ndarray, "k p"]:
+        """Feasible proposals for one query, cheapest first."""
+        order = np.argsort(self.cost[:, query], kind="stable")
+        return self.phi[order, query][self.feasible[order, query]]
+
+
+def propose(
+    problem: GeodesicProblem, policies: Sequence[MeanPolicy], settings: EpisodeSettings, ends: Ends
+) -> Proposals:
+    """Follow every policy's mean from the straight line for one episode; the straight line is met too."""
+    count, queries = len(policies), len(ends)
+    states = begin(
+        problem, ends[np.tile(np.arange(queries), count)], np.zeros((count * queries, problem.curve.coefficients))
+    )
+    phi, cost, feasible = states.phi, states.cost, states.feasible
+    for _ in range(settings.steps):
+        seen = observe(settings, states).reshape(count, queries, -1)
+        actions = np.concatenate([policy.act(rows) for policy, rows in zip(policies, seen, strict=True)])
+        states, _ = advance(problem, settings, states, actions)
+        better = (states.feasible & ~feasible) | ((states.feasible == feasible) & (states.cost < cost))
+        phi = np.where(better[:, None], states.phi, phi)
+        cost, feasible = np.where(better, states.cost, cost), feasible | states.feasible
+    return Proposals(
+        phi.reshape(count, queries, -1), cost.reshape(count, queries), feasible.reshape(count, queries)
+    )  # fmt: skip

@@ -1,0 +1,262 @@
+"""The project's own planner: proposals of a curve, the shortest of which is refined by an elastic band.
+
+Proposals are tried in the order of what they cost: the straight joint line, curves of the policies on the learned
+manifold, the sub-manifold's graph.  Each is relaxed by Newton's method on the exact constraint; the shortest curve
+that is continuous, within the limits and clear of the workcell's boxes is drawn as rows so close together that the
+straight lines between them keep the constraint, and goes to the caller, who has it certified.
+"""
+
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Literal, Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.constraints.vector import ConstraintManifold
+from constraint_geodesics.geodesics.band import BandCurve, BandSettings, BandSpace, relax
+from constraint_geodesics.geodesics.roadmap import Joined, Roadmap, join, resample, shortest_way
+from constraint_geodesics.planners.path_planner import SATISFIED
+from constraint_geodesics.robot.clearance import ClearanceModel, clearance_batch
+
+Status = Literal["solved", "not_connected", "start_violates", "goal_violates", "out_of_limits", "not_found"]
+Source = Literal["straight", "policy", "graph"]
+
+LIMIT_SLACK = 1e-9
+"""How far beyond a limit an end may lie [rad], by rounding."""
+CHECK_STEP = 0.1
+"""Distance of the points at which a relaxed curve is first looked at [rad]."""
+JUMP = 3.0
+"""A step between two of these points longer than so many times CHECK_STEP is a jump to another branch."""
+ROW_SAFETY = 0.8
+"""Share of the allowed violation between two rows that their distance is chosen for."""
+PARTLY_RELAXED = (3, 1, 0)
+"""Iterations of a band that must stay near the graph."""
+HALVINGS = 8
+"""Times that rows are drawn closer where the lines between them still leave the constraint."""
+LONGEST_ROW_STEP = 0.08
+"""Distance of two rows at most [rad], however flat the path."""
+
+
+class Proposals(Protocol):
+    """Curves proposed for a query, as points (K, n + 1, D) [rad] from start to goal, the most promising first."""
+
+    def __call__(
+        self, manifold: ConstraintManifold, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], points: int
+    ) -> Float[np.ndarray, "K n D"]:
+        """Some curves, each of which need not be continuous."""
+        ...
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Which parts of the planner are switched on; all of them but for an ablation."""
+
+    straight: bool = True
+    policy: bool = True
+    graph: bool = True
+    refinement: bool = True
+
+
+ALL_PARTS = Parts()
+
+
+@dataclass(frozen=True)
+class Task:
+    """One constraint, prepared: the space of its configurations with and without the workcell's boxes, its graph.
+
+    roadmap: the graph, made when it is first asked for; None where there is none.  has_graph: whether it came with
+    the planner.
+    """
+
+    manifold: ConstraintManifold
+    clearance: ClearanceModel
+    roadmap: Callable[[], Roadmap | None]
+    has_graph: bool
+    settings: BandSettings = field(default_factory=BandSettings)
+
+    def __post_init__(self) -> None:
+        space = BandSpace(self.manifold, self.clearance, self.settings.clearance_m)
+        object.__setattr__(self, "clear", space.arrays)
+        object.__setattr__(self, "open", space.without_boxes().arrays)
+
+    clear: tuple = field(init=False, repr=False)
+    open: tuple = field(init=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A curve that looks sound: where it came from, its length [rad], and points about CHECK_STEP apart."""
+
+    source: Source
+    curve: BandCurve
+    length: float
+    shares: Float[np.ndarray, "n"]
+    points: Float[np.ndarray, "n D"]
+    iterations: int
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What `candidates` ended with where nothing was found, and how the ends are joined to the graph."""
+
+    status: Status
+    at_start: Joined | None = None
+    at_goal: Joined | None = None
+
+
+def refusal(task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]) -> Status | None:
+    """Why the ends can't be those of a path, collisions apart; None where they can."""
+    violation = task.manifold.violation(np.stack([start, goal]))
+    if violation[0] > SATISFIED:
+        return "start_violates"
+    if violation[1] > SATISFIED:
+        return "goal_violates"
+    if task.manifold.robot.limit_distance(np.stack([start, goal])).min() < -LIMIT_SLACK:
+        return "out_of_limits"
+    return None
+
+
+def candidates(
+    task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"],
+    proposals: Callable[[], Proposals | None], parts: Parts = ALL_PARTS,
+) -> Iterator[Candidate | Answer]:  # fmt: skip
+    """Sound curves from the cheapest proposals to the dearest, of one kind the shortest first; an Answer ends them.
+
+    A graph that came with the planner goes before the policies, which take longer to ask; one that has to be made,
+    which takes longer still, after them.
+    """
+    segments = task.settings.segments
+    if parts.straight:
+        share = np.linspace(0.0, 1.0, segments + 1)[:, None]
+        found = refined(task, "straight", (1.0 - share) * start + share * goal, parts.refinement)
+        if found is not None:
+            yield found
+    asked = parts.policy and not (parts.graph and task.has_graph)
+    if asked:
+        yield from _proposed(task, proposals(), start, goal, parts.refinement)
+    answer = Answer("not_found")
+    if parts.graph:
+        answer = yield from _over_graph(task, start, goal, parts.refinement)
+    if parts.policy and not asked and answer.status != "not_connected":
+        yield from _proposed(task, proposals(), start, goal, parts.refinement)
+    yield answer
+
+
+def _proposed(
+    task: Task, proposals: Proposals | None, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], refine: bool
+) -> Iterator[Candidate]:
+    if proposals is None:
+        return
+    curves = proposals(task.manifold, start, goal, task.settings.segments + 1)
+    relaxed = [refined(task, "policy", nodes, refine) for nodes in curves]
+    yield from sorted((c for c in relaxed if c is not None), key=lambda c: c.length)
+
+
+def _over_graph(
+    task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], refine: bool
+) -> Generator[Candidate, None, Answer]:
+    """The relaxed way over the graph; returns how the ends are joined to it."""
+    roadmap = task.roadmap()
+    if roadmap is None:
+        return Answer("not_found")
+    at_start, at_goal = join(roadmap, task.clear, start), join(roadmap, task.clear, goal)
+    if not (at_start.components(roadmap) & at_goal.components(roadmap)):
+        apart = len(at_start.nodes) > 0 and len(at_goal.nodes) > 0
+        return Answer("not_connected" if apart else "not_found", at_start, at_goal)
+    corners = shortest_way(roadmap, start, goal, at_start, at_goal)
+    if corners is not None:
+        yield from _along_graph(task, corners, refine)
+    return Answer("not_found", at_start, at_goal)
+
+
+def _along_graph(task: Task, corners: Float[np.ndarray, "k D"], refine: bool) -> Iterator[Candidate]:
+    """The relaxed way over the graph, with more nodes where fewer jump; then less and less relaxed, since the graph's
+    own edges are free of collisions that a band knows nothing of, those of the arm with itself.
+    """
+    segments = task.settings.segments
+    if refine:
+        for pieces in (segments, 2 * segments, 4 * segments):
+            found = refined(task, "graph", resample(corners, pieces + 1))
+            if found is not None:
+                yield found
+                break
+    for iterations in PARTLY_RELAXED if refine else (0,):
+        partly = replace(task, settings=replace(task.settings, iterations=iterations))
+        found = refined(partly, "graph", resample(corners, 4 * segments + 1))
+        if found is not None:
+            yield found
+
+
+def refined(task: Task, source: Source, nodes: Float[np.ndarray, "n D"], refine: bool = True) -> Candidate | None:
+    """The curve through the relaxed nodes; None if it jumps, leaves the limits or runs into a box.
+
+    Most curves never meet a box: they are relaxed without, and again with them only where they do.  A proposal of the
+    graph is clear of the boxes itself, so it is taken up again as it was; what leads through a box is pushed out of it.
+    """
+    settings = task.settings if refine else replace(task.settings, iterations=0)
+    band = relax(task.open, nodes, settings)
+    candidate = _sound(task.open, source, band.nodes, band.iterations)
+    if candidate is not None and _is_clear(task, candidate.points):
+        return candidate
+    if candidate is None and source != "graph":
+        return None
+    band = relax(task.clear, nodes if source == "graph" else band.nodes, settings)
+    candidate = _sound(task.clear, source, band.nodes, band.iterations)
+    return candidate if candidate is not None and _is_clear(task, candidate.points) else None
+
+
+def _sound(space: tuple, source: Source, nodes: Float[np.ndarray, "n D"], iterations: int) -> Candidate | None:
+    """The curve through nodes if its points keep the constraint and the limits, without a jump."""
+    curve = BandCurve.through(space, nodes)
+    if curve is None:
+        return None
+    shares = np.linspace(0.0, 1.0, max(int(np.ceil(curve.length / CHECK_STEP)), 2) + 1)
+    points, left = curve.at(shares)
+    steps = np.sqrt(np.square(np.diff(points, axis=0)).sum(axis=1))
+    longest = JUMP * curve.length / (len(shares) - 1)
+    if left > 1e-6 or steps.max() > longest:
+        return None
+    return Candidate(source, curve, float(steps.sum()), shares, points, iterations)
+
+
+def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
+    if not len(task.clearance.points):
+        return True
+    smallest = np.empty(len(points))
+    robot, margin = task.manifold.robot, task.settings.clearance_m
+    clearance_batch(robot.chain.arrays, task.clear[6], 2.0 * margin, points, smallest)
+    # the ends are what they are; PyBullet has the last word on them
+    return bool(smallest[1:-1].min(initial=np.inf) >= 0.5 * margin)
+
+
+def rows_of(
+    task: Task, candidate: Candidate, violation: float
+) -> tuple[Float[np.ndarray, "T"], Float[np.ndarray, "T D"]]:
+    """Rows so close that straight joint lines between them leave the constraint by less than `violation` [rad or m].
+
+    Between two points h apart a straight line is off by r''h²/8; halfway it is measured, and h chosen from it.  Near
+    a singular configuration r'' changes faster than that: lines that are still off are halved.
+    Returns the shares of the way and the rows (T, D).
+    """
+    allowed = ROW_SAFETY * violation
+    points = candidate.points
+    steps = np.sqrt(np.square(np.diff(points, axis=0)).sum(axis=1))
+    pieces = np.maximum(np.sqrt(_halfway(task, points) / allowed), steps / LONGEST_ROW_STEP)
+    pieces = np.maximum(np.ceil(pieces), 1.0).astype(int)
+    shares = np.concatenate([[0.0], np.cumsum(np.repeat(np.diff(candidate.shares) / pieces, pieces))])
+    shares[-1] = 1.0
+    rows, _ = candidate.curve.at(shares)
+    for _ in range(HALVINGS):
+        steps = np.sqrt(np.square(np.diff(rows, axis=0)).sum(axis=1))
+        off = np.flatnonzero((_halfway(task, rows) > allowed) | (steps > 1.1 * LONGEST_ROW_STEP))
+        if not len(off):
+            break
+        between = 0.5 * (shares[off] + shares[off + 1])
+        new, _ = candidate.curve.at(between)
+        shares, rows = np.insert(shares, off + 1, between), np.insert(rows, off + 1, new, axis=0)
+    return shares, rows
+
+
+def _halfway(task: Task, points: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T-1"]:
+    return task.manifold.violation(0.5 * (points[1:] + points[:-1]))

@@ -1,0 +1,35 @@
+"""Stage: the planner's files, from the run's manifold, graphs and policies; a copy travels with the package."""
+
+import shutil
+import sys
+
+from safetensors.numpy import load_file
+
+from constraint_geodesics.bundle import Bundle
+from constraint_geodesics.cli import run_stage
+from constraint_geodesics.constraints.submanifold import GraphSubmanifold, load_submanifold
+from constraint_geodesics.geodesics.roadmap import Roadmap
+from constraint_geodesics.learning.files import WEIGHTS
+from constraint_geodesics.params import Params
+from constraint_geodesics.paths import Layout
+
+
+def main(params: Params, layout: Layout) -> None:
+    """Write data/planner/ and src/constraint_geodesics/pretrained/."""
+    manifold = params.geodesics.searched[0]
+    graphs = {name: load_submanifold(layout.submanifold(manifold, name)) for name in params.constraints}
+    roadmaps = {n: Roadmap.from_submanifold(g) for n, g in graphs.items() if isinstance(g, GraphSubmanifold)}
+    seeds = {
+        seed: load_file(layout.policies(manifold) / f"policy-{seed}.safetensors") for seed in params.geodesics.seeds
+    }
+    bundle = Bundle(
+        params.robot, params.workcell, params.constraints, params.planner, params.policy_settings(), params.judge,
+        load_file(layout.manifold(manifold) / WEIGHTS),
+        {f"{seed}/{name}": values for seed, policy in seeds.items() for name, values in policy.items()}, roadmaps,
+    )  # fmt: skip
+    bundle.write(layout.planner)
+    shutil.copytree(layout.planner, layout.pretrained, dirs_exist_ok=True)
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])

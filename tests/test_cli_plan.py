@@ -1,0 +1,314 @@
+"""The commands `plan`, `check` and `constraints`: exit codes, one line for an error, strict JSON, files."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from constraint_geodesics import bundle, cli
+from constraint_geodesics.planner import read_path
+from constraint_geodesics.tracking.recording import read_recording
+from tests.planner_fixtures import NAMES, nodes_of, packaged_bundle, packaged_planner, pairs_of
+
+COMMAND = str(Path(sys.executable).parent / "geodesics")
+TOUCHES_ITSELF = "0 2.0 -0.2 0 0.3 0.1"
+
+
+@pytest.fixture
+def command(monkeypatch, capfd):
+    """The command in this process: its exit code and what it wrote, the planner's folder given unless it is there."""
+
+    def run(*words: str) -> tuple[int, str, str]:
+        given = () if "--planner" in words else ("--planner", str(bundle.PACKAGED))
+        monkeypatch.setattr(sys, "argv", ["geodesics", *words, *given])
+        capfd.readouterr()
+        code: object = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = stop.code
+        out, err = capfd.readouterr()
+        assert isinstance(code, int | None)
+        return code or 0, out, err
+
+    return run
+
+
+def words_of(q: np.ndarray) -> str:
+    return " ".join(repr(float(x)) for x in q)
+
+
+def strict(text: str) -> dict:
+    """JSON as other languages read it: no NaN, no Infinity."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def error_line(err: str) -> str:
+    """The one line that says what is wrong, after the one that names the planner."""
+    assert "Traceback" not in err
+    lines = [line for line in err.splitlines() if not line.startswith("planner: ")]
+    assert len(lines) == 1, err
+    assert lines[0].startswith("error: ")
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def query() -> tuple[str, str]:
+    start, goal = pairs_of("level_cup", 1, seed=1)[0]
+    return words_of(start), words_of(goal)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory) -> Path:
+    file = tmp_path_factory.mktemp("paths") / "path.csv"
+    path = packaged_planner().plan(*pairs_of("level_cup", 1, seed=1)[0], "level_cup")
+    path.save(file)
+    return file
+
+
+def test_a_path_is_planned_and_its_files_are_written(command, query, tmp_path) -> None:
+    csv, rrd, png = (tmp_path / "new" / f"path.{kind}" for kind in ("csv", "rrd", "png"))
+    code, out, err = command(
+        "plan", "--start", query[0], "--goal", query[1], "--constraint", "level_cup",
+        "--out", str(csv), "--record", str(rrd), "--picture", str(png),
+    )  # fmt: skip
+    assert code == 0
+    assert out.startswith("solved: ")
+    assert out.count("\n") == 1
+    assert err.strip() == f"planner: {bundle.PACKAGED}"
+    joints, times, constraint = read_path(csv)
+    own = packaged_planner().plan(*pairs_of("level_cup", 1, seed=1)[0], "level_cup")
+    assert joints.tobytes() == own.joints.tobytes()
+    assert times.tobytes() == own.times.tobytes()
+    assert constraint.axes == own.constraint.axes
+    assert len(read_recording(rrd).joints) > 1
+    assert png.read_bytes().startswith(b"\x89PNG")
+    code, out, err = command("check", str(csv))
+    assert (code, err) == (0, "")
+    assert out.startswith("valid: ")
+
+
+def test_an_answer_is_one_json_object(command, query, tmp_path) -> None:
+    code, out, _ = command("plan", "--start", query[0], "--goal", query[1], "--constraint", "level_cup", "--json")
+    assert code == 0
+    answer = strict(out)
+    assert answer["status"] == "solved"
+    assert answer["constraint"] == "level_cup"
+    assert 0.0 <= answer["violation_bound_rad"] <= 1e-4
+    code, out, _ = command(
+        "plan", "--start", query[0], "--goal", TOUCHES_ITSELF, "--constraint", "free", "--json",
+        "--out", str(tmp_path / "path.csv"),
+    )  # fmt: skip
+    assert code == 3
+    answer = strict(out)
+    assert answer["status"] == "in_collision"
+    assert answer["length_rad"] is None
+    assert not (tmp_path / "path.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("start", "constraint", "status"),
+    [
+        ("0 0 -0.5 0 0.3 0", "level_cup", "start_violates"),
+        ("9 0 -0.5 0 0.3 0", "free", "out_of_limits"),
+        (TOUCHES_ITSELF, "free", "in_collision"),
+    ],
+)
+def test_no_path_is_code_three_and_a_line_that_says_why(command, query, start, constraint, status) -> None:
+    code, out, err = command("plan", f"--start={start}", "--goal", query[1], "--constraint", constraint)
+    assert code == 3
+    assert out.startswith(f"{status}: ")
+    assert out.count("\n") == 1
+    assert "error" not in err
+
+
+def test_configurations_are_numbers_with_spaces_or_commas_negative_ones_first(command, query) -> None:
+    q = nodes_of("free")[0]
+    start = q[np.argmax(q[:, 0] < 0.0)]
+    assert start[0] < 0.0
+    answers = []
+    spaces, commas, both = (mark.join(words_of(start).split()) for mark in (" ", ",", ", "))
+    for option in (["--start", spaces], [f"--start={spaces}"], ["--start", commas], [f"--start={both}"]):
+        code, out, err = command("plan", *option, "--goal", query[1], "--constraint", "free", "--json")
+        assert code == 0, err
+        answers.append(strict(out)["length_rad"])
+    assert len(set(answers)) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--start", "1 2 3", "--goal", "0 0 0 0 0 0", "--constraint", "free"), r"start.*\(3,\)"),
+        (("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 0 0", "--constraint", "free"), r"goal.*\(7,\)"),
+        (("--start", "0 0 0 0 0 zero", "--goal", "0 0 0 0 0 0", "--constraint", "free"), "--start '0 0 0 0 0 zero'"),
+        (("--start", "", "--goal", "0 0 0 0 0 0", "--constraint", "free"), r"start.*\(0,\)"),
+        (("--start", "nan 0 0 0 0 0", "--goal", "0 0 0 0 0 0", "--constraint", "free"), r"start\[0\] is not finite"),
+        (("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 inf", "--constraint", "free"), r"goal\[5\] is not finite"),
+        (("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 0", "--constraint", "cup"), "'cup'.*level_cup"),
+    ],
+    ids=("three", "seven", "word", "nothing", "nan", "inf", "name"),
+)
+def test_wrong_usage_of_plan_is_code_two(command, words, said) -> None:
+    code, out, err = command("plan", *words)
+    assert (code, out) == (2, "")
+    assert re.search(said, error_line(err)), err
+
+
+@pytest.mark.parametrize("missing", ["--start", "--goal", "--constraint"])
+def test_every_needed_option_is_asked_for(command, missing) -> None:
+    given = {"--start": "0 0 0 0 0 0", "--goal": "0 0 0 0 0 0", "--constraint": "free"}
+    del given[missing]
+    code, out, err = command("plan", *(word for pair in given.items() for word in pair))
+    assert (code, out) == (2, "")
+    assert missing in err
+    assert "Traceback" not in err
+
+
+def test_a_planner_that_is_none_is_one_line(command, tmp_path) -> None:
+    words = {
+        "plan": ("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 0", "--constraint", "free"),
+        "constraints": (),
+    }
+    for name, own in words.items():
+        code, out, err = command(name, *own, "--planner", str(tmp_path))
+        assert code in (1, 2)
+        assert out == ""
+        assert "planner.json" in error_line(err)
+
+
+def test_a_file_that_can_not_be_written_is_one_line(command, query, tmp_path) -> None:
+    (tmp_path / "file").write_text("")
+    code, _, err = command(
+        "plan", "--start", query[0], "--goal", query[1], "--constraint", "free",
+        "--out", str(tmp_path / "file" / "path"),
+    )  # fmt: skip
+    assert code in (1, 2)
+    assert str(tmp_path / "file") in error_line(err)
+
+
+def test_a_path_that_breaks_a_promise_is_code_three(command, saved, tmp_path) -> None:
+    code, out, _ = command("check", str(saved), "--constraint", "tool_down")
+    assert code == 3
+    assert out.startswith("constraint: in row ")
+    code, out, _ = command("check", str(saved), "--constraint", "tool_down", "--json")
+    assert code == 3
+    answer = strict(out)
+    assert answer["valid"] is False
+    assert answer["violation"]["kind"] == "constraint"
+    lines = saved.read_text().splitlines()
+    (tmp_path / "jump.csv").write_text("\n".join([*lines[:10], *lines[20:]]))
+    code, out, _ = command("check", str(tmp_path / "jump.csv"))
+    assert code == 3
+    assert out.startswith("step: rows 7 and 8")
+
+
+def test_a_certificate_is_one_json_object(command, saved) -> None:
+    code, out, err = command("check", str(saved), "--json")
+    assert (code, err) == (0, "")
+    answer = strict(out)
+    assert answer["valid"] is True
+    assert answer["violation"] is None
+    assert answer["violation_bound"] <= 1e-4
+    assert answer["collision_checks"] > 10
+
+
+def through_itself(folder: Path) -> Path:
+    """A path into the arm itself, slow enough."""
+    file = folder / "collision.csv"
+    rows = np.linspace(0.0, 1.0, 60)[:, None] * np.array([float(x) for x in TOUCHES_ITSELF.split()])
+    names = ",".join(packaged_planner().scene.robot.joint_names)
+    file.write_text("\n".join([names, *(",".join(map(repr, row)) for row in rows.tolist())]))
+    return file
+
+
+def test_a_collision_is_named(command, tmp_path) -> None:
+    code, out, _ = command("check", str(through_itself(tmp_path)), "--constraint", "free")
+    assert code == 3
+    assert out.startswith("self_collision: ")
+
+
+def test_a_collision_is_json_as_well(command, tmp_path) -> None:
+    code, out, _ = command("check", str(through_itself(tmp_path)), "--constraint", "free", "--json")
+    assert code == 3
+    assert strict(out)["violation"]["kind"] == "self_collision"
+
+
+@pytest.mark.parametrize(
+    ("line", "text", "said"),
+    [
+        (1, "# constraint: {}", "line 1: not a constraint"),
+        (4, "0,0,0,0,zero,0,0", "line 4: not a row of numbers"),
+        (9, "0,0,0", "line 9: 3 numbers under 7 names"),
+    ],
+)
+def test_a_corrupted_file_is_code_two_and_names_the_line(command, saved, tmp_path, line, text, said) -> None:
+    lines = saved.read_text().splitlines()
+    lines[line - 1] = text
+    broken = tmp_path / "broken.csv"
+    broken.write_text("\n".join(lines))
+    for option in ((), ("--json",)):
+        code, out, err = command("check", str(broken), *option)
+        assert (code, out) == (2, "")
+        assert f"{broken}, {said}" in error_line(err)
+
+
+def test_wrong_usage_of_check_is_code_two(command, saved, tmp_path) -> None:
+    code, out, err = command("check", str(tmp_path / "nowhere.csv"))
+    assert (code, out) == (2, "")
+    assert "nowhere.csv" in error_line(err)
+    code, out, err = command("check", str(saved), "--constraint", "cup")
+    assert (code, out) == (2, "")
+    assert "'cup'" in error_line(err)
+    bare = tmp_path / "bare.csv"
+    bare.write_text("\n".join(saved.read_text().splitlines()[1:]))
+    code, out, err = command("check", str(bare))
+    assert (code, out) == (2, "")
+    assert "--constraint" in error_line(err)
+
+
+def test_a_reference_in_a_file_that_is_no_pose_is_code_two(command, saved, tmp_path) -> None:
+    about = '# constraint: {"axes": [0,0,0,1,1,0], "tolerance": [0,0,0,0,0,0], "reference": {"position_m": [0,0,0], '
+    lines = saved.read_text().splitlines()
+    lines[0] = about + '"rotation": [[2,0,0],[0,1,0],[0,0,1]]}}'
+    (tmp_path / "broken.csv").write_text("\n".join(lines))
+    code, _, err = command("check", str(tmp_path / "broken.csv"))
+    assert code == 2
+    assert "line 1" in error_line(err)
+
+
+def test_constraints_are_listed(command) -> None:
+    code, out, err = command("constraints")
+    assert (code, err) == (0, "")
+    assert [line.split()[0] for line in out.splitlines()] == list(packaged_bundle().constraints)
+    code, out, _ = command("constraints", "--json")
+    listed = strict(out)
+    assert set(NAMES) <= set(listed)
+    for name, constraint in packaged_bundle().constraints.items():
+        assert tuple(listed[name]["axes"]) == constraint.axes
+        assert listed[name]["description"] == constraint.description
+
+
+def test_the_installed_command_answers(query, tmp_path) -> None:
+    """In processes of its own: a path, and wrong usage."""
+    given = ("--planner", str(bundle.PACKAGED))
+    runs = {
+        0: ("plan", f"--start={query[0]}", f"--goal={query[1]}", "--constraint", "level_cup", "--json", *given),
+        2: ("check", "nowhere.csv", *given),
+    }
+    for code, words in runs.items():
+        done = subprocess.run([COMMAND, *words], capture_output=True, text=True, cwd=tmp_path, check=False)
+        assert done.returncode == code, done.stderr
+        assert "Traceback" not in done.stderr
+        if code == 0:
+            assert strict(done.stdout)["status"] == "solved"
+        if code == 2:
+            assert "nowhere.csv" in error_line(done.stderr)
+    assert not list(tmp_path.iterdir())
