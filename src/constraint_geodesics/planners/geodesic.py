@@ -123,21 +123,30 @@ def candidates(
 ) -> Iterator[Candidate | Answer]:  # fmt: skip
     """Sound curves from the cheapest proposals to the dearest, of one kind the shortest first; an Answer ends them.
 
+    A straight start that leads through a box is pushed out of it only after the graph was asked: that takes longer.
+
     A graph that came with the planner goes before the policies, which take longer to ask; one that has to be made,
     which takes longer still, after them.
     """
     segments = task.settings.segments
+    blocked = None
     if parts.straight:
         share = np.linspace(0.0, 1.0, segments + 1)[:, None]
-        found = refined(task, "straight", (1.0 - share) * start + share * goal, parts.refinement)
-        if found is not None:
+        found = _relaxed(task, "straight", (1.0 - share) * start + share * goal, _settings(task, parts.refinement))
+        if found is not None and _is_clear(task, found.points):
             yield found
+        else:
+            blocked = found
     asked = parts.policy and not (parts.graph and task.has_graph)
     if asked:
         yield from _proposed(task, proposals(), start, goal, parts.refinement)
     answer = Answer("not_found")
     if parts.graph:
-        answer = yield from _over_graph(task, start, goal, parts.refinement)
+        answer = yield from _over_graph(task, start, goal, parts.refinement, blocked is not None)
+    if blocked is not None and parts.refinement:
+        pushed = _relaxed(task, "straight", blocked.curve.nodes, task.settings, boxes=True)
+        if pushed is not None and _is_clear(task, pushed.points):
+            yield pushed
     if parts.policy and not asked and answer.status != "not_connected":
         yield from _proposed(task, proposals(), start, goal, parts.refinement)
     yield answer
@@ -154,9 +163,9 @@ def _proposed(
 
 
 def _over_graph(
-    task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], refine: bool
+    task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], refine: bool, boxes: bool
 ) -> Generator[Candidate, None, Answer]:
-    """The relaxed way over the graph; returns how the ends are joined to it."""
+    """The relaxed way over the graph; returns how the ends are joined to it.  boxes: whether some are in the way."""
     roadmap = task.roadmap()
     if roadmap is None:
         return Answer("not_found")
@@ -166,44 +175,58 @@ def _over_graph(
         return Answer("not_connected" if apart else "not_found", at_start, at_goal)
     corners = shortest_way(roadmap, start, goal, at_start, at_goal)
     if corners is not None:
-        yield from _along_graph(task, corners, refine)
+        yield from _along_graph(task, corners, refine, boxes)
     return Answer("not_found", at_start, at_goal)
 
 
-def _along_graph(task: Task, corners: Float[np.ndarray, "k D"], refine: bool) -> Iterator[Candidate]:
+def _along_graph(task: Task, corners: Float[np.ndarray, "k D"], refine: bool, boxes: bool) -> Iterator[Candidate]:
     """The relaxed way over the graph, with more nodes where fewer jump; then less and less relaxed, since the graph's
     own edges are free of collisions that a band knows nothing of, those of the arm with itself.
     """
     segments = task.settings.segments
     if refine:
         for pieces in (segments, 2 * segments, 4 * segments):
-            found = refined(task, "graph", resample(corners, pieces + 1))
+            found = refined(task, "graph", resample(corners, pieces + 1), boxes=boxes)
             if found is not None:
                 yield found
                 break
     for iterations in PARTLY_RELAXED if refine else (0,):
         partly = replace(task, settings=replace(task.settings, iterations=iterations))
-        found = refined(partly, "graph", resample(corners, 4 * segments + 1))
+        found = refined(partly, "graph", resample(corners, 4 * segments + 1), boxes=boxes)
         if found is not None:
             yield found
 
 
-def refined(task: Task, source: Source, nodes: Float[np.ndarray, "n D"], refine: bool = True) -> Candidate | None:
+def refined(
+    task: Task, source: Source, nodes: Float[np.ndarray, "n D"], refine: bool = True, boxes: bool = False
+) -> Candidate | None:
     """The curve through the relaxed nodes; None if it jumps, leaves the limits or runs into a box.
 
-    Most curves never meet a box: they are relaxed without, and again with them only where they do.  A proposal of the
-    graph is clear of the boxes itself, so it is taken up again as it was; what leads through a box is pushed out of it.
+    Most curves never meet a box: they are relaxed without, and again with them only where they do.
+    boxes: take them into account at once.
     """
-    settings = task.settings if refine else replace(task.settings, iterations=0)
-    band = relax(task.open, nodes, settings)
-    candidate = _sound(task.open, source, band.nodes, band.iterations)
-    if candidate is not None and _is_clear(task, candidate.points):
-        return candidate
-    if candidate is None and source != "graph":
-        return None
-    band = relax(task.clear, nodes if source == "graph" else band.nodes, settings)
-    candidate = _sound(task.clear, source, band.nodes, band.iterations)
-    return candidate if candidate is not None and _is_clear(task, candidate.points) else None
+    settings = _settings(task, refine)
+    if not boxes:
+        found = _relaxed(task, source, nodes, settings)
+        if found is not None and _is_clear(task, found.points):
+            return found
+        if found is None and source != "graph":
+            return None
+    found = _relaxed(task, source, nodes, settings, boxes=True)
+    return found if found is not None and _is_clear(task, found.points) else None
+
+
+def _settings(task: Task, refine: bool) -> BandSettings:
+    return task.settings if refine else replace(task.settings, iterations=0)
+
+
+def _relaxed(
+    task: Task, source: Source, nodes: Float[np.ndarray, "n D"], settings: BandSettings, boxes: bool = False
+) -> Candidate | None:
+    """The curve through relaxed nodes, whether or not it runs into a box."""
+    space = task.clear if boxes else task.open
+    band = relax(space, nodes, settings)
+    return _sound(space, source, band.nodes, band.iterations)
 
 
 def _sound(space: tuple, source: Source, nodes: Float[np.ndarray, "n D"], iterations: int) -> Candidate | None:
