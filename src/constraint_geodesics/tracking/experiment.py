@@ -126,7 +126,9 @@ class StageRun:
         file.write_text(
             json.dumps(stable, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n", "utf-8"
         )
-        numbers = {name: value for name, value in _flat(stable, "/").items() if isinstance(value, int | float)}
+        flat = _flat(stable, "/").items()
+        # MLflow takes no other characters in a metric's name
+        numbers = {re.sub(r"[^\w\-. :/]", "_", k): value for k, value in flat if isinstance(value, int | float)}
         self.metric_logger()(0, numbers)
 
     def metric_logger(self) -> MetricLogger:
