@@ -18,6 +18,7 @@ from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.lift import as_executed
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.constraints.vector import Constraint, ConstraintManifold
+from constraint_geodesics.evaluation.figures import PLANNERS
 from constraint_geodesics.evaluation.metrics import judge_limits
 from constraint_geodesics.geodesics.band import BandSettings
 from constraint_geodesics.geodesics.roadmap import resample
@@ -41,9 +42,6 @@ PARTS = {
 }
 """The planner whole and in parts, by the names the table shows."""
 MULTI_START, BAND_AFTER = "band from many starts", "BiRRT + band"
-SHOWN_PEERS = {"birrt": "BiRRT", "prm": "PRM", "rrt_star": "RRT*"}
-WITHIN = 1e-6
-"""Relative difference of two lengths that counts as none."""
 
 
 class PlannedPath(Protocol):
@@ -141,7 +139,7 @@ def plan_rows(
                         began = time.perf_counter()
                         joints = as_executed(manifold, path.joints, judge.row_spacing_rad)
                         found = Found(path.status, joints, path.time_s + time.perf_counter() - began)
-                        keep(SHOWN_PEERS[peer], seed, query, found)
+                        keep(PLANNERS[peer].label, seed, query, found)
                         if peer == "birrt":
                             after = _after(task, world, path.joints, path.status, judge.row_spacing_rad)
                             keep(BAND_AFTER, seed, query, replace(after, time_s=after.time_s + path.time_s))

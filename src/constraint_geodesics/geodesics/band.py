@@ -92,7 +92,7 @@ class BandCurve:
     @classmethod
     def through(cls, space: tuple, nodes: Float[np.ndarray, "n D"]) -> "BandCurve | None":
         """None where nodes coincide or are not finite, so that there is no curve."""
-        steps = np.sqrt(np.square(nodes[1:] - nodes[:-1]).sum(axis=1))
+        steps = step_lengths(nodes)
         if not (np.isfinite(steps).all() and steps.min(initial=np.inf) > _COINCIDENT):
             return None
         knots = np.concatenate([_ZERO, np.cumsum(steps)])
@@ -110,6 +110,11 @@ class BandCurve:
         left = project(self.space, points)
         points[s == 0.0], points[s == 1.0] = self.nodes[0], self.nodes[-1]
         return points, left
+
+
+def step_lengths(points: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T-1"]:
+    """Distances between neighbouring points [rad]; `norm` and `diff` would cost as much again in calls."""
+    return np.sqrt(np.square(points[1:] - points[:-1]).sum(axis=1))
 
 
 def project(space: tuple, points: Float[np.ndarray, "n D"]) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints.vector import ConstraintManifold
-from constraint_geodesics.geodesics.band import BandCurve, BandSettings, BandSpace, relax
+from constraint_geodesics.geodesics.band import BandCurve, BandSettings, BandSpace, relax, step_lengths
 from constraint_geodesics.geodesics.roadmap import Joined, Roadmap, join, resample, shortest_way
 from constraint_geodesics.planners.path_planner import SATISFIED
 from constraint_geodesics.robot.clearance import ClearanceModel, clearance_batch
@@ -236,7 +236,7 @@ def _sound(space: tuple, source: Source, nodes: Float[np.ndarray, "n D"], iterat
         return None
     shares = np.linspace(0.0, 1.0, max(int(np.ceil(curve.length / CHECK_STEP)), 2) + 1)
     points, left = curve.at(shares)
-    steps = np.sqrt(np.square(np.diff(points, axis=0)).sum(axis=1))
+    steps = step_lengths(points)
     longest = JUMP * curve.length / (len(shares) - 1)
     if left > 1e-6 or steps.max() > longest:
         return None
@@ -264,14 +264,14 @@ def rows_of(
     """
     allowed = ROW_SAFETY * violation
     points = candidate.points
-    steps = np.sqrt(np.square(np.diff(points, axis=0)).sum(axis=1))
+    steps = step_lengths(points)
     pieces = np.maximum(np.sqrt(_halfway(task, points) / allowed), steps / LONGEST_ROW_STEP)
     pieces = np.maximum(np.ceil(pieces), 1.0).astype(int)
     shares = np.concatenate([[0.0], np.cumsum(np.repeat(np.diff(candidate.shares) / pieces, pieces))])
     shares[-1] = 1.0
     rows, _ = candidate.curve.at(shares)
     for _ in range(HALVINGS):
-        steps = np.sqrt(np.square(np.diff(rows, axis=0)).sum(axis=1))
+        steps = step_lengths(rows)
         off = np.flatnonzero((_halfway(task, rows) > allowed) | (steps > 1.1 * LONGEST_ROW_STEP))
         if not len(off):
             break

@@ -229,13 +229,13 @@ class World:
         elif kind == bullet.GEOM_BOX:
             points = 0.5 * size * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
         elif kind == bullet.GEOM_SPHERE:
-            points = size[0] * _directions(96)
+            points = size[0] * directions(96)
         elif kind == bullet.GEOM_CYLINDER:
             turn = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
             rim = size[1] * np.stack([np.cos(turn), np.sin(turn), np.zeros(32)], axis=1)
             points = np.concatenate([rim + np.array([0.0, 0.0, z]) for z in (-0.5 * size[0], 0.5 * size[0])])
         elif kind == bullet.GEOM_CAPSULE:
-            ball = size[1] * _directions(96)
+            ball = size[1] * directions(96)
             points = np.concatenate([ball + np.array([0.0, 0.0, z]) for z in (-0.5 * size[0], 0.5 * size[0])])
         else:
             return np.empty((0, 3))
@@ -299,7 +299,7 @@ def _mesh_vertices(file: Path) -> Float[np.ndarray, "n 3"]:
     return np.array(rows, float).reshape(-1, 3)
 
 
-def _directions(count: int) -> Float[np.ndarray, "count 3"]:
+def directions(count: int) -> Float[np.ndarray, "count 3"]:
     """Evenly spread unit vectors (Fibonacci's lattice)."""
     k = np.arange(count) + 0.5
     height, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + np.sqrt(5.0)) * k

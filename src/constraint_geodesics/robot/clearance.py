@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numba import njit
 
-from constraint_geodesics.robot.bullet import Body, Box, World
+from constraint_geodesics.robot.bullet import Body, Box, World, directions
 from constraint_geodesics.robot.kinematics import SerialRobot
 
 DIRECTIONS = 48
@@ -79,12 +79,8 @@ def clearance_model(robot: SerialRobot, workcell: Sequence[Box | Body]) -> Clear
 
 
 def outermost(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """The points that lie furthest out in any of DIRECTIONS evenly spread directions (Fibonacci's lattice)."""
-    k = np.arange(DIRECTIONS) + 0.5
-    height, turn = 1.0 - 2.0 * k / DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * k
-    width = np.sqrt(1.0 - height**2)
-    directions = np.stack([width * np.cos(turn), width * np.sin(turn), height], axis=1)
-    return np.ascontiguousarray(points[np.unique((points @ directions.T).argmax(axis=0))])
+    """The points that lie furthest out in any of DIRECTIONS evenly spread directions."""
+    return np.ascontiguousarray(points[np.unique((points @ directions(DIRECTIONS).T).argmax(axis=0))])
 
 
 @njit(**_COMPILE)
