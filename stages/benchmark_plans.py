@@ -1,6 +1,5 @@
 """Stage: the planner, its parts and its peers on queries that no training saw, unseen constraints among them."""
 
-import json
 import sys
 
 import pandas as pd
@@ -9,10 +8,10 @@ from constraint_geodesics.bundle import read_bundle
 from constraint_geodesics.cli import run_stage
 from constraint_geodesics.constraints.scene import constraint_from
 from constraint_geodesics.constraints.vector import ConstraintManifold
+from constraint_geodesics.evaluation.machine import machine
 from constraint_geodesics.evaluation.plan_benchmark import (
     batch_rate,
     figures_of,
-    markdown,
     plan_rows,
     plan_table,
     save_arrays,
@@ -27,9 +26,9 @@ STAGE = "benchmark_plans"
 
 
 def main(params: Params, layout: Layout) -> None:
-    """Write data/plans/ (queries and valid paths), the rows of each constraint, the table and its figures."""
+    """Write data/plans/ (queries and valid paths), the rows of each constraint and the figures of all."""
     settings, tables, batches = params.plans, [], {}
-    layout.report(STAGE, "table").parent.mkdir(parents=True, exist_ok=True)
+    layout.report(STAGE, "plans").parent.mkdir(parents=True, exist_ok=True)
     names = [settings.constraint, *settings.unseen]
     described = {**params.constraints, **settings.unseen}
     with (
@@ -60,9 +59,8 @@ def main(params: Params, layout: Layout) -> None:
             rows.to_csv(layout.report(STAGE, name, "csv"), index=False)
             tables.append(plan_table(rows))
         table = pd.concat(tables, ignore_index=True)
-        layout.report(STAGE, "table", "md").write_text(markdown(table, names))
-        layout.report(STAGE, "batch").write_text(json.dumps(batches, indent=2) + "\n")
-        run.report(figures_of(table), layout.report(STAGE, "plans"))
+        measured = {"machine": machine(), "plans": figures_of(table), "batch": batches}
+        run.report(measured, layout.report(STAGE, "plans"))
 
 
 if __name__ == "__main__":

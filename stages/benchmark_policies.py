@@ -8,7 +8,7 @@ from constraint_geodesics.cli import run_stage
 from constraint_geodesics.compute import parallel_map
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.evaluation.policy_benchmark import policy_table
-from constraint_geodesics.evaluation.policy_tasks import PolicyTask, policy_figures, policy_markdown, run_policies
+from constraint_geodesics.evaluation.policy_tasks import PolicyTask, policy_figures, run_policies
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.paths import Layout
@@ -39,7 +39,6 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
             file = layout.report(STAGE, f"{manifold}-{task.name}", "csv")
             file.parent.mkdir(parents=True, exist_ok=True)
             own.to_csv(file, index=False)
-        layout.report(STAGE, "table", "md").write_text(policy_markdown(table))
         run.report(policy_figures(table), layout.report(STAGE, manifold))
 
 

@@ -12,7 +12,7 @@ STAGE = "report"
 
 
 def main(params: Params, layout: Layout) -> None:
-    """Write reports/table.csv, table.md, geometry.md, figures/ and index.html."""
+    """Write reports/table.csv, README's tables (*.md), figures/ and index.html."""
     sources = [layout.report("benchmark_planners", constraint, "csv") for constraint in params.constraints]
     with tracked_stage(
         STAGE, STAGE, params.judge, sources, experiment=params.tracking.experiment, root=layout.root

@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from urllib.parse import unquote
 
 import pytest
 import yaml
@@ -16,12 +17,11 @@ def between(marker: str) -> str:
     return README.split(f"<!-- {marker} -->")[1].split(f"<!-- /{marker} -->")[0].strip()
 
 
-def test_the_result_table_is_the_reports() -> None:
-    assert between("results") == (ROOT / "reports" / "table.md").read_text().strip()
-
-
-def test_the_geometry_table_is_the_reports() -> None:
-    assert between("geometry") == (ROOT / "reports" / "geometry.md").read_text().strip()
+@pytest.mark.parametrize(
+    ("marker", "file"), [("results", "table"), ("geometry", "geometry"), ("plans", "plans"), ("policies", "policies")]
+)
+def test_every_table_is_the_reports(marker: str, file: str) -> None:
+    assert between(marker) == (ROOT / "reports" / f"{file}.md").read_text().strip()
 
 
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.S)
@@ -50,19 +50,22 @@ def test_every_figure_and_linked_file_is_in_the_repository() -> None:
 
 
 def test_the_numbers_of_the_reports_are_quoted_as_they_are() -> None:
-    """Every quoted number has its source behind it, <!-- from file key scale digits -->, and is recomputed here."""
+    """Every quoted number has its source behind it, <!-- from file key scale digits -->, and is recomputed here.
+
+    A blank in a key is written %20.
+    """
     quoted = re.findall(r"([\d.]+)[^\d<]{0,12}<!-- from (\S+) (\S+) ([\d.e-]+) (\d) -->", README)
     assert len(quoted) >= 8
     for shown, file, key, scale, digits in quoted:
         value = json.loads((ROOT / file).read_text())
-        for part in key.split("/"):
+        for part in unquote(key).split("/"):
             value = value[int(part) if isinstance(value, list) else part]
         assert shown == f"{value * float(scale):.{digits}f}", (file, key)
 
 
 def test_no_figure_of_the_run_stands_without_its_source() -> None:
     """Between its table and its last section README quotes nothing in %, degrees or millimetres by hand."""
-    told = README.split("<!-- /results -->")[1]
+    told = README.split("<!-- /policies -->")[1].replace(between("results"), "")
     bare = re.sub(r"[\d.]+[^\d<]{0,12}<!-- from [^>]*-->", "", told)
     assert not re.findall(r"\d\s?(?:%|°|mm)", bare)
 

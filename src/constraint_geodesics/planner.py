@@ -34,9 +34,9 @@ from constraint_geodesics.planners.geodesic import (
     Proposals,
     Task,
     candidates,
-    refusal,
     rows_of,
 )
+from constraint_geodesics.planners.path_planner import ends_refused
 from constraint_geodesics.robot.clearance import clearance_model
 
 Status = Literal[
@@ -377,7 +377,7 @@ class Planner:
     ) -> tuple[Status, str] | None:
         """Why these ends can't be those of a path, as a status and a line for people."""
         task = self._task(constraint)
-        status = refusal(task, start, goal)
+        status = ends_refused(task.manifold, start, goal)
         if status in ("start_violates", "goal_violates"):
             end, q = ("start", start) if status == "start_violates" else ("goal", goal)
             return status, f"the {end} violates {name} by {_amount(task.manifold, q)}"

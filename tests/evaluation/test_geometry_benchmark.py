@@ -10,7 +10,6 @@ from constraint_geodesics.evaluation.geometry_benchmark import (
     GeometryBenchmark,
     alternately,
     default_length,
-    machine,
     naive_length,
     naive_retracted_length,
     one_thread,
@@ -18,6 +17,7 @@ from constraint_geodesics.evaluation.geometry_benchmark import (
     reference_length,
     solver_figures,
 )
+from constraint_geodesics.evaluation.machine import machine
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.graph_search import GraphSolver
 from constraint_geodesics.geodesics.problem import Box, ChartProblem, LearnedProblem, Samples

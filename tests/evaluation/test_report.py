@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from tests.evaluation.plan_fixtures import write_plan_reports
 
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.constraints.submanifold import extract, save_submanifold, submanifold_figures
@@ -186,6 +187,7 @@ def run(tmp_path_factory):
     write_json(layout.root / "reports" / "geometry.json", GEOMETRY)
     write_csv(layout.report("benchmark_geometry", "quadrature", "csv"), QUADRATURE)
     write_csv(layout.report("benchmark_planners", "removed", "csv"), sampled_rows())
+    write_plan_reports(params, layout)
     return params, layout
 
 
@@ -294,7 +296,7 @@ def test_the_printed_table_says_what_the_csv_says(run, written):
 
 
 def test_the_page_sets_the_papers_figures_beside_this_runs(page):
-    section = page[page.index('id="published"') : page.index('id="results"')]
+    section = page[page.index('id="published"') : page.index('id="planner"')]
     for figure in ("530.89 ± 24.43", "155.28 ± 17.84", "84.65 ± 25.52", "79.81 ± 7.64", "70.56", "6.65"):
         assert figure in section
     assert "6.50 ± 0.71" in section

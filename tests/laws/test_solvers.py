@@ -304,7 +304,8 @@ class Disc:
 def test_a_metric_that_is_not_finite_gives_no_short_curves() -> None:
     problem = ChartProblem(Disc(), CUBIC, Box((-1.0, -1.0), (1.0, 1.0)))
     inside, outside = np.array([[0.1, 0.1]]), np.array([[2.0, 2.0]])
-    (lost,) = geodesics_between(GradientSolver(), problem, inside, outside)
+    with np.errstate(over="raise"):
+        (lost,) = geodesics_between(GradientSolver(), problem, inside, outside)
     assert lost.status == "not_found"
     assert math.isnan(lost.length)
     (found,) = geodesics_between(GradientSolver(), problem, inside, -inside)
@@ -313,6 +314,16 @@ def test_a_metric_that_is_not_finite_gives_no_short_curves() -> None:
         curve_length(
             Disc(), CUBIC, torch.zeros(4, dtype=torch.float64), *torch.tensor([[0.1, 0.1], [2.0, 2.0]]).double()
         )
+
+
+def test_a_graph_has_no_edges_where_the_metric_is_not_finite() -> None:
+    graph = GraphSolver.over_grid(Disc(), (-1.2, -1.2), (1.2, 1.2), (25, 25))
+    problem = ChartProblem(Disc(), CUBIC, Box((-1.0, -1.0), (1.0, 1.0)))
+    start, goal = np.array([[0.1, 0.1], [0.1, 0.1]]), np.array([[-0.5, 0.4], [1.1, 1.1]])
+    for solver in (graph, CombinedSolver(graph)):
+        inside, outside = geodesics_between(solver, problem, start, goal)
+        assert inside.found
+        assert outside.status == "not_connected"
 
 
 def test_a_straight_line_over_a_hill_is_left() -> None:

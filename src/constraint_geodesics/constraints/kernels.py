@@ -151,29 +151,37 @@ def residual_of(held, reference_position, reference_rotation, position, rotation
 
 
 @njit(**_COMPILE)
+def shared_tolerance(held, tolerance):  # type: ignore[no-untyped-def]
+    """The tolerance [rad] that all held angles have; −1 if they differ, or none is held."""
+    common = -1.0
+    for i in range(3, 6):
+        if held[i]:
+            if common < 0.0:
+                common = tolerance[i]
+            elif tolerance[i] != common:
+                return -1.0
+    return common
+
+
+@njit(**_COMPILE)
 def excess_of(held, tolerance, residual, excess, active):  # type: ignore[no-untyped-def]
     """What of the residual lies outside the tolerance, signed, eq. 7; marks the rows a step must correct.
 
     Held angles that share one tolerance form a cone (a ball, for three of them): the size of their vector counts.
     """
     worst = 0.0
-    shared = True
-    common = -1.0
+    common = shared_tolerance(held, tolerance)
     square = 0.0
     for i in range(6):
         excess[i] = 0.0
         active[i] = False
         if i >= 3 and held[i]:
             square += residual[i] * residual[i]
-            if common < 0.0:
-                common = tolerance[i]
-            elif tolerance[i] != common:
-                shared = False
     size = np.sqrt(square)
     for i in range(6):
         if not held[i]:
             continue
-        if i >= 3 and shared:
+        if i >= 3 and common >= 0.0:
             if size > common:
                 excess[i] = residual[i] * (1.0 - common / size)
                 active[i] = True
@@ -187,6 +195,19 @@ def excess_of(held, tolerance, residual, excess, active):  # type: ignore[no-unt
     return worst
 
 
+@njit(**_COMPILE, inline="always")
+def residual_row(i, linear, geometric, rows, k):  # type: ignore[no-untyped-def]
+    """Row i of the residual's Jacobian into row k, from the matrix of `residual_of` and the geometric Jacobian."""
+    for d in range(rows.shape[1]):
+        value = 0.0
+        if i < 3:
+            value = geometric[i, d]
+        else:
+            for a in range(3):
+                value += linear[i - 3, a] * geometric[3 + a, d]
+        rows[k, d] = value
+
+
 @njit(**_COMPILE)
 def residual_batch(chain, held, reference_position, reference_rotation, q, residuals, jacobians):  # type: ignore[no-untyped-def]
     """Residuals (B, 6) and their Jacobians (B, 6, D) of q (B, D); rows of axes that are not held are zero."""
@@ -198,19 +219,14 @@ def residual_batch(chain, held, reference_position, reference_rotation, q, resid
     joint_axes = np.empty((dof, 3))
     geometric = np.empty((6, dof))
     linear = np.empty((3, 3))
+    jacobians[:] = 0.0
     for b in range(q.shape[0]):
         pose_of(origins, axes, prismatic, base, tool, q[b], position, rotation, joint_origins, joint_axes)
         residual_of(held, reference_position, reference_rotation, position, rotation, residuals[b], linear)
         geometric_jacobian(prismatic, position, joint_origins, joint_axes, geometric)
         for i in range(6):
-            for d in range(dof):
-                value = 0.0
-                if held[i] and i < 3:
-                    value = geometric[i, d]
-                elif held[i]:
-                    for k in range(3):
-                        value += linear[i - 3, k] * geometric[3 + k, d]
-                jacobians[b, i, d] = value
+            if held[i]:
+                residual_row(i, linear, geometric, jacobians[b], i)
 
 
 @njit(**_COMPILE)
@@ -222,28 +238,38 @@ def excess_batch(held, tolerance, residuals, excesses, worst):  # type: ignore[n
 
 
 @njit(**_COMPILE)
-def _solve(matrix, right, size):  # type: ignore[no-untyped-def]
-    """Solve a small symmetric positive definite system in place by Cholesky's method; False if it is singular."""
+def cholesky(matrix, size, smallest):  # type: ignore[no-untyped-def]
+    """Lower Cholesky factor of the leading `size` rows, in place; False if a pivot is not above `smallest`."""
     for i in range(size):
         for j in range(i + 1):
             value = matrix[i, j]
             for k in range(j):
                 value -= matrix[i, k] * matrix[j, k]
             if i == j:
-                if value <= 0.0:
+                if not value > smallest:
                     return False
                 matrix[i, i] = np.sqrt(value)
             else:
                 matrix[i, j] = value / matrix[j, j]
+    return True
+
+
+@njit(**_COMPILE)
+def forward(factor, size, right):  # type: ignore[no-untyped-def]
+    """Solve L x = right in place, with the factor L of `cholesky`."""
     for i in range(size):
         for k in range(i):
-            right[i] -= matrix[i, k] * right[k]
-        right[i] /= matrix[i, i]
+            right[i] -= factor[i, k] * right[k]
+        right[i] /= factor[i, i]
+
+
+@njit(**_COMPILE)
+def backward(factor, size, right):  # type: ignore[no-untyped-def]
+    """Solve Lᵀ x = right in place, with the factor L of `cholesky`."""
     for i in range(size - 1, -1, -1):
         for k in range(i + 1, size):
-            right[i] -= matrix[k, i] * right[k]
-        right[i] /= matrix[i, i]
-    return True
+            right[i] -= factor[k, i] * right[k]
+        right[i] /= factor[i, i]
 
 
 @njit(**_COMPILE)
@@ -282,13 +308,7 @@ def retract_batch(  # type: ignore[no-untyped-def]
             for i in range(6):
                 if not active[i]:
                     continue
-                for d in range(dof):
-                    if i < 3:
-                        rows[size, d] = geometric[i, d]
-                    else:
-                        rows[size, d] = 0.0
-                        for k in range(3):
-                            rows[size, d] += linear[i - 3, k] * geometric[3 + k, d]
+                residual_row(i, linear, geometric, rows, size)
                 right[size] = excess[i]
                 size += 1
             trace = 0.0
@@ -301,8 +321,10 @@ def retract_batch(  # type: ignore[no-untyped-def]
                 trace += normal[i, i]
             for i in range(size):
                 normal[i, i] += 1e-10 * trace + 1e-300
-            if not _solve(normal, right, size):
+            if not cholesky(normal, size, 0.0):
                 break
+            forward(normal, size, right)
+            backward(normal, size, right)
             length = 0.0
             for d in range(dof):
                 step[d] = 0.0

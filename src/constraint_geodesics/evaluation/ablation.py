@@ -35,8 +35,12 @@ COARSE, DRAWN_AT_ONCE, MOST_DRAWN = 17, 500, 10_000
 def policy_variants(params: GeodesicParams) -> dict[str, tuple[GeodesicParams, int]]:
     """Name of each ablated policy search, its parameters and the segments of its splines (0: the polynomial)."""
     printed = params.model_copy(update={"reward": params.reward.model_copy(update={"form": "printed"})})
-    splines = {f"spline_{segments}": (params, segments) for segments in params.ablated_segments}
-    return {"printed_reward": (printed, 0), **splines}
+    return {"printed_reward": (printed, 0)} | {name: (params, n) for name, n in _segments(params).items() if n}
+
+
+def _segments(params: GeodesicParams) -> dict[str, int]:
+    """Name of each curve family compared, and its segments (0: the polynomial)."""
+    return {"polynomial": 0} | {f"spline_{n}": n for n in params.ablated_segments}
 
 
 def variant_task(
@@ -53,7 +57,7 @@ def family_ratios(name: str, params: GeodesicParams) -> dict[str, float]:
     that family could reach at most.
     """
     ratios = {}
-    for label, segments in {"polynomial": 0, **{f"spline_{n}": n for n in params.ablated_segments}}.items():
+    for label, segments in _segments(params).items():
         problem = analytic_problem(name, curve_family(2, params, segments))
         ends, exact = unseen_pairs(name, problem)
         found = geodesics_between(GradientSolver(), problem, ends.z_start, ends.z_goal)
@@ -103,12 +107,11 @@ class LearnedAblation:
 
     def _families(self, domain: Samples, rng: np.random.Generator) -> dict[str, dict[str, float]]:
         """Length of the best curve of each family over the shortest of all."""
-        families = {"polynomial": 0, **{f"spline_{n}": n for n in self.params.ablated_segments}}
-        problems = [self._problem(segments, domain) for segments in families.values()]
-        ends = problems[0].sample_ends(self.pairs, rng)
-        lengths = np.array([[found.length for found in self._solved(problem, ends)] for problem in problems])
+        problems = {name: self._problem(segments, domain) for name, segments in _segments(self.params).items()}
+        ends = problems["polynomial"].sample_ends(self.pairs, rng)
+        lengths = np.array([[found.length for found in self._solved(problem, ends)] for problem in problems.values()])
         ratios = (lengths / lengths.min(axis=0)).mean(axis=1)
-        return {name: {"mean_ratio_to_best": float(ratio)} for name, ratio in zip(families, ratios, strict=True)}
+        return {name: {"mean_ratio_to_best": float(ratio)} for name, ratio in zip(problems, ratios, strict=True)}
 
     def _variance(self, domain: Samples, rng: np.random.Generator) -> dict[str, dict[str, float]]:
         """`path_figures` of geodesics with and without the variance term, and of the straight line.

@@ -4,13 +4,11 @@ Everything is timed on one thread.  Rates are medians of several rounds in which
 solver's times are those of one warm pass.
 """
 
-import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +25,7 @@ from constraint_geodesics.evaluation.analytic_search import (
     curve_family,
     unseen_pairs,
 )
+from constraint_geodesics.evaluation.machine import machine
 from constraint_geodesics.geodesics.environment import CurveEnv, CurveVecEnv, scalar_environments
 from constraint_geodesics.geodesics.episodes import episode_settings
 from constraint_geodesics.geodesics.gradient import GradientSolver
@@ -415,12 +414,3 @@ def one_thread() -> Iterator[None]:
             yield
     finally:
         torch.set_num_threads(before)
-
-
-def machine() -> dict[str, str]:
-    """What the timings were taken on."""
-    cpuinfo = Path("/proc/cpuinfo")  # Linux only; elsewhere the platform's own word must do
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
-    named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    processor = named[0] if named else platform.processor() or platform.machine()
-    return {"processor": processor, "python": platform.python_version(), "torch": torch.__version__, "threads": "1"}

@@ -274,25 +274,3 @@ def figures_of(table: pd.DataFrame) -> dict[str, Any]:
         about: Mapping[str, Any] = {str(k): v for k, v in row.items() if k not in ("constraint", "planner")}
         figures.setdefault(row["constraint"], {})[row["planner"]] = about
     return figures
-
-
-def markdown(table: pd.DataFrame, constraints: Sequence[str]) -> str:
-    """The table of README, one block a constraint."""
-    lines = []
-    for constraint in constraints:
-        own = table[table["constraint"] == constraint]
-        queries, solvable = int(own["queries"].max()), int(own["solvable"].max())
-        lines += [
-            f"`{constraint}`: {queries} queries, of which any planner solved {solvable}", "",
-            "| planner | solved | length / best known | p95 | time, median [ms] | p95 | with check, median | p95 |",
-            "|---|---:|---:|---:|---:|---:|---:|---:|",
-        ]  # fmt: skip
-        for row in own.to_dict("records"):
-            checked = (row["checked_median_ms"], row["checked_p95_ms"])
-            lines.append(
-                f"| {row['planner']} | {row['success_of_solvable']:.1%} | {row['ratio_median']:.4f} | "
-                f"{row['ratio_p95']:.3f} | {row['time_median_ms']:.3g} | {row['time_p95_ms']:.3g} | "
-                f"{checked[0]:.3g} | {checked[1]:.3g} |"
-            )
-        lines.append("")
-    return "\n".join(lines)

@@ -70,22 +70,3 @@ def policy_figures(table: pd.DataFrame) -> dict[str, Any]:
         finite = {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in about.items()}
         figures.setdefault(str(row["constraint"]), {})[str(row["method"])] = finite
     return figures
-
-
-def policy_markdown(table: pd.DataFrame) -> str:
-    """The table of README, one block a constraint; ratios are over the queries that every method of it solves."""
-    lines = []
-    for constraint, own in table.groupby("constraint", sort=False):
-        first = own.iloc[0]
-        lines += [
-            f"`{constraint}`: {first['queries']} queries, {first['solvable']} of which have a curve of the family; "
-            f"ratios over the {first['shared']} that every method solves", "",
-            "| one cubic, not refined | feasible | length / shortest cubic, mean | median | p95 | curves looked at |",
-            "|---|---:|---:|---:|---:|---:|",
-        ]  # fmt: skip
-        for row in own.to_dict("records"):
-            ratios = (row["shared_ratio_mean"], row["shared_ratio_median"], row["shared_ratio_p95"])
-            shown = " | ".join("–" if not np.isfinite(ratio) else f"{ratio:.4f}" for ratio in ratios)
-            lines.append(f"| {row['method']} | {row['feasible']:.1%} | {shown} | {row['curves']} |")
-        lines.append("")
-    return "\n".join(lines)

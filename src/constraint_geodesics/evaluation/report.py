@@ -16,10 +16,18 @@ from matplotlib.figure import Figure
 from constraint_geodesics.constraints.submanifold import GraphSubmanifold, GridSubmanifold, load_submanifold
 from constraint_geodesics.evaluation import figures
 from constraint_geodesics.evaluation.figures import PLANNERS, LatentCurves
+from constraint_geodesics.evaluation.plan_report import (
+    execution_block,
+    plan_blocks,
+    plans_markdown,
+    policies_markdown,
+    policy_blocks,
+)
 from constraint_geodesics.evaluation.results import (
     COLUMNS,
     COUNTED,
     LEARNED,
+    Block,
     ReportError,
     compare_planners,
     findings,
@@ -66,7 +74,7 @@ class Drawn:
 
 
 def write_report(params: Params, layout: Layout) -> list[Path]:
-    """Write reports/table.csv, table.md, geometry.md, figures/*.png and index.html; returns the figures' files.
+    """Write reports/table.csv, *.md (README's tables), figures/*.png and index.html; returns the figures' files.
 
     Raises ReportError naming the first file that is missing or can't be used.
     """
@@ -80,6 +88,8 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
     table.to_csv(reports / "table.csv", index=False, float_format="%.6g")
     (reports / "table.md").write_text(result_table(layout))
     (reports / "geometry.md").write_text(geometry_table(layout))
+    (reports / "plans.md").write_text(plans_markdown(params, layout))
+    (reports / "policies.md").write_text(policies_markdown(params, layout))
     for entry in (*drawn, *cards):
         figures.save_png(entry.figure, figure_file(layout, entry))
     (reports / "index.html").write_text(_page(layout, drawn=drawn, cards=cards, **content))
@@ -327,20 +337,6 @@ def _mean_of(values: Sequence[float]) -> float:
     return float(np.mean(values))
 
 
-@dataclass(frozen=True)
-class Block:
-    """A table of the page: a title, how to read it, its header, and its rows of texts.
-
-    groups: titles over the columns after the first, each with the number of columns it spans.
-    """
-
-    title: str
-    note: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    groups: Sequence[tuple[str, int]] = ()
-
-
 def page_content(params: Params, layout: Layout, table: pd.DataFrame) -> dict[str, Any]:
     """What the page says beside its figures."""
     metrics = {name: read_metrics(layout.report("train_manifold", name)) for name in params.manifolds}
@@ -349,6 +345,8 @@ def page_content(params: Params, layout: Layout, table: pd.DataFrame) -> dict[st
         "learned": PLANNERS[LEARNED].label,
         "findings": findings(params, table, metrics),
         "published": [published_block(params, table, c) for c in params.geodesics.illustrated_constraints[:1]],
+        "plans": [*plan_blocks(params, layout), execution_block(params, layout)],
+        "proposals": policy_blocks(params, layout),
         "results": result_blocks(params, table),
         "metrics": metric_blocks(params, layout, metrics),
         "recordings": recorded_paths(params, layout),

@@ -32,6 +32,20 @@ class ReportError(ValueError):
     """A file that the report needs is missing or can't be used; the message is one line with its name."""
 
 
+@dataclass(frozen=True)
+class Block:
+    """A table of the report: a title, how to read it, its header, and its rows of texts.
+
+    groups: titles over the columns after the first, each with the number of columns it spans.
+    """
+
+    title: str
+    note: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    groups: Sequence[tuple[str, int]] = ()
+
+
 def searched_items(params: Params) -> list[tuple[str, str]]:
     """The pairs (manifold, constraint) whose geodesics were searched."""
     geodesics = params.geodesics
@@ -110,7 +124,7 @@ def result_table(layout: Layout) -> str:
             for k, row in enumerate(records(group)):
                 cells.append((str(constraint) if k == 0 else "", *table_cells(row)))
         heading = f"`{manifold}`, {latent_dim} latent dimensions; lengths are those of {COUNTED[str(counted)]}"
-        parts.append(f"{heading}:\n\n{_markdown(cells)}")
+        parts.append(f"{heading}:\n\n{markdown_table(cells)}")
     return "\n\n".join(parts) + "\n"
 
 
@@ -141,7 +155,7 @@ def geometry_table(layout: Layout) -> str:
                 f"{geometry['solvers'][name]['gradient']['mean_ratio']:.5f}", searched["domain"].replace("|", "\\|"),
             )
         )  # fmt: skip
-    return f"{_markdown(rates)}\n\n{_markdown(found)}\n"
+    return f"{markdown_table(rates)}\n\n{markdown_table(found)}\n"
 
 
 @dataclass(frozen=True)
@@ -268,7 +282,8 @@ def plus_minus(mean: float, deviation: float, number: Callable[[float], str]) ->
     return number(mean) if np.isnan(deviation) else f"{number(mean)} ± {number(deviation)}"
 
 
-def _markdown(rows: Sequence[Sequence[str]]) -> str:
+def markdown_table(rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table, its header first; columns are aligned, so that it reads in a terminal too."""
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     # names to the left, figures to the right
     padded = [

@@ -14,13 +14,22 @@ along N, so that any residual with a Jacobian will do.
 import numpy as np
 from numba import njit
 
-from constraint_geodesics.constraints.kernels import excess_of, residual_of
+from constraint_geodesics.constraints.kernels import (
+    backward,
+    cholesky,
+    excess_of,
+    forward,
+    residual_of,
+    residual_row,
+    shared_tolerance,
+)
 from constraint_geodesics.robot.clearance import clearance_row, link_clearances
 from constraint_geodesics.robot.kernels import geometric_jacobian, pose_of
 
 _COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 _TOUCHING = 1e-9
 _DIFFERENCE = 1e-5
+_SMALLEST_PIVOT = 1e-12
 _BESIDE = 1e-6  # an inequality so near is on its bound
 _NEAR = 0.05  # rad or m: an inequality so near is taken into the step, which then ends on it instead of beyond
 _RESIDUAL, _EXCESS, _ACTIVE, _WEIGHTS = range(4)
@@ -52,62 +61,8 @@ def _linearise(chain, held, reference_position, reference_rotation, q, work):  #
     residual_of(held, reference_position, reference_rotation, frame[0], frame[1:], sixes[_RESIDUAL], linear)
     geometric_jacobian(prismatic, frame[0], carried[0], carried[1], geometric)
     for i in range(6):
-        if not held[i]:
-            continue
-        for d in range(q.shape[0]):
-            if i < 3:
-                jacobian[i, d] = geometric[i, d]
-            else:
-                value = 0.0
-                for k in range(3):
-                    value += linear[i - 3, k] * geometric[3 + k, d]
-                jacobian[i, d] = value
-
-
-@njit(**_COMPILE)
-def _is_cone(held, tolerance):  # type: ignore[no-untyped-def]
-    """Whether the held angles share one tolerance above zero, so that the size of their vector is bounded."""
-    common = -1.0
-    for i in range(3, 6):
         if held[i]:
-            if common < 0.0:
-                common = tolerance[i]
-            elif tolerance[i] != common:
-                return False
-    return common > 0.0
-
-
-@njit(**_COMPILE)
-def _cholesky(matrix, size):  # type: ignore[no-untyped-def]
-    """Lower Cholesky factor in place; False if the matrix is not positive definite."""
-    for i in range(size):
-        for j in range(i + 1):
-            value = matrix[i, j]
-            for k in range(j):
-                value -= matrix[i, k] * matrix[j, k]
-            if i == j:
-                if not value > 1e-12:
-                    return False
-                matrix[i, i] = np.sqrt(value)
-            else:
-                matrix[i, j] = value / matrix[j, j]
-    return True
-
-
-@njit(**_COMPILE)
-def _forward(factor, size, right):  # type: ignore[no-untyped-def]
-    for i in range(size):
-        for k in range(i):
-            right[i] -= factor[i, k] * right[k]
-        right[i] /= factor[i, i]
-
-
-@njit(**_COMPILE)
-def _backward(factor, size, right):  # type: ignore[no-untyped-def]
-    for i in range(size - 1, -1, -1):
-        for k in range(i + 1, size):
-            right[i] -= factor[k, i] * right[k]
-        right[i] /= factor[i, i]
+            residual_row(i, linear, geometric, jacobian, i)
 
 
 @njit(**_COMPILE)
@@ -160,10 +115,10 @@ def project_node(space, q, iterations, work):  # type: ignore[no-untyped-def]
             trace += normal[i, i]
         for i in range(size):
             normal[i, i] += 1e-9 * trace
-        if not _cholesky(normal, size):
+        if not cholesky(normal, size, _SMALLEST_PIVOT):
             break
-        _forward(normal, size, right)
-        _backward(normal, size, right)
+        forward(normal, size, right)
+        backward(normal, size, right)
         length = 0.0
         for d in range(dof):
             value = 0.0
@@ -279,7 +234,8 @@ def _node(space, q, pull, basis, hessian, onto, work):  # type: ignore[no-untype
     chain, held, tolerance, reference_position, reference_rotation, limits, model, margin = space
     carried, sixes, links, vectors, matrices = work[1], work[3], work[5], work[6], work[7]
     residual, jacobian = sixes[_RESIDUAL], work[4][1]
-    cone = _is_cone(held, tolerance)
+    common = shared_tolerance(held, tolerance)
+    cone = common > 0.0  # the size of the angles' vector is bounded, not each angle
     # kinds: 0-5 a residual's row, 6 the cone, 7 a joint limit, 8 + d a link; free: an inequality, which may be let go
     kinds, signs, free, multipliers = vectors[_KINDS], vectors[_SIGNS], vectors[_LET_GO], vectors[_MULTIPLIERS]
     rows, normal, slack = matrices[_ROWS], matrices[_NORMAL], vectors[_SLACK]
@@ -301,7 +257,6 @@ def _node(space, q, pull, basis, hessian, onto, work):  # type: ignore[no-untype
             size += 1
     if cone:
         length = np.sqrt(residual[3] ** 2 + residual[4] ** 2 + residual[5] ** 2)
-        common = max(tolerance[3], tolerance[4], tolerance[5])
         if length >= common - _NEAR and length > 1e-3 and size < dof:
             rows[size] = 0.0
             for i in range(3, 6):
@@ -341,10 +296,10 @@ def _node(space, q, pull, basis, hessian, onto, work):  # type: ignore[no-untype
                     value += rows[i, d] * rows[j, d]
                 normal[i, j] = value
             normal[i, i] += 1e-9
-        if not _cholesky(normal, size):
+        if not cholesky(normal, size, _SMALLEST_PIVOT):
             break
-        _forward(normal, size, multipliers)
-        _backward(normal, size, multipliers)
+        forward(normal, size, multipliers)
+        backward(normal, size, multipliers)
         # one that is near is kept only if the pull leads beyond it; on its bound, unless the pull leads away
         worst, weakest = -1, -1e-12
         for i in range(size):
@@ -354,8 +309,8 @@ def _node(space, q, pull, basis, hessian, onto, work):  # type: ignore[no-untype
         if worst < 0:
             for i in range(size):
                 here[i] = slack[i]
-            _forward(normal, size, here)
-            _backward(normal, size, here)
+            forward(normal, size, here)
+            backward(normal, size, here)
             for d in range(dof):
                 for i in range(size):
                     onto[d] += rows[i, d] * here[i]
@@ -473,7 +428,7 @@ def _newton(bases, counts, hessians, gradients, shift, steps):  # type: ignore[n
                     for d in range(dof):
                         value -= bases[i, d, a] * bases[i - 1, d, b]
                     couplings[i, a, b] = value
-                _forward(factors[i - 1], before, couplings[i, a])
+                forward(factors[i - 1], before, couplings[i, a])
             for a in range(size):
                 for b in range(size):
                     value = 0.0
@@ -482,16 +437,16 @@ def _newton(bases, counts, hessians, gradients, shift, steps):  # type: ignore[n
                     factors[i, a, b] -= value
                 for c in range(before):
                     right[i, a] -= couplings[i, a, c] * right[i - 1, c]
-        if not _cholesky(factors[i], size):
+        if not cholesky(factors[i], size, _SMALLEST_PIVOT):
             return False
-        _forward(factors[i], size, right[i])
+        forward(factors[i], size, right[i])
     for i in range(m - 1, -1, -1):
         size = counts[i]
         if i < m - 1:
             for a in range(size):
                 for b in range(counts[i + 1]):
                     right[i, a] -= couplings[i + 1, b, a] * right[i + 1, b]
-        _backward(factors[i], size, right[i])
+        backward(factors[i], size, right[i])
         for d in range(dof):
             value = 0.0
             for a in range(size):

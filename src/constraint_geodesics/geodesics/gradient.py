@@ -101,7 +101,7 @@ def _promising(query: Int[np.ndarray, "C"], energy: Float[np.ndarray, "C"]) -> I
     Where no curve of a query can be used (all inf), all of them stay: the second descent may find back.
     """
     least = np.full(query.max() + 1, np.inf)
-    np.minimum.at(least, query, np.nan_to_num(energy, nan=np.inf))
+    np.fmin.at(least, query, energy)
     return np.flatnonzero((energy <= PROMISING * least[query]) | np.isinf(least[query]))
 
 

@@ -16,10 +16,10 @@ from scipy.spatial import KDTree
 
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.problem import ChartProblem, Ends, Geodesic
-from constraint_geodesics.geodesics.solver import Candidates, nearest_image, shortest_of
+from constraint_geodesics.geodesics.solver import Candidates, nearest_image, shortest_of, with_goals_bits
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.graph import nearest_neighbour_edges, shortest_path
-from constraint_geodesics.geometry.length import curve_length
+from constraint_geodesics.geometry.length import estimate_length
 from constraint_geodesics.geometry.manifold import (
     BoundedManifold,
     EmbeddedManifold,
@@ -98,12 +98,11 @@ class GraphSolver:
         paths = [self.path(start, goal) for start, goal in zip(ends.z_start, ends.z_goal, strict=True)]
         found = [query for query, path in enumerate(paths) if path is not None]
         fits = [_fitted(problem, path) for path in paths if path is not None]
-        size, dim = problem.curve.coefficients, problem.curve.dim
         return Candidates(
             np.array(found, dtype=np.int64),
-            np.array([fit[0] for fit in fits]).reshape(-1, size),
+            np.array([fit[0] for fit in fits]).reshape(-1, problem.curve.coefficients),
             ends.z_start[found],
-            np.array([_same_bits(fit[1], ends.z_goal[q]) for q, fit in zip(found, fits, strict=True)]).reshape(-1, dim),
+            with_goals_bits(np.array([fit[1] for fit in fits]).reshape(-1, problem.curve.dim), ends.z_goal[found]),
         ), np.array([0 if path is None else len(path) - 1 for path in paths])
 
     def path(self, start: Float[np.ndarray, "N"], goal: Float[np.ndarray, "N"]) -> Float[np.ndarray, "k N"] | None:
@@ -191,11 +190,11 @@ def _fitted(problem: ChartProblem, corners: Float[np.ndarray, "k N"]) -> tuple[F
 def _straight_lengths(
     manifold: Manifold, start: Float[np.ndarray, "m N"], offset: Float[np.ndarray, "m N"]
 ) -> Float[np.ndarray, "m"]:
-    """Length of straight chart lines; inf where one leaves the manifold."""
+    """Length of straight chart lines; inf where one leaves the manifold or its metric is not finite."""
     line, first = PinnedPolynomial(manifold.dim, 1), torch.from_numpy(start)
     last = first + torch.from_numpy(offset)
     with torch.no_grad():
-        lengths = curve_length(manifold, line, first.new_zeros(len(first), 0), first, last).numpy()
+        lengths = estimate_length(manifold, line, first.new_zeros(len(first), 0), first, last).length.numpy()
     if isinstance(manifold, BoundedManifold):
         t = torch.linspace(0.0, 1.0, ON_EDGE, dtype=first.dtype)[:, None]
         inside = manifold.contains((1 - t) * first[:, None] + t * last[:, None]).all(-1).numpy()
@@ -209,11 +208,6 @@ def _position(manifold: Manifold, points: Float[np.ndarray, "n N"]) -> Float[np.
         return points
     with torch.no_grad():
         return manifold.embed(torch.from_numpy(points)).double().numpy()
-
-
-def _same_bits(found: Float[np.ndarray, "N"], wanted: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-    """The goal asked for where the path's end, a sum of steps, differs from it by rounding only."""
-    return np.where(np.abs(found - wanted) < 1e-9, wanted, found)
 
 
 def _shifted_pairs(rows: Int[np.ndarray, "r c"], down: int, right: int) -> Int[np.ndarray, "k 2"]:

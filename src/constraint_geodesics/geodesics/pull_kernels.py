@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from constraint_geodesics.constraints.kernels import residual_of
+from constraint_geodesics.constraints.kernels import residual_of, residual_row, shared_tolerance
 from constraint_geodesics.robot.kernels import geometric_jacobian, pose_of
 
 _COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
@@ -53,20 +53,12 @@ def tangential_pull(  # type: ignore[no-untyped-def]
     geometric = np.empty((6, dof))
     linear = np.empty((3, 3))
     residual = np.empty(6)
-    jacobian = np.zeros((6, dof))
+    jacobian = np.empty((6, dof))
     rows = np.empty((dof, dof))
     row = np.empty(dof)
-    any_held = False
-    cone = True
-    common = -1.0
-    for i in range(6):
-        any_held = any_held or held[i]
-        if i >= 3 and held[i]:
-            if common < 0.0:
-                common = tolerance[i]
-            elif tolerance[i] != common:
-                cone = False
-    cone = cone and common > 0.0
+    any_held = held.any()
+    common = shared_tolerance(held, tolerance)
+    cone = common > 0.0
     for b in range(joints.shape[0]):
         for d in range(dof):
             pulls[b, 0, d] = 0.0
@@ -86,15 +78,7 @@ def tangential_pull(  # type: ignore[no-untyped-def]
                 for i in range(6):
                     if not held[i]:
                         continue
-                    for d in range(dof):
-                        if i < 3:
-                            jacobian[i, d] = geometric[i, d]
-                        else:
-                            jacobian[i, d] = (
-                                linear[i - 3, 0] * geometric[3, d]
-                                + linear[i - 3, 1] * geometric[4, d]
-                                + linear[i - 3, 2] * geometric[5, d]
-                            )
+                    residual_row(i, linear, geometric, jacobian, i)
                     if i >= 3:
                         square += residual[i] * residual[i]
                     if tolerance[i] == 0.0:

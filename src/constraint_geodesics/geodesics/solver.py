@@ -1,7 +1,7 @@
 """The driver of every geodesic solver: checks the ends, answers what needs no search, hands on the rest."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -69,10 +69,13 @@ def nearest_image(manifold: Manifold, offset: Float[np.ndarray, "m N"]) -> Float
 
 def to_nearest_images(problem: ChartProblem, ends: Ends) -> Ends:
     """The same ends with the image of each goal that lies nearest to its start in the chart."""
-    goal = ends.z_start + nearest_image(problem.manifold, ends.z_goal - ends.z_start)
-    # an image no turn away is the goal itself: keep its bits
-    goal = np.where(np.abs(goal - ends.z_goal) < 1e-9, ends.z_goal, goal)
-    return Ends(ends.z_start, goal, ends.q_start, ends.q_goal)
+    image = ends.z_start + nearest_image(problem.manifold, ends.z_goal - ends.z_start)
+    return replace(ends, z_goal=with_goals_bits(image, ends.z_goal))
+
+
+def with_goals_bits(images: Float[np.ndarray, "*#B N"], goal: Float[np.ndarray, "*#B N"]) -> Float[np.ndarray, "*B N"]:
+    """Images of goals; a coordinate that is no turn away, but for rounding, gets the bits of the goal's own."""
+    return np.where(np.abs(images - goal) < 1e-9, goal, images)
 
 
 def goal_images(problem: ChartProblem, ends: Ends) -> tuple[Int[np.ndarray, "C"], Float[np.ndarray, "C N"]]:
@@ -82,7 +85,7 @@ def goal_images(problem: ChartProblem, ends: Ends) -> tuple[Int[np.ndarray, "C"]
     other = np.where(near >= ends.z_start, -1.0, 1.0) * np.where(np.isfinite(period), period, 0.0)
     choices = product(*([0, 1] if np.isfinite(p) else [0] for p in period))
     goals = np.stack([near + np.array(choice) * other for choice in choices], axis=1)
-    goals = np.where(np.abs(goals - ends.z_goal[:, None]) < 1e-9, ends.z_goal[:, None], goals)
+    goals = with_goals_bits(goals, ends.z_goal[:, None])
     return np.repeat(np.arange(len(ends)), goals.shape[1]), goals.reshape(-1, goals.shape[-1])
 
 

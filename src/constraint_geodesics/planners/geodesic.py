@@ -16,14 +16,11 @@ from jaxtyping import Float
 from constraint_geodesics.constraints.vector import ConstraintManifold
 from constraint_geodesics.geodesics.band import BandCurve, BandSettings, BandSpace, relax, step_lengths
 from constraint_geodesics.geodesics.roadmap import Joined, Roadmap, join, resample, shortest_way
-from constraint_geodesics.planners.path_planner import SATISFIED
 from constraint_geodesics.robot.clearance import ClearanceModel, clearance_batch
 
-Status = Literal["solved", "not_connected", "start_violates", "goal_violates", "out_of_limits", "not_found"]
+Status = Literal["not_connected", "not_found"]
 Source = Literal["straight", "policy", "graph"]
 
-LIMIT_SLACK = 1e-9
-"""How far beyond a limit an end may lie [rad], by rounding."""
 CHECK_STEP = 0.1
 """Distance of the points at which a relaxed curve is first looked at [rad]."""
 JUMP = 3.0
@@ -103,18 +100,6 @@ class Answer:
     status: Status
     at_start: Joined | None = None
     at_goal: Joined | None = None
-
-
-def refusal(task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]) -> Status | None:
-    """Why the ends can't be those of a path, collisions apart; None where they can."""
-    violation = task.manifold.violation(np.stack([start, goal]))
-    if violation[0] > SATISFIED:
-        return "start_violates"
-    if violation[1] > SATISFIED:
-        return "goal_violates"
-    if task.manifold.robot.limit_distance(np.stack([start, goal])).min() < -LIMIT_SLACK:
-        return "out_of_limits"
-    return None
 
 
 def candidates(

@@ -12,15 +12,11 @@ from constraint_geodesics.constraints.vector import ConstraintManifold
 SATISFIED = 1e-4
 """Largest violation [rad or m] at which a configuration still keeps its constraint."""
 
-Status = Literal[
-    "solved",
-    "not_found",
-    "start_violates",
-    "goal_violates",
-    "out_of_limits",
-    "start_in_collision",
-    "goal_in_collision",
-]
+LIMIT_SLACK = 1e-9
+"""How far beyond a limit an end may lie [rad], by rounding."""
+
+EndStatus = Literal["start_violates", "goal_violates", "out_of_limits"]
+Status = Literal[EndStatus, "solved", "not_found", "start_in_collision", "goal_in_collision"]
 
 
 @dataclass(frozen=True)
@@ -65,14 +61,26 @@ class PathPlanner(Protocol):
 
 def refusal(problem: PlanningProblem) -> Status | None:
     """Why no planner needs to look at this problem, or None if both ends can be reached by a robot."""
-    if problem.manifold.violation(problem.start) > SATISFIED:
-        return "start_violates"
-    if problem.manifold.violation(problem.goal) > SATISFIED:
-        return "goal_violates"
-    if problem.manifold.robot.limit_distance(np.stack([problem.start, problem.goal])).min() < 0.0:
-        return "out_of_limits"
+    violated = ends_refused(problem.manifold, problem.start, problem.goal)
+    if violated is not None:
+        return violated
     if not problem.is_free(problem.start):
         return "start_in_collision"
     if not problem.is_free(problem.goal):
         return "goal_in_collision"
+    return None
+
+
+def ends_refused(
+    manifold: ConstraintManifold, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]
+) -> EndStatus | None:
+    """Why these can't be the ends of a path, collisions apart; None where they can."""
+    ends = np.stack([start, goal])
+    violation = manifold.violation(ends)
+    if violation[0] > SATISFIED:
+        return "start_violates"
+    if violation[1] > SATISFIED:
+        return "goal_violates"
+    if manifold.robot.limit_distance(ends).min() < -LIMIT_SLACK:
+        return "out_of_limits"
     return None

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from numba import njit
 
 from constraint_geodesics.robot.bullet import Body, Box, World, directions
+from constraint_geodesics.robot.kernels import frame_of, joint_frame
 from constraint_geodesics.robot.kinematics import SerialRobot
 
 DIRECTIONS = 48
@@ -91,57 +92,12 @@ def link_clearances(chain, model, far, q, distances, normals, nearest, joint_ori
     """
     origins, axes, prismatic, base, _ = chain
     points, boxes, reach = model
-    # scalars instead of small arrays, as in `pose_of`
-    r00, r01, r02 = base[0, 0], base[0, 1], base[0, 2]
-    r10, r11, r12 = base[1, 0], base[1, 1], base[1, 2]
-    r20, r21, r22 = base[2, 0], base[2, 1], base[2, 2]
-    p0, p1, p2 = base[0, 3], base[1, 3], base[2, 3]
+    frame = frame_of(base)
     next_point = 0
     for j in range(q.shape[0]):
         distances[j] = np.inf
-        m = origins[j]
-        p0, p1, p2 = (
-            p0 + r00 * m[0, 3] + r01 * m[1, 3] + r02 * m[2, 3],
-            p1 + r10 * m[0, 3] + r11 * m[1, 3] + r12 * m[2, 3],
-            p2 + r20 * m[0, 3] + r21 * m[1, 3] + r22 * m[2, 3],
-        )
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = (
-            r00 * m[0, 0] + r01 * m[1, 0] + r02 * m[2, 0],
-            r00 * m[0, 1] + r01 * m[1, 1] + r02 * m[2, 1],
-            r00 * m[0, 2] + r01 * m[1, 2] + r02 * m[2, 2],
-            r10 * m[0, 0] + r11 * m[1, 0] + r12 * m[2, 0],
-            r10 * m[0, 1] + r11 * m[1, 1] + r12 * m[2, 1],
-            r10 * m[0, 2] + r11 * m[1, 2] + r12 * m[2, 2],
-            r20 * m[0, 0] + r21 * m[1, 0] + r22 * m[2, 0],
-            r20 * m[0, 1] + r21 * m[1, 1] + r22 * m[2, 1],
-            r20 * m[0, 2] + r21 * m[1, 2] + r22 * m[2, 2],
-        )
-        x, y, z = axes[j, 0], axes[j, 1], axes[j, 2]
-        a0 = r00 * x + r01 * y + r02 * z
-        a1 = r10 * x + r11 * y + r12 * z
-        a2 = r20 * x + r21 * y + r22 * z
-        joint_origins[j, 0], joint_origins[j, 1], joint_origins[j, 2] = p0, p1, p2
-        joint_axes[j, 0], joint_axes[j, 1], joint_axes[j, 2] = a0, a1, a2
-        if prismatic[j]:
-            p0, p1, p2 = p0 + a0 * q[j], p1 + a1 * q[j], p2 + a2 * q[j]
-        else:
-            c, s = np.cos(q[j]), np.sin(q[j])
-            x, y, z = x * (1.0 - c), y * (1.0 - c), z * (1.0 - c)
-            r00, r10, r20 = (
-                r00 * c + (a1 * r20 - a2 * r10) * s + a0 * x,
-                r10 * c + (a2 * r00 - a0 * r20) * s + a1 * x,
-                r20 * c + (a0 * r10 - a1 * r00) * s + a2 * x,
-            )
-            r01, r11, r21 = (
-                r01 * c + (a1 * r21 - a2 * r11) * s + a0 * y,
-                r11 * c + (a2 * r01 - a0 * r21) * s + a1 * y,
-                r21 * c + (a0 * r11 - a1 * r01) * s + a2 * y,
-            )
-            r02, r12, r22 = (
-                r02 * c + (a1 * r22 - a2 * r12) * s + a0 * z,
-                r12 * c + (a2 * r02 - a0 * r22) * s + a1 * z,
-                r22 * c + (a0 * r12 - a1 * r02) * s + a2 * z,
-            )
+        frame = joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes)
+        p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = frame
         bound = np.inf
         for b in range(boxes.shape[0]):
             if boxes[b, 6 + j] == 0.0:

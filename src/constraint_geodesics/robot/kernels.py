@@ -12,46 +12,52 @@ from numba import njit
 _COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 
 
-@njit(**_COMPILE)
-def pose_of(origins, axes, prismatic, base, tool, q, position, rotation, joint_origins, joint_axes):  # type: ignore[no-untyped-def]
-    """Tool pose in the base frame, with every joint's origin [m] and axis in the base frame; writes its outputs."""
-    # scalars instead of small arrays: an allocation costs more than the arithmetic of a joint
-    r00, r01, r02 = base[0, 0], base[0, 1], base[0, 2]
-    r10, r11, r12 = base[1, 0], base[1, 1], base[1, 2]
-    r20, r21, r22 = base[2, 0], base[2, 1], base[2, 2]
-    p0, p1, p2 = base[0, 3], base[1, 3], base[2, 3]
-    for j in range(q.shape[0] + 1):
-        m = origins[j] if j < q.shape[0] else tool
-        p0, p1, p2 = (
-            p0 + r00 * m[0, 3] + r01 * m[1, 3] + r02 * m[2, 3],
-            p1 + r10 * m[0, 3] + r11 * m[1, 3] + r12 * m[2, 3],
-            p2 + r20 * m[0, 3] + r21 * m[1, 3] + r22 * m[2, 3],
-        )
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = (
-            r00 * m[0, 0] + r01 * m[1, 0] + r02 * m[2, 0],
-            r00 * m[0, 1] + r01 * m[1, 1] + r02 * m[2, 1],
-            r00 * m[0, 2] + r01 * m[1, 2] + r02 * m[2, 2],
-            r10 * m[0, 0] + r11 * m[1, 0] + r12 * m[2, 0],
-            r10 * m[0, 1] + r11 * m[1, 1] + r12 * m[2, 1],
-            r10 * m[0, 2] + r11 * m[1, 2] + r12 * m[2, 2],
-            r20 * m[0, 0] + r21 * m[1, 0] + r22 * m[2, 0],
-            r20 * m[0, 1] + r21 * m[1, 1] + r22 * m[2, 1],
-            r20 * m[0, 2] + r21 * m[1, 2] + r22 * m[2, 2],
-        )
-        if j == q.shape[0]:
-            break
-        x, y, z = axes[j, 0], axes[j, 1], axes[j, 2]
-        a0 = r00 * x + r01 * y + r02 * z
-        a1 = r10 * x + r11 * y + r12 * z
-        a2 = r20 * x + r21 * y + r22 * z
-        joint_origins[j, 0], joint_origins[j, 1], joint_origins[j, 2] = p0, p1, p2
-        joint_axes[j, 0], joint_axes[j, 1], joint_axes[j, 2] = a0, a1, a2
-        if prismatic[j]:
-            p0, p1, p2 = p0 + a0 * q[j], p1 + a1 * q[j], p2 + a2 * q[j]
-            continue
+# A frame is a tuple of scalars, its position and its rotation by rows: an allocation costs more than the arithmetic of
+# a joint.  The three functions below are inlined, since passing a frame through a call is slower.
+@njit(**_COMPILE, inline="always")
+def frame_of(m):  # type: ignore[no-untyped-def]
+    """The frame that a transform (4, 4) leads to from the base."""
+    return (
+        m[0, 3], m[1, 3], m[2, 3],
+        m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2], m[2, 0], m[2, 1], m[2, 2],
+    )  # fmt: skip
+
+
+@njit(**_COMPILE, inline="always")
+def moved_frame(frame, m):  # type: ignore[no-untyped-def]
+    """The frame that a transform (4, 4) leads to from `frame`."""
+    p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = frame
+    return (
+        p0 + r00 * m[0, 3] + r01 * m[1, 3] + r02 * m[2, 3],
+        p1 + r10 * m[0, 3] + r11 * m[1, 3] + r12 * m[2, 3],
+        p2 + r20 * m[0, 3] + r21 * m[1, 3] + r22 * m[2, 3],
+        r00 * m[0, 0] + r01 * m[1, 0] + r02 * m[2, 0],
+        r00 * m[0, 1] + r01 * m[1, 1] + r02 * m[2, 1],
+        r00 * m[0, 2] + r01 * m[1, 2] + r02 * m[2, 2],
+        r10 * m[0, 0] + r11 * m[1, 0] + r12 * m[2, 0],
+        r10 * m[0, 1] + r11 * m[1, 1] + r12 * m[2, 1],
+        r10 * m[0, 2] + r11 * m[1, 2] + r12 * m[2, 2],
+        r20 * m[0, 0] + r21 * m[1, 0] + r22 * m[2, 0],
+        r20 * m[0, 1] + r21 * m[1, 1] + r22 * m[2, 1],
+        r20 * m[0, 2] + r21 * m[1, 2] + r22 * m[2, 2],
+    )
+
+
+@njit(**_COMPILE, inline="always")
+def joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes):  # type: ignore[no-untyped-def]
+    """The frame that joint j carries, from that of the joint before; writes the joint's origin and axis."""
+    p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = moved_frame(frame, origins[j])
+    x, y, z = axes[j, 0], axes[j, 1], axes[j, 2]
+    a0 = r00 * x + r01 * y + r02 * z
+    a1 = r10 * x + r11 * y + r12 * z
+    a2 = r20 * x + r21 * y + r22 * z
+    joint_origins[j, 0], joint_origins[j, 1], joint_origins[j, 2] = p0, p1, p2
+    joint_axes[j, 0], joint_axes[j, 1], joint_axes[j, 2] = a0, a1, a2
+    if prismatic[j]:
+        p0, p1, p2 = p0 + a0 * q[j], p1 + a1 * q[j], p2 + a2 * q[j]
+    else:
         # Rodrigues' rotation of each column c about the axis a: c cos + (a × c) sin + a (a·c)(1 − cos)
-        c = np.cos(q[j])
-        s = np.sin(q[j])
+        c, s = np.cos(q[j]), np.sin(q[j])
         x, y, z = x * (1.0 - c), y * (1.0 - c), z * (1.0 - c)
         r00, r10, r20 = (
             r00 * c + (a1 * r20 - a2 * r10) * s + a0 * x,
@@ -68,6 +74,16 @@ def pose_of(origins, axes, prismatic, base, tool, q, position, rotation, joint_o
             r12 * c + (a2 * r02 - a0 * r22) * s + a1 * z,
             r22 * c + (a0 * r12 - a1 * r02) * s + a2 * z,
         )
+    return p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22
+
+
+@njit(**_COMPILE)
+def pose_of(origins, axes, prismatic, base, tool, q, position, rotation, joint_origins, joint_axes):  # type: ignore[no-untyped-def]
+    """Tool pose in the base frame, with every joint's origin [m] and axis in the base frame; writes its outputs."""
+    frame = frame_of(base)
+    for j in range(q.shape[0]):
+        frame = joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes)
+    p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = moved_frame(frame, tool)
     position[0], position[1], position[2] = p0, p1, p2
     rotation[0, 0], rotation[0, 1], rotation[0, 2] = r00, r01, r02
     rotation[1, 0], rotation[1, 1], rotation[1, 2] = r10, r11, r12

@@ -1,0 +1,130 @@
+"""What the planner that users call reached, as tables of README and of the report's page, from its stages' JSON."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from constraint_geodesics.evaluation.results import Block, markdown_table, read_metrics, short
+from constraint_geodesics.params import Params
+from constraint_geodesics.paths import Layout
+
+PLAN_COLUMNS = (
+    "planner", "solved", "claimed, not valid", "length / best known, median", "p95", "time [ms], median", "p95",
+    "with check, median", "p95",
+)  # fmt: skip
+POLICY_COLUMNS = (
+    "one cubic, not refined", "feasible", "length / shortest cubic, mean", "median", "p95", "curves looked at",
+    "time [ms]",
+)  # fmt: skip
+EXECUTION_COLUMNS = (
+    "path", "executed", "spheres kept, mean", "worst", "largest tilt [°]", "collisions", "tracking error [rad]",
+    "duration [s]",
+)  # fmt: skip
+COMPARED = ("planner", "band from many starts", "BiRRT + band", "BiRRT")
+"""Rows that are shown of constraints that nothing was trained on."""
+
+
+def plan_blocks(params: Params, layout: Layout) -> list[Block]:
+    """The planner, its parts and its peers under the constraint of the plans, then under the unseen ones."""
+    measured = read_metrics(layout.report("benchmark_plans", "plans"))
+    name, plans, batches = params.plans.constraint, measured["plans"], measured["batch"]
+    rows = plans[name]
+    first, batch = next(iter(rows.values())), batches[name]
+    note = (
+        f"{first['queries']} queries, {first['solvable']} of which any planner solved; one thread of "
+        f"{measured['machine']['processor']}. Times without and with PyBullet's check of the final path; violation "
+        f"bound of the planner's paths at most {short(rows['planner']['violation_bound_max'])} rad. In one batch of "
+        f"{batch['size']}: {batch['checked_per_second']:.0f} plans a second, "
+        f"{batch['per_second']:.0f} without the check"
+    )
+    blocks = [Block(f"{name}, whole and in parts", note, PLAN_COLUMNS, [_plan_row(*row) for row in rows.items()])]
+    unseen = [
+        (f"{constraint}, {found[0]}", found[1])
+        for constraint in params.plans.unseen
+        for found in plans[constraint].items()
+        if found[0] in COMPARED
+    ]
+    if unseen:
+        counted = ", ".join(f"{c} {_solvable(plans[c])}" for c in params.plans.unseen)
+        note = f"constraints that nothing was trained on; solved of the queries that any planner solved: {counted}"
+        header = ("constraint, planner", *PLAN_COLUMNS[1:])
+        blocks.append(Block("Unseen constraints", note, header, [_plan_row(*row) for row in unseen]))
+    return blocks
+
+
+def policy_blocks(params: Params, layout: Layout) -> list[Block]:
+    """What the policies propose before any refinement, one block a constraint."""
+    found = read_metrics(layout.report("benchmark_policies", params.geodesics.searched[0]))
+    names = [name for name in (params.plans.constraint, *params.plans.unseen) if name in found]
+    return [_policy_block(name, found[name]) for name in names]
+
+
+def execution_block(params: Params, layout: Layout) -> Block:
+    """What an open cup keeps of its content on planned paths and on straight joint lines."""
+    found = read_metrics(layout.report("execute_paths", params.plans.constraint))
+    kinds = {kind: row for kind, row in found.items() if isinstance(row, Mapping)}
+    tilt = np.degrees(found["smallest_line_tilt_rad"])
+    note = (
+        f"{found['queries']} queries of {params.plans.constraint} whose straight joint line tilts the cup by "
+        f"{tilt:.0f}° or more; followed by PyBullet's position control with gravity, with "
+        f"{params.execution.spheres} spheres in an open cup"
+    )
+    rows = [
+        [
+            kind, str(row["executed"]), f"{row['kept_share_mean']:.0%}", f"{row['kept_share_worst']:.0%}",
+            f"{np.degrees(row['largest_tilt_rad']):.1f}", str(row["collisions"]),
+            short(row["largest_tracking_error_rad"]), f"{row['duration_mean_s']:.2f}",
+        ]
+        for kind, row in kinds.items()
+    ]  # fmt: skip
+    return Block("Execution", note, EXECUTION_COLUMNS, rows)
+
+
+def plans_markdown(params: Params, layout: Layout) -> str:
+    """All of it but the policies, as README shows it."""
+    return "\n\n".join(map(_markdown, [*plan_blocks(params, layout), execution_block(params, layout)])) + "\n"
+
+
+def policies_markdown(params: Params, layout: Layout) -> str:
+    """The policies' first table, as README shows it."""
+    return _markdown(policy_blocks(params, layout)[0]) + "\n"
+
+
+def _markdown(block: Block) -> str:
+    return f"**{block.title}** ({block.note}):\n\n{markdown_table([block.header, *block.rows])}"
+
+
+def _plan_row(name: str, row: Mapping[str, Any]) -> Sequence[str]:
+    times = (row[key] for key in ("time_median_ms", "time_p95_ms", "checked_median_ms", "checked_p95_ms"))
+    return [
+        name, _number(row["success_of_solvable"], "{:.1%}"), str(row["claimed_but_invalid"]),
+        _number(row["ratio_median"], "{:.4f}"), _number(row["ratio_p95"], "{:.4f}"),
+        *(_number(value, "{:.3g}") for value in times),
+    ]  # fmt: skip
+
+
+def _solvable(rows: Mapping[str, Mapping[str, Any]]) -> str:
+    first = next(iter(rows.values()))
+    return f"{first['solvable']} of {first['queries']}"
+
+
+def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]]) -> Block:
+    first = next(iter(rows.values()))
+    note = (
+        f"{first['queries']} queries, {first['solvable']} of which have a curve of the family; ratios over the "
+        f"{first['shared']} that every method solves"
+    )
+    cells = [
+        [
+            method, _number(row["feasible"], "{:.1%}"),
+            *(_number(row[f"shared_ratio_{what}"], "{:.4f}") for what in ("mean", "median", "p95")),
+            str(row["curves"]), _number(row["time_median_ms"], "{:.3g}"),
+        ]
+        for method, row in rows.items()
+    ]  # fmt: skip
+    return Block(f"{constraint}, proposals", note, POLICY_COLUMNS, cells)
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else form.format(value)
