@@ -112,8 +112,7 @@ def test_both_ends_are_the_querys_to_the_bit(planner, name) -> None:
     for parts in (Parts(), ONLY_GRAPH):
         for start, goal in pairs_of(name, 2, seed=3):
             path = planner.plan(start.tolist(), goal, name, parts=parts)
-            if path.status != "solved":
-                continue
+            assert path.status == "solved", path.explanation
             for end, wanted, share in ((path.joints[0], start, 0), (path.joints[-1], goal, 1)):
                 assert end.tobytes() == wanted.tobytes()
                 assert path.at(share).tobytes() == wanted.tobytes()
@@ -362,11 +361,14 @@ def test_an_alternative_goal_is_named_and_can_be_reached(planner, name) -> None:
 
 
 def test_an_alternative_goal_can_be_reached_as_it_is_printed(planner) -> None:
+    told = 0
     for start, goal in pairs_of("tool_down", 25, seed=12, joined=False):
         path = planner.plan(start, goal, "tool_down")
         if path.status == "not_connected":
             again = planner.plan(start, alternative(path.explanation), "tool_down")
             assert again.status not in ("goal_violates", "out_of_limits"), again.explanation
+            told += 1
+    assert told >= 5
 
 
 @pytest.mark.parametrize(
@@ -691,6 +693,56 @@ def test_a_planner_says_where_it_came_from_and_can_be_closed() -> None:
         assert set(own.constraints) == set(packaged_bundle().constraints)
         own.prepare("free")
     own.close()
+    nobody = np.empty((0, 6))
+    for question in (
+        lambda: own.plan([0.0] * 6, [0.1] * 6, "free"), lambda: own.plan_batch(nobody, nobody, "free"),
+        lambda: own.nodes("free"), lambda: own.prepare("free"), own.__enter__,
+    ):  # fmt: skip
+        with pytest.raises(PlannerError, match="closed"):
+            question()
+
+
+def test_a_batch_is_refused_as_a_whole_before_anything_is_planned(planner) -> None:
+    starts = np.zeros((3, 6))
+    goals = starts.copy()
+    goals[1, 2] = np.nan
+    planned = []
+    with pytest.raises(PlannerError, match=r"goals\[1\].*finite"):
+        planner.plan_batch(starts, goals, "free", progress=planned.append)
+    with pytest.raises(PlannerError, match="nowhere"):
+        planner.plan_batch(starts[:0], goals[:0], "nowhere")
+    assert not planned
+    assert planner.plan_batch(starts[:0], goals[:0], "free") == []
+
+
+def test_a_graphs_configurations_cannot_be_written_to(planner) -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        planner.nodes("level_cup")[0] = 0.0
+
+
+def test_a_graph_needs_a_reference(planner) -> None:
+    with pytest.raises(PlannerError, match="reference"):
+        planner.prepare(Constraint([0, 0, 0, 1, 1, 0]))
+
+
+def test_standing_still_is_certified_too() -> None:
+    """An end that satisfies the planner, but not a stricter judge, gives no path."""
+    given = packaged_bundle()
+    strict = replace(given, judge=given.judge.model_copy(update={"violation_tolerance": 1e-6}))
+    start = pairs_of("level_cup", 1, seed=4)[0][0]
+    axis = manifold_of(packaged_planner(), "level_cup").jacobian(start)[3:5]
+    off = start + 5e-5 * axis[0] / np.square(axis[0]).sum()
+    with Planner(strict, "a strict judge") as own:
+        path = own.plan(off, off, "level_cup")
+        assert path.status == "not_found"
+        assert own.plan(start, start, "level_cup").status == "solved"
+
+
+def test_paths_are_equal_as_objects_only() -> None:
+    first, second = solved("level_cup")[:2]
+    assert first == first
+    assert first != second
+    assert len({first, second}) == 2
 
 
 # candidates

@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import math
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -145,12 +146,14 @@ def check(
     except (BundleError, PlannerError) as error:
         raise SystemExit(_complain(error, WRONG_USAGE)) from None
     broken = certificate.violation
+    untimed = " (no times: velocity and acceleration not looked at)" if math.isnan(certificate.duration_s) else ""
+    meant = constraint or f"the constraint that {file.name} names"
     if as_json:
         print(json.dumps(certificate.summary()))
     elif broken is None:
         print(
-            f"valid: {certificate.length_rad:.3f} rad, at most {certificate.violation_bound:.1e} (rad, m) off the "
-            f"constraint anywhere, {certificate.collision_checks} configurations free of collision"
+            f"valid: {certificate.length_rad:.3f} rad, at most {certificate.violation_bound:.1e} (rad, m) off {meant} "
+            f"anywhere, {certificate.collision_checks} configurations free of collision{untimed}"
         )
     else:
         print(f"{broken.kind}: {broken.message}")

@@ -59,9 +59,9 @@ class PlannerError(ValueError):
     """A question that can't be meant; the message names the value and what is allowed."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Path:
-    """A planner's answer.
+    """A planner's answer; two of them are equal only if they are the same object.
 
     status: "solved", or why there is no path.  joints (T, D) [rad]: both ends exact, straight lines between the rows
     keep the constraint to within `violation_bound_rad`; (0, D) without a path.  times (T,) [s]: within the velocity
@@ -89,8 +89,12 @@ class Path:
     _space: tuple | None = field(default=None, repr=False)
 
     def at(self, s: float | Sequence[float] | Float[np.ndarray, "n"]) -> Float[np.ndarray, "*n D"]:
-        """Configurations [rad] at shares s in [0, 1] of the way, each on the constraint: the straight lines between the
-        rows, projected, so nowhere further from the certified path than its bound.
+        """Configurations [rad] at shares s in [0, 1] of the way, each on the constraint: points of the straight lines
+        between the rows, projected.
+
+        What is certified are the rows and those lines.  The projected points keep the constraint itself, but nothing
+        was asked of their collisions, and near a singular configuration they lie further from the lines than the
+        violation's bound says, since that is no distance of joints.
 
         Raises PlannerError without a path, or if a share lies outside [0, 1].
         """
@@ -194,6 +198,7 @@ class Planner:
         for name, roadmap in bundle.roadmaps.items():
             # the nodes are written in single precision, which may lie beyond a limit
             inside = np.clip(roadmap.joints, self.scene.robot.lower, self.scene.robot.upper)
+            inside.setflags(write=False)
             self._roadmaps[_key(self.constraints[name])] = replace(roadmap, joints=inside)
         self._supplied = frozenset(self._roadmaps)
 
@@ -207,6 +212,7 @@ class Planner:
         return cls(*open_bundle(source))
 
     def __enter__(self) -> Self:
+        self._require_open()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -218,14 +224,18 @@ class Planner:
         self._certifier.close()
         self._world.close()
 
+    def _require_open(self) -> None:
+        if self._closed:
+            raise PlannerError("this planner is closed: load another")
+
     def prepare(self, constraint: str | Constraint) -> None:
-        """Make the constraint's graph now (about a second), and load the compiled code, so that no query waits."""
-        constraint, _ = self._named(constraint)
-        if constraint.is_free or constraint.reference is not None:
-            task = self._task(constraint)
-            roadmap = task.roadmap()
-            if roadmap is not None and len(roadmap.joints):
-                self.plan(roadmap.joints[0], roadmap.joints[-1], constraint)
+        """Make the constraint's graph now (about a second), and load the compiled code, so that no query waits.
+
+        Raises PlannerError if it holds an axis but has no reference: its graph would be another for every start.
+        """
+        nodes = self.nodes(constraint)
+        if len(nodes):
+            self.plan(nodes[0], nodes[-1], constraint)
 
     @cached_property
     def _proposals(self) -> Proposals | None:
@@ -237,10 +247,11 @@ class Planner:
         return PolicyProposals.from_arrays(self.bundle.manifold, self.bundle.policies, self.bundle.policy)
 
     def nodes(self, constraint: str | Constraint) -> Float[np.ndarray, "n D"]:
-        """Configurations of the constraint's graph [rad]; none where it has no graph.
+        """Configurations of the constraint's graph [rad], not to be written to; none where it has no graph.
 
         Raises PlannerError if it holds an axis but has no reference.
         """
+        self._require_open()
         meant, name = self._named(constraint)
         if meant.reference is None and not meant.is_free:
             raise PlannerError(f"{name} has no reference pose: use constraint.relative_to(pose)")
@@ -258,8 +269,7 @@ class Planner:
         Raises PlannerError if an end has the wrong shape or is not finite, or the name is unknown.
         """
         began = time.perf_counter()
-        if self._closed:
-            raise PlannerError("this planner is closed: load another")
+        self._require_open()
         q_start, q_goal = self._configuration(start, "start"), self._configuration(goal, "goal")
         meant, name = self._named(constraint)
         held = self._held_at(meant, q_start)
@@ -288,8 +298,11 @@ class Planner:
         *, progress: Callable[[int], None] | None = None,
     ) -> list[Path]:  # fmt: skip
         """The paths of B queries of one constraint, one for each, in their order; progress is called with the number
-        done.  Raises PlannerError if starts and goals have not the same shape (B, D).
+        done.  Raises PlannerError, before anything is planned, if starts and goals have not the same shape (B, D), a
+        row is not finite, or the constraint is unknown.
         """
+        self._require_open()
+        self._named(constraint)
         try:
             first, last = np.asarray(starts, float), np.asarray(goals, float)
         except (TypeError, ValueError):
@@ -297,6 +310,10 @@ class Planner:
         if first.ndim != 2 or first.shape != last.shape or first.shape[1] != self.scene.robot.dof:
             wanted = f"both must be (B, {self.scene.robot.dof})"
             raise PlannerError(f"starts and goals have shapes {first.shape} and {last.shape}: {wanted}")
+        for name, ends in (("starts", first), ("goals", last)):
+            wrong = np.flatnonzero(~np.isfinite(ends).all(axis=1))
+            if len(wrong):
+                raise PlannerError(f"{name}[{wrong[0]}] = {ends[wrong[0]].tolist()}: must be finite")
         paths = []
         for row, (start, goal) in enumerate(zip(first, last, strict=True)):
             paths.append(self.plan(start, goal, constraint))
@@ -429,6 +446,9 @@ class Planner:
         """The path between ends that only rounding tells apart."""
         times = np.array([0.0, STANDING_S])
         certificate = self._certifier.certify(rows, task.manifold.constraint, rows[0], rows[1], times)
+        if certificate.violation is not None:
+            explanation = f"the start is the goal, and no path: {certificate.violation.message}"
+            return self._nothing("not_found", explanation, task.manifold.constraint, name, began)
         return Path(
             "solved", rows, times, "the start is the goal", certificate.length_rad, certificate.max_violation,
             certificate.violation_bound, time.perf_counter() - began, certificate.collision_time_s, "straight",

@@ -24,6 +24,7 @@ def plan_rows(constraint: str) -> pd.DataFrame:
             found = np.isfinite(length)
             rows.append({
                 "planner": planner, "constraint": constraint, "query": query, "seed": 0,
+                "source": "straight" if planner == "planner" else "",
                 "status": "solved" if found or planner == "BiRRT" else "not_found",
                 "time_s": 0.005, "check_time_s": 0.001 if planner == "planner" else np.nan, "valid": found,
                 "reason": "", "length_rad": length, "max_violation": 1e-5, "violation_bound": 8e-5,

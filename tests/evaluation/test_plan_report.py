@@ -26,12 +26,13 @@ def reported(tmp_path_factory):
 def test_every_planner_has_its_row_and_failures_count(reported):
     whole, unseen = plan_blocks(*reported)
     rows = {row[0]: row[1:] for row in whole.rows}
-    assert rows["planner"] == ["100.0%", "0", "1.0000", "1.0000", "4", "4", "5", "5"]
+    assert rows["planner"] == ["100.0%", "0", "1.0000", "1.0000", "1.0000", "4", "4", "5", "5"]
     # of lengths 1.1 and 1.0 times the best, and 1.5 and 2; one of three queries is missed
-    assert rows["BiRRT + band"][:4] == ["66.7%", "0", "1.0500", "1.0950"]
+    assert rows["BiRRT + band"][:5] == ["66.7%", "0", "1.0500", "1.0950", "–"]
     assert rows["BiRRT"][:4] == ["66.7%", "1", "1.7500", "1.9750"]
     assert "3 queries, 3 of which" in whole.note
-    assert "300 plans a second, 400 without" in whole.note
+    assert "300 queries a second, 400 without" in whole.note
+    assert "the straight start (100%), the graph (0%), the policies (0%)" in whole.note
     assert len(unseen.rows) == 3 * len(reported[0].plans.unseen)
 
 

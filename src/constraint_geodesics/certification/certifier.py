@@ -1,6 +1,7 @@
-"""The certificate of a path: every promise checked again, by code that shares nothing with the search.
+"""The certificate of a path: every promise checked again, by code that shares no geometry with the search.
 
-Its kinematics are unit quaternions along the chain that PyBullet itself loaded, not the project's reading of the URDF,
+What it takes from elsewhere are the robot's limits and PyBullet's word on collisions (robot/bullet.py).  Its
+kinematics are unit quaternions along the chain that PyBullet itself loaded, not the project's reading of the URDF,
 and are compared with PyBullet's poses in every certificate.  A path is what an arm executes: straight joint lines
 between its rows.  The constraint is bounded along all of them (proof in kernels.py); joint limits hold between rows
 because they hold at both ends; collisions are examined at points of the path, so they are sampled, not proven.

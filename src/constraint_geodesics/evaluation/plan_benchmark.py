@@ -5,10 +5,10 @@ one query that is not counted.  Best known is the shortest certified path of all
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
-from typing import Any, Protocol
+from typing import Any, Protocol, get_args
 
 import numpy as np
 import pandas as pd
@@ -24,8 +24,8 @@ from constraint_geodesics.geodesics.band import BandSettings
 from constraint_geodesics.geodesics.roadmap import resample
 from constraint_geodesics.learning.dataset import Queries
 from constraint_geodesics.params import BenchmarkParams, JudgeParams, PlanBenchmarkParams
-from constraint_geodesics.planners.geodesic import Parts, Task, refined, rows_of
-from constraint_geodesics.planners.sampling import plan_all
+from constraint_geodesics.planners.geodesic import Parts, Source, Task, refined, rows_of
+from constraint_geodesics.planners.sampling import PlannerName, plan_all
 from constraint_geodesics.progress import progress
 from constraint_geodesics.robot.bullet import World
 from constraint_geodesics.robot.clearance import clearance_model
@@ -41,7 +41,8 @@ PARTS = {
     "graph + band": Parts(straight=False, policy=False),
 }
 """The planner whole and in parts, by the names the table shows."""
-MULTI_START, BAND_AFTER = "band from many starts", "BiRRT + band"
+MULTI_START, BAND_AFTER, TANGENT = "band from many starts", "BiRRT + band", "BiRRT, tangent bundle"
+SOURCES = get_args(Source)
 
 
 class PlannedPath(Protocol):
@@ -65,6 +66,11 @@ class PlannedPath(Protocol):
     @property
     def collision_time_s(self) -> float:
         """What PyBullet's check of the path took of it."""
+        ...
+
+    @property
+    def source(self) -> str:
+        """The proposal it came from."""
         ...
 
 
@@ -91,13 +97,14 @@ class Planner(Protocol):
 @dataclass(frozen=True)
 class Found:
     """One planner's answer to one query: status, path (T, D) [rad] or (0, D), seconds, of which in PyBullet's check of
-    the final path (nan where the check is part of the search).
+    the final path (nan where the check is part of the search), and the proposal it came from, where there are several.
     """
 
     status: str
     joints: Float[np.ndarray, "T D"]
     time_s: float
     check_time_s: float = float("nan")
+    source: str = ""
 
 
 Plan = Callable[[int], Found]
@@ -124,23 +131,25 @@ def plan_rows(
             if valid:
                 paths[shown, query, seed] = found.joints
 
-        with progress(f"plans {name}", len(jobs) + len(settings.peers) * len(settings.seeds)) as advance:
+        peers = list(_peers(settings.peers, benchmark.space, manifold))
+        with progress(f"plans {name}", len(jobs) + len(peers) * len(settings.seeds)) as advance:
             for shown, seed, plan in jobs:
                 plan(0)
                 for query in range(len(queries)):
                     keep(shown, seed, query, plan(query))
                 advance()
-            for peer in settings.peers:
+            for shown, peer, space in peers:
                 for seed in settings.seeds:
                     planned = plan_all(
-                        peer, benchmark, scene.robot, constraint, scene.workcell, queries.starts, queries.goals, seed
-                    )
+                        peer, benchmark.model_copy(update={"space": space}), scene.robot, constraint, scene.workcell,
+                        queries.starts, queries.goals, seed,
+                    )  # fmt: skip
                     for query, path in enumerate(planned):
                         began = time.perf_counter()
                         joints = as_executed(manifold, path.joints, judge.row_spacing_rad)
                         found = Found(path.status, joints, path.time_s + time.perf_counter() - began)
-                        keep(PLANNERS[peer].label, seed, query, found)
-                        if peer == "birrt":
+                        keep(shown, seed, query, found)
+                        if shown == PLANNERS["birrt"].label:
                             after = _after(task, world, path.joints, path.status, judge.row_spacing_rad)
                             keep(BAND_AFTER, seed, query, replace(after, time_s=after.time_s + path.time_s))
                     advance()
@@ -152,6 +161,10 @@ def plan_rows(
 def plan_table(rows: pd.DataFrame) -> pd.DataFrame:
     """One row a constraint and planner: success over all queries and over those that any planner solved, paths called
     solved but not valid, length over best known, time with and without PyBullet's check of the final path.
+
+    ratio_*: of the planner's own valid paths; ratio_p95_all: the 95th percentile over all queries that any planner
+    solved, failures counted as infinitely long, so that leaving out what is hard is no merit.  Times are of all rows,
+    failures too.  from_*: share of the valid paths from each proposal.
     """
     table = []
     for (constraint, planner), group in rows.groupby(["constraint", "planner"], sort=False):
@@ -166,17 +179,26 @@ def plan_table(rows: pd.DataFrame) -> pd.DataFrame:
                 "success_of_solvable": float(solvable["valid"].mean()) if len(solvable) else np.nan,
                 "claimed_but_invalid": int(((group["status"] == "solved") & ~group["valid"]).sum()),
                 "ratio_median": _quantile(ratio, 0.5), "ratio_p95": _quantile(ratio, 0.95),
+                "ratio_p95_all": _p95_with_failures(solvable),
                 "time_median_ms": 1e3 * _quantile(bare, 0.5), "time_p95_ms": 1e3 * _quantile(bare, 0.95),
                 "checked_median_ms": 1e3 * _quantile(group["time_s"], 0.5),
                 "checked_p95_ms": 1e3 * _quantile(group["time_s"], 0.95),
                 "violation_bound_max": float(valid["violation_bound"].max()) if len(valid) else np.nan,
+                **{f"from_{source}": float((valid["source"] == source).mean()) for source in SOURCES},
             }
         )  # fmt: skip
     return pd.DataFrame(table)
 
 
+def _p95_with_failures(solvable: pd.DataFrame) -> float:
+    """The smallest ratio that 95 % of the rows do not pass; nan if fewer are valid."""
+    ratio = (solvable["length_rad"] / solvable["best_known_rad"]).where(solvable["valid"], np.inf).sort_values()
+    worst = ratio.iloc[int(np.ceil(0.95 * len(ratio))) - 1] if len(ratio) else np.inf
+    return float(worst) if np.isfinite(worst) else float("nan")
+
+
 def batch_rate(planner: Planner, constraint: Constraint, queries: Queries, size: int) -> dict[str, float]:
-    """Plans a second in one batch of `size` queries, with PyBullet's check of the paths and without its time."""
+    """Queries answered a second in one batch of `size`, with PyBullet's check of the paths and without its time."""
     rows = np.arange(size) % len(queries)
     began = time.perf_counter()
     paths = planner.plan_batch(queries.starts[rows], queries.goals[rows], constraint)
@@ -185,10 +207,20 @@ def batch_rate(planner: Planner, constraint: Constraint, queries: Queries, size:
     return {"size": size, "per_second": size / (seconds - checking), "checked_per_second": size / seconds}
 
 
+def _peers(
+    names: Sequence[PlannerName], space: str, manifold: ConstraintManifold
+) -> Iterator[tuple[str, PlannerName, str]]:
+    """Label, planner and state space: BiRRT in the tangent bundle as well, which a tolerance does not have."""
+    for name in names:
+        yield PLANNERS[name].label, name, space
+        if name == "birrt" and not manifold.constraint.is_free and not manifold.tolerance.any():
+            yield TANGENT, name, "tangent_bundle"
+
+
 def _own(planner: Planner, queries: Queries, constraint: Constraint, parts: Parts) -> Plan:
     def plan(query: int) -> Found:
         path = planner.plan(queries.starts[query], queries.goals[query], constraint, parts=parts)
-        return Found(path.status, path.joints, path.planning_time_s, path.collision_time_s)
+        return Found(path.status, path.joints, path.planning_time_s, path.collision_time_s, path.source)
 
     return plan
 
@@ -203,14 +235,17 @@ def _multi_start(planner: Planner, task: Task, queries: Queries, settings: PlanB
         t = np.linspace(0.0, 1.0, task.settings.segments + 1)[:, None]
         line = (1.0 - t) * start + t * goal
         began = time.perf_counter()
-        bends = rng.uniform(size=(settings.starts, 1)) * (past[rng.integers(len(past), size=settings.starts)] - line[8])
+        bends = rng.uniform(size=(settings.starts, 1)) * (
+            past[rng.integers(len(past), size=settings.starts)] - line[len(line) // 2]
+        )
         bends[0] = 0.0
         found = [refined(task, "straight", line + 4.0 * t * (1.0 - t) * bend) for bend in bends]
         sound = sorted((c for c in found if c is not None), key=lambda c: c.length)
         for candidate in sound:
             rows = rows_of(task, candidate, 1e-4)[1]
+            asked = time.perf_counter()
             if world.first_collision(rows) is None:
-                return Found("solved", rows, time.perf_counter() - began)
+                return Found("solved", rows, time.perf_counter() - began, time.perf_counter() - asked)
         return Found("not_found", np.empty((0, len(start))), time.perf_counter() - began)
 
     return plan
@@ -228,8 +263,9 @@ def _after(task: Task, world: World, joints: Float[np.ndarray, "T D"], status: s
         if candidate is None:
             continue
         rows = rows_of(task, candidate, 1e-4)[1]
+        asked = time.perf_counter()
         if world.first_collision(rows) is None:
-            return Found(status, rows, time.perf_counter() - began)
+            return Found(status, rows, time.perf_counter() - began, time.perf_counter() - asked)
     return Found(status, as_executed(task.manifold, joints, spacing), time.perf_counter() - began)
 
 
@@ -240,7 +276,9 @@ def _task(scene: Scene, manifold: ConstraintManifold, band: BandSettings) -> Tas
 def _judged(
     certifier: Certifier, constraint: Constraint, queries: Queries, query: int, found: Found
 ) -> tuple[dict[str, Any], bool]:
-    about = {"status": found.status, "time_s": found.time_s, "check_time_s": found.check_time_s}
+    about = {
+        "status": found.status, "source": found.source, "time_s": found.time_s, "check_time_s": found.check_time_s,
+    }  # fmt: skip
     if len(found.joints) < 2:
         nan = float("nan")
         empty = {"valid": False, "reason": "no path", "length_rad": nan, "max_violation": nan, "violation_bound": nan}

@@ -10,18 +10,18 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.paths import Layout
 
 PLAN_COLUMNS = (
-    "planner", "solved", "claimed, not valid", "length / best known, median", "p95", "time [ms], median", "p95",
-    "with check, median", "p95",
+    "planner", "solved", "claimed, not valid", "length / best known, median", "p95", "p95, failures as ∞",
+    "time [ms], median", "p95", "with check, median", "p95",
 )  # fmt: skip
 POLICY_COLUMNS = (
     "one cubic, not refined", "feasible", "length / shortest cubic, mean", "median", "p95", "curves looked at",
-    "time [ms]",
+    "time [ms], beside another process",
 )  # fmt: skip
 EXECUTION_COLUMNS = (
     "path", "executed", "spheres kept, mean", "worst", "largest tilt [°]", "collisions", "tracking error [rad]",
     "duration [s]",
 )  # fmt: skip
-COMPARED = ("planner", "band from many starts", "BiRRT + band", "BiRRT")
+COMPARED = ("planner", "band from many starts", "BiRRT + band", "BiRRT", "BiRRT, tangent bundle")
 """Rows that are shown of constraints that nothing was trained on."""
 
 
@@ -35,8 +35,9 @@ def plan_blocks(params: Params, layout: Layout) -> list[Block]:
         f"{first['queries']} queries, {first['solvable']} of which any planner solved; one thread of "
         f"{measured['machine']['processor']}. Times without and with PyBullet's check of the final path; violation "
         f"bound of the planner's paths at most {short(rows['planner']['violation_bound_max'])} rad. In one batch of "
-        f"{batch['size']}: {batch['checked_per_second']:.0f} plans a second, "
-        f"{batch['per_second']:.0f} without the check"
+        f"{batch['size']}: {batch['checked_per_second']:.0f} queries a second, "
+        f"{batch['per_second']:.0f} without the check. The planner's paths come from "
+        f"{_sources(rows['planner'])}; ratios are over the planner's own paths, but in the column with failures"
     )
     blocks = [Block(f"{name}, whole and in parts", note, PLAN_COLUMNS, [_plan_row(*row) for row in rows.items()])]
     unseen = [
@@ -47,7 +48,10 @@ def plan_blocks(params: Params, layout: Layout) -> list[Block]:
     ]
     if unseen:
         counted = ", ".join(f"{c} {_solvable(plans[c])}" for c in params.plans.unseen)
-        note = f"constraints that nothing was trained on; solved of the queries that any planner solved: {counted}"
+        note = (
+            "constraints that nothing was trained on; their graphs, made in about a second each, are not in the times; "
+            f"solved of the queries that any planner solved: {counted}"
+        )
         header = ("constraint, planner", *PLAN_COLUMNS[1:])
         blocks.append(Block("Unseen constraints", note, header, [_plan_row(*row) for row in unseen]))
     return blocks
@@ -66,8 +70,8 @@ def execution_block(params: Params, layout: Layout) -> Block:
     kinds = {kind: row for kind, row in found.items() if isinstance(row, Mapping)}
     tilt = np.degrees(found["smallest_line_tilt_rad"])
     note = (
-        f"{found['queries']} queries of {params.plans.constraint} whose straight joint line tilts the cup by "
-        f"{tilt:.0f}° or more; followed by PyBullet's position control with gravity, with "
+        f"{found['queries']} of {found['drawn']} drawn queries of {params.plans.constraint}, whose straight joint line "
+        f"tilts the cup by {tilt:.0f}° or more; followed by PyBullet's position control with gravity, with "
         f"{params.execution.spheres} spheres in an open cup"
     )
     rows = [
@@ -100,8 +104,14 @@ def _plan_row(name: str, row: Mapping[str, Any]) -> Sequence[str]:
     return [
         name, _number(row["success_of_solvable"], "{:.1%}"), str(row["claimed_but_invalid"]),
         _number(row["ratio_median"], "{:.4f}"), _number(row["ratio_p95"], "{:.4f}"),
+        _number(row["ratio_p95_all"], "{:.4f}"),
         *(_number(value, "{:.3g}") for value in times),
     ]  # fmt: skip
+
+
+def _sources(row: Mapping[str, Any]) -> str:
+    told = {"straight": "the straight start", "graph": "the graph", "policy": "the policies"}
+    return ", ".join(f"{told[name]} ({row[f'from_{name}']:.0%})" for name in told)
 
 
 def _solvable(rows: Mapping[str, Mapping[str, Any]]) -> str:
@@ -127,4 +137,4 @@ def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]]) -> Blo
 
 
 def _number(value: float | None, form: str) -> str:
-    return "–" if value is None else form.format(value)
+    return "–" if value is None or np.isnan(value) else form.format(value)
