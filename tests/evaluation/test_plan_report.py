@@ -33,6 +33,7 @@ def test_every_planner_has_its_row_and_failures_count(reported):
     assert "3 queries, 3 of which" in whole.note
     assert "300 queries a second, 400 without" in whole.note
     assert "the straight start (100%), the graph (0%), the policies (0%)" in whole.note
+    assert [row[0] for row in whole.rows] == ["planner", "BiRRT + band", "BiRRT"]
     assert len(unseen.rows) == 3 * len(reported[0].plans.unseen)
 
 

@@ -21,6 +21,10 @@ EXECUTION_COLUMNS = (
     "path", "executed", "spheres kept, mean", "worst", "largest tilt [°]", "collisions", "tracking error [rad]",
     "duration [s]",
 )  # fmt: skip
+PEERS = ("band from many starts", "BiRRT + band", "BiRRT", "BiRRT, tangent bundle", "RRT*", "PRM")
+"""The order of rows after the planner and its parts."""
+METHODS = ("straight latent line", "random curves", "descent", "policy, one seed", "policies", "separate policies")
+"""The order of the proposals, each on the learned manifold first."""
 COMPARED = ("planner", "band from many starts", "BiRRT + band", "BiRRT", "BiRRT, tangent bundle")
 """Rows that are shown of constraints that nothing was trained on."""
 
@@ -29,6 +33,7 @@ def plan_blocks(params: Params, layout: Layout) -> list[Block]:
     """The planner, its parts and its peers under the constraint of the plans, then under the unseen ones."""
     measured = read_metrics(layout.report("benchmark_plans", "plans"))
     name, plans, batches = params.plans.constraint, measured["plans"], measured["batch"]
+    plans = {constraint: _ordered(rows, (*params.plans.parts, *PEERS)) for constraint, rows in plans.items()}
     rows = plans[name]
     first, batch = next(iter(rows.values())), batches[name]
     note = (
@@ -61,7 +66,7 @@ def policy_blocks(params: Params, layout: Layout) -> list[Block]:
     """What the policies propose before any refinement, one block a constraint."""
     found = read_metrics(layout.report("benchmark_policies", params.geodesics.searched[0]))
     names = [name for name in (params.plans.constraint, *params.plans.unseen) if name in found]
-    return [_policy_block(name, found[name]) for name in names]
+    return [_policy_block(name, _ordered(found[name], METHODS)) for name in names]
 
 
 def execution_block(params: Params, layout: Layout) -> Block:
@@ -93,6 +98,18 @@ def plans_markdown(params: Params, layout: Layout) -> str:
 def policies_markdown(params: Params, layout: Layout) -> str:
     """The policies' first table, as README shows it."""
     return _markdown(policy_blocks(params, layout)[0]) + "\n"
+
+
+def _ordered(rows: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> dict[str, Mapping[str, Any]]:
+    """Rows in the order of the names that theirs begin with, the longest match first; JSON has them by the alphabet."""
+
+    def place(name: str) -> tuple[int, str]:
+        fitting = [known for known in names if name == known or name.startswith(f"{known}, ")]
+        rest = name.removeprefix(max(fitting, key=len)) if fitting else name
+        # of two charts the learned manifold comes first
+        return (names.index(max(fitting, key=len)) if fitting else len(names)), rest.replace("learned", "")
+
+    return {name: rows[name] for name in sorted(rows, key=place)}
 
 
 def _markdown(block: Block) -> str:
