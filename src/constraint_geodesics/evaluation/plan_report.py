@@ -42,7 +42,7 @@ def plan_blocks(params: Params, layout: Layout) -> list[Block]:
         f"bound of the planner's paths at most {short(rows['planner']['violation_bound_max'])} rad. In one batch of "
         f"{batch['size']}: {batch['checked_per_second']:.0f} queries a second, "
         f"{batch['per_second']:.0f} without the check. The planner's paths come from "
-        f"{_sources(rows['planner'])}; ratios are over the planner's own paths, but in the column with failures"
+        f"{_sources(rows['planner'])}; ratios are over each planner's own valid paths, but in the column with failures"
     )
     blocks = [Block(f"{name}, whole and in parts", note, PLAN_COLUMNS, [_plan_row(*row) for row in rows.items()])]
     unseen = [
