@@ -1,10 +1,14 @@
 """What the planner that users call reached, as tables of README and of the report's page, from its stages' JSON."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from constraint_geodesics.evaluation.figures import PLANNERS
+from constraint_geodesics.evaluation.plan_benchmark import BAND_AFTER, MULTI_START, PARTS, TANGENT
+from constraint_geodesics.evaluation.policy_benchmark import DESCENT, ONE_SEED, POLICIES, RANDOM, SEPARATE, STRAIGHT
+from constraint_geodesics.evaluation.policy_tasks import JOINTS, LEARNED
 from constraint_geodesics.evaluation.results import Block, markdown_table, read_metrics, short
 from constraint_geodesics.params import Params
 from constraint_geodesics.paths import Layout
@@ -21,12 +25,12 @@ EXECUTION_COLUMNS = (
     "path", "executed", "spheres kept, mean", "worst", "largest tilt [°]", "collisions", "tracking error [rad]",
     "duration [s]",
 )  # fmt: skip
-PEERS = ("band from many starts", "BiRRT + band", "BiRRT", "BiRRT, tangent bundle", "RRT*", "PRM")
+PEERS = (MULTI_START, BAND_AFTER, PLANNERS["birrt"].label, TANGENT, PLANNERS["rrt_star"].label, PLANNERS["prm"].label)
 """The order of rows after the planner and its parts."""
-METHODS = ("straight latent line", "random curves", "descent", "policy, one seed", "policies", "separate policies")
-"""The order of the proposals, each on the learned manifold first."""
-COMPARED = ("planner", "band from many starts", "BiRRT + band", "BiRRT", "BiRRT, tangent bundle")
+COMPARED = (next(iter(PARTS)), *PEERS[:4])
 """Rows that are shown of constraints that nothing was trained on."""
+METHODS = (STRAIGHT, RANDOM, DESCENT, ONE_SEED, POLICIES, SEPARATE)
+"""The order of the proposals, each on the learned manifold first."""
 
 
 def plan_blocks(params: Params, layout: Layout) -> list[Block]:
@@ -66,7 +70,8 @@ def policy_blocks(params: Params, layout: Layout) -> list[Block]:
     """What the policies propose before any refinement, one block a constraint."""
     found = read_metrics(layout.report("benchmark_policies", params.geodesics.searched[0]))
     names = [name for name in (params.plans.constraint, *params.plans.unseen) if name in found]
-    return [_policy_block(name, _ordered(found[name], METHODS)) for name in names]
+    named = [f"{method}, {chart}" for method in METHODS for chart in (LEARNED, JOINTS)]
+    return [_policy_block(name, _ordered(found[name], named)) for name in names]
 
 
 def execution_block(params: Params, layout: Layout) -> Block:
@@ -100,16 +105,9 @@ def policies_markdown(params: Params, layout: Layout) -> str:
     return _markdown(policy_blocks(params, layout)[0]) + "\n"
 
 
-def _ordered(rows: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> dict[str, Mapping[str, Any]]:
-    """Rows in the order of the names that theirs begin with, the longest match first; JSON has them by the alphabet."""
-
-    def place(name: str) -> tuple[int, str]:
-        fitting = [known for known in names if name == known or name.startswith(f"{known}, ")]
-        rest = name.removeprefix(max(fitting, key=len)) if fitting else name
-        # of two charts the learned manifold comes first
-        return (names.index(max(fitting, key=len)) if fitting else len(names)), rest.replace("learned", "")
-
-    return {name: rows[name] for name in sorted(rows, key=place)}
+def _ordered(rows: Mapping[str, Mapping[str, Any]], names: Iterable[str]) -> dict[str, Mapping[str, Any]]:
+    """Rows in the order of these names, any others behind them; JSON has them by the alphabet."""
+    return {name: rows[name] for name in dict.fromkeys([*names, *rows]) if name in rows}
 
 
 def _markdown(block: Block) -> str:
