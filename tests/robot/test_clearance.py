@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from constraint_geodesics.robot.bullet import Body, Box, World, data_path
+from constraint_geodesics.robot.bullet import Body, Box, Sphere, World, data_path
 from constraint_geodesics.robot.clearance import (
     ClearanceModel,
     clearance_batch,
@@ -19,6 +19,7 @@ from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
 TABLE = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1), ("link_base",))
 KUKA_TABLE = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1), ("lbr_iiwa_link_0",))
 WALL = Box("wall", (0.6, 0.0, 0.5), (0.1, 2.0, 1.0))
+BALL = Sphere("ball", (0.35, 0.1, 0.4), 0.12)
 BESIDE = Box("wall", (0.0, 0.55, 0.5), (4.0, 0.2, 4.0))
 SKIN = 0.004
 """Clearance [m] up to which PyBullet may report a contact: the margin of its collision shapes, and a little."""
@@ -55,11 +56,13 @@ def lift(tmp_path_factory: pytest.TempPathFactory) -> SerialRobot:
     [
         ("xarm", (TABLE,), 0.1),
         ("xarm", (TABLE, WALL), 0.15),
+        ("xarm", (BALL,), 0.1),
+        ("xarm", (TABLE, BALL), 0.15),
         ("kuka", (KUKA_TABLE,), 0.05),
         ("kuka", (KUKA_TABLE, WALL), 0.1),
         ("lift", (BESIDE,), 0.1),
     ],
-    ids=("xarm table", "xarm wall", "kuka table", "kuka wall", "sliding joint"),
+    ids=("xarm table", "xarm wall", "xarm ball", "xarm table and ball", "kuka table", "kuka wall", "sliding joint"),
 )
 def test_what_is_clear_is_free_for_pybullet_and_what_reaches_in_is_not(request, name, boxes, share) -> None:
     robot: SerialRobot = request.getfixturevalue(name)
@@ -95,7 +98,7 @@ def distances(model: ClearanceModel, robot: SerialRobot, q: np.ndarray) -> tuple
 
 
 @pytest.mark.parametrize(
-    ("name", "boxes"), [("xarm", (TABLE, WALL)), ("kuka", (KUKA_TABLE, WALL)), ("lift", (BESIDE,))]
+    ("name", "boxes"), [("xarm", (TABLE, WALL)), ("xarm", (BALL,)), ("kuka", (KUKA_TABLE, WALL)), ("lift", (BESIDE,))]
 )
 def test_each_row_is_the_gradient_of_its_links_distance(request, name, boxes) -> None:
     robot: SerialRobot = request.getfixturevalue(name)
@@ -200,3 +203,35 @@ def test_links_of_any_collision_shape_are_known(tmp_path, shapes) -> None:
     with World(robot, (BESIDE,)) as world:
         hit = world.label(q).workcell_collision
     assert not hit[model.clearance(robot, q) > SKIN].any()
+
+
+@pytest.mark.parametrize("bodies", [(TABLE, BALL), (WALL, BALL, BESIDE)], ids=("table and ball", "three"))
+def test_points_passed_over_in_groups_are_none_that_are_nearest(xarm, bodies) -> None:
+    """Against every point asked one by one."""
+    model, rng = clearance_model(xarm, bodies), np.random.default_rng(4)
+    for q in xarm.sample(40, rng):
+        far = float(rng.uniform(0.02, 0.3))
+        distances, normals, nearest = np.empty(6), np.empty((6, 3)), np.empty((6, 3))
+        axes, origins = np.empty((6, 3)), np.empty((6, 3))
+        link_clearances(xarm.chain.arrays, model.arrays, far, q, distances, normals, nearest, origins, axes)
+        for joint in range(6):
+            exact = one_by_one(xarm, model, q, joint)
+            if distances[joint] <= far:
+                assert distances[joint] == pytest.approx(exact, abs=1e-12)
+            else:
+                assert far < distances[joint] <= exact + 1e-12
+
+
+def one_by_one(robot, model, q, joint) -> float:
+    alone = ClearanceModel(
+        model.points[model.joints == joint],
+        model.joints[model.joints == joint],
+        model.boxes,
+        model.rounding,
+        model.exempt,
+    )
+    smallest = np.inf
+    for point in alone.points:
+        single = ClearanceModel(point[None], np.array([joint]), model.boxes, model.rounding, model.exempt)
+        smallest = min(smallest, float(single.clearance(robot, q)))
+    return smallest

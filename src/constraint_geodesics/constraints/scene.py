@@ -5,7 +5,7 @@ from pathlib import Path
 
 from constraint_geodesics.constraints.vector import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.params import ConstraintParams, Params, RobotParams, WorkcellParams
-from constraint_geodesics.robot.bullet import Body, Box, World, data_path
+from constraint_geodesics.robot.bullet import Body, Box, Solid, Sphere, World, data_path
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, load_robot
 
 
@@ -14,7 +14,7 @@ class Scene:
     """A robot in its workcell.  Picklable, so that a worker process can open a world of its own."""
 
     robot: SerialRobot
-    workcell: tuple[Box | Body, ...] = ()
+    workcell: tuple[Solid, ...] = ()
 
     @classmethod
     def from_params(cls, params: Params) -> "Scene":
@@ -43,14 +43,15 @@ def robot_from(params: RobotParams) -> SerialRobot:
     return load_robot(find_urdf(params.urdf), params.tool_link, params.limits_rad)
 
 
-def workcell_from(params: WorkcellParams) -> tuple[Box | Body, ...]:
+def workcell_from(params: WorkcellParams) -> tuple[Solid, ...]:
     """The fixed bodies that params.yaml lists."""
     boxes = [Box(name, box.centre_m, box.size_m, box.exempt_links) for name, box in params.boxes.items()]
     bodies = [
         Body(name, find_urdf(body.urdf), body.position_m, body.rpy_rad, body.exempt_links)
         for name, body in params.urdfs.items()
     ]
-    return (*boxes, *bodies)
+    spheres = [Sphere(name, ball.centre_m, ball.radius_m, ball.exempt_links) for name, ball in params.spheres.items()]
+    return (*boxes, *spheres, *bodies)
 
 
 def constraint_from(params: ConstraintParams) -> Constraint:

@@ -29,6 +29,16 @@ class Box:
 
 
 @dataclass(frozen=True)
+class Sphere:
+    """A fixed sphere: its centre and radius [m], and the robot's links that may touch it."""
+
+    name: str
+    centre: tuple[float, float, float]
+    radius: float
+    exempt_links: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Body:
     """A fixed body read from a URDF at a pose [m, rad], and the robot's links that may touch it."""
 
@@ -37,6 +47,10 @@ class Body:
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
     exempt_links: tuple[str, ...] = ()
+
+
+Solid = Box | Sphere | Body
+"""What can stand in a workcell."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +120,7 @@ class World:
     Raises FileNotFoundError if a URDF is missing and ValueError if an exempt link is not the robot's.
     """
 
-    def __init__(self, robot: SerialRobot, fixed: Sequence[Box | Body] = ()) -> None:
+    def __init__(self, robot: SerialRobot, fixed: Sequence[Solid] = ()) -> None:
         with _quiet():
             import pybullet
         self._bullet = pybullet
@@ -267,11 +281,14 @@ class World:
                 workcell = True
         return own, workcell
 
-    def _add(self, body: Box | Body) -> int:
+    def _add(self, body: Solid) -> int:
         bullet, client = self._bullet, self._client
         if isinstance(body, Box):
             half = [0.5 * edge for edge in body.size]
             shape = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half, physicsClientId=client)
+            return int(bullet.createMultiBody(0, shape, basePosition=body.centre, physicsClientId=client))
+        if isinstance(body, Sphere):
+            shape = bullet.createCollisionShape(bullet.GEOM_SPHERE, radius=body.radius, physicsClientId=client)
             return int(bullet.createMultiBody(0, shape, basePosition=body.centre, physicsClientId=client))
         if not body.urdf.is_file():
             raise FileNotFoundError(f"workcell {body.name!r}: no such URDF file: {body.urdf}")
@@ -284,7 +301,7 @@ class World:
                 )
             )  # fmt: skip
 
-    def _links(self, body: Box | Body) -> frozenset[int]:
+    def _links(self, body: Solid) -> frozenset[int]:
         unknown = [name for name in body.exempt_links if name not in self._link_index]
         if unknown:
             raise ValueError(f"workcell {body.name!r}: {unknown} are not links of {self.robot.name}")

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
-from constraint_geodesics.robot.bullet import Body, Box, Physics, World, physics
+from constraint_geodesics.robot.bullet import Physics, Solid, World, physics
 from constraint_geodesics.robot.kinematics import SerialRobot
 
 GRAVITY = 9.81
@@ -103,7 +103,7 @@ class Execution:
 
 def execute(
     robot: SerialRobot,
-    workcell: Sequence[Box | Body],
+    workcell: Sequence[Solid],
     joints: Float[np.ndarray, "T D"],
     times: Float[np.ndarray, "T"],
     cup_axis_in_tool: Float[np.ndarray, "3"],

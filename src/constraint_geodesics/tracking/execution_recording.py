@@ -16,7 +16,7 @@ from jaxtyping import Float
 from rerun.chunk import Chunk
 from scipy.spatial.transform import Rotation
 
-from constraint_geodesics.robot.bullet import Body, Box
+from constraint_geodesics.robot.bullet import Solid
 from constraint_geodesics.robot.execution import CupSettings, Execution
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.tracking.recording import (
@@ -65,7 +65,7 @@ class ExecutionRecord:
         return f"{self.constraint}-{self.name}-executed"
 
 
-def record_execution(file: Path, record: ExecutionRecord, robot: SerialRobot, workcell: Sequence[Box | Body]) -> None:
+def record_execution(file: Path, record: ExecutionRecord, robot: SerialRobot, workcell: Sequence[Solid]) -> None:
     """Write the recording of one execution, its blueprint inside.
 
     Raises RecordingError if the execution is not one of this robot and cup, or a mesh of the robot or a body is
@@ -91,7 +91,7 @@ def record_execution(file: Path, record: ExecutionRecord, robot: SerialRobot, wo
 
 
 def record_executions(
-    folder: Path, records: Sequence[ExecutionRecord | None], robot: SerialRobot, workcell: Sequence[Box | Body]
+    folder: Path, records: Sequence[ExecutionRecord | None], robot: SerialRobot, workcell: Sequence[Solid]
 ) -> list[str]:
     """Record executions, one file each; returns the file of each, or "" where there is None."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -24,7 +24,7 @@ from rerun.chunk import Chunk, RrdReader
 from rerun.urdf import UrdfTree
 
 from constraint_geodesics.constraints.vector import AXES, ConstraintManifold
-from constraint_geodesics.robot.bullet import Body, Box
+from constraint_geodesics.robot.bullet import Box, Solid, Sphere
 from constraint_geodesics.robot.kinematics import SerialRobot, rotation_from_rpy
 
 APPLICATION = "constraint_geodesics"
@@ -113,7 +113,7 @@ class _Series:
 
 
 def record_path(
-    file: Path, path: PathRecord, manifold: ConstraintManifold, workcell: Sequence[Box | Body], *, frames: int
+    file: Path, path: PathRecord, manifold: ConstraintManifold, workcell: Sequence[Solid], *, frames: int
 ) -> None:
     """Write the recording of one path, its blueprint inside.
 
@@ -241,7 +241,7 @@ def robot_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
             yield static(entity, joint.compute_transform(0.0, clamp=False))
 
 
-def workcell_chunks(body: Box | Body) -> Iterator[Chunk]:
+def workcell_chunks(body: Solid) -> Iterator[Chunk]:
     """A body of the workcell at its place.  Raises RecordingError if a mesh is missing."""
     entity = _entity("workcell", body.name)
     if isinstance(body, Box):
@@ -249,6 +249,15 @@ def workcell_chunks(body: Box | Body) -> Iterator[Chunk]:
             entity,
             rr.Boxes3D(
                 centers=[body.centre], sizes=[body.size], colors=[_BOX], fill_mode="solid",
+                labels=[body.name], show_labels=False,
+            ),
+        )  # fmt: skip
+        return
+    if isinstance(body, Sphere):
+        yield static(
+            entity,
+            rr.Ellipsoids3D(
+                centers=[body.centre], radii=[body.radius], colors=[_BOX], fill_mode="solid",
                 labels=[body.name], show_labels=False,
             ),
         )  # fmt: skip

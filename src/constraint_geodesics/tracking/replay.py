@@ -12,7 +12,7 @@ from constraint_geodesics.constraints.submanifold import GridSubmanifold, Subman
 from constraint_geodesics.constraints.vector import ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import RecordingParams
-from constraint_geodesics.robot.bullet import Body, Box
+from constraint_geodesics.robot.bullet import Solid
 from constraint_geodesics.tracking.recording import LatentView, PathRecord, record_path
 
 GRID_POINTS = 100
@@ -21,7 +21,7 @@ GRID_POINTS = 100
 
 def record_rows(
     folder: Path, rows: Sequence[Mapping[str, Any]], paths: Sequence[Float[np.ndarray, "T D"]], constraint: str,
-    chart: LearnedManifold, manifold: ConstraintManifold, submanifold: Submanifold, workcell: Sequence[Box | Body],
+    chart: LearnedManifold, manifold: ConstraintManifold, submanifold: Submanifold, workcell: Sequence[Solid],
     params: RecordingParams,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Record the paths of the first queries; returns the rows with the file of each, or "", as `recording`."""
