@@ -17,6 +17,7 @@ from constraint_geodesics import Constraint, Planner, Pose, bundle
 from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.retraction import retract
 from constraint_geodesics.constraints.vector import ConstraintError, ConstraintManifold
+from constraint_geodesics.params import SphereParams
 from constraint_geodesics.planner import Path as PlannedPath
 from constraint_geodesics.planner import PlannerError, check_path, read_path
 from constraint_geodesics.planners.geodesic import Answer, Parts, Task, candidates, refined, rows_of
@@ -30,7 +31,7 @@ from tests.planner_fixtures import (
     pairs_of,
 )
 
-ONLY_GRAPH = Parts(straight=False, policy=False)
+ONLY_GRAPH = Parts(straight=False, policy=False, tree=False)
 OTHER_WAY_ROUND = np.array([0.0, 2.0, -0.2, 0.0, 0.3, 0.1])
 """A configuration in which the arm touches itself."""
 
@@ -221,7 +222,7 @@ def test_ends_beside_the_constraint_within_its_tolerance_are_taken(planner) -> N
 
 @pytest.mark.parametrize("name", ["level_cup", "slide"])
 def test_refinement_shortens_a_way_over_the_graph(planner, name) -> None:
-    plain = Parts(straight=False, policy=False, refinement=False)
+    plain = Parts(straight=False, policy=False, refinement=False, tree=False)
     ratios = []
     for ends in pairs_of(name, 6, seed=6):
         paths = [planner.plan(*ends, name, parts=parts) for parts in (ONLY_GRAPH, plain)]
@@ -307,7 +308,7 @@ def refusals(planner: Planner) -> dict[str, tuple[np.ndarray, np.ndarray, str, s
 )
 def test_what_can_not_be_planned_is_said(planner, tmp_path, status) -> None:
     start, goal, name, expected = refusals(planner)[status]
-    parts = Parts(False, False, False) if status == "not_found" else Parts()
+    parts = Parts(False, False, False, tree=False) if status == "not_found" else Parts()
     path = planner.plan(start, goal, name, parts=parts)
     assert path.status == status, path.explanation
     assert re.search(expected, path.explanation), path.explanation
@@ -459,7 +460,7 @@ def test_without_a_reference_the_axes_are_held_where_the_start_has_them(planner)
     held = ConstraintManifold(robot, height.relative_to(Pose(position, rotation)))
     goals = retract(held, start + np.random.default_rng(1).uniform(-0.6, 0.6, (8, 6))).joints
     for goal in goals:
-        path = planner.plan(start, goal, height, parts=Parts(policy=False, graph=False))
+        path = planner.plan(start, goal, height, parts=Parts(policy=False, graph=False, tree=False))
         if path.status != "solved":
             continue
         found += 1
@@ -517,7 +518,7 @@ def test_the_answer_does_not_depend_on_earlier_queries() -> None:
 def test_many_constraints_may_come_and_go(small) -> None:
     """What is remembered of them changes no answer."""
     start, goal = pairs_of("free", 1, seed=15)[0]
-    straight = Parts(policy=False, graph=False)
+    straight = Parts(policy=False, graph=False, tree=False)
     wide = Constraint((0, 0, 1, 0, 0, 0), (0, 0, 5.0, 0, 0, 0))
     first = small.plan(start, goal, wide, parts=straight)
     assert first.status == "solved"
@@ -782,7 +783,7 @@ def test_proposed_curves_come_the_shortest_first_and_broken_ones_not_at_all(plan
         jumps = line + np.array([0, 0, 0, 0, 0, 4.0]) * (share > 0.5) * (share < 1.0)
         return np.stack([jumps, way_round, np.full_like(line, np.nan), line])
 
-    only = Parts(straight=False, graph=False, refinement=False)
+    only = Parts(straight=False, graph=False, refinement=False, tree=False)
     found = list(candidates(task, start, goal, lambda: proposals, only))
     assert isinstance(found[-1], Answer)
     assert found[-1].status == "not_found"
@@ -793,3 +794,60 @@ def test_proposed_curves_come_the_shortest_first_and_broken_ones_not_at_all(plan
     best, worst = found[:2]
     assert best.length < 1.1 * np.linalg.norm(np.diff(best.points, axis=0), axis=1).sum()
     assert worst.length > best.length + 0.5
+
+
+# budgets and obstacles
+
+
+def around(planner: Planner, name: str, seed: int) -> tuple[Planner, np.ndarray, np.ndarray]:
+    """The same planner with a sphere on the way of a query that its graphs know nothing of."""
+    for start, goal in pairs_of(name, 8, seed=seed):
+        free = planner.plan(start, goal, name)
+        if free.status != "solved" or free.length_rad < 3.0:
+            continue
+        middle = free.at(0.5)
+        x, y, z = map(float, planner.scene.robot.forward(middle)[0])
+        ball = SphereParams(centre_m=(x, y, z), radius_m=0.1)
+        workcell = planner.bundle.workcell.model_copy(update={"spheres": {"ball": ball}})
+        other = Planner(replace(planner.bundle, workcell=workcell), "with a sphere")
+        with other.scene.world() as world:
+            if world.is_free(start) and world.is_free(goal) and world.first_collision(free.joints) is not None:
+                return other, start, goal
+        other.close()
+    raise AssertionError("no query leaves room for a sphere")
+
+
+@pytest.mark.parametrize("name", ["free", "level_cup", "slide"])
+def test_a_sphere_that_no_graph_knows_is_gone_round(planner, name) -> None:
+    other, start, goal = around(planner, name, seed=11)
+    with other:
+        path = other.plan(start, goal, name)
+        assert path.status == "solved", path.explanation
+        assert path.certificate is not None
+        assert path.certificate.valid
+        alone = other.plan(start, goal, name, parts=Parts(straight=False, policy=False, graph=False))
+        assert (alone.status, alone.source) == ("solved", "tree"), alone.explanation
+
+
+def test_a_budget_makes_paths_no_longer_and_is_kept_roughly(planner) -> None:
+    for start, goal in pairs_of("tool_down", 3, seed=12):
+        first = planner.plan(start, goal, "tool_down")
+        better = planner.plan(start, goal, "tool_down", budget_s=0.2)
+        assert first.status == better.status == "solved"
+        assert better.length_rad <= first.length_rad
+        assert better.planning_time_s >= 0.2
+        assert better.certificate is not None
+        assert better.certificate.valid
+
+
+def test_without_parts_that_propose_curves_a_budget_is_not_waited_for(planner) -> None:
+    start, goal = pairs_of("free", 1, seed=1)[0]
+    only = Parts(policy=False, graph=False, tree=False)
+    assert planner.plan(start, goal, "free", parts=only, budget_s=100.0).status == "solved"
+
+
+@pytest.mark.parametrize("budget", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_budget_is_a_positive_number(planner, budget) -> None:
+    start, goal = pairs_of("free", 1, seed=1)[0]
+    with pytest.raises(PlannerError, match="budget_s"):
+        planner.plan(start, goal, "free", budget_s=budget)

@@ -34,6 +34,7 @@ from constraint_geodesics.planners.geodesic import (
     Proposals,
     Task,
     candidates,
+    improvements,
     rows_of,
 )
 from constraint_geodesics.planners.path_planner import ends_refused
@@ -51,6 +52,9 @@ STANDING_S = 0.001
 KEPT_TASKS = 64
 """Constraints without a name that are remembered, with their graphs."""
 _ROUNDS = 20
+_NO_MORE = "no more curves"
+_WORTHWHILE = 1e-4
+"""Share by which a curve must be shorter than the path so far to be certified."""
 _TIGHTENED = (1.0, 0.7, 0.4)
 """Shares of the allowed violation that a path's rows are drawn for, should the certificate ask for closer ones."""
 
@@ -260,16 +264,21 @@ class Planner:
 
     def plan(
         self, start: Float[np.ndarray, "D"] | Sequence[float], goal: Float[np.ndarray, "D"] | Sequence[float],
-        constraint: str | Constraint, *, parts: Parts = ALL_PARTS,
+        constraint: str | Constraint, *, parts: Parts = ALL_PARTS, budget_s: float | None = None,
     ) -> Path:  # fmt: skip
         """A short path from start to goal [rad] under a constraint: a name from params.yaml, or a Constraint, which
         without a reference holds its axes where the start has them.
 
-        parts: of the planner to use, for comparisons.
-        Raises PlannerError if an end has the wrong shape or is not finite, or the name is unknown.
+        parts: of the planner to use, for comparisons.  budget_s: by default the first path that is certified is the
+        answer; with a budget shorter ones, round the other side of something, are looked for until so many seconds
+        have passed since the call.
+        Raises PlannerError if an end has the wrong shape or is not finite, the name is unknown, or the budget is no
+        positive number.
         """
         began = time.perf_counter()
         self._require_open()
+        if budget_s is not None and not (np.isfinite(budget_s) and budget_s > 0.0):
+            raise PlannerError(f"budget_s = {budget_s}: must be a positive number of seconds")
         q_start, q_goal = self._configuration(start, "start"), self._configuration(goal, "goal")
         meant, name = self._named(constraint)
         held = self._held_at(meant, q_start)
@@ -287,7 +296,7 @@ class Planner:
                 break
             found = self._certified(task, candidate, q_start, q_goal, name, began)
             if isinstance(found, Path):
-                return found
+                return found if budget_s is None else self._improved(task, found, parts, began, budget_s)
             problem = f"; the {candidate.source} curve fails: {found}"
         if answer.status == "not_connected":
             return self._nothing("not_connected", self._apart(task, answer, q_goal, name), held, name, began)
@@ -411,6 +420,20 @@ class Planner:
                 own = bool(self._world.label(q[None]).self_collision[0])
                 return "in_collision", f"the {end} touches {'the arm itself' if own else 'the workcell'}"
         return None
+
+    def _improved(self, task: Task, path: Path, parts: Parts, began: float, budget_s: float) -> Path:
+        """The shortest certified path that is found until the time is over; `path` if it remains that."""
+        start, goal = path.joints[0], path.joints[-1]
+        curves = improvements(task, start, goal, parts)
+        while time.perf_counter() - began < budget_s:
+            candidate = next(curves, _NO_MORE)
+            if isinstance(candidate, str):
+                break
+            if candidate is not None and candidate.length < (1.0 - _WORTHWHILE) * path.length_rad:
+                found = self._certified(task, candidate, start, goal, path.constraint_name, began)
+                if isinstance(found, Path) and found.length_rad < path.length_rad:
+                    path = found
+        return replace(path, planning_time_s=time.perf_counter() - began)
 
     def _certified(
         self, task: Task, candidate: Candidate, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], name: str,

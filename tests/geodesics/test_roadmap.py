@@ -25,6 +25,7 @@ from constraint_geodesics.geodesics.roadmap import (
 )
 from constraint_geodesics.geometry.graph import components, nearest_neighbour_edges
 from constraint_geodesics.params import Params
+from constraint_geodesics.robot.bullet import Sphere
 from constraint_geodesics.robot.clearance import ClearanceModel, clearance_model
 
 MARGIN = 0.006
@@ -241,3 +242,30 @@ def test_graphs_of_few_nodes_have_few_edges(made) -> None:
     assert len(join(alone, made.space, nodes[0]).nodes) == 1
     few = build_roadmap(made.space, nodes[:4], 10)
     assert len(few.edges) <= 6
+
+
+def test_edges_that_something_new_stands_on_are_left_out(made) -> None:
+    """The shortest way over a graph of another workcell is that over the edges which hold in this one."""
+    roadmap, robot = made.roadmap, made.manifold.robot
+    rng, changed = np.random.default_rng(9), 0
+    for _ in range(12):
+        start, goal = roadmap.joints[rng.choice(np.flatnonzero(roadmap.labels == 0), 2, replace=False)]
+        at_start, at_goal = join(roadmap, made.space, start), join(roadmap, made.space, goal)
+        before = shortest_way(roadmap, start, goal, at_start, at_goal, made.space)
+        assert before is not None
+        np.testing.assert_array_equal(before, shortest_way(roadmap, start, goal, at_start, at_goal))
+        ball = Sphere("ball", tuple(map(float, robot.forward(before[len(before) // 2])[0])), 0.1)
+        model = clearance_model(robot, (ball,))
+        if model.clearance(robot, np.stack([start, goal])).min() < 0.05:
+            continue
+        space = BandSpace(made.manifold, model, MARGIN).arrays
+        after = shortest_way(roadmap, start, goal, at_start, at_goal, space)
+        assert after is None or after.tobytes() != before.tobytes()
+        changed += 1
+        if after is None or len(after) < 5:
+            continue
+        lengths = np.empty(len(after) - 3)
+        corners = np.arange(1, len(after) - 1)
+        edge_lengths(space, after, np.stack([corners[:-1], corners[1:]], axis=1), lengths)
+        assert np.isfinite(lengths).all()
+    assert changed >= 4

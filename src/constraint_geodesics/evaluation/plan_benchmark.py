@@ -33,12 +33,13 @@ from constraint_geodesics.robot.clearance import clearance_model
 PARTS = {
     "planner": Parts(),
     "without policy": Parts(policy=False),
-    "straight": Parts(policy=False, graph=False, refinement=False),
-    "straight + band": Parts(policy=False, graph=False),
-    "policy": Parts(straight=False, graph=False, refinement=False),
-    "policy + band": Parts(straight=False, graph=False),
-    "graph": Parts(straight=False, policy=False, refinement=False),
-    "graph + band": Parts(straight=False, policy=False),
+    "straight": Parts(policy=False, graph=False, refinement=False, tree=False),
+    "straight + band": Parts(policy=False, graph=False, tree=False),
+    "policy": Parts(straight=False, graph=False, refinement=False, tree=False),
+    "policy + band": Parts(straight=False, graph=False, tree=False),
+    "graph": Parts(straight=False, policy=False, refinement=False, tree=False),
+    "graph + band": Parts(straight=False, policy=False, tree=False),
+    "trees + band": Parts(straight=False, policy=False, graph=False),
 }
 """The planner whole and in parts, by the names the table shows."""
 MULTI_START, BAND_AFTER, TANGENT = "band from many starts", "BiRRT + band", "BiRRT, tangent bundle"

@@ -2,7 +2,8 @@
 
 The graph of `constraints/submanifold.py` (eq. 8) with a query's two ends joined to it, searched by A* [Hart et al.
 1968] with the straight joint distance as the bound from below.  Compiled; PyBullet checked the graph's own edges
-when it was made, the edges to a query's ends are checked here for jumps, limits and the workcell's boxes.
+when it was made; the edges to a query's ends, and those of the way that is found, are checked here for jumps, limits
+and the workcell's boxes and spheres.
 """
 
 import heapq
@@ -75,17 +76,27 @@ def join(roadmap: Roadmap, space: tuple, q: Float[np.ndarray, "D"], tried: int =
 
 
 def shortest_way(
-    roadmap: Roadmap, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], at_start: Joined, at_goal: Joined
-) -> Float[np.ndarray, "k D"] | None:
-    """Corners of the shortest way over the graph, both ends included; None where the graph does not join them."""
+    roadmap: Roadmap, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], at_start: Joined, at_goal: Joined,
+    space: tuple | None = None,
+) -> Float[np.ndarray, "k D"] | None:  # fmt: skip
+    """Corners of the shortest way over the graph, both ends included; None where the graph does not join them.
+
+    space: as `BandSpace.arrays`; the edges of a way that was found are looked at in it, since the graph may be of a
+    workcell with less in it.  Those that fail are left out, and the search is begun again [lazy shortest paths, Dellin
+    and Srinivasa 2016].
+    """
     if not len(at_start.nodes) or not len(at_goal.nodes):
         return None
-    nodes = _a_star(
-        roadmap.joints, *roadmap.neighbours, goal, at_start.nodes, at_start.lengths, at_goal.nodes, at_goal.lengths
-    )
-    if not len(nodes):
-        return None
-    return np.concatenate([start[None], roadmap.joints[nodes], goal[None]])
+    begins, leads, lengths = roadmap.neighbours
+    own, looked_at = lengths.copy(), np.zeros(len(lengths), bool)
+    while True:
+        nodes = _a_star(
+            roadmap.joints, begins, leads, own, goal, at_start.nodes, at_start.lengths, at_goal.nodes, at_goal.lengths
+        )
+        if not len(nodes):
+            return None
+        if space is None or _holds(space, roadmap.joints, begins, leads, own, looked_at, nodes):
+            return np.concatenate([start[None], roadmap.joints[nodes], goal[None]])
 
 
 def build_roadmap(space: tuple, joints: Float[np.ndarray, "n D"], neighbours: int) -> Roadmap:
@@ -154,6 +165,34 @@ def edge_lengths(space, nodes, edges, lengths):  # type: ignore[no-untyped-def]
     work = workspace(nodes.shape[1])
     for k in range(edges.shape[0]):
         lengths[k] = edge_length(space, nodes[edges[k, 0]], nodes[edges[k, 1]], work)
+
+
+@njit(**_COMPILE)
+def _holds(space, joints, begins, leads, lengths, looked_at, way):  # type: ignore[no-untyped-def]
+    """Whether all edges of a way hold in the space; those that do not become infinitely long, in either direction."""
+    work = workspace(joints.shape[1])
+    sound = True
+    for k in range(way.shape[0] - 1):
+        here, there = way[k], way[k + 1]
+        for e in range(begins[here], begins[here + 1]):
+            if leads[e] != there or looked_at[e]:
+                continue
+            point = joints[there].copy()  # a node may lie in what the graph does not know
+            holds = (
+                project_node(space, point, 12, work) <= 1e-6
+                and np.sum((point - joints[there]) ** 2) < EDGE_STEP**2
+                and edge_length(space, joints[here], joints[there], work) < np.inf
+            )
+            looked_at[e] = True
+            if not holds:
+                sound = False
+                lengths[e] = np.inf
+            for back in range(begins[there], begins[there + 1]):
+                if leads[back] == here:
+                    looked_at[back] = True
+                    if not holds:
+                        lengths[back] = np.inf
+    return sound
 
 
 @njit(**_COMPILE)

@@ -1,9 +1,10 @@
 """The project's own planner: proposals of a curve, the shortest of which is refined by an elastic band.
 
 Proposals are tried in the order of what they cost: the straight joint line, curves of the policies on the learned
-manifold, the sub-manifold's graph.  Each is relaxed by Newton's method on the exact constraint; the shortest curve
-that is continuous, within the limits and clear of the workcell's boxes is drawn as rows so close together that the
-straight lines between them keep the constraint, and goes to the caller, who has it certified.
+manifold, the sub-manifold's graph, two trees grown towards each other.  Each is relaxed by Newton's method on the exact
+constraint; the shortest curve that is continuous, within the limits and clear of the workcell's boxes and spheres is
+drawn as rows so close together that the straight lines between them keep the constraint, and goes to the caller, who
+has it certified.
 """
 
 from collections.abc import Callable, Generator, Iterator
@@ -16,10 +17,11 @@ from jaxtyping import Float
 from constraint_geodesics.constraints.vector import ConstraintManifold
 from constraint_geodesics.geodesics.band import BandCurve, BandSettings, BandSpace, relax, step_lengths
 from constraint_geodesics.geodesics.roadmap import Joined, Roadmap, join, resample, shortest_way
+from constraint_geodesics.geodesics.tree import tree_way
 from constraint_geodesics.robot.clearance import ClearanceModel, clearance_batch
 
 Status = Literal["not_connected", "not_found"]
-Source = Literal["straight", "policy", "graph"]
+Source = Literal["straight", "policy", "graph", "tree", "bend"]
 
 CHECK_STEP = 0.1
 """Distance of the points at which a relaxed curve is first looked at [rad]."""
@@ -33,6 +35,10 @@ HALVINGS = 8
 """Times that rows are drawn closer where the lines between them still leave the constraint."""
 LONGEST_ROW_STEP = 0.08
 """Distance of two rows at most [rad], however flat the path."""
+TREES = 4
+"""Pairs of trees that are grown where all else failed."""
+BENDS = 4
+"""Bent lines that are tried for each pair of trees, where a path is to be improved: they cost less."""
 
 
 class Proposals(Protocol):
@@ -53,6 +59,7 @@ class Parts:
     policy: bool = True
     graph: bool = True
     refinement: bool = True
+    tree: bool = True
 
 
 ALL_PARTS = Parts()
@@ -111,7 +118,7 @@ def candidates(
     A straight start that leads through a box is pushed out of it only after the graph was asked: that takes longer.
 
     A graph that came with the planner goes before the policies, which take longer to ask; one that has to be made,
-    which takes longer still, after them.
+    which takes longer still, after them.  Trees come last, and not where the graph holds the ends to be unconnected.
     """
     segments = task.settings.segments
     blocked = None
@@ -134,7 +141,38 @@ def candidates(
             yield pushed
     if parts.policy and not asked and answer.status != "not_connected":
         yield from _proposed(task, proposals(), start, goal, parts.refinement)
+    if parts.tree and answer.status != "not_connected":
+        for seed in range(TREES):
+            yield from _over_tree(task, start, goal, parts.refinement, seed)
     yield answer
+
+
+def improvements(
+    task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts = ALL_PARTS
+) -> Iterator[Candidate | None]:
+    """Further curves, for as long as the caller has time: the straight line pushed out of what it leads through, lines
+    bent past configurations of the graph, and now and then the way of new trees, all relaxed; None for one that is not
+    sound.
+
+    Which is tried when depends on nothing but the query.
+    """
+    rng, segments = np.random.default_rng(0), task.settings.segments
+    t = np.linspace(0.0, 1.0, segments + 1)[:, None]
+    line = (1.0 - t) * start + t * goal
+    roadmap = task.roadmap() if parts.graph else None
+    nodes = np.empty((0, len(start))) if roadmap is None else roadmap.joints
+    seed = TREES
+    if parts.straight:
+        yield refined(task, "straight", line, boxes=True)
+    while parts.tree or len(nodes):
+        for _ in range(BENDS if len(nodes) else 0):
+            bend = rng.uniform() * (nodes[rng.integers(len(nodes))] - 0.5 * (start + goal))
+            bent = line + 4.0 * t * (1.0 - t) * bend
+            bent[0], bent[-1] = start, goal
+            yield refined(task, "bend", bent)
+        if parts.tree:
+            yield next(_over_tree(task, start, goal, refine=True, seed=seed), None)
+        seed += 1
 
 
 def _proposed(
@@ -158,26 +196,36 @@ def _over_graph(
     if not (at_start.components(roadmap) & at_goal.components(roadmap)):
         apart = len(at_start.nodes) > 0 and len(at_goal.nodes) > 0
         return Answer("not_connected" if apart else "not_found", at_start, at_goal)
-    corners = shortest_way(roadmap, start, goal, at_start, at_goal)
+    corners = shortest_way(roadmap, start, goal, at_start, at_goal, task.clear)
     if corners is not None:
-        yield from _along_graph(task, corners, refine, boxes)
+        yield from _along(task, "graph", corners, refine, boxes)
     return Answer("not_found", at_start, at_goal)
 
 
-def _along_graph(task: Task, corners: Float[np.ndarray, "k D"], refine: bool, boxes: bool) -> Iterator[Candidate]:
-    """The relaxed way over the graph, with more nodes where fewer jump; then less and less relaxed, since the graph's
-    own edges are free of collisions that a band knows nothing of, those of the arm with itself.
+def _over_tree(
+    task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], refine: bool, seed: int
+) -> Iterator[Candidate]:
+    corners = tree_way(task.clear, start, goal, seed)
+    if corners is not None:
+        yield from _along(task, "tree", corners, refine, boxes=True)
+
+
+def _along(
+    task: Task, source: Source, corners: Float[np.ndarray, "k D"], refine: bool, boxes: bool
+) -> Iterator[Candidate]:
+    """The relaxed way over a graph or tree, with more nodes where fewer jump; then less and less relaxed, since the
+    graph's own edges are free of collisions that a band knows nothing of, those of the arm with itself.
     """
     segments = task.settings.segments
     if refine:
         for pieces in (segments, 2 * segments, 4 * segments):
-            found = refined(task, "graph", resample(corners, pieces + 1), boxes=boxes)
+            found = refined(task, source, resample(corners, pieces + 1), boxes=boxes)
             if found is not None:
                 yield found
                 break
     for iterations in PARTLY_RELAXED if refine else (0,):
         partly = replace(task, settings=replace(task.settings, iterations=iterations))
-        found = refined(partly, "graph", resample(corners, 4 * segments + 1), boxes=boxes)
+        found = refined(partly, source, resample(corners, 4 * segments + 1), boxes=boxes)
         if found is not None:
             yield found
 
@@ -195,7 +243,7 @@ def refined(
         found = _relaxed(task, source, nodes, settings)
         if found is not None and _is_clear(task, found.points):
             return found
-        if found is None and source != "graph":
+        if found is None and source not in ("graph", "tree"):
             return None
     found = _relaxed(task, source, nodes, settings, boxes=True)
     return found if found is not None and _is_clear(task, found.points) else None
