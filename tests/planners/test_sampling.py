@@ -180,13 +180,18 @@ def test_all_axes_held_leave_no_way(world: World) -> None:
     position, rotation = world.robot.forward(asked.start)
     held = ConstraintManifold(world.robot, Constraint((1,) * 6, reference=Pose(position, rotation)))
     stuck = PlanningProblem(asked.start, asked.start, held, world.is_free)
-    assert SamplingPlanner("birrt", SETTINGS).plan(stuck, seed=0).status == "not_found"
+    answer = SamplingPlanner("birrt", SETTINGS).plan(stuck, seed=0)
+    assert answer.status == "not_applicable"
+    assert "isolated points" in answer.explanation
 
 
 def test_relaxed_cup_uses_its_band_and_stays_in_it(world: World) -> None:
     asked = problem(world, RELAXED, 10)
-    # the atlas has no charts for a band: the projected space stands in
-    path = SamplingPlanner("birrt", SETTINGS.model_copy(update={"space": "atlas"})).plan(asked, seed=0)
+    for space in ("atlas", "tangent_bundle"):
+        answer = SamplingPlanner("birrt", SETTINGS.model_copy(update={"space": space})).plan(asked, seed=0)
+        assert answer.status == "not_applicable"
+        assert "no tangent spaces" in answer.explanation
+    path = SamplingPlanner("birrt", SETTINGS).plan(asked, seed=0)
     assert_sound(path, asked, world)
     tilt = np.linalg.norm(asked.manifold.residual(path.joints)[:, 3:], axis=1)
     assert np.radians(2) < tilt.max() <= np.radians(10) + 1e-4

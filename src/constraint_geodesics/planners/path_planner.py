@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints.vector import ConstraintManifold
+from constraint_geodesics.robot.clearance import ClearanceModel
 
 SATISFIED = 1e-4
 """Largest violation [rad or m] at which a configuration still keeps its constraint."""
@@ -16,7 +17,11 @@ LIMIT_SLACK = 1e-9
 """How far beyond a limit an end may lie [rad], by rounding."""
 
 EndStatus = Literal["start_violates", "goal_violates", "out_of_limits"]
-Status = Literal[EndStatus, "solved", "not_found", "start_in_collision", "goal_in_collision"]
+Status = Literal[
+    EndStatus, "solved", "not_found", "not_connected", "start_in_collision", "goal_in_collision", "in_collision",
+    "not_applicable",
+]  # fmt: skip
+"""not_applicable: the planner cannot work on such a problem at all; `PlannedPath.explanation` says why."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +35,8 @@ class PlanningProblem:
     manifold: ConstraintManifold
     is_free: Callable[[np.ndarray], bool]
     """Whether one configuration (D,) touches neither itself nor the workcell."""
+    clearance: ClearanceModel | None = None
+    """Distances to the workcell's boxes, for planners that use them; None if unknown."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,8 @@ class PlannedPath:
     """Wall-clock time from the problem to these configurations."""
     iterations: int
     """How often the planner's own loop ran; for a roadmap, its samples."""
+    explanation: str = ""
+    """Why there is no path, where the status does not say it all."""
 
 
 class PathPlanner(Protocol):

@@ -1,9 +1,9 @@
-"""PRM, RRT* and BiRRT (RRTConnect) from OMPL on the constraint manifold: the peers of the learned planner.
+"""OMPL's PRM, PRM*, RRT*, Informed RRT* and BiRRT (RRTConnect) on the constraint manifold: the planner's peers.
 
 The only importer of ompl.  Held axes are planned in OMPL's constrained state spaces (projected, atlas, tangent
-bundle), no constraint in the plain space of the joints.  A search ends by counting, never by a clock, and OMPL's
-random numbers restart with every problem: a seed gives the same path in any process, whatever was planned before
-and however busy the machine is.  `budget_s` is a safety limit; where it strikes, the result depends on the machine.
+bundle), no constraint in the plain space of the joints.  OMPL's random numbers restart with every problem: where a
+search ends by counting, a seed gives the same path in any process, whatever was planned before and however busy the
+machine is.  Where `budget_s` ends it, the path depends on the machine.
 """
 
 import itertools
@@ -16,14 +16,15 @@ import numpy as np
 from jaxtyping import Float
 from ompl import base, geometric, util
 
+from constraint_geodesics.constraints.lift import as_executed
 from constraint_geodesics.constraints.retraction import retract
 from constraint_geodesics.constraints.vector import Constraint, ConstraintManifold
 from constraint_geodesics.params import BenchmarkParams
 from constraint_geodesics.planners.path_planner import SATISFIED, PlannedPath, PlanningProblem, refusal
-from constraint_geodesics.robot.bullet import Body, Box, World
+from constraint_geodesics.robot.bullet import Solid, World
 from constraint_geodesics.robot.kinematics import SerialRobot
 
-PlannerName = Literal["prm", "rrt_star", "birrt"]
+PlannerName = Literal["prm", "prm_star", "rrt_star", "informed_rrt_star", "birrt"]
 
 _STALL = 0.2
 """A step along the constraint that advances by less than this share of itself leads nowhere."""
@@ -32,14 +33,21 @@ _WANDER = 2.0
 _MILESTONES_BETWEEN_LOOKS = 5
 _SHORTCUTS = 50
 
+Sampler = Callable[[], Float[np.ndarray, "D"]]
+"""Draws one configuration [rad], which is projected onto the constraint afterwards."""
+
 
 @dataclass(frozen=True)
 class SamplingPlanner:
-    """One of OMPL's planners with its settings."""
+    """One of OMPL's planners with its settings.
+
+    row_spacing_rad: distance of the path's rows at most, the constraint kept between them; None for OMPL's own rows.
+    """
 
     name: PlannerName
     settings: BenchmarkParams
     simplify: bool = True
+    row_spacing_rad: float | None = None
 
     def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
         """Look for a path until one is found (PRM, BiRRT) or the iterations are used up (RRT* always uses them).
@@ -52,24 +60,45 @@ class SamplingPlanner:
         refused = refusal(problem)
         if refused is not None:
             return PlannedPath(refused, nothing, time.perf_counter() - began, 0)
-        if problem.manifold.codim >= problem.manifold.robot.dof:  # isolated points, which OMPL has no space for
-            return PlannedPath("not_found", nothing, time.perf_counter() - began, 0)
-        util.noOutputHandler()
-        util.RNG.setSeed(seed + 1)  # OMPL refuses the seed 0
+        misfit = self._misfit(problem.manifold)
+        if misfit:
+            return PlannedPath("not_applicable", nothing, time.perf_counter() - began, 0, misfit)
+        _start_random_numbers(seed)
         space = _Space(problem, self.settings)
         found, iterations = _SEARCHES[self.name](space, self.settings, began + self.settings.budget_s)
         joints = nothing if found is None else self._as_executed(space, found)
+        if found is not None and self.row_spacing_rad is not None:
+            joints = as_executed(problem.manifold, joints, self.row_spacing_rad)
         status: Literal["solved", "not_found"] = "not_found" if found is None else "solved"
         return PlannedPath(status, joints, time.perf_counter() - began, iterations)
 
+    def _misfit(self, manifold: ConstraintManifold) -> str:
+        """Why OMPL has no space of this kind for the constraint; empty where it has one."""
+        if manifold.codim >= manifold.robot.dof:
+            return f"{manifold.codim} rows are held by {manifold.robot.dof} joints: isolated points are no space"
+        if manifold.tolerance.any() and self.settings.space != "projected":
+            return f"a tolerance has no tangent spaces, which the {self.settings.space} space is made of"
+        return ""
+
     def _as_executed(self, space: "_Space", found: Any) -> Float[np.ndarray, "T D"]:
-        if self.simplify:
-            shorter = geometric.PathGeometric(found)
-            _shorten(space, shorter)
-            joints, sound = space.dense(shorter)
-            if sound:
-                return joints
-        return space.dense(found)[0]
+        return _simplified(space, found)[0] if self.simplify else space.dense(found)[0]
+
+
+def birrt_with_sampler(
+    problem: PlanningProblem, settings: BenchmarkParams, sampler: Sampler, seed: int, deadline: float
+) -> tuple[Float[np.ndarray, "T D"] | None, int]:
+    """RRTConnect in the projected space with samples from elsewhere, simplified as `SamplingPlanner`'s paths are.
+
+    Both ends must be sound.  deadline: of time.perf_counter().  Returns the rows, None without a sound path, and the
+    iterations.
+    """
+    _start_random_numbers(seed)
+    space = _Space(problem, settings, sampler)
+    found, iterations = _birrt(space, settings, deadline)
+    if found is None:
+        return None, iterations
+    joints, sound = _simplified(space, found)
+    return (joints if sound else None), iterations
 
 
 def plan_all(
@@ -77,7 +106,7 @@ def plan_all(
     settings: BenchmarkParams,
     robot: SerialRobot,
     constraint: Constraint,
-    workcell: Sequence[Box | Body],
+    workcell: Sequence[Solid],
     starts: Float[np.ndarray, "n D"],
     goals: Float[np.ndarray, "n D"],
     seed: int,
@@ -101,11 +130,16 @@ class _HeldAxes(base.Constraint):
 
     Projection and test are those of the compiled retraction, which also knows tolerances; `function` and `jacobian`
     (exactly held axes only) serve the tangent spaces of the atlas.
+
+    OMPL's Python bindings let nobody replace the sampler of a projected space.  But a tree's iteration first asks
+    whether to go on, then projects its sample: the first projection after `expect_sample` is given another one.
     """
 
-    def __init__(self, manifold: ConstraintManifold, step: float) -> None:
+    def __init__(self, manifold: ConstraintManifold, step: float, sampler: Sampler | None) -> None:
         super().__init__(manifold.robot.dof, manifold.codim, SATISFIED)
         self._manifold = manifold
+        self._sampler = sampler
+        self._samples = False
         self._exact = np.flatnonzero(manifold.held & (manifold.tolerance == 0.0))
         self._step = step
         self._last = np.full(manifold.robot.dof, np.inf)
@@ -116,7 +150,14 @@ class _HeldAxes(base.Constraint):
     def jacobian(self, x: np.ndarray, out: np.ndarray) -> None:
         out[:] = self._manifold.jacobian(x)[self._exact]
 
+    def expect_sample(self) -> None:
+        """What is projected next is a tree's sample."""
+        self._samples = self._sampler is not None
+
     def project(self, x: np.ndarray) -> bool:
+        if self._samples and self._sampler is not None:
+            self._samples = False
+            x[:] = self._sampler()
         retracted = retract(self._manifold, x)
         if not retracted.converged or self._stalls(x, retracted.joints):
             return False
@@ -153,26 +194,31 @@ class _Space:
 
     problem: PlanningProblem
     settings: BenchmarkParams
+    sampler: Sampler | None = None
+    """Where a tree's samples come from; by default from OMPL.  Only the projected space can take one."""
     information: Any = field(init=False)
     definition: Any = field(init=False)
+    expect_sample: Callable[[], None] = field(init=False)
 
     def __post_init__(self) -> None:
         manifold, kind = self.problem.manifold, self.settings.space
-        if manifold.tolerance.any():  # a band has no tangent spaces
+        if self.sampler is not None:
             kind = "projected"
         joints = _joint_space(manifold.robot)
-        if manifold.constraint.is_free:
+        axes = _HeldAxes(manifold, self.settings.delta_rad, self.sampler)
+        self.expect_sample = axes.expect_sample
+        if self.is_plain:
             self.information = base.SpaceInformation(joints)
             self.information.setStateValidityCheckingResolution(self.settings.delta_rad / joints.getMaximumExtent())
         else:
-            self.information = _constrained(joints, kind, _HeldAxes(manifold, self.settings.delta_rad))
+            self.information = _constrained(joints, kind, axes, self.settings)
             self.information.getStateSpace().setDelta(self.settings.delta_rad)
             self.information.getStateSpace().setLambda(_WANDER)
             self.information.setMotionValidator(_Motions(self.information, _validity(self.problem)))
         self.information.setStateValidityChecker(_validity(self.problem))
         self.information.setup()
         ends = [self._state(q) for q in (self.problem.start, self.problem.goal)]
-        if not manifold.constraint.is_free and kind != "projected":
+        if not self.is_plain and kind != "projected":
             for end in ends:
                 self.information.getStateSpace().anchorChart(end)
         self.definition = base.ProblemDefinition(self.information)
@@ -212,11 +258,16 @@ class _Space:
 
     def _state(self, q: np.ndarray) -> Any:
         state = self.information.getStateSpace().allocState()
-        if self.problem.manifold.constraint.is_free:
+        if self.is_plain:
             state[0 : self._dof] = q.tolist()
         else:
             state.copy(q.tolist())
         return state
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether this is the space of the joints itself, which projects nothing."""
+        return self.problem.manifold.constraint.is_free and self.sampler is None
 
     @property
     def _dof(self) -> int:
@@ -233,12 +284,22 @@ def _joint_space(robot: SerialRobot) -> Any:
     return space
 
 
-def _constrained(joints: Any, kind: str, constraint: _HeldAxes) -> Any:
+def _constrained(joints: Any, kind: str, constraint: _HeldAxes, settings: BenchmarkParams) -> Any:
     if kind == "projected":
         return base.ConstrainedSpaceInformation(base.ProjectedStateSpace(joints, constraint))
     if kind == "atlas":
-        return base.ConstrainedSpaceInformation(base.AtlasStateSpace(joints, constraint))
-    return base.TangentBundleSpaceInformation(base.TangentBundleStateSpace(joints, constraint))
+        space = base.AtlasStateSpace(joints, constraint)
+        information = base.ConstrainedSpaceInformation(space)
+    else:
+        space = base.TangentBundleStateSpace(joints, constraint)
+        information = base.TangentBundleSpaceInformation(space)
+    if settings.chart_radius_rad is not None:
+        space.setRho(settings.chart_radius_rad)
+    if settings.chart_error_rad is not None:
+        space.setEpsilon(settings.chart_error_rad)
+    if settings.exploration is not None:
+        space.setExploration(settings.exploration)
+    return information
 
 
 def _validity(problem: PlanningProblem) -> Callable[[Any], bool]:
@@ -257,6 +318,19 @@ def _read(state: Any, dof: int) -> Float[np.ndarray, "D"]:
     return np.array([state[i] for i in range(dof)])
 
 
+def _start_random_numbers(seed: int) -> None:
+    util.noOutputHandler()
+    util.RNG.setSeed(seed + 1)  # OMPL refuses the seed 0
+
+
+def _simplified(space: _Space, found: Any) -> tuple[Float[np.ndarray, "T D"], bool]:
+    """The rows of the shortened path, of the path itself where that is not sound, and whether they are."""
+    shorter = geometric.PathGeometric(found)
+    _shorten(space, shorter)
+    joints, sound = space.dense(shorter)
+    return (joints, True) if sound else space.dense(found)
+
+
 def _shorten(space: _Space, path: Any) -> None:
     # `simplify` leaves out the shortcuts in constrained spaces, and its limit is a time
     simplifier = geometric.PathSimplifier(space.information)
@@ -266,36 +340,63 @@ def _shorten(space: _Space, path: Any) -> None:
 
 
 def _prm(space: _Space, settings: BenchmarkParams, deadline: float) -> tuple[Any, int]:
-    """Grow a roadmap of at most `prm_iterations` samples around both ends, looking for a path every few samples.
+    """The first path over a roadmap of at most `prm_iterations` samples."""
+    planner = geometric.PRM(space.information)
+    return _grow_roadmap(planner, space, settings.prm_iterations, _MILESTONES_BETWEEN_LOOKS, deadline)
+
+
+def _prm_star(space: _Space, settings: BenchmarkParams, deadline: float) -> tuple[Any, int]:
+    """The shortest path over a roadmap of `prm_iterations` samples."""
+    planner = geometric.PRMstar(space.information)
+    return _grow_roadmap(planner, space, settings.prm_iterations, settings.prm_iterations, deadline)
+
+
+def _grow_roadmap(planner: Any, space: _Space, most: int, between_looks: int, deadline: float) -> tuple[Any, int]:
+    """Grow a roadmap of at most `most` samples around both ends, looking for a path every few samples.
 
     OMPL's own loop lets a second thread look while the first one samples for 0.2 s at a time, so that a path depends
     on the machine.  Here `solve` may not run at all: it only enters the ends and answers with the path that
     comes nearest to the goal, found by A*.
     """
-    planner = geometric.PRM(space.information)
     planner.setProblemDefinition(space.definition)
     planner.setup()
-    tries = 0
+    tries, wanted = 0, 0
 
     def enough() -> bool:
         nonlocal tries
         tries += 1
         return planner.milestoneCount() >= wanted or tries > most_tries or time.perf_counter() > deadline
 
-    most_tries = 100 * settings.prm_iterations
+    most_tries = 100 * most
     while True:
         planner.solve(base.plannerAlwaysTerminatingCondition())
-        wanted = planner.milestoneCount() + _MILESTONES_BETWEEN_LOOKS
-        if space.definition.getSolutionDifference() == 0.0:
+        looked = wanted > 0 or between_looks < most
+        wanted = planner.milestoneCount() + between_looks
+        if looked and space.definition.getSolutionDifference() == 0.0:
             return space.definition.getSolutionPath(), planner.milestoneCount()
         space.definition.clearSolutionPaths()
-        if wanted > settings.prm_iterations or tries > most_tries or time.perf_counter() > deadline:
+        if (looked and wanted > most) or tries > most_tries or time.perf_counter() > deadline:
             return None, planner.milestoneCount()
         planner.growRoadmapPtc(base.PlannerTerminationCondition(enough))
 
 
 def _rrt_star(space: _Space, settings: BenchmarkParams, deadline: float) -> tuple[Any, int]:
     planner = geometric.RRTstar(space.information)
+    planner.setRange(settings.range_rad)
+    return _grow_tree(planner, space, settings.rrt_star_iterations, deadline)
+
+
+def _informed_rrt_star(space: _Space, settings: BenchmarkParams, deadline: float) -> tuple[Any, int]:
+    """On a constraint OMPL's sampler of the ellipsoid leaves it, and nearly all of its samples are lost: there the tree
+    rejects what lies outside instead, and is pruned.
+    """
+    if space.is_plain:
+        planner = geometric.InformedRRTstar(space.information)
+    else:
+        planner = geometric.RRTstar(space.information)
+        planner.setSampleRejection(True)
+        planner.setNewStateRejection(True)
+        planner.setTreePruning(True)
     planner.setRange(settings.range_rad)
     return _grow_tree(planner, space, settings.rrt_star_iterations, deadline)
 
@@ -314,6 +415,7 @@ def _grow_tree(planner: Any, space: _Space, most: int, deadline: float) -> tuple
         if iterations >= most or time.perf_counter() > deadline:
             return True
         iterations += 1
+        space.expect_sample()
         return False
 
     planner.setProblemDefinition(space.definition)
@@ -325,6 +427,8 @@ def _grow_tree(planner: Any, space: _Space, most: int, deadline: float) -> tuple
 
 _SEARCHES: dict[PlannerName, Callable[[_Space, BenchmarkParams, float], tuple[Any, int]]] = {
     "prm": _prm,
+    "prm_star": _prm_star,
     "rrt_star": _rrt_star,
+    "informed_rrt_star": _informed_rrt_star,
     "birrt": _birrt,
 }
