@@ -6,7 +6,7 @@ FILE ?=
 FIRST_START = 1.329923 -0.584036 -3.766650 -2.008429 0.728803 -2.581396
 FIRST_GOAL = 1.071549 -0.217480 -1.682647 -2.906655 -0.337949 1.348704
 
-.PHONY: help env plan repro smoke bench-geometry test lint format results ui replay clean
+.PHONY: help env plan repro smoke bench bench-quick bench-geometry test lint format results ui replay clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
@@ -36,6 +36,14 @@ repro: env  ## run all stages that are out of date, then print the results
 
 smoke: env  ## the same pipeline on small parameters, in a copy of this checkout
 	python tests/pipeline/smoke.py .geodesics/smoke
+
+bench: env  ## all planners on all queries (hours; go on after an interruption by calling it again), tables, figures
+	geodesics params
+	dvc repro stages/dvc.yaml
+
+bench-quick: env  ## the same table on one query of each constraint and scene (minutes), after `make repro`
+	dvc repro stages/dvc.yaml:draw_benchmark_queries
+	geodesics bench
 
 bench-geometry: env  ## time the geometry core again, after whatever it needs; writes reports/geometry.json
 	dvc repro label_joints train_manifold train_analytic

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -36,14 +37,25 @@ def run_stage(stage: Callable[..., None], arguments: Sequence[str]) -> None:
 
     arguments: the names after (params, layout), as dvc.yaml passes them; each must be one that params.yaml has.
     """
+    began = time.perf_counter()
     try:
         params = load_params()
         _check_names(params, stage, arguments)
         stage(params, Layout(), *arguments)
+        note_stage_time(Layout().stage_times, Path(sys.argv[0]).stem, arguments, time.perf_counter() - began)
     except (ValueError, OSError, RuntimeError) as error:
         if os.environ.get("GEODESICS_TRACEBACK"):
             raise
         raise SystemExit(_complain(error)) from None
+
+
+def note_stage_time(file: Path, stage: str, names: Sequence[str], seconds: float) -> None:
+    """Keep how long the last finished run of each stage took, workers and all: what training costs is read from it."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    own = " ".join([stage, *names])
+    kept = dict(line.split(",") for line in file.read_text().splitlines()[1:]) if file.is_file() else {}
+    kept[own] = f"{seconds:.1f}"
+    file.write_text("\n".join(["stage,seconds", *(f"{name},{kept[name]}" for name in sorted(kept))]) + "\n")
 
 
 def _check_names(params: Params, stage: Callable[..., None], arguments: Sequence[str]) -> None:
@@ -103,6 +115,9 @@ def plan(
         str | None,
         typer.Option(help="A planner's folder or MLflow address; by default the pipeline's outputs or the package's."),
     ] = None,
+    budget: Annotated[
+        float | None, typer.Option(help="Look for shorter paths until so many seconds have passed; by default do not.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the answer as one JSON object.")] = False,
 ) -> None:
     """Plan one path.  Exit code 0: solved; 2: wrong usage; 3: there is no path, and the line says why."""
@@ -112,7 +127,7 @@ def plan(
     try:
         first, last = _joints(start, "--start"), _joints(goal, "--goal")
         with Planner.load(planner) as loaded:
-            path = loaded.plan(first, last, constraint)
+            path = loaded.plan(first, last, constraint, budget_s=budget)
             source = loaded.source
     except (BundleError, PlannerError) as error:
         raise SystemExit(_complain(error, WRONG_USAGE)) from None
@@ -167,6 +182,41 @@ def _joints(text: str, option: str) -> list[float]:
         return [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
         raise PlannerError(f"{option} {text!r}: must be numbers [rad], with spaces or commas between them") from None
+
+
+@app.command("bench")
+def bench(
+    queries: Annotated[int, typer.Option(help="Queries of each constraint and scene.", min=1)] = 1,
+    seeds: Annotated[int, typer.Option(help="Seeds of each planner that chance plays a part in.", min=1)] = 1,
+    constraint: Annotated[list[str] | None, typer.Option(help="One of params.yaml's; by default all.")] = None,
+    planner: Annotated[
+        list[str] | None, typer.Option(help="One of params.yaml's bench.planners; by default all.")
+    ] = None,
+    longest: Annotated[float, typer.Option(help="Leave out planners that are given more seconds a query.")] = 2.0,
+    out: Annotated[Path, typer.Option(help="Folder of rows, table and summary.")] = Path(".geodesics/bench"),
+) -> None:
+    """Hold planners against each other on a few of the benchmark's queries; what is done is not done again."""
+    from constraint_geodesics.benchmark_blocks import answered, blocks_of, fewer
+    from constraint_geodesics.evaluation.benchmark import write_table
+    from constraint_geodesics.evaluation.benchmark_report import overview_markdown
+    from constraint_geodesics.evaluation.benchmark_statistics import all_constraints, benchmark_summary
+    from constraint_geodesics.evaluation.machine import run_header
+
+    params, layout = load_params(), Layout()
+    some, left_out = fewer(params, queries, seeds, constraint, planner, longest)
+    table = answered(blocks_of(some, layout, out / "rows", out / "recordings"), some.compute)
+    write_table(table, out / "benchmark.csv", run_header(layout.root))
+    order = {name: k for k, name in enumerate(some.bench.planners)}
+    table = table.sort_values("planner", key=lambda names: names.map(order), kind="stable")
+    summary = benchmark_summary(all_constraints(table), next(iter(some.bench.planners)))
+    text = overview_markdown(
+        summary, [n for n, e in some.bench.planners.items() if e.kind in ("ompl", "decoder_sampling")]
+    )
+    (out / "overview.md").write_text(text)
+    print(text)
+    if left_out:
+        print(f"left out, as they are given more than {longest:g} s a query (--longest): {', '.join(left_out)}")
+    print(f"rows: {out / 'benchmark.csv'}")
 
 
 @app.command("results")

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -42,6 +42,14 @@ class BoxParams(_Record):
     exempt_links: tuple[str, ...] = ()
 
 
+class SphereParams(_Record):
+    """A fixed sphere of the workcell."""
+
+    centre_m: Vector3
+    radius_m: Positive
+    exempt_links: tuple[str, ...] = ()
+
+
 class BodyParams(_Record):
     """A fixed body of the workcell read from a URDF."""
 
@@ -55,6 +63,7 @@ class WorkcellParams(_Record):
     """What surrounds the arm."""
 
     boxes: dict[Name, BoxParams] = {}
+    spheres: dict[Name, SphereParams] = {}
     urdfs: dict[Name, BodyParams] = {}
 
 
@@ -230,6 +239,12 @@ class BenchmarkParams(_Record):
     birrt_iterations: Count
     delta_rad: Positive
     range_rad: Positive
+    chart_radius_rad: Positive | None = None
+    """Radius ρ of a chart of the atlas; None, here and below: OMPL's own."""
+    chart_error_rad: Positive | None = None
+    """Distance ε from a chart to the manifold, at most."""
+    exploration: Annotated[float, Field(ge=0.0, lt=1.0)] | None = None
+    """Share of samples drawn beyond the charts that there are."""
 
 
 class PlannerParams(_Record):
@@ -259,6 +274,29 @@ class PlanBenchmarkParams(_Record):
     starts: Count
     batch: Count
     unseen: dict[Name, ConstraintParams]
+
+
+class PeerParams(_Record):
+    """One planner of the benchmark."""
+
+    kind: Name
+    queries: Count
+    seeds: Count
+    settings: dict[str, Any] = {}
+
+
+class BenchParams(_Record):
+    """The benchmark of all planners."""
+
+    queries: Count
+    radius_m: Positive
+    seed: Seed
+    block: Count
+    recorded: tuple[str, ...]
+    placed_by: Annotated[tuple[str, ...], Field(min_length=1)]
+    repeated: Count
+    drawn: tuple[str, ...]
+    planners: Annotated[dict[str, PeerParams], Field(min_length=1)]
 
 
 class ExecutionParams(_Record):
@@ -312,6 +350,7 @@ class Params(_Record):
     plans: PlanBenchmarkParams
     execution: ExecutionParams
     benchmark: BenchmarkParams
+    bench: BenchParams
     judge: JudgeParams
     recording: RecordingParams
     tracking: TrackingParams

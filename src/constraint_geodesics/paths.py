@@ -45,6 +45,30 @@ class Layout:
         """Folder of the planner's benchmark: queries (CSV) and paths (npz)."""
         return self.root / "data" / "plans"
 
+    def benchmark_queries(self, constraint: str) -> Path:
+        """The benchmark's queries of one constraint, with their obstacles (CSV)."""
+        return self.root / "data" / "benchmark_queries" / f"{constraint}.csv"
+
+    @property
+    def stage_times(self) -> Path:
+        """How long each stage took when it last ran (CSV)."""
+        return self.root / "reports" / "stage_times.csv"
+
+    @property
+    def benchmark_rows(self) -> Path:
+        """Folder of the benchmark's rows as they come (JSON lines)."""
+        return self.root / "data" / "benchmark_rows"
+
+    @property
+    def benchmark_table(self) -> Path:
+        """The benchmark's rows, all together (CSV)."""
+        return self.root / "reports" / "benchmark.csv"
+
+    @property
+    def benchmark_recordings(self) -> Path:
+        """Folder of the recordings of some of the benchmark's paths."""
+        return self.root / "data" / "recordings" / "run_benchmark"
+
     def policies(self, manifold: str) -> Path:
         """Folder of the policies trained on all constraints together."""
         return self.root / "data" / "policies" / manifold

@@ -38,6 +38,7 @@ SMALL: dict[str, Any] = {
     "plans": {"queries": 3, "seeds": [0], "peers": ["birrt"], "starts": 4, "batch": 4},
     "execution": {"queries": 1, "spheres": 4},
     "benchmark": {"seeds": [0], "rrt_star_iterations": 40, "prm_iterations": 50},
+    "bench": {"queries": 2},
 }
 CONSTRAINTS = ("free", "level_cup")
 MARK = ".smoke"
@@ -77,7 +78,16 @@ def shrink_params(folder: Path) -> None:
     unseen = params["plans"]["unseen"]
     params["plans"]["unseen"] = {name: unseen[name] for name in list(unseen)[:1]}
     _overlay(params, SMALL)
+    params["bench"]["planners"] = _one_of_each_kind(params["bench"]["planners"])
     file.write_text(yaml.safe_dump(params, sort_keys=False))
+
+
+def _one_of_each_kind(planners: dict[str, Any]) -> dict[str, Any]:
+    """Those that the benchmark's parameters name, and of the others the first of its kind, on one query each."""
+    named = ("BiRRT", "BiRRT + band", "band from many starts")
+    first = {planner["kind"]: name for name, planner in reversed(planners.items())}
+    kept = {name: planners[name] for name in planners if name in named or name in first.values()}
+    return {name: {**planner, "queries": 1, "seeds": min(planner["seeds"], 2)} for name, planner in kept.items()}
 
 
 def _overlay(params: dict[str, Any], changes: dict[str, Any]) -> None:

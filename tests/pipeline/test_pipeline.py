@@ -12,6 +12,7 @@ import pytest
 import yaml
 from mlflow.tracking import MlflowClient
 
+from constraint_geodesics.evaluation.benchmark import read_table
 from constraint_geodesics.tracking.recording import read_recording, same_recordings
 from tests.pipeline import smoke
 
@@ -19,12 +20,13 @@ pytestmark = [pytest.mark.xdist_group("pipeline"), pytest.mark.timeout(600)]
 
 SHARED = {"train_policies@planner", "build_planner", "benchmark_plans", "execute_paths", "benchmark_policies"}
 """What is made from all constraints together, and what is measured with it."""
+BENCHMARK = "stages/dvc.yaml:report_benchmark"
 LEARNED = "data/recordings/train_geodesics/planner-level_cup/query0-learned_geodesic-seed0.rrd"
 
 
 def stages_to_run(folder: Path) -> set[str]:
-    """Names of the stages that `dvc repro` would run now."""
-    result = smoke.dvc(folder, "status", "--json")
+    """Names of the stages that `dvc repro` would run now; the benchmark of all planners is not among them."""
+    result = smoke.dvc(folder, "status", "--json", "dvc.yaml")
     return set(yaml.safe_load(result.stdout))
 
 
@@ -157,3 +159,27 @@ def test_a_comment_in_the_report_retrains_nothing(finished: Path) -> None:
     changed = stages_to_run(finished)
     file.write_text(kept)
     assert changed == {"report"}
+
+
+def test_the_benchmark_has_a_row_for_every_planner_and_says_where_it_is_from(finished: Path) -> None:
+    result = smoke.dvc(finished, "repro", BENCHMARK)
+    assert result.returncode == 0, result.stderr
+    params = yaml.safe_load((finished / "params.yaml").read_text())["bench"]
+    table, about = read_table(finished / "reports/benchmark.csv")
+    assert set(table["planner"]) == set(params["planners"])
+    assert set(table["constraint"]) == set(smoke.CONSTRAINTS)
+    assert set(table["scene"]) == {"table", "keep_out"}
+    seeds = {name: planner["seeds"] for name, planner in params["planners"].items()}
+    assert (table.groupby("planner").size() == 4 * pd.Series(seeds).sort_index()).all()
+    assert table[table["planner"] == "planner"]["valid"].any()
+    assert {"commit", "dvc.lock", "processor", "date"} <= set(about)
+    recorded = table[table["recording"] != ""]
+    assert {"planner", "BiRRT"} <= set(recorded["planner"])
+    for file, planner in recorded[["recording", "planner"]].itertuples(index=False):
+        assert read_recording(finished / file).application_id == "constraint_geodesics", planner
+    report = finished / "reports/benchmark"
+    for name in ("overview.md", "summary.md", "table_i.md", "budgets.md", "break_even.md"):
+        assert "planner" in (report / name).read_text()
+    for name in ("success_over_budget", "length_over_budget", "ratio_distributions", "break_even"):
+        assert (report / f"{name}.png").stat().st_size > 5000
+    assert "Running stage" not in smoke.dvc(finished, "repro", BENCHMARK).stdout

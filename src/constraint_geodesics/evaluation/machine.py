@@ -1,6 +1,9 @@
 """What timings were taken on."""
 
+import hashlib
 import platform
+import subprocess
+from datetime import UTC, datetime
 from pathlib import Path
 
 import torch
@@ -13,3 +16,15 @@ def machine() -> dict[str, str]:
     named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     processor = named[0] if named else platform.processor() or platform.machine()
     return {"processor": processor, "python": platform.python_version(), "torch": torch.__version__, "threads": "1"}
+
+
+def run_header(root: Path) -> dict[str, str]:
+    """Where a table is from: commit, digest of dvc.lock, processor and date; blank where there is none."""
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=False)
+    lock = root / "dvc.lock"
+    return {
+        "commit": commit.stdout.strip(),
+        "dvc.lock": hashlib.sha256(lock.read_bytes()).hexdigest() if lock.is_file() else "",
+        "processor": machine()["processor"],
+        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+    }

@@ -1,0 +1,41 @@
+"""Stage: part of the benchmark once more, held against the first time: lengths, validity, and times."""
+
+import shutil
+import sys
+
+from constraint_geodesics.benchmark_blocks import answered, blocks_of, ends_by_counting
+from constraint_geodesics.cli import run_stage
+from constraint_geodesics.evaluation.benchmark import read_table
+from constraint_geodesics.evaluation.benchmark_report import repeated_markdown
+from constraint_geodesics.evaluation.benchmark_statistics import repeated
+from constraint_geodesics.params import Params
+from constraint_geodesics.paths import Layout
+
+STAGE = "repeat_benchmark"
+SEEDS = 2
+
+
+def main(params: Params, layout: Layout) -> None:
+    """Write repeat.csv and repeat.md in reports/benchmark_repeat/: planners whose search no clock ends."""
+    folder, scratch = layout.root / "reports" / "benchmark_repeat", layout.scratch(STAGE, "rows")
+    shutil.rmtree(scratch, ignore_errors=True)
+    again = {
+        name: peer.model_copy(
+            update={"queries": min(peer.queries, params.bench.repeated), "seeds": min(peer.seeds, SEEDS)}
+        )
+        for name, peer in params.bench.planners.items()
+        if ends_by_counting(peer)
+    }
+    some = params.model_copy(update={"bench": params.bench.model_copy(update={"planners": again})})
+    table = answered(blocks_of(some, layout, scratch, scratch), params.compute)
+    first, _ = read_table(layout.benchmark_table)
+    compared = repeated(first, table)
+    order = {name: k for k, name in enumerate(again)}
+    compared = compared.sort_values("planner", key=lambda names: names.map(order))
+    folder.mkdir(parents=True, exist_ok=True)
+    compared.to_csv(folder / "repeat.csv", index=False, float_format="%.6g")
+    (folder / "repeat.md").write_text(repeated_markdown(compared))
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])
