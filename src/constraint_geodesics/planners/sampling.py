@@ -7,6 +7,7 @@ machine is.  Where `budget_s` ends it, the path depends on the machine.
 """
 
 import itertools
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -16,8 +17,9 @@ import numpy as np
 from jaxtyping import Float
 from ompl import base, geometric, util
 
+from constraint_geodesics.constraints import kernels
 from constraint_geodesics.constraints.lift import as_executed
-from constraint_geodesics.constraints.retraction import retract
+from constraint_geodesics.constraints.retraction import Retraction, retract
 from constraint_geodesics.constraints.vector import Constraint, ConstraintManifold
 from constraint_geodesics.params import BenchmarkParams
 from constraint_geodesics.planners.path_planner import SATISFIED, PlannedPath, PlanningProblem, refusal
@@ -125,6 +127,43 @@ def plan_all(
         return [planner.plan(problem, seed) for problem in problems]
 
 
+class _Single:
+    """The constraint of one configuration at a time, without what arrays and checks of a batch cost: OMPL asks for it
+    thousands of times a path.
+    """
+
+    def __init__(self, manifold: ConstraintManifold) -> None:
+        self._about = (manifold.robot.chain.arrays, manifold.held, *manifold.reference_arrays)
+        self._tolerance = manifold.tolerance[None]
+        self._q = np.empty((1, manifold.robot.dof))
+        self._residual, self._jacobian = np.empty((1, 6)), np.empty((1, 6, manifold.robot.dof))
+        self._excess, self._worst = np.empty((1, 6)), np.empty(1)
+        self._settings = Retraction()
+
+    def linearise(self, x: np.ndarray) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6 D"]]:
+        """Residual and Jacobian, until the next call."""
+        self._q[0] = x
+        kernels.residual_batch(*self._about, self._q, self._residual, self._jacobian)
+        return self._residual[0], self._jacobian[0]
+
+    def violation(self, x: np.ndarray) -> float:
+        """Excess over the tolerance [rad or m]."""
+        self.linearise(x)
+        kernels.excess_batch(self._about[1], self._tolerance[0], self._residual, self._excess, self._worst)
+        return float(self._worst[0])
+
+    def retract(self, x: np.ndarray) -> Float[np.ndarray, "D"] | None:
+        """The configuration on the constraint, or None; as `retraction.retract`."""
+        joints = np.array(x, np.float64)[None]
+        chain, held, *reference = self._about
+        own = self._settings
+        kernels.retract_batch(
+            chain, held, self._tolerance, *reference, joints, own.accuracy, own.iterations, own.largest_step,
+            self._worst,
+        )  # fmt: skip
+        return joints[0] if self._worst[0] <= own.accuracy else None
+
+
 class _HeldAxes(base.Constraint):
     """The constraint as OMPL asks for it.
 
@@ -137,7 +176,7 @@ class _HeldAxes(base.Constraint):
 
     def __init__(self, manifold: ConstraintManifold, step: float, sampler: Sampler | None) -> None:
         super().__init__(manifold.robot.dof, manifold.codim, SATISFIED)
-        self._manifold = manifold
+        self._single = _Single(manifold)
         self._sampler = sampler
         self._samples = False
         self._exact = np.flatnonzero(manifold.held & (manifold.tolerance == 0.0))
@@ -145,10 +184,10 @@ class _HeldAxes(base.Constraint):
         self._last = np.full(manifold.robot.dof, np.inf)
 
     def function(self, x: np.ndarray, out: np.ndarray) -> None:
-        out[:] = self._manifold.residual(x)[self._exact]
+        out[:] = self._single.linearise(x)[0][self._exact]
 
     def jacobian(self, x: np.ndarray, out: np.ndarray) -> None:
-        out[:] = self._manifold.jacobian(x)[self._exact]
+        out[:] = self._single.linearise(x)[1][self._exact]
 
     def expect_sample(self) -> None:
         """What is projected next is a tree's sample."""
@@ -158,22 +197,27 @@ class _HeldAxes(base.Constraint):
         if self._samples and self._sampler is not None:
             self._samples = False
             x[:] = self._sampler()
-        retracted = retract(self._manifold, x)
-        if not retracted.converged or self._stalls(x, retracted.joints):
+        joints = self._single.retract(x)
+        if joints is None or self._stalls(x, joints):
             return False
-        self._last = retracted.joints
-        x[:] = retracted.joints
+        self._last = joints
+        x[:] = joints
         return True
 
     def isSatisfied(self, x: np.ndarray) -> bool:
-        return bool(self._manifold.violation(x) <= SATISFIED)
+        return self._single.violation(x) <= SATISFIED
 
     def _stalls(self, wanted: np.ndarray, reached: np.ndarray) -> bool:
         # OMPL walks along the manifold as long as the goal comes nearer, by however little: thousands of steps
         # into a dead end.  It steps from the point projected last, which is how such a step is told from a sample.
-        if abs(np.linalg.norm(wanted - self._last) - self._step) > 1e-6 * self._step:
+        if abs(_distance(wanted, self._last) - self._step) > 1e-6 * self._step:
             return False
-        return bool(np.linalg.norm(reached - self._last) < _STALL * self._step)
+        return _distance(reached, self._last) < _STALL * self._step
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    """`np.linalg.norm` of a difference, at a third of its cost."""
+    return math.dist(a.tolist(), b.tolist())
 
 
 class _Motions(base.MotionValidator):
@@ -305,11 +349,16 @@ def _constrained(joints: Any, kind: str, constraint: _HeldAxes, settings: Benchm
 def _validity(problem: PlanningProblem) -> Callable[[Any], bool]:
     # it must not hold OMPL's own objects: nothing collects such a cycle
     robot, is_free = problem.manifold.robot, problem.is_free
+    limits = list(zip(robot.lower.tolist(), robot.upper.tolist(), strict=True))
+    axes = range(robot.dof)
 
     def is_valid(state: Any) -> bool:
-        q = _read(state, robot.dof)
+        q = [state[i] for i in axes]
         # projection may leave the bounds that were sampled in
-        return bool((q >= robot.lower).all() and (q <= robot.upper).all() and is_free(q))
+        for value, (low, high) in zip(q, limits, strict=True):
+            if not low <= value <= high:
+                return False
+        return bool(is_free(np.array(q)))
 
     return is_valid
 
