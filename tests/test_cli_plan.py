@@ -153,8 +153,9 @@ def test_configurations_are_numbers_with_spaces_or_commas_negative_ones_first(co
         (("--start", "nan 0 0 0 0 0", "--goal", "0 0 0 0 0 0", "--constraint", "free"), r"start\[0\] is not finite"),
         (("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 inf", "--constraint", "free"), r"goal\[5\] is not finite"),
         (("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 0", "--constraint", "cup"), "'cup'.*level_cup"),
+        (("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 0", "--constraint", "free", "--budget", "0"), "budget_s = 0"),
     ],
-    ids=("three", "seven", "word", "nothing", "nan", "inf", "name"),
+    ids=("three", "seven", "word", "nothing", "nan", "inf", "name", "budget"),
 )
 def test_wrong_usage_of_plan_is_code_two(command, words, said) -> None:
     code, out, err = command("plan", *words)
@@ -312,3 +313,27 @@ def test_the_installed_command_answers(query, tmp_path) -> None:
         if code == 2:
             assert "nowhere.csv" in error_line(done.stderr)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_budget_is_used(command, query) -> None:
+    words = ("--start", query[0], "--goal", query[1], "--constraint", "level_cup", "--json")
+    first, longer = (strict(command("plan", *words, *more)[1]) for more in ((), ("--budget", "0.2")))
+    assert longer["planning_time_s"] >= 0.2
+    assert longer["length_rad"] <= first["length_rad"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--constraint", "cup"), "no constraint 'cup': must be one of free, level_cup"),
+        (("--planner", "RRT"), "no planner 'RRT': must be one of planner"),
+        (("--planner", "RRT* 10 s"), "no planner is left"),
+    ],
+)
+def test_what_bench_does_not_know_is_one_line(monkeypatch, capfd, tmp_path, words, said) -> None:
+    monkeypatch.setattr(sys, "argv", ["geodesics", "bench", "--out", str(tmp_path / "bench"), *words])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 1
+    assert said in error_line(capfd.readouterr().err)
+    assert not (tmp_path / "bench").exists()
