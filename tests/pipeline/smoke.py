@@ -40,6 +40,12 @@ SMALL: dict[str, Any] = {
     "benchmark": {"seeds": [0], "rrt_star_iterations": 40, "prm_iterations": 50},
     "bench": {"queries": 2},
 }
+QUICK: dict[str, Any] = {
+    "many_bands": {"starts": 4},
+    "gradient_geodesic": {"drawn": 32, "starts": 2, "descent_steps": 3, "polish_steps": 2, "rounds": 1},
+    "bayesian_optimisation": {"drawn": 64, "kept": 10, "initial": 4, "evaluations": 6},
+}
+"""Settings of the benchmark's planners that take long."""
 CONSTRAINTS = ("free", "level_cup")
 MARK = ".smoke"
 
@@ -87,7 +93,13 @@ def _one_of_each_kind(planners: dict[str, Any]) -> dict[str, Any]:
     named = ("BiRRT", "BiRRT + band", "band from many starts")
     first = {planner["kind"]: name for name, planner in reversed(planners.items())}
     kept = {name: planners[name] for name in planners if name in named or name in first.values()}
-    return {name: {**planner, "queries": 1, "seeds": min(planner["seeds"], 2)} for name, planner in kept.items()}
+    return {
+        name: {
+            **planner, "queries": 1, "seeds": 2 if name == "BiRRT" else 1,
+            "settings": planner.get("settings", {}) | QUICK.get(planner["kind"], {}),
+        }
+        for name, planner in kept.items()
+    }  # fmt: skip
 
 
 def _overlay(params: dict[str, Any], changes: dict[str, Any]) -> None:
