@@ -8,7 +8,7 @@ import pandas as pd
 
 from constraint_geodesics.cli import run_stage
 from constraint_geodesics.evaluation import benchmark_figures
-from constraint_geodesics.evaluation.benchmark import TABLE, read_table
+from constraint_geodesics.evaluation.benchmark import KEEP_OUT, TABLE, read_table
 from constraint_geodesics.evaluation.benchmark_report import (
     ahead_markdown,
     benchmark_markdown,
@@ -37,8 +37,11 @@ def main(params: Params, layout: Layout) -> None:
     """Write reports/benchmark/ and data/benchmark.db."""
     folder, planners = layout.root / "reports" / "benchmark", params.bench.planners
     rows, about = read_table(layout.benchmark_table)
-    order = {name: k for k, name in enumerate(planners)}
-    rows = rows.sort_values("planner", key=lambda names: names.map(order), kind="stable")
+    orders = {"planner": list(planners), "constraint": list(params.constraints), "scene": [TABLE, KEEP_OUT]}
+    rows = rows.sort_values(
+        list(orders), key=lambda names: names.map({name: k for k, name in enumerate(orders[str(names.name)])}),
+        kind="stable",
+    )  # fmt: skip
     reference = next(iter(planners))
     folder.mkdir(parents=True, exist_ok=True)
 

@@ -4,8 +4,17 @@ from pathlib import Path
 
 import pytest
 
-from constraint_geodesics.benchmark_blocks import after, blocks_of, code_digest, data_digest, fewer
+from constraint_geodesics.benchmark_blocks import (
+    after,
+    blocks_of,
+    code_digest,
+    data_digest,
+    ends_by_counting,
+    fewer,
+    uses_clearance,
+)
 from constraint_geodesics.cli import note_stage_time
+from constraint_geodesics.evaluation.benchmark_figures import FAMILIES
 from constraint_geodesics.params import Params, PeerParams
 from constraint_geodesics.paths import Layout
 from constraint_geodesics.peers import KINDS, PeerBuilder, PeerError, Remembered
@@ -51,7 +60,8 @@ def test_every_kind_of_the_parameters_exists_and_every_band_follows_its_planner(
     assert after("BiRRT + band", planners) == "BiRRT"
     assert after("BiRRT, decoded samples + band", planners) == "BiRRT, decoded samples"
     assert after("BiRRT", planners) == after("BiRRT + band, 1 s", planners) == after("planner", planners) == ""
-    assert set(params.bench.recorded) | set(params.bench.placed_by) <= set(planners)
+    assert set(params.bench.recorded) | set(params.bench.placed_by) | set(params.bench.drawn) <= set(planners)
+    assert set(FAMILIES) == set(KINDS), "every kind has its colour"
 
 
 def test_fewer_planners_queries_and_constraints(params) -> None:
@@ -116,3 +126,12 @@ def test_the_last_time_of_each_stage_is_kept(tmp_path) -> None:
     ):
         note_stage_time(file, stage, names, seconds)
     assert file.read_text().splitlines() == ["stage,seconds", "label,3.0", "train a,1.0", "train b,5.0"]
+
+
+def test_planners_that_a_clock_may_stop_are_not_asked_for_the_same_path_twice(params) -> None:
+    counted = {name for name, peer in params.bench.planners.items() if ends_by_counting(peer)}
+    assert {"planner", "without graph", "BiRRT", "BiRRT + band", "PRM", "latent grid", "SLSQP"} <= counted
+    assert not counted & {"planner 1 s", "RRT* 1 s", "PRM* 10 s", "BiRRT + band, 1 s", "band from many starts, 1 s"}
+    clearance = {name for name, peer in params.bench.planners.items() if uses_clearance(peer)}
+    assert {"straight + band", "BiRRT + band", "SLSQP"} <= clearance
+    assert not clearance & {"planner", "BiRRT", "PRM", "BiRRT, decoded samples"}

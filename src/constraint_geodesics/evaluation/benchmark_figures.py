@@ -71,7 +71,7 @@ def ratio_distributions(rows: pd.DataFrame, kinds: Mapping[str, str]) -> Figure:
                 share = np.arange(1, len(values) + 1) / len(values)
                 axes.step(np.maximum(values, 1e-5), share, where="post", label=planner, **styles[planner])
         axes.set(xscale="log", xlim=(1e-5, 3.0), ylim=(0.0, 1.02))
-    _finished(figure, grid, rows, "excess over best known", "share of solvable rows")
+    _finished(figure, grid, rows, kinds, "excess over best known", "share of solvable rows")
     return figure
 
 
@@ -90,17 +90,28 @@ def overview(rows: pd.DataFrame, kinds: Mapping[str, str]) -> Figure:
             if planner in kinds:
                 share = np.arange(1, len(values) + 1) / len(values)
                 line[2].step(np.maximum(values, 1e-5), share, where="post", **styles[planner])
-        line[0].set(xscale="log", ylim=(0.0, 1.02), ylabel=f"{scene}: solved of solvable", xlabel="time budget [s]")
+        line[0].set(
+            xscale="log",
+            xlim=BUDGETS[[0, -1]],
+            ylim=(0.0, 1.02),
+            ylabel=f"{scene}: solved of solvable",
+            xlabel="time budget [s]",
+        )
         line[0].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-        line[1].set(xscale="log", ylim=(0.98, 2.5), ylabel="length / best known, p95", xlabel="time budget [s]")
+        line[1].set(
+            xscale="log",
+            xlim=BUDGETS[[0, -1]],
+            ylim=(0.98, 2.5),
+            ylabel="length / best known, p95",
+            xlabel="time budget [s]",
+        )
         line[2].set(
             xscale="log", xlim=(1e-5, 3.0), ylim=(0.0, 1.02), ylabel="share of rows", xlabel="excess over best known"
         )
         for axes in line:
             axes.grid(color=LIGHT, linewidth=0.6)
             axes.tick_params(labelsize=7)
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=5, fontsize=7, frameon=False)
+    _legend(figure, grid[:, 0].tolist(), kinds)
     return figure
 
 
@@ -137,10 +148,10 @@ def _over_budget(
         for planner, own in case.groupby("planner", sort=False):
             if planner in kinds:
                 axes.plot(own["budget_s"], own[column], label=planner, **styles[str(planner)])
-        axes.set(xscale="log", ylim=limits)
+        axes.set(xscale="log", xlim=BUDGETS[[0, -1]], ylim=limits)
         if column == "success":
             axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-    _finished(figure, grid, rows, "time budget [s]", label)
+    _finished(figure, grid, rows, kinds, "time budget [s]", label)
     return figure
 
 
@@ -154,7 +165,9 @@ def _grid_of(rows: pd.DataFrame) -> tuple[Figure, list[Axes]]:
     return figure, [figure.add_subplot(lines, columns, k + 1) for k in range(cases)]
 
 
-def _finished(figure: Figure, grid: Sequence[Axes], rows: pd.DataFrame, below: str, beside: str) -> None:
+def _finished(
+    figure: Figure, grid: Sequence[Axes], rows: pd.DataFrame, kinds: Mapping[str, str], below: str, beside: str
+) -> None:
     solvable = rows[rows["best_known_rad"].notna()]
     names = [f"{c}, {s}" for (c, s), _ in solvable.groupby(["constraint", "scene"], sort=False)]
     for axes, name in zip(grid, names, strict=True):
@@ -163,8 +176,16 @@ def _finished(figure: Figure, grid: Sequence[Axes], rows: pd.DataFrame, below: s
         axes.tick_params(labelsize=7)
     figure.supxlabel(below, fontsize=9)
     figure.supylabel(beside, fontsize=9)
+    _legend(figure, grid, kinds)
+
+
+def _legend(figure: Figure, grid: Sequence[Axes], kinds: Mapping[str, str]) -> None:
+    """One legend for all panels, planners in the order of `kinds`."""
     handles: dict[str, Any] = {}
     for axes in grid:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(str(label), handle)
-    figure.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=5, fontsize=7, frameon=False)
+    names = [name for name in kinds if name in handles]
+    figure.legend(
+        [handles[name] for name in names], names, loc="outside upper center", ncols=5, fontsize=7, frameon=False
+    )
