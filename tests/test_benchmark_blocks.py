@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from constraint_geodesics.benchmark_blocks import (
@@ -11,6 +12,7 @@ from constraint_geodesics.benchmark_blocks import (
     data_digest,
     ends_by_counting,
     fewer,
+    spread,
     uses_clearance,
 )
 from constraint_geodesics.cli import note_stage_time
@@ -135,3 +137,13 @@ def test_planners_that_a_clock_may_stop_are_not_asked_for_the_same_path_twice(pa
     clearance = {name for name, peer in params.bench.planners.items() if uses_clearance(peer)}
     assert {"straight + band", "BiRRT + band", "SLSQP"} <= clearance
     assert not clearance & {"planner", "BiRRT", "PRM", "BiRRT, decoded samples"}
+
+
+def test_blocks_with_all_planners_stand_evenly_apart() -> None:
+    """Three cases of four blocks each."""
+    numbered = [(number, f"{case}{number}") for case in "abc" for number in range(4)]
+    order = spread(numbered)  # type: ignore[arg-type]
+    assert sorted(map(str, order)) == sorted(name for _, name in numbered)
+    firsts = [k for k, name in enumerate(order) if str(name).endswith("0")]
+    assert np.ptp(np.diff(firsts)) <= 4
+    assert firsts[-1] - firsts[0] >= 6

@@ -34,8 +34,10 @@ BESIDE = ("__init__.py", "params.py", "paths.py", "progress.py", "compute.py", "
 
 
 def blocks_of(params: Params, layout: Layout, folder: Path, recordings: Path) -> list[Block]:
-    """The benchmark of `params.bench` in blocks of a few queries of one constraint and scene; those with all planners
-    come first.
+    """The benchmark of `params.bench` in blocks of a few queries of one constraint and scene.
+
+    The first block of each has all planners, the slow ones too: they are spread, so that what is done tells how long
+    the rest will take.
 
     folder: where the rows are kept.  recordings: where some of the paths are recorded.
     Raises PeerError if the pipeline has not been run, FileNotFoundError if a stage that this needs has not.
@@ -79,8 +81,19 @@ def blocks_of(params: Params, layout: Layout, folder: Path, recordings: Path) ->
                         scene, scene.manifold(described), charts, chosen, entries, PeerBuilder(params, layout.root),
                         params.judge, folder / f"{constraint}-{name}-{first}.jsonl", record,
                     )  # fmt: skip
-                    found.append((first, block))
-    return [block for _, block in sorted(found, key=lambda entry: entry[0])]
+                    found.append((first // settings.block, block))
+    return spread(found)
+
+
+def spread(numbered: Sequence[tuple[int, Block]]) -> list[Block]:
+    """Blocks, each with its number within its constraint and scene, so that equal numbers stand evenly apart."""
+    count = 1 + max(number for number, _ in numbered)
+    starts = [index for index, (number, _) in enumerate(numbered) if number == 0]
+    placed = []
+    for index, (number, block) in enumerate(numbered):
+        turn = sum(start <= index for start in starts) - 1
+        placed.append(((number + turn * count // len(starts)) % count, turn, block))
+    return [block for *_, block in sorted(placed, key=lambda entry: entry[:2])]
 
 
 def after(planner: str, known: Mapping[str, PeerParams]) -> str:
