@@ -6,9 +6,13 @@ import numpy as np
 
 from constraint_geodesics import bundle
 from constraint_geodesics.bundle import Bundle, read_bundle
+from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.retraction import retract
 from constraint_geodesics.constraints.vector import ConstraintManifold
 from constraint_geodesics.planner import Planner
+from constraint_geodesics.planners.path_planner import PlannedPath, PlanningProblem
+from constraint_geodesics.robot.bullet import World
+from constraint_geodesics.robot.clearance import clearance_model
 
 NAMES = ("free", "level_cup", "level_cup_relaxed", "slide", "fixed_orientation", "tool_down")
 
@@ -48,3 +52,22 @@ def pairs_of(name: str, count: int, seed: int, *, joined: bool = True) -> list[t
         if (labels[a] == labels[b]) == joined:
             found.append((joints[a], joints[b]))
     return found
+
+
+def problems(world: World, name: str, count: int) -> list[PlanningProblem]:
+    """Queries of one constraint in the packaged planner's workcell."""
+    planner = packaged_planner()
+    clearance = clearance_model(planner.scene.robot, planner.scene.workcell)
+    manifold = manifold_of(planner, name)
+    return [PlanningProblem(a, b, manifold, world.is_free, clearance) for a, b in pairs_of(name, count, 3)]
+
+
+def assert_sound(path: PlannedPath, asked: PlanningProblem, certifier: Certifier) -> None:
+    """A peer's answer that the certifier accepts, its ends those of the problem to the bit."""
+    assert path.status == "solved"
+    assert path.time_s > 0.0
+    assert path.iterations > 0
+    np.testing.assert_array_equal(path.joints[[0, -1]], [asked.start, asked.goal])
+    certificate = certifier.certify(path.joints, asked.manifold.constraint, asked.start, asked.goal)
+    assert certificate.valid, certificate.violation
+    assert certificate.violation_bound <= 1e-4

@@ -1,16 +1,15 @@
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.planner_fixtures import NAMES, manifold_of, packaged_planner, pairs_of
+from tests.planner_fixtures import NAMES, assert_sound, manifold_of, packaged_planner, problems
 
-from constraint_geodesics.certification.certifier import Certifier, Limits
+from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.constraints.vector import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.params import BenchmarkParams
 from constraint_geodesics.planners.decoder_sampling import BATCH, DecoderSampling, decoded_samples
-from constraint_geodesics.planners.path_planner import PlannedPath, PlanningProblem
+from constraint_geodesics.planners.path_planner import PlanningProblem
 from constraint_geodesics.planners.sampling import SamplingPlanner, birrt_with_sampler
 from constraint_geodesics.robot.bullet import World
 
@@ -21,23 +20,6 @@ SETTINGS = BenchmarkParams(
 PLANNER = DecoderSampling(packaged_planner().chart, SETTINGS, iterations=200)
 
 
-@pytest.fixture(scope="module")
-def world() -> Iterator[World]:
-    with packaged_planner().scene.world() as loaded:
-        yield loaded
-
-
-@pytest.fixture(scope="module")
-def certifier() -> Iterator[Certifier]:
-    with Certifier(packaged_planner().scene, Limits()) as loaded:
-        yield loaded
-
-
-def problems(world: World, name: str, count: int) -> list[PlanningProblem]:
-    manifold = manifold_of(packaged_planner(), name)
-    return [PlanningProblem(a, b, manifold, world.is_free) for a, b in pairs_of(name, count, 3)]
-
-
 def hard(world: World) -> PlanningProblem:
     """A problem that chance decides: two seeds give two paths."""
     for asked in problems(world, "level_cup", 20):
@@ -45,15 +27,6 @@ def hard(world: World) -> PlanningProblem:
         if first.status == second.status == "solved" and not np.array_equal(first.joints, second.joints):
             return asked
     pytest.fail("every query is solved by the straight walk")
-
-
-def assert_sound(path: PlannedPath, asked: PlanningProblem, certifier: Certifier) -> None:
-    assert path.status == "solved"
-    assert path.iterations > 0
-    np.testing.assert_array_equal(path.joints[[0, -1]], [asked.start, asked.goal])
-    certificate = certifier.certify(path.joints, asked.manifold.constraint, asked.start, asked.goal)
-    assert certificate.valid, certificate.violation
-    assert certificate.violation_bound <= 1e-4
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -1,16 +1,15 @@
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.planner_fixtures import NAMES, manifold_of, packaged_planner, pairs_of
+from tests.planner_fixtures import NAMES, assert_sound, manifold_of, packaged_planner, pairs_of, problems
 
 from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.constraints.vector import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.geodesics.band import BandSettings
 from constraint_geodesics.planners.elastic_band import StraightBand, task_of
-from constraint_geodesics.planners.path_planner import PathPlanner, PlannedPath, PlanningProblem
+from constraint_geodesics.planners.path_planner import PathPlanner, PlanningProblem
 from constraint_geodesics.planners.trajectory_optimisation import (
     Course,
     Demand,
@@ -26,36 +25,8 @@ TRUST = TrajectoryOptimisation("trust-constr", starts=2, iterations=100)
 PILLAR = Box("pillar", (0.45, 0.0, 0.5), (0.1, 0.1, 1.0))
 
 
-@pytest.fixture(scope="module")
-def world() -> Iterator[World]:
-    with packaged_planner().scene.world() as loaded:
-        yield loaded
-
-
-@pytest.fixture(scope="module")
-def certifier() -> Iterator[Certifier]:
-    with Certifier(packaged_planner().scene, Limits()) as loaded:
-        yield loaded
-
-
-def problems(world: World, name: str, count: int) -> list[PlanningProblem]:
-    planner = packaged_planner()
-    manifold = manifold_of(planner, name)
-    clearance = clearance_model(planner.scene.robot, planner.scene.workcell)
-    return [PlanningProblem(a, b, manifold, world.is_free, clearance) for a, b in pairs_of(name, count, 3)]
-
-
 def length(joints: np.ndarray) -> float:
     return float(np.linalg.norm(np.diff(joints, axis=0), axis=1).sum())
-
-
-def assert_sound(path: PlannedPath, asked: PlanningProblem, certifier: Certifier) -> None:
-    assert path.status == "solved"
-    assert path.iterations > 0
-    np.testing.assert_array_equal(path.joints[[0, -1]], [asked.start, asked.goal])
-    certificate = certifier.certify(path.joints, asked.manifold.constraint, asked.start, asked.goal)
-    assert certificate.valid, certificate.violation
-    assert certificate.violation_bound <= 1e-4
 
 
 @pytest.mark.parametrize("name", NAMES)
