@@ -6,7 +6,7 @@ FILE ?=
 FIRST_START = 1.329923 -0.584036 -3.766650 -2.008429 0.728803 -2.581396
 FIRST_GOAL = 1.071549 -0.217480 -1.682647 -2.906655 -0.337949 1.348704
 
-.PHONY: help env plan repro smoke bench bench-quick bench-geometry test lint format results ui replay clean
+.PHONY: help env plan repro smoke bench bench-quick bench-geometry test lint format results readme ui replay clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
@@ -64,6 +64,9 @@ format: env  ## format and mend what can be mended
 
 results: env  ## print the result table
 	geodesics results
+
+readme: env  ## write README's tables and numbers again from the reports
+	python tests/readme.py
 
 ui: env  ## MLflow's dashboard, on this machine only
 	geodesics ui

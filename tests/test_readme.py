@@ -1,27 +1,20 @@
 """README's figures and numbers are those of the committed run."""
 
-import json
 import re
-from pathlib import Path
-from urllib.parse import unquote
 
 import pytest
 import yaml
 from ruamel.yaml import YAML
 
-ROOT = Path(__file__).resolve().parents[1]
+from tests.readme import BLOCKS, QUOTED, ROOT, filled
+
 README = (ROOT / "README.md").read_text()
 
 
-def between(marker: str) -> str:
-    return README.split(f"<!-- {marker} -->")[1].split(f"<!-- /{marker} -->")[0].strip()
-
-
-@pytest.mark.parametrize(
-    ("marker", "file"), [("results", "table"), ("geometry", "geometry"), ("plans", "plans"), ("policies", "policies")]
-)
-def test_every_table_is_the_reports(marker: str, file: str) -> None:
-    assert between(marker) == (ROOT / "reports" / f"{file}.md").read_text().strip()
+def test_every_table_and_quoted_number_is_the_reports() -> None:
+    """`make readme` writes them."""
+    assert len(QUOTED.findall(README)) >= 8
+    assert filled(README) == README
 
 
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.S)
@@ -49,24 +42,12 @@ def test_every_figure_and_linked_file_is_in_the_repository() -> None:
         assert (ROOT / target).is_file(), target
 
 
-def test_the_numbers_of_the_reports_are_quoted_as_they_are() -> None:
-    """Every quoted number has its source behind it, <!-- from file key scale digits -->, and is recomputed here.
-
-    A blank in a key is written %20.
-    """
-    quoted = re.findall(r"([\d.]+)[^\d<]{0,12}<!-- from (\S+) (\S+) ([\d.e-]+) (\d) -->", README)
-    assert len(quoted) >= 8
-    for shown, file, key, scale, digits in quoted:
-        value = json.loads((ROOT / file).read_text())
-        for part in unquote(key).split("/"):
-            value = value[int(part) if isinstance(value, list) else part]
-        assert shown == f"{value * float(scale):.{digits}f}", (file, key)
-
-
 def test_no_figure_of_the_run_stands_without_its_source() -> None:
-    """Between its table and its last section README quotes nothing in %, degrees or millimetres by hand."""
-    told = README.split("<!-- /policies -->")[1].replace(between("results"), "")
-    bare = re.sub(r"[\d.]+[^\d<]{0,12}<!-- from [^>]*-->", "", told)
+    """After its first tables README quotes nothing in %, degrees or millimetres by hand."""
+    told = README.split("<!-- /policies -->")[1]
+    for name in BLOCKS:
+        told = re.sub(rf"<!-- {name} -->.*?<!-- /{name} -->", "", told, flags=re.S)
+    bare = QUOTED.sub("", told)
     assert not re.findall(r"\d\s?(?:%|°|mm)", bare)
 
 
