@@ -18,6 +18,7 @@ from constraint_geodesics.evaluation.growth import (
     Subject,
     measure_growth,
     slopes,
+    slopes_markdown,
 )
 from constraint_geodesics.evaluation.growth_figure import growth_figure
 from constraint_geodesics.evaluation.machine import run_header
@@ -43,7 +44,7 @@ def configurations(file: Path, robot: SerialRobot, count: int) -> Float[np.ndarr
 
 
 def main(params: Params, layout: Layout) -> None:
-    """Write growth.csv, slopes.csv and growth.png in reports/growth/."""
+    """Write growth.csv, slopes.csv, growth.md and growth.png in reports/growth/."""
     folder, sizes, scene = layout.root / "reports" / "growth", GrowthSizes(), Scene.from_params(params)
     manifold = scene.manifold(params.constraints[CONSTRAINT])
     with (
@@ -64,6 +65,7 @@ def main(params: Params, layout: Layout) -> None:
     fits, about = slopes(table), run_header(layout.root)
     write_table(table, folder / "growth.csv", about)
     write_table(fits, folder / "slopes.csv", about)
+    (folder / "growth.md").write_text(slopes_markdown(fits))
     save_png(growth_figure(table, fits), folder / "growth.png")
 
 

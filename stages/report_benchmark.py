@@ -53,9 +53,12 @@ def main(params: Params, layout: Layout) -> None:
     in_python = [name for name, entry in planners.items() if entry.kind in ("ompl", "decoder_sampling")]
     (folder / "overview.md").write_text(overview_markdown(overview, in_python))
 
+    shown = overview[overview["planner"].isin(params.bench.drawn)]
+    (folder / "drawn.md").write_text(overview_markdown(shown, in_python))
+
     illustrated = params.geodesics.illustrated_constraints[0]
-    shown = rows[(rows["constraint"] == illustrated) & (rows["scene"] == TABLE)]
-    (folder / "table_i.md").write_text(table_i_markdown(shown))
+    case = rows[(rows["constraint"] == illustrated) & (rows["scene"] == TABLE)]
+    (folder / "table_i.md").write_text(table_i_markdown(case))
     ours, own = own_names(planners)
     ahead = ours_against_peers(rows, ours, own, BUDGETS)
     ahead.to_csv(folder / "budgets.csv", index=False, float_format="%.6g")

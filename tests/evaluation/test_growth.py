@@ -29,6 +29,7 @@ from constraint_geodesics.evaluation.growth import (
     measure_growth,
     place_spheres,
     slopes,
+    slopes_markdown,
 )
 from constraint_geodesics.evaluation.growth_figure import LABELS, growth_figure
 from constraint_geodesics.learning.dataset import draw_queries
@@ -108,6 +109,15 @@ def test_two_points_have_a_slope_without_an_error():
 def test_fewer_than_two_sizes_have_no_slope(values):
     fit = slopes(law(values, np.linspace(1.0, 2.0, len(values)))).iloc[0]
     assert np.isnan([fit["slope"], fit["standard_error"], fit["seconds_at_1"]]).all()
+
+
+def test_the_table_has_a_line_for_each_exponent_and_a_dash_for_none():
+    sizes = np.array([1.0, 2.0, 4.0])
+    fits = slopes(pd.concat([law(sizes, 0.1 * sizes**2), law([3], [0.1], axis="joints")]))
+    lines = slopes_markdown(fits).splitlines()
+    assert len(lines) == 2 + len(fits)
+    assert [cell.strip() for cell in lines[2].split("|")][3:6] == ["2.00", "0.00", "3"]
+    assert [cell.strip() for cell in lines[3].split("|")][3:6] == ["–", "–", "1"]
 
 
 def test_held_axes_are_as_many_as_they_are_listed_for():

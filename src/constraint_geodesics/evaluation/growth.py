@@ -24,6 +24,7 @@ from jaxtyping import Float, Int
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.constraints.vector import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.evaluation.geometry_benchmark import one_thread
+from constraint_geodesics.evaluation.results import markdown_table
 from constraint_geodesics.geodesics.band import BandSettings, BandSpace
 from constraint_geodesics.geodesics.roadmap import build_roadmap
 from constraint_geodesics.geometry.curves import PinnedPolynomial
@@ -251,6 +252,15 @@ def slopes(table: pd.DataFrame) -> pd.DataFrame:
             }
         )  # fmt: skip
     return pd.DataFrame(rows, columns=["axis", "what", "slope", "standard_error", "seconds_at_1", "points"])
+
+
+def slopes_markdown(fits: pd.DataFrame) -> str:
+    """The exponents as a table, axis by axis."""
+    rows: list[Sequence[str]] = [("grows with", "what", "exponent", "± standard error", "points")]
+    for row in fits.to_dict("records"):
+        slope, error = (f"{row[name]:.2f}" if np.isfinite(row[name]) else "–" for name in ("slope", "standard_error"))
+        rows.append((row["axis"], row["what"], slope, error, str(row["points"])))
+    return f"{markdown_table(rows)}\n"
 
 
 def _line(x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"]) -> tuple[float, float, float]:
