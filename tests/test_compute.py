@@ -156,6 +156,36 @@ def test_a_worker_that_dies_is_an_error_not_a_wait(dask: ComputeParams) -> None:
         assert "\n" not in str(caught.value)
 
 
+def test_workers_do_not_outlive_a_killed_run(tmp_path: Path) -> None:
+    """They would go on with the run's items beside the one that continues it."""
+    code = (
+        "import os, sys, time\n"
+        "from pathlib import Path\n"
+        "from constraint_geodesics.compute import parallel_map\n"
+        "from constraint_geodesics.params import ComputeParams\n"
+        "def wait(item):\n"
+        "    (Path(sys.argv[1]) / f'{item}-{os.getpid()}').touch()\n"
+        "    time.sleep(60)\n"
+        "parallel_map(wait, [0, 1], ComputeParams(backend='loky', workers=2))\n"
+    )
+    run = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)])
+    began = time.monotonic()
+    while len(list(tmp_path.iterdir())) < 2 and time.monotonic() - began < 60:
+        time.sleep(0.1)
+    workers = [int(file.name.split("-")[1]) for file in tmp_path.iterdir()]
+    assert len(workers) == 2
+    run.kill()
+    run.wait()
+    while any(_runs(worker) for worker in workers) and time.monotonic() - began < 90:
+        time.sleep(0.1)
+    assert not any(_runs(worker) for worker in workers)
+
+
+def _runs(process: int) -> bool:
+    state = Path(f"/proc/{process}/stat")
+    return state.is_file() and state.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense"])
 def test_a_bad_address_is_one_line_within_seconds(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compute, "DASK_CONNECT_S", 1)

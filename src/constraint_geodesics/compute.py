@@ -8,9 +8,12 @@ import asyncio
 import os
 import reprlib
 import sys
+import threading
+import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import joblib
@@ -30,6 +33,7 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_
 """Read by the libraries that a task is the first to load."""
 DASK_CONNECT_S = 5
 DASK_WORKERS_S = 10
+WATCH_S = 1.0
 
 
 class ComputeError(RuntimeError):
@@ -81,6 +85,23 @@ class _Task(Generic[Item, Result]):
         _set_torch_threads(1)
         return self(index, item)
 
+    def below(self, parent: int, index: int, item: Item) -> tuple[int, Result]:
+        """In a worker on this machine."""
+        _end_after(parent)
+        return self.in_worker(index, item)
+
+
+@cache
+def _end_after(parent: int) -> None:
+    """End this process soon after its parent: a killed run would go on in it, beside the one that continues."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(WATCH_S)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
 
 def _outcomes(
     task: _Task[Item, Result], items: Sequence[Item], settings: ComputeParams
@@ -125,7 +146,7 @@ def _set_torch_threads(count: int) -> None:
 def _on_loky(
     task: _Task[Item, Result], items: Sequence[Item], workers: int
 ) -> Generator[tuple[int, Result], None, None]:
-    calls = (joblib.delayed(task.in_worker)(index, item) for index, item in enumerate(items))
+    calls = (joblib.delayed(task.below)(os.getpid(), index, item) for index, item in enumerate(items))
     # max_nbytes=None: joblib would hand large arrays over read-only, which the other backends don't
     with joblib.parallel_config(backend="loky", n_jobs=workers, inner_max_num_threads=1, max_nbytes=None):
         outcomes: Any = joblib.Parallel(return_as="generator_unordered")(calls)
