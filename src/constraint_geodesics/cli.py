@@ -87,6 +87,18 @@ def check_params(file: Annotated[Path, typer.Argument(help="The file to check.")
     print(f"{file}: ok")
 
 
+@app.command("doctor")
+def look_for_trouble(
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as one JSON object.")] = False,
+) -> None:
+    """Look for what is wrong with this checkout and its environment, and say the mend.  Exit code 1: a problem."""
+    from constraint_geodesics.doctor import report
+
+    findings = report.examine(Path())
+    print(report.as_json(findings) if as_json else report.as_text(findings, report.terminal_colours()))
+    raise SystemExit(report.exit_code(findings))
+
+
 @app.command("constraints")
 def list_constraints(
     planner: Annotated[str | None, typer.Option(help="Where the planner comes from, as for `plan`.")] = None,
