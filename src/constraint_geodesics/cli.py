@@ -8,12 +8,15 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from constraint_geodesics.params import Params, ParamsError, load_params
 from constraint_geodesics.paths import Layout
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 WRONG_USAGE = 2
 NO_PATH = 3
@@ -81,10 +84,19 @@ def _complain(error: Exception, code: int | None = None) -> int:
 
 
 @app.command("params")
-def check_params(file: Annotated[Path, typer.Argument(help="The file to check.")] = Path("params.yaml")) -> None:
-    """Check a params.yaml: one line naming the first bad entry, or "ok"."""
-    load_params(file)
-    print(f"{file}: ok")
+def check_params(
+    file: Annotated[Path, typer.Argument(help="The file to check.")] = Path("params.yaml"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as one JSON object.")] = False,
+) -> None:
+    """Check a params.yaml: one line naming the first bad entry, or "ok".  Exit code 0: good; 2: bad."""
+    try:
+        load_params(file)
+    except ParamsError as error:
+        if not as_json:
+            raise
+        print(json.dumps({"file": str(file), "valid": False, "error": str(error)}))
+        raise SystemExit(WRONG_USAGE) from None
+    print(json.dumps({"file": str(file), "valid": True, "error": None}) if as_json else f"{file}: ok")
 
 
 @app.command("doctor")
@@ -206,6 +218,7 @@ def bench(
     ] = None,
     longest: Annotated[float, typer.Option(help="Leave out planners that are given more seconds a query.")] = 2.0,
     out: Annotated[Path, typer.Option(help="Folder of rows, table and summary.")] = Path(".geodesics/bench"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object.")] = False,
 ) -> None:
     """Hold planners against each other on a few of the benchmark's queries; what is done is not done again."""
     from constraint_geodesics.benchmark_blocks import answered, blocks_of, fewer
@@ -225,6 +238,9 @@ def bench(
         summary, [n for n, e in some.bench.planners.items() if e.kind in ("ompl", "decoder_sampling")]
     )
     (out / "overview.md").write_text(text)
+    if as_json:
+        print(json.dumps({"rows": str(out / "benchmark.csv"), "overview": _records(summary), "left_out": left_out}))
+        return
     print(text)
     if left_out:
         print(f"left out, as they are given more than {longest:g} s a query (--longest): {', '.join(left_out)}")
@@ -232,11 +248,18 @@ def bench(
 
 
 @app.command("results")
-def show_results() -> None:
+def show_results(
+    as_json: Annotated[bool, typer.Option("--json", help="Print the table's rows as one JSON object.")] = False,
+) -> None:
     """Print the committed result table and how to look further."""
-    table = Layout().root / "reports" / "table.md"
+    table = Layout().root / "reports" / ("table.csv" if as_json else "table.md")
     if not table.is_file():
         raise FileNotFoundError(f"{table}: no results yet; run `make repro`")
+    if as_json:
+        import pandas as pd
+
+        print(json.dumps({"rows": _records(pd.read_csv(table, float_precision="round_trip"))}))
+        return
     recordings = recordings_of(Layout())
     print(table.read_text().rstrip())
     print("\nOpen the runs in MLflow:    make ui")
@@ -249,20 +272,26 @@ def show_results() -> None:
 def replay(
     files: Annotated[list[Path] | None, typer.Argument(help="Recordings to open; none lists them.")] = None,
     web: Annotated[bool, typer.Option(help="Open in a browser on this machine instead of a window.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the list as one JSON object.")] = False,
 ) -> None:
     """Replay recorded paths in Rerun; without a file, list the recordings."""
-    from constraint_geodesics.tracking.recording import open_recordings
-
+    if as_json and files:
+        raise SystemExit(_complain(ValueError("--json prints the list of recordings: give no file"), WRONG_USAGE))
     if not files:
         found = recordings_of(Layout())
         if not found:
             raise FileNotFoundError("data/recordings: no recordings yet; run `make repro`")
+        if as_json:
+            print(json.dumps({"recordings": [str(file) for file in found]}))
+            return
         print("\n".join(map(str, found)))
         print(f"\nOpen one with: geodesics replay {found[0]}")
         return
     for file in files:
         if not file.is_file():
             raise FileNotFoundError(f"{file}: no such recording")
+    from constraint_geodesics.tracking.recording import open_recordings
+
     raise SystemExit(open_recordings(files, web=web))
 
 
@@ -274,6 +303,12 @@ def ui(port: Annotated[int, typer.Option(help="Port on 127.0.0.1.", min=1, max=6
     command = ui_command(Path().resolve(), port)
     print(f"http://127.0.0.1:{port}  (stop with Ctrl-C)", flush=True)
     os.execvp(command[0], command)
+
+
+def _records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
+    """The rows of a table for JSON: what is not a finite number there is null."""
+    records: list[dict[str, Any]] = json.loads(frame.to_json(orient="records", double_precision=15))
+    return records
 
 
 def recordings_of(layout: Layout) -> list[Path]:
