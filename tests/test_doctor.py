@@ -170,7 +170,7 @@ def test_torch_for_a_graphics_card_is_noted(tmp_path, installed, parts) -> None:
     found = only(look("torch", tmp_path, replace(HERE, installed=installed)), "note")
     for part in parts:
         assert part in f"{found.message} {found.mend}"
-    assert "/whl/cpu torch==2.13.0" in found.mend
+    assert "torch==2.13.0 again in its build for the processor" in found.mend
 
 
 def test_torch_for_the_processor_is_well(tmp_path) -> None:

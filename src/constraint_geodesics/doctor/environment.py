@@ -76,10 +76,9 @@ def check_torch(root: Path, here: Surroundings) -> Look:
     if not unused and not re.match(r"cu|rocm|xpu", build):
         return f"{version}, without packages for a graphics card"
     beside = f", and {len(unused)} packages for graphics cards" if unused else ""
-    index = "--index-url https://download.pytorch.org/whl/cpu"
-    mend = f"python -m pip install --force-reinstall --no-deps {index} torch=={locked(root).get('torch', release)}"
+    mend = f"install torch=={locked(root).get('torch', release)} again in its build for the processor"
     if unused:
-        mend += f" && python -m pip uninstall -y {' '.join(unused)}"
+        mend += f", then: python -m pip uninstall -y {' '.join(unused)}"
     yield "note", f"{version}{beside}: gigabytes that nothing here uses, training is on the processor", mend
     return ""
 
