@@ -88,7 +88,7 @@ def own_names(planners: Mapping[str, PeerParams]) -> tuple[dict[str, float], lis
     """
     own = {name: dict(entry.settings) for name, entry in planners.items() if entry.kind == "planner"}
     ours = {name: float(given.get("budget_s", 0.0)) for name, given in own.items() if not set(given) - {"budget_s"}}
-    learned = [name for name, given in own.items() if given.get("graph", True) or given.get("policy", True)]
+    learned = [name for name in own if not _learns_nothing(planners[name])]
     return ours, [name for name in learned if name not in ours]
 
 
@@ -109,7 +109,16 @@ def training_times(params: Params, layout: Layout) -> dict[str, float]:
         "planner": whole, "gradient_geodesic": manifold, "straight_latent": manifold, "decoder_sampling": manifold,
         "latent_graph": graph, "latent_grid": paper, "many_bands": graph,
     }  # fmt: skip
-    return {name: needs.get(entry.kind, 0.0) for name, entry in params.bench.planners.items()}
+    nothing = {name for name, entry in params.bench.planners.items() if _learns_nothing(entry)}
+    return {
+        name: 0.0 if name in nothing else needs.get(entry.kind, 0.0) for name, entry in params.bench.planners.items()
+    }
+
+
+def _learns_nothing(entry: PeerParams) -> bool:
+    """Whether it is the planner with neither graph nor policies."""
+    parts = entry.settings
+    return entry.kind == "planner" and not parts.get("graph", True) and not parts.get("policy", True)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,12 @@ BLOCKS = {
     "geometry": "geometry.md",
     "plans": "plans.md",
     "policies": "policies.md",
+    "benchmark": "benchmark/drawn.md",
+    "budgets": "benchmark/budgets.md",
+    "break_even": "benchmark/break_even.md",
+    "table_i": "benchmark/table_i.md",
+    "repeat": "benchmark_repeat/repeat.md",
+    "growth": "growth/growth.md",
 }
 """What stands between <!-- name --> and <!-- /name -->: a file of reports/."""
 QUOTED = re.compile(r"([\d.]+)([^\d<]{0,12})<!-- from (\S+) (\S+) ([\d.e-]+) (\d) -->")

@@ -129,13 +129,13 @@ def break_even(costs: pd.DataFrame, kinds: Mapping[str, str]) -> Figure:
     costs: planner, training_s, query_s (mean time of a query).
     """
     styles, served = styles_of(kinds), np.geomspace(1, 1e7, 200)
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    figure = Figure(figsize=(8.0, 4.2), layout="constrained")
     axes = figure.add_subplot()
     for row in costs[costs["planner"].isin(list(kinds))].to_dict("records"):
         axes.plot(served, row["training_s"] + served * row["query_s"], label=row["planner"], **styles[row["planner"]])
     axes.set(xscale="log", yscale="log", xlabel="queries served", ylabel="training and planning [s]")
     axes.grid(color=LIGHT, linewidth=0.6)
-    axes.legend(fontsize=7, frameon=False)
+    figure.legend(loc="outside right upper", fontsize=7, frameon=False)
     return figure
 
 
