@@ -13,12 +13,12 @@ BLOCKS = {
     "policies": "policies.md",
     "benchmark": "benchmark/drawn.md",
     "budgets": "benchmark/budgets.md",
-    "break_even": "benchmark/break_even.md",
     "table_i": "benchmark/table_i.md",
-    "repeat": "benchmark_repeat/repeat.md",
     "growth": "growth/growth.md",
 }
 """What stands between <!-- name --> and <!-- /name -->: a file of reports/."""
+SHORTENED = ("budgets",)
+"""Blocks that are their file's first paragraph."""
 QUOTED = re.compile(r"([\d.]+)([^\d<]{0,12})<!-- from (\S+) (\S+) ([\d.e-]+) (\d) -->")
 """A number with its source behind it: file, key (a blank is written %20), scale, digits."""
 
@@ -28,7 +28,9 @@ def filled(text: str) -> str:
     for name, file in BLOCKS.items():
         begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
         head, rest = text.split(begin)
-        text = f"{head}{begin}\n{(ROOT / 'reports' / file).read_text().strip()}\n{end}{rest.split(end)[1]}"
+        content = (ROOT / "reports" / file).read_text().strip()
+        shown = content.split("\n\n")[0] if name in SHORTENED else content
+        text = f"{head}{begin}\n{shown}\n{end}{rest.split(end)[1]}"
     return QUOTED.sub(_requoted, text)
 
 
