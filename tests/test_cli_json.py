@@ -1,19 +1,18 @@
 """`--json` of `params`, `results`, `replay` and `bench`: one strict object, and the exit codes as without it."""
 
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
-from constraint_geodesics import bundle, cli
+from constraint_geodesics import bundle
 from constraint_geodesics.evaluation.benchmark import TABLE, Case, write_cases
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.paths import Layout
 from tests.planner_fixtures import packaged_bundle, pairs_of
-from tests.test_cli_plan import strict
+from tests.test_cli_plan import called, strict
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -24,16 +23,7 @@ def geodesics(monkeypatch, capfd, tmp_path):
     monkeypatch.chdir(tmp_path)
 
     def start(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["geodesics", *words])
-        capfd.readouterr()
-        code: object = 0
-        try:
-            cli.main()
-        except SystemExit as stop:
-            code = stop.code
-        out, err = capfd.readouterr()
-        assert isinstance(code, int | None)
-        return code or 0, out, err
+        return called(monkeypatch, capfd, words)
 
     return start
 

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,22 +19,27 @@ COMMAND = str(Path(sys.executable).parent / "geodesics")
 TOUCHES_ITSELF = "0 2.0 -0.2 0 0.3 0.1"
 
 
+def called(monkeypatch, capfd, words: Sequence[str]) -> tuple[int, str, str]:
+    """The command in this process: its exit code and what it wrote."""
+    monkeypatch.setattr(sys, "argv", ["geodesics", *words])
+    capfd.readouterr()
+    code: object = 0
+    try:
+        cli.main()
+    except SystemExit as stop:
+        code = stop.code
+    out, err = capfd.readouterr()
+    assert isinstance(code, int | None)
+    return code or 0, out, err
+
+
 @pytest.fixture
 def command(monkeypatch, capfd):
-    """The command in this process: its exit code and what it wrote, the planner's folder given unless it is there."""
+    """The command in this process, the planner's folder given unless it is there."""
 
     def run(*words: str) -> tuple[int, str, str]:
         given = () if "--planner" in words else ("--planner", str(bundle.PACKAGED))
-        monkeypatch.setattr(sys, "argv", ["geodesics", *words, *given])
-        capfd.readouterr()
-        code: object = 0
-        try:
-            cli.main()
-        except SystemExit as stop:
-            code = stop.code
-        out, err = capfd.readouterr()
-        assert isinstance(code, int | None)
-        return code or 0, out, err
+        return called(monkeypatch, capfd, [*words, *given])
 
     return run
 
