@@ -12,7 +12,7 @@ from constraint_geodesics.learning.dataset import read_queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.paths import Layout
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 from constraint_geodesics.tracking.replay import record_rows, save_paths
 
 STAGE = "benchmark_planners"
@@ -25,8 +25,9 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     manifold = scene.manifold(params.constraints[constraint])
     charts = {name: LearnedManifold.load(layout.manifold(name)) for name in params.manifolds}
     queries, shown = read_queries(source), params.geodesics.searched[0]
+    about = subject_of(params, constraint=constraint)
     with tracked_stage(
-        STAGE, constraint, settings, [source], experiment=params.tracking.experiment, root=layout.root
+        STAGE, constraint, settings, [source], experiment=params.tracking.experiment, root=layout.root, subject=about
     ) as run:
         tasks = [
             PlannerTask(planner, seed, scene, manifold, charts, queries, settings, params.judge)
@@ -41,6 +42,7 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
             layout.recordings(STAGE, constraint), rows, paths, constraint, charts[shown], manifold,
             load_submanifold(layout.submanifold(shown, constraint)), scene.workcell, params.recording,
         )  # fmt: skip
+        run.recordings(rows)
         write_table(rows, layout.report(STAGE, constraint, "csv"), constraint=constraint)
         run.report(planner_figures(results), layout.report(STAGE, constraint))
 

@@ -12,7 +12,7 @@ from constraint_geodesics.paths import Layout
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.robot.execution import CupSettings
 from constraint_geodesics.tracking.execution_recording import ExecutionRecord, record_executions
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 
 STAGE = "execute_paths"
 
@@ -21,8 +21,15 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     """Write reports/execute_paths/<constraint>.csv and .json, and recordings of the first queries."""
     scene, settings = Scene.from_params(params), params.execution
     manifold, cup = scene.manifold(params.constraints[constraint]), CupSettings(spheres=settings.spheres)
+    about = subject_of(params, constraint=constraint)
     with tracked_stage(
-        STAGE, constraint, settings, [layout.planner], experiment=params.tracking.experiment, root=layout.root
+        STAGE,
+        constraint,
+        settings,
+        [layout.planner],
+        experiment=params.tracking.experiment,
+        root=layout.root,
+        subject=about,
     ) as run:
         found = tipping_queries(scene, manifold, constraint, settings.queries, settings.least_tilt_rad, settings.seed)
         with Planner(read_bundle(layout.planner), str(layout.planner)) as planner:

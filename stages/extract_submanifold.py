@@ -9,7 +9,7 @@ from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.paths import Layout
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 
 STAGE = "extract_submanifold"
 
@@ -20,9 +20,16 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     sources = [layout.joints("free"), layout.joints(constraint)]
     scene = Scene.from_params(params)
     constrained = scene.manifold(params.constraints[constraint])
+    about = subject_of(params, constraint=constraint, manifold=manifold)
     with (
         tracked_stage(
-            STAGE, item, params.submanifold, sources, experiment=params.tracking.experiment, root=layout.root
+            STAGE,
+            item,
+            params.submanifold,
+            sources,
+            experiment=params.tracking.experiment,
+            root=layout.root,
+            subject=about,
         ) as run,
         scene.world() as world,
     ):

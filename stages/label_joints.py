@@ -15,7 +15,7 @@ from constraint_geodesics.learning.dataset import (
 )
 from constraint_geodesics.params import Params
 from constraint_geodesics.paths import Layout
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 
 STAGE = "label_joints"
 
@@ -26,13 +26,15 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     manifold = scene.manifold(params.constraints[constraint])
     labels = params.labels
     rows = labels.free_rows if constraint == "free" else labels.constrained_rows
-    settings = {"rows": rows, "labels": labels.model_dump(), "constraint": params.constraints[constraint].model_dump()}
-    with tracked_stage(STAGE, constraint, settings, [], experiment=params.tracking.experiment, root=layout.root) as run:
+    settings, about = {"rows": rows, "labels": labels.model_dump()}, subject_of(params, constraint=constraint)
+    with tracked_stage(
+        STAGE, constraint, settings, [], experiment=params.tracking.experiment, root=layout.root, subject=about
+    ) as run:
         tasks = shard_tasks(scene, manifold, constraint, rows, labels.shard_rows, labels.seed)
         shards = parallel_map(draw_shard, tasks, params.compute, description=f"label {constraint}")
         queries = draw_queries(scene, manifold, constraint, params.queries.count, params.queries.seed)
-        about = {"constraint": constraint, "robot": scene.robot.name, "seed": str(labels.seed), "rows": str(rows)}
-        write_joints(shards, layout.joints(constraint), about)
+        card = {"constraint": constraint, "robot": scene.robot.name, "seed": str(labels.seed), "rows": str(rows)}
+        write_joints(shards, layout.joints(constraint), card)
         write_queries(queries, layout.queries(constraint))
         run.report(data_card(shards), layout.report(STAGE, constraint))
 

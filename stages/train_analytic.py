@@ -17,7 +17,7 @@ from constraint_geodesics.evaluation.geodesic_search import write_table
 from constraint_geodesics.geodesics.policy_search import save_policy
 from constraint_geodesics.params import Params
 from constraint_geodesics.paths import Layout
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 
 STAGE = "train_analytic"
 
@@ -25,7 +25,10 @@ STAGE = "train_analytic"
 def main(params: Params, layout: Layout, analytic: str) -> None:
     """Write data/analytic/<analytic>/, its learning curves and figures."""
     settings = params.geodesics.model_copy(update={"steps": params.geodesics.analytic_steps})
-    with tracked_stage(STAGE, analytic, settings, [], experiment=params.tracking.experiment, root=layout.root) as run:
+    about = subject_of(params, manifold=analytic, reward=settings.reward)
+    with tracked_stage(
+        STAGE, analytic, settings, [], experiment=params.tracking.experiment, root=layout.root, subject=about
+    ) as run:
         tasks = [
             AnalyticTask(
                 analytic, curve_family(MANIFOLDS[analytic].manifold.dim, settings), settings, seed,
@@ -35,7 +38,7 @@ def main(params: Params, layout: Layout, analytic: str) -> None:
             for seed in settings.seeds
         ]  # fmt: skip
         results = parallel_map(run_analytic, tasks, params.compute, description=f"policy search {analytic}")
-        run.summarise([result.figures() for result in results])
+        run.summarise([result.figures() for result in results], [result.policy.curve for result in results])
         folder = layout.analytic(analytic)
         for result in results:
             save_policy(result.policy, folder, result.seed)

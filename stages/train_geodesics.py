@@ -8,6 +8,7 @@ from constraint_geodesics.compute import parallel_map
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.constraints.submanifold import load_submanifold
 from constraint_geodesics.evaluation.geodesic_search import (
+    PLANNER,
     SeedTask,
     connected_queries,
     geodesic_figures,
@@ -21,7 +22,7 @@ from constraint_geodesics.learning.dataset import read_joints, read_queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.paths import Layout
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 from constraint_geodesics.tracking.replay import record_rows
 
 STAGE = "train_geodesics"
@@ -39,7 +40,10 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     with scene.world() as world:
         connected, connection_s = connected_queries(submanifold, problem, queries, world.free, params.submanifold)
     settings = params.policy_settings(separate=True) if problem.retract else params.geodesics
-    with tracked_stage(STAGE, item, settings, sources, experiment=params.tracking.experiment, root=layout.root) as run:
+    about = subject_of(params, constraint=constraint, manifold=manifold, reward=settings.reward)
+    with tracked_stage(
+        STAGE, item, settings, sources, experiment=params.tracking.experiment, root=layout.root, subject=about
+    ) as run:
         tasks = [
             SeedTask(
                 problem, scene, settings, params.judge, manifold, queries, connected, connection_s, seed,
@@ -48,7 +52,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
             for seed in settings.seeds
         ]  # fmt: skip
         results = parallel_map(run_seed, tasks, params.compute, description=f"policy search {item}")
-        run.summarise([result.figures() for result in results])
+        run.summarise([result.figures() for result in results], [result.policy.curve for result in results])
         save_seeds(results, queries, layout, STAGE, manifold, constraint)
         rows, paths = straight_rows(tasks[0])
         rows += [row for result in results for row in result.rows]
@@ -57,6 +61,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
             layout.recordings(STAGE, item), rows, paths, constraint, chart, constrained, submanifold, scene.workcell,
             params.recording,
         )  # fmt: skip
+        run.recordings(rows, shown=PLANNER)
         write_table(rows, layout.report(STAGE, item, "csv"), manifold=manifold, constraint=constraint)
         run.report(geodesic_figures(results, connected), layout.report(STAGE, item))
         for task in tasks:  # finished: the next run of this stage starts from nothing

@@ -10,7 +10,7 @@ from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.training import train_manifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.paths import Layout
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 
 STAGE = "train_manifold"
 
@@ -18,9 +18,9 @@ STAGE = "train_manifold"
 def main(params: Params, layout: Layout, manifold: str) -> None:
     """Write data/manifolds/<manifold>/, its held-out figures and its learning curve."""
     source = layout.joints("free")
-    settings = params.manifolds[manifold]
+    settings, about = params.manifolds[manifold], subject_of(params, manifold=manifold)
     with tracked_stage(
-        STAGE, manifold, settings, [source], experiment=params.tracking.experiment, root=layout.root
+        STAGE, manifold, {}, [source], experiment=params.tracking.experiment, root=layout.root, subject=about
     ) as run:
         joints = read_joints(source).free_joints
         trained = train_manifold(

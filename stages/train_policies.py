@@ -12,7 +12,7 @@ from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.paths import Layout
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 
 STAGE = "train_policies"
 
@@ -24,8 +24,9 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
     manifolds = {name: scene.manifold(constraint) for name, constraint in params.constraints.items()}
     joints = {name: read_joints(layout.joints(name)).free_joints for name in params.constraints}
     problem = shared_problem(params, LearnedManifold.load(layout.manifold(manifold)), manifolds, joints, manifold)
+    about = subject_of(params, manifold=manifold, reward=settings.reward)
     with tracked_stage(
-        STAGE, manifold, params.policies, sources, experiment=params.tracking.experiment, root=layout.root
+        STAGE, manifold, settings, sources, experiment=params.tracking.experiment, root=layout.root, subject=about
     ) as run:
         tasks = [
             TrainingTask(
@@ -40,7 +41,7 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
             save_policy(policy, layout.policies(manifold), task.seed)
         write_table(learning, layout.report(STAGE, f"{manifold}-learning", "csv"))
         figures = [{"final_saving": policy.curve[-1]["saving"]} for policy in policies]
-        run.summarise(figures)
+        run.summarise(figures, [policy.curve for policy in policies])
         run.report(
             {"final_saving_mean": sum(f["final_saving"] for f in figures) / len(figures)},
             layout.report(STAGE, manifold),

@@ -29,7 +29,10 @@ from constraint_geodesics.tracking.benchmark_recording import PathRecorder
 
 JUDGED_BY = "evaluation.benchmark"
 """The module that asks the planners and judges their answers: every row depends on what it imports."""
-BESIDE = ("__init__.py", "params.py", "paths.py", "progress.py", "compute.py", "tracking", "evaluation/figures.py")
+BESIDE = (
+    "__init__.py", "params.py", "paths.py", "progress.py", "compute.py", "palette.py", "tracking",
+    "evaluation/figures.py",
+)  # fmt: skip
 """What no row depends on: parameters are hashed by their values."""
 
 

@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -23,11 +24,14 @@ from mlflow import MlflowClient
 from mlflow.entities import Run
 
 from constraint_geodesics.compute import parallel_map
-from constraint_geodesics.params import ComputeParams, ConstraintParams, PoseParams
+from constraint_geodesics.params import ComputeParams, ConstraintParams, PoseParams, load_params
+from constraint_geodesics.tracking import experiment
 from constraint_geodesics.tracking.experiment import (
     ChildRun,
+    Subject,
     TrackingError,
     dvc_md5,
+    subject_of,
     tracked_stage,
     tracking_uri,
     ui_command,
@@ -82,11 +86,11 @@ def test_a_stage_is_a_parent_its_seeds_are_children(root: Path) -> None:
     reference = PoseParams(position_m=(0.4, 0, 0.3), rpy_rad=(0, 0, 0))
     held = ConstraintParams(description="level", axes=(0, 0, 0, 1, 1, 0), tolerance=(0,) * 6, reference=reference)
     params = {"seeds": [1, 3], "constraint": held, "long": "x" * 7000, **{f"p{i}": i for i in range(150)}}
-    with tracked_stage(
-        "train", "planner-cup", params, [], experiment="tree", root=root, tags={"constraint": "cup"}
-    ) as stage:
+    about = Subject({"constraint": "cup"}, {"manifold": {"latent_dim": 6}})
+    with tracked_stage("train", "planner-cup", params, [], experiment="tree", root=root, subject=about) as stage:
         tasks = [(stage.child(f"seed {seed}", {"seed": seed}), seed) for seed in (1, 3)]
-        stage.summarise(parallel_map(work, tasks, TWO))
+        curves = [[{"steps": 1.0, "loss": 1.0}, {"steps": 2.0, "loss": 5.0}], [{"steps": 2.0, "loss": 3.0}]]
+        stage.summarise(parallel_map(work, tasks, TWO), curves)
     runs = runs_of(tracking_uri(root), "tree")
     assert set(runs) == {"train planner-cup", "planner-cup seed 1", "planner-cup seed 3"}
     parent, child = runs["train planner-cup"], runs["planner-cup seed 3"]
@@ -99,13 +103,68 @@ def test_a_stage_is_a_parent_its_seeds_are_children(root: Path) -> None:
     tags = {"stage": "train", "item": "planner-cup", "constraint": "cup", "git_dirty": "false"}
     tags["git_commit"] = git(root, "rev-parse", "HEAD")
     assert parent.data.tags.items() >= tags.items()
-    assert parent.data.metrics == {"seeds/length_mean": 2.0, "seeds/length_std": 1.0, "seeds/length_count": 2.0}
+    assert parent.data.params["manifold.latent_dim"] == "6"
+    figures = {name: value for name, value in parent.data.metrics.items() if not name.startswith("system/")}
+    assert figures == {
+        "seeds/length_mean": 2.0, "seeds/length_std": 1.0, "seeds/length_count": 2.0,
+        "seeds/loss_mean": 4.0, "seeds/loss_std": 1.0,
+    }  # fmt: skip
+    (mean,) = MlflowClient(tracking_uri(root)).get_metric_history(parent.info.run_id, "seeds/loss_mean")
+    assert mean.step == 2, "the only step that both have"
 
-    assert child.data.tags.items() >= {**tags, "mlflow.parentRunId": stage.run_id}.items()
-    assert child.data.params == {"seed": "3"}
+    assert child.data.tags.items() >= {**tags, "seed": "3", "mlflow.parentRunId": stage.run_id}.items()
+    assert child.data.params == {**parent.data.params, "seed": "3"}, "children of different runs can be compared"
     history = MlflowClient(tracking_uri(root)).get_metric_history(child.info.run_id, "loss")
     assert [(point.step, point.value) for point in history] == [(0, 4.0), (1, 3.5), (2, 3 + 1 / 3)]
     assert child.data.metrics == {"loss": 3 + 1 / 3, "final/length": 3.0}
+
+
+def test_a_run_says_where_its_paths_are_recorded(root: Path) -> None:
+    def row(planner: str, seed: int, recording: str) -> dict[str, Any]:
+        return {"planner": planner, "query": 0, "seed": seed, "length_rad": 1.5, "recording": recording}
+
+    with tracked_stage("train", "cup", {}, [], experiment="recorded", root=root) as stage:
+        for seed in (0, 1):
+            with stage.child(f"seed {seed}", {"seed": seed}):
+                pass
+        stage.recordings(
+            [row("line", 0, "line.rrd"), row("ours", 0, "a.rrd"), row("ours", 0, ""), row("ours", 1, "b.rrd")], "ours"
+        )
+    runs = runs_of(tracking_uri(root), "recorded")
+    assert [runs[f"cup seed {seed}"].data.tags["recording"] for seed in (0, 1)] == ["a.rrd", "b.rrd"]
+    listed = (root / "mlartifacts/recorded" / stage.run_id / "artifacts/recordings.md").read_text()
+    for text in (listed, runs["train cup"].data.tags["mlflow.note.content"]):
+        assert re.findall(r"`geodesics replay (\S+)`", text) == ["line.rrd", "a.rrd", "b.rrd"]
+
+
+def test_the_machine_is_watched_while_a_stage_runs(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(experiment, "SYSTEM_EVERY_S", 0.05)
+    with tracked_stage("train", "cup", {}, [], experiment="watched", root=root) as stage:
+        time.sleep(0.5)
+    metrics = MlflowClient(stage.tracking_uri).get_run(stage.run_id).data.metrics
+    assert 0.0 < metrics["system/system_memory_usage_percentage"] < 100.0
+    assert "system/cpu_utilization_percentage" in metrics
+
+
+def test_a_run_of_an_experiment_is_named_after_it(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DVC_EXP_NAME", "tilt-5")
+    with (
+        tracked_stage("train", "cup", {}, [], experiment="named after", root=root) as stage,
+        stage.child("seed 1", {"seed": 1}),
+    ):
+        pass
+    runs = runs_of(tracking_uri(root), "named after")
+    assert set(runs) == {"train cup (tilt-5)", "cup seed 1 (tilt-5)"}
+    assert {run.data.tags["dvc_experiment"] for run in runs.values()} == {"tilt-5"}
+
+
+def test_runs_are_found_by_constraint_manifold_and_reward() -> None:
+    params = load_params(Path(__file__).resolve().parents[2] / "params.yaml")
+    found = subject_of(params, constraint="slide", manifold="planner", reward=params.policies.reward)
+    assert set(found.tags) == {"constraint", "manifold", "reward"}
+    assert found.tags["reward"].startswith("corrected b=")
+    assert found.params == {"constraint": params.constraints["slide"], "manifold": params.manifolds["planner"]}
+    assert subject_of(params, manifold="sphere") == Subject({"manifold": "sphere"}), "a known manifold is in no file"
 
 
 def test_figures_that_some_seeds_lack_are_counted(root: Path) -> None:

@@ -1,0 +1,162 @@
+"""The planner in a real registry: registered, loaded by its alias, and served by MLflow's own command."""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from constraint_geodesics import Planner
+from constraint_geodesics.bundle import PACKAGED
+from constraint_geodesics.tracking.experiment import (
+    CHAMPION,
+    PLANNER_MODEL,
+    TrackingError,
+    client_of,
+    fetch_artifacts,
+    tracked_stage,
+    tracking_uri,
+)
+from constraint_geodesics.tracking.registry import register_planner
+
+ROOT = Path(__file__).resolve().parents[2]
+CODE = ROOT / "src/constraint_geodesics/served_model.py"
+QUERY = {
+    "start": [1.329923, -0.584036, -3.766650, -2.008429, 0.728803, -2.581396],
+    "goal": [1.071549, -0.217480, -1.682647, -2.906655, -0.337949, 1.348704],
+    "constraint": "level_cup",
+}
+ADDRESS = f"models:/{PLANNER_MODEL}@{CHAMPION}"
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkout whose store has the packaged planner."""
+    folder = tmp_path_factory.mktemp("registry")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("MLFLOW_TRACKING_URI", raising=False)
+        assert registered(folder, PACKAGED) == "1"
+    return folder
+
+
+@pytest.fixture
+def copy(root: Path, tmp_path: Path) -> Path:
+    """One to change; a new store would take seconds."""
+    return shutil.copytree(root, tmp_path / "copy")
+
+
+@pytest.fixture(autouse=True)
+def own_store(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.delenv("DVC_EXP_NAME", raising=False)
+
+
+def registered(root: Path, files: Path) -> str:
+    with tracked_stage("build_planner", "planner", {}, [], experiment="built", root=root) as run:
+        return register_planner(run, files, CODE, QUERY)
+
+
+def champion(root: Path) -> str:
+    return str(client_of(tracking_uri(root)).get_model_version_by_alias(PLANNER_MODEL, CHAMPION).version)
+
+
+def other_files(folder: Path) -> Path:
+    """The same planner with another file beside it."""
+    shutil.copytree(PACKAGED, folder)
+    (folder / "note.txt").write_text("another")
+    return folder
+
+
+def test_the_champion_plans_without_a_server(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(root)
+    with Planner.load(ADDRESS) as planner, Planner.load(PACKAGED) as packaged:
+        assert planner.source == f"MLflow's {ADDRESS}"
+        path, same = (each.plan(QUERY["start"], QUERY["goal"], "level_cup") for each in (planner, packaged))
+    np.testing.assert_array_equal(path.joints, same.joints)
+
+
+@pytest.mark.parametrize("address", [f"models:/{PLANNER_MODEL}@nobody", f"models:/{PLANNER_MODEL}/9", "runs:/0/x"])
+def test_what_is_not_there_is_said_in_one_line(root: Path, address: str) -> None:
+    with pytest.raises(TrackingError, match=address) as caught, fetch_artifacts(address, root):
+        pass
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_were_deleted_are_missed_by_name(copy: Path) -> None:
+    shutil.rmtree(copy / "mlartifacts")
+    with pytest.raises(TrackingError, match="mlartifacts"), fetch_artifacts(ADDRESS, copy):
+        pass
+
+
+def test_other_files_are_a_new_version_and_equal_ones_are_not(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert registered(copy, PACKAGED) == "1"
+    assert registered(copy, other_files(copy / "other")) == "2"
+    assert champion(copy) == "2"
+    assert registered(copy, PACKAGED) == "1"
+    assert champion(copy) == "1", "what the pipeline built last"
+    monkeypatch.setenv("DVC_EXP_NAME", "tilt-5")
+    assert registered(copy, copy / "other") == "2"
+    assert champion(copy) == "1", "an experiment does not replace it"
+
+
+def test_a_model_has_a_signature_an_example_and_nothing_pickled(root: Path) -> None:
+    (model,) = (root / "mlartifacts").rglob("MLmodel")
+    files = {file.name for file in model.parent.rglob("*") if file.is_file()}
+    assert {"served_model.py", "input_example.json", "planner.json", "manifold.safetensors"} <= files
+    assert not [name for name in files if name.endswith((".pkl", ".pickle"))]
+    for name in ("start", "goal", "constraint", "status", "joints", "times"):
+        assert f'"name": "{name}"' in model.read_text()
+
+
+def test_mlflow_serves_the_planner(root: Path) -> None:
+    (model,) = (root / "mlartifacts").rglob("MLmodel")
+    rows = [QUERY, QUERY | {"constraint": "nothing"}, QUERY | {"constraint": '{"axes": [0, 0, 0, 1, 1, 0]}'}]
+    with served(model.parent) as address:
+        path, unknown, own = ask(address, rows)
+    assert path["status"] == own["status"] == "solved"
+    np.testing.assert_allclose([path["joints"][0], path["joints"][-1]], [QUERY["start"], QUERY["goal"]], atol=1e-6)
+    assert len(path["times"]) == len(path["joints"]) == path["rows"]
+    assert unknown["status"] == "bad_query"
+    assert "level_cup" in unknown["explanation"]
+
+
+@contextmanager
+def served(model: Path) -> Iterator[str]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "mlflow", "models", "serve", "-m", str(model), "--env-manager", "local"]
+    command += ["--host", "127.0.0.1", "--port", str(port)]
+    environment = {**os.environ, "MLFLOW_DISABLE_TELEMETRY": "true", "PATH": f"{Path(sys.executable).parent}:/usr/bin"}
+    log = (model.parent / "serve.log").open("w")
+    server = subprocess.Popen(command, stdout=log, stderr=log, env=environment, start_new_session=True)
+    try:
+        deadline = time.monotonic() + 90
+        while time.monotonic() < deadline and server.poll() is None:
+            try:
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/ping")
+                break
+            except OSError:
+                time.sleep(0.2)
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        os.killpg(server.pid, 15)
+        server.wait(20)
+        log.close()
+
+
+def ask(address: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    body = json.dumps({"dataframe_records": rows}).encode()
+    request = urllib.request.Request(f"{address}/invocations", body, {"Content-Type": "application/json"})
+    answer: list[dict[str, Any]] = json.loads(urllib.request.urlopen(request, timeout=120).read())["predictions"]
+    return answer
