@@ -11,6 +11,7 @@ from constraint_geodesics.evaluation import benchmark_figures
 from constraint_geodesics.evaluation.benchmark import KEEP_OUT, TABLE, read_table
 from constraint_geodesics.evaluation.benchmark_report import (
     ahead_markdown,
+    asks_in_python,
     benchmark_markdown,
     break_even_markdown,
     overview_markdown,
@@ -50,7 +51,7 @@ def main(params: Params, layout: Layout) -> None:
     (folder / "summary.md").write_text(benchmark_markdown(summary))
     overview = benchmark_summary(all_constraints(rows), reference)
     overview.to_csv(folder / "overview.csv", index=False, float_format="%.6g")
-    in_python = [name for name, entry in planners.items() if entry.kind in ("ompl", "decoder_sampling")]
+    in_python = asks_in_python(planners)
     (folder / "overview.md").write_text(overview_markdown(overview, in_python))
 
     shown = overview[overview["planner"].isin(params.bench.drawn)]
@@ -67,7 +68,7 @@ def main(params: Params, layout: Layout) -> None:
     costs.to_csv(folder / "break_even.csv", index=False, float_format="%.6g")
     (folder / "break_even.md").write_text(break_even_markdown(costs))
 
-    drawn = {name: planners[name].kind for name in params.bench.drawn if name in planners}
+    drawn = [name for name in params.bench.drawn if name in planners]
     pooled = all_constraints(rows)
     for name, figure in (
         ("success_over_budget", benchmark_figures.success_over_budget(rows, drawn)),

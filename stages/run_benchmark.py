@@ -11,7 +11,7 @@ from constraint_geodesics.paths import Layout
 
 
 def main(params: Params, layout: Layout) -> None:
-    """Write data/benchmark_rows/ as they come, then data/benchmark.csv, and recordings of some paths."""
+    """Write data/benchmark_rows/ as they come, then reports/benchmark.csv, and recordings of some paths."""
     table = answered(blocks_of(params, layout, layout.benchmark_rows, layout.benchmark_recordings), params.compute)
     write_table(table, layout.benchmark_table, run_header(layout.root))
 

@@ -16,7 +16,6 @@ from constraint_geodesics.benchmark_blocks import (
     uses_clearance,
 )
 from constraint_geodesics.cli import note_stage_time
-from constraint_geodesics.evaluation.benchmark_figures import FAMILIES
 from constraint_geodesics.params import Params, PeerParams
 from constraint_geodesics.paths import Layout
 from constraint_geodesics.peers import KINDS, PeerBuilder, PeerError, Remembered
@@ -63,7 +62,6 @@ def test_every_kind_of_the_parameters_exists_and_every_band_follows_its_planner(
     assert after("BiRRT, decoded samples + band", planners) == "BiRRT, decoded samples"
     assert after("BiRRT", planners) == after("BiRRT + band, 1 s", planners) == after("planner", planners) == ""
     assert set(params.bench.recorded) | set(params.bench.placed_by) | set(params.bench.drawn) <= set(planners)
-    assert set(FAMILIES) == set(KINDS), "every kind has its colour"
 
 
 def test_fewer_planners_queries_and_constraints(params) -> None:

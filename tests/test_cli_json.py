@@ -67,7 +67,9 @@ def test_recordings_are_listed_as_json(geodesics, tmp_path) -> None:
     file.write_bytes(b"RRF2")
     code, out, err = geodesics("replay", "--json")
     assert (code, err) == (0, "")
-    assert strict(out) == {"recordings": [str(file.relative_to(tmp_path))]}
+    (row,) = strict(out)["recordings"]
+    assert (row["number"], row["file"]) == (1, str(file.relative_to(tmp_path)))
+    assert row["query"] is row["seed"] is row["length_rad"] is row["valid"] is None, "it is no recording"
     code, out, err = geodesics("replay", "--json", str(file))
     assert (code, out) == (2, "")
     assert err.startswith("error: --json prints the list")

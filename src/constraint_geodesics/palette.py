@@ -4,7 +4,7 @@ figures, on the report's pages and in Rerun.
 
 BLACK, ORANGE, SKY, GREEN = "#222222", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILION, PURPLE, YELLOW = "#0072B2", "#D55E00", "#CC79A7", "#F0E442"
-GREY, LIGHT = "#8A8A8A", "#E4E4E4"
+GREY, LIGHT = "#606060", "#E4E4E4"
 START, GOAL = GREEN, VERMILION
 """A path's ends."""
 

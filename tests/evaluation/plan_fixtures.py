@@ -73,3 +73,9 @@ def write_plan_reports(params: Params, layout: Layout) -> None:
     ):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(content))
+    executed = [
+        {"query": 0, "kind": kind, "status": "executed", "kept": kept, "spheres": 12,
+         "recording": f"data/recordings/execute_paths/{params.plans.constraint}/{k}.rrd" if k == 0 else ""}
+        for k, (kind, kept) in enumerate(((PLANNED, 12), (STRAIGHT, 3)))
+    ]  # fmt: skip
+    pd.DataFrame(executed).to_csv(layout.report("execute_paths", params.plans.constraint, "csv"), index=False)

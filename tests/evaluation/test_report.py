@@ -1,21 +1,26 @@
 """The report of a small run laid out in a folder: real data, manifolds and sub-manifolds, tables written by hand."""
 
 import csv
-import html.parser
 import json
 import re
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
+from mlflow.utils.search_utils import SearchUtils
+from tests.evaluation.pages import DASHBOARD, check_page
 from tests.evaluation.plan_fixtures import write_plan_reports
 
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.constraints.submanifold import extract, save_submanifold, submanifold_figures
+from constraint_geodesics.evaluation.blocks import Recorded, in_checkout
 from constraint_geodesics.evaluation.figures import PLANNERS
-from constraint_geodesics.evaluation.report import latent_curves, recorded_paths, write_report
+from constraint_geodesics.evaluation.report import write_report
+from constraint_geodesics.evaluation.report_figures import latent_curves
+from constraint_geodesics.evaluation.report_tables import ablation_blocks, recorded_paths
 from constraint_geodesics.evaluation.results import (
     ReportError,
     compare_planners,
@@ -29,6 +34,7 @@ from constraint_geodesics.evaluation.results import (
 from constraint_geodesics.learning.dataset import data_card, draw_shard, read_joints, shard_tasks, write_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.vae import JointVae
+from constraint_geodesics.palette import planner_colour
 from constraint_geodesics.params import load_params
 from constraint_geodesics.paths import Layout
 
@@ -201,37 +207,79 @@ def page(run, written):
     return (run[1].root / "reports" / "index.html").read_text()
 
 
-class Balance(html.parser.HTMLParser):
-    """Collects what a page refers to, and checks that every element is closed where it was opened."""
-
-    VOID = frozenset({"meta", "img", "br"})
-
-    def __init__(self):
-        super().__init__()
-        self.open, self.links, self.targets = [], [], set()
-
-    def handle_starttag(self, tag, attrs):
-        attrs = dict(attrs)
-        self.links += [attrs[name] for name in ("href", "src") if name in attrs]
-        self.targets |= {attrs["id"]} if "id" in attrs else set()
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
+@pytest.fixture(scope="module")
+def checked(run, page):
+    return check_page(page, run[1].root / "reports", ("benchmark.html", "../docs/data_card.md"))
 
 
-def test_the_page_is_well_formed_small_and_asks_the_network_for_nothing(page, written):
-    parser = Balance()
-    parser.feed(page)
-    assert parser.open == []
-    assert len(page.encode()) < 3_000_000
-    assert not re.search(
-        r"https?:|//[a-z]|@import|url\(|<script|<link", re.sub(r'"data:image/png;base64,[^"]*"', '""', page)
-    )
-    for link in parser.links:
-        assert link.startswith(("data:image/png;base64,", "../data/recordings/")) or link[1:] in parser.targets
-    assert sum(link.startswith("data:") for link in parser.links) == len(written)
+def test_the_page_asks_the_network_for_nothing_and_every_figure_is_on_it(checked, written):
+    assert len(checked.sources) == len(checked.alts) == len(written)
+    assert {"benchmark.html", "benchmark.html#parts", "../docs/data_card.md"} <= set(checked.links)
+    assert "figures/fig2_analytic_submanifolds.png" in checked.links
+
+
+def test_the_pages_tables_say_what_the_csv_says(run, checked):
+    table = pd.read_csv(run[1].root / "reports" / "table.csv")
+    for row in table.to_dict("records"):
+        label = PLANNERS[row["planner"]].label
+        cells = checked.rows(f"{row['manifold']}, {row['constraint']}")[label]
+        assert cells[0] == f"{row['success']:.0%}"
+        assert cells[1] == f"{row['compared']}/{row['queries']}"
+        assert cells[2] == ("–" if np.isnan(row["latent_shortest"]) else f"{row['latent_shortest']:.2f}")
+        assert cells[5].split(" ± ")[0] == short(row["time_mean_s"])
+
+
+def test_a_planner_has_its_colour_beside_its_name(checked):
+    for title in ("planner, slide", "level_cup", "level_cup, whole and in parts"):
+        rows = checked.tables[title]
+        named = {rows[place][0]: colour for place, colour in checked.colours[title].items()}
+        assert "planner" in named or "learned geodesic" in named
+        assert named == {name: planner_colour(name) for name in named}
+
+
+def test_every_recorded_row_has_its_command_and_every_row_its_runs(run, checked):
+    params, layout = run
+    for stage in ("train_geodesics", "benchmark_planners"):
+        for file in (layout.root / "reports" / stage).glob("*.csv"):
+            rows = pd.read_csv(file)
+            if "recording" in rows and file.stem != "removed":
+                for recording in rows["recording"].dropna():
+                    assert f"geodesics replay {recording}" in checked.commands
+    results = [title for title in checked.tables if title.partition(", ")[0] in params.manifolds]
+    assert len(results) == 4
+    for title in results:
+        rows = checked.rows(title)
+        assert [row[-1] for name, row in rows.items() if name == "learned geodesic"] == ["2 recorded · runs"]
+        assert all(row[-1].endswith("runs") for name, row in rows.items() if name != "planner")
+
+
+def test_links_to_runs_are_filters_that_mlflow_takes(checked):
+    found = {link for link in checked.links if link.startswith(DASHBOARD)}
+    wanted = set()
+    for link in found:
+        address = urlsplit(link)
+        path, _, query = address.fragment.partition("?")
+        assert path == "/experiments/1/runs"
+        (text,) = parse_qs(query)["searchFilter"]
+        stage, item = SearchUtils.parse_search_filter(text)
+        assert (stage["key"], stage["comparator"], item["key"]) == ("stage", "=", "item")
+        wanted.add((stage["value"], item["value"]))
+    assert {
+        ("train_geodesics", "planner-slide"), ("benchmark_planners", "slide"), ("benchmark_plans", "level_cup"),
+        ("execute_paths", "level_cup"), ("train_manifold", "paper"), ("ablate_analytic", "plane"),
+        ("label_joints", "free"), ("benchmark_geometry", "planner"), ("benchmark_policies", "planner"),
+    } <= wanted  # fmt: skip
+
+
+def test_ablations_say_what_their_stages_measured(run):
+    searched, variance, families = ablation_blocks(*run)
+    rows = {row[0]: row[1:] for row in searched.rows}
+    assert rows["plane, corrected reward, cubic"] == ["0.200", "0.100", "0.300", "2", "0.020"]
+    assert rows["plane, reward as printed"] == ["3.000", "2.000", "4.000", "2", "0.020"]
+    assert rows["plane, 2 segments"] == ["1.000", "1.000", "1.000", "2", "0.001"]
+    assert variance.rows[0][:3] == ["paper, with the variance term", "5", "0.8"]
+    assert variance.rows[2][1:3] == ["5", "–"]
+    assert families.header == ["manifold", "cubic", "2 segments"]
 
 
 def test_every_figure_of_the_paper_has_its_counterpart(written):
@@ -305,8 +353,9 @@ def test_the_page_sets_the_papers_figures_beside_this_runs(page):
 
 def test_the_page_shows_the_other_stages_metrics(page):
     section = page[page.index('id="metrics"') : page.index('id="data"')]
-    for cell in ("<td>12.5</td>", "<td>233</td>", "<td>0.875</td>", "<td>1.001, 1.003</td>", "<td>planner, slide</td>"):
+    for cell in ("<td>12.5</td>", "<td>233</td>", "<td>0.875</td>", "<td>1.001, 1.003</td>"):
         assert cell in section
+    assert '<th scope="row">planner, slide</th>' in section
 
 
 def test_findings_come_from_the_tables(run):
@@ -329,15 +378,20 @@ def test_findings_come_from_the_tables(run):
     )
 
 
-def test_recordings_are_linked_from_the_page_to_where_they_lie(run, page):
-    found = recorded_paths(*run)
-    assert {name: len(paths) for name, paths in found.items()} == {"free": 2, "level_cup": 4, "slide": 2}
-    first = found["level_cup"][0]
+def test_recorded_paths_say_what_they_show(run):
+    found = recorded_paths(*run, "planner", "level_cup")
+    assert {name: len(paths) for name, paths in found.items()} == {"learned_geodesic": 2}
+    first = found["learned_geodesic"][0]
     assert first.file == "data/recordings/train_geodesics/planner-level_cup/query0-learned_geodesic-seed0.rrd"
-    assert first.link == f"../{first.file}"
-    assert f'href="{first.link}"' in page
+    assert first.command == f"geodesics replay {first.file}"
     assert "seed 0: valid, 3.00 rad" in first.text
-    assert "not valid: constraint violated" in found["level_cup"][-1].text
+    assert "not valid: constraint violated" in recorded_paths(*run, "paper", "level_cup")["learned_geodesic"][-1].text
+
+
+def test_a_recording_is_found_in_any_checkout():
+    assert in_checkout("/elsewhere/data/recordings/a b.rrd") == "data/recordings/a b.rrd"
+    assert in_checkout("data/recordings/a.rrd") == "data/recordings/a.rrd"
+    assert Recorded("data/recordings/a b.rrd", "").command == "geodesics replay 'data/recordings/a b.rrd'"
 
 
 def test_drawn_curves_are_those_of_the_seeds_that_found_one(run, tmp_path):

@@ -1,5 +1,6 @@
 """The whole pipeline, from the first configuration to the report, and what it promises about running again."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -53,9 +54,10 @@ def test_every_query_keeps_its_row(finished: Path) -> None:
 
 
 def test_the_report_opens_offline(finished: Path) -> None:
-    page = (finished / "reports/index.html").read_text()
-    assert "http://" not in page.replace("http://www.w3.org", "")
-    assert 'src="http' not in page
+    page = re.sub(r'src="data:image/png;base64,[^"]*"', "", (finished / "reports/index.html").read_text())
+    assert not re.search(r"src=|<link|@import|url\(", page)
+    # nothing but what a person may follow: the runs in the dashboard of this checkout
+    assert not re.search(r"https?:|//", re.sub(r'<a href="http://127\.0\.0\.1:5000/#/[^"]*">', "", page))
     for name in ("fig2_analytic_submanifolds", "fig3_plane_search", "fig4a_latent_metric", "fig4c_geodesics"):
         assert (finished / f"reports/figures/{name}.png").stat().st_size > 5000
     assert "learned geodesic" in (finished / "reports/table.md").read_text()
@@ -69,7 +71,7 @@ def test_recordings_replay_the_path(finished: Path) -> None:
     queries = pd.read_csv(finished / "data/joints/level_cup/queries.csv")
     np.testing.assert_allclose(summary.joints[0], queries.filter(like="start_").iloc[0], atol=1e-9)
     np.testing.assert_allclose(summary.joints[-1], queries.filter(like="goal_").iloc[0], atol=1e-9)
-    assert summary.meshes >= 7
+    assert summary.meshes == 0, "`geodesics replay` adds them"
     assert summary.has_blueprint
 
 

@@ -1,5 +1,6 @@
 """Recordings of a real execution that spills, read back from the file."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from constraint_geodesics.tracking.execution_recording import (
     record_executions,
     tilt,
 )
-from constraint_geodesics.tracking.recording import RecordingError, read_recording, same_recordings
+from constraint_geodesics.tracking.recording import About, RecordingError, read_recording, same_recordings
 
 CUP = CupSettings(spheres=4, settle_s=0.2)
 AXIS = np.array([0.0, 1.0, 0.0])
@@ -59,7 +60,8 @@ def column(file: Path, entity: str, component: str) -> tuple[list[Any], list[Any
 def test_recording_reads_back_as_the_execution(file: Path, record: ExecutionRecord, scene: Scene) -> None:
     summary, execution = read_recording(file), record.execution
     assert summary.application_id == "constraint_geodesics"
-    assert summary.recording_id == "level_cup-query2-straight-joint-line-executed"
+    assert re.fullmatch(r"level_cup-query2-straight-joint-line-executed-[0-9a-f]{8}", summary.recording_id)
+    assert summary.about == About("straight joint line", "level_cup", query=2, executed=True)
     assert summary.meshes == 7
     assert {"/cup", "/cup/wall", "/spheres", "/cup_tilt", "/cup_spheres", "/workcell/table", "/status"} <= set(
         summary.entity_paths
@@ -124,6 +126,8 @@ def test_each_record_gets_a_file_of_its_name(record: ExecutionRecord, scene: Sce
     files = record_executions(tmp_path / "new", [None, record], scene.robot, scene.workcell)
     assert files == ["", (tmp_path / "new" / "query2-straight-joint-line.rrd").as_posix()]
     assert [path.as_posix() for path in (tmp_path / "new").iterdir()] == files[1:]
+    assert read_recording(Path(files[1])).meshes == 0
+    assert Path(files[1]).stat().st_size < 0.3e6
 
 
 def test_what_does_not_fit_together_is_refused(

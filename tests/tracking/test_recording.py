@@ -1,6 +1,7 @@
 """Recordings are written with real robots and meshes, read back from the file, and compared."""
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -20,14 +21,16 @@ from constraint_geodesics.constraints.vector import Constraint, ConstraintManifo
 from constraint_geodesics.robot.bullet import Body, Box, data_path
 from constraint_geodesics.robot.kinematics import load_robot, rotation_from_rpy
 from constraint_geodesics.tracking.recording import (
+    About,
     LatentView,
     PathRecord,
     RecordingError,
-    open_recordings,
+    about_of,
     read_recording,
     record_path,
     same_recordings,
 )
+from constraint_geodesics.tracking.viewer import open_recordings
 
 FRAMES = 25
 TABLE = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1))
@@ -117,7 +120,8 @@ def test_recording_reads_back_as_the_path(robot, meshes, tmp_path):
     record_path(file, path_of(joints), manifold, [TABLE, TRAY], frames=FRAMES)
     summary = read_recording(file)
     assert summary.application_id == "constraint_geodesics"
-    assert summary.recording_id == "slide-query2-birrt-seed1"
+    assert re.fullmatch(r"slide-query2-birrt-seed1-[0-9a-f]{8}", summary.recording_id)
+    assert summary.about == About("birrt", "slide", query=2, seed=1)
     assert summary.meshes == meshes + 1, "the robot's visual meshes and the tray's"
     assert "/workcell/table" in summary.entity_paths
     assert not any("collision" in entity for entity in summary.entity_paths)
@@ -207,6 +211,66 @@ def test_latent_curve_and_sub_manifold_are_drawn_upright(xarm, tmp_path):
     for name, end in (("start", 0), ("goal", -1)):
         marker = np.array(column(file, f"/latent/{name}", "Points2D:positions"))
         np.testing.assert_allclose(marker[0] * [1, -1], latent.curve[[end]], atol=1e-6)
+
+
+def test_joints_are_shown_within_their_limits(xarm, tmp_path):
+    manifold, joints = xarm
+    robot, file = manifold.robot, tmp_path / "path.rrd"
+    record_path(file, path_of(joints), manifold, [], frames=FRAMES)
+    shown = np.array(column(file, "/joint_range", "Scalars:scalars"))
+    middle, half = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 2
+    np.testing.assert_allclose(shown[:, :6] * half + middle, read_recording(file).joints)
+    np.testing.assert_array_equal(shown[:, 6:], np.tile([1.0, -1.0], (FRAMES, 1)))
+    names = column(file, "/joint_range", "SeriesLines:names")[0]
+    assert names == [*robot.joint_names, "upper limit", "lower limit"]
+    np.testing.assert_array_equal(column(file, "/joints", "lower")[0], robot.lower)
+    np.testing.assert_array_equal(column(file, "/joints", "upper")[0], robot.upper)
+
+
+def test_the_violation_is_shown_as_a_power_of_ten_with_the_judges_limit(xarm, tmp_path):
+    manifold, joints = xarm
+    held = replace(manifold, constraint=replace(SLIDE, tolerance=(0.0,) * 6))
+    off = joints + np.linspace(0.0, 1e-3, len(joints))[:, None] * np.eye(6)[1]
+    file = tmp_path / "path.rrd"
+    record_path(file, path_of(off, tolerance=1e-3), held, [], frames=FRAMES)
+    shown = np.array(column(file, "/violation", "Scalars:scalars"))
+    expected = np.maximum(held.violation(read_recording(file).joints), 1e-12)
+    np.testing.assert_allclose(10.0 ** shown[:, 0], expected)
+    assert expected.max() > 1e-4
+    np.testing.assert_allclose(shown[:, 1], -3.0)
+
+
+def test_without_meshes_a_recording_is_small_and_names_the_urdfs(xarm, tmp_path):
+    manifold, joints = xarm
+    latent = latent_view(len(joints), np.zeros(900))
+    whole, slim = tmp_path / "whole.rrd", tmp_path / "slim.rrd"
+    for file, meshes in ((whole, True), (slim, False)):
+        record_path(file, path_of(joints, latent=latent), manifold, [TABLE, TRAY], frames=100, meshes=meshes)
+    small, large = read_recording(slim), read_recording(whole)
+    assert (small.meshes, large.meshes) == (0, 8)
+    assert slim.stat().st_size < 0.3e6 < whole.stat().st_size
+    assert small.recording_id == large.recording_id
+    assert set(small.entity_paths) < set(large.entity_paths)
+    assert column(slim, "/robot", "urdf") == [["xarm/xarm6_robot.urdf"]]
+    assert column(slim, "/workcell/tray", "urdf") == [["tray/traybox.urdf"]]
+
+
+def test_ids_tell_paths_apart_that_share_their_name(xarm, tmp_path):
+    manifold, joints = xarm
+    paths = {"one": joints, "same": joints.copy(), "other": joints[::-1]}
+    for name, own in paths.items():
+        record_path(tmp_path / name, path_of(own), manifold, [], frames=FRAMES, meshes=False)
+    one, same, other = (read_recording(tmp_path / name).recording_id for name in paths)
+    assert one == same != other
+
+
+def test_recordings_from_before_they_said_so_are_known_by_their_ids():
+    assert about_of("level_cup_relaxed-query3-BiRRT, tangent bundle + band-seed4", []) == About(
+        "BiRRT, tangent bundle + band", "level_cup_relaxed", query=3, seed=4
+    )
+    executed = About("planned-path", "level_cup", query=0, executed=True)
+    assert about_of("level_cup-query0-planned-path-executed", []) == executed
+    assert about_of("another", []) == About()
 
 
 def test_inclusion_values_become_a_scale_of_colours(xarm, tmp_path):
@@ -311,7 +375,7 @@ def test_viewer_is_served_on_loopback_alone(xarm, tmp_path):
     file = tmp_path / "path.rrd"
     record_path(file, path_of(joints), manifold, [], frames=FRAMES)
     code = (
-        "from pathlib import Path; from constraint_geodesics.tracking.recording import open_recordings; "
+        "from pathlib import Path; from constraint_geodesics.tracking.viewer import open_recordings; "
         f"open_recordings([Path({str(file)!r})], web=True)"
     )
     viewer = subprocess.Popen(
@@ -328,6 +392,15 @@ def test_viewer_is_served_on_loopback_alone(xarm, tmp_path):
     finally:
         os.killpg(viewer.pid, signal.SIGKILL)
         viewer.wait()
+
+
+def test_without_a_display_the_browser_is_named(xarm, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    record_path(tmp_path / "path.rrd", path_of(xarm[1]), xarm[0], [], frames=FRAMES, meshes=False)
+    with pytest.raises(RecordingError, match="no display .* add --web"):
+        open_recordings([tmp_path / "path.rrd"], web=False)
 
 
 def wait_for(page, seconds=20.0):

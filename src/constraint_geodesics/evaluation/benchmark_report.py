@@ -1,4 +1,4 @@
-"""The benchmark's tables as Markdown, from its summary and rows."""
+"""The benchmark's tables as texts, from its summary and rows: cells for its page, and Markdown with the same cells."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 
 from constraint_geodesics.evaluation.results import markdown_table
+from constraint_geodesics.params import PeerParams
 
 COLUMNS = (
     "planner", "queries × seeds", "solved of solvable", "claimed, not valid", "length / best known, median", "p95",
@@ -41,17 +42,31 @@ TABLE_I_NOTE = (
 )
 
 
+Cells = list[Sequence[str]]
+"""A table's header and its rows."""
+
+
+def asks_in_python(planners: Mapping[str, PeerParams]) -> list[str]:
+    """Planners whose search asks PyBullet through Python for every state."""
+    return [name for name, peer in planners.items() if peer.kind in ("ompl", "decoder_sampling")]
+
+
 def benchmark_markdown(summary: pd.DataFrame) -> str:
     """A block for each constraint and scene, planners in their order."""
     parts = []
     for (constraint, scene), case in summary.groupby(["constraint", "scene"], sort=False):
-        solvable = int(case["solvable"].max())
-        queries = int(case["queries"].max())
-        rows = [COLUMNS, *(_cells(row) for row in case.to_dict("records"))]
-        parts.append(
-            f"`{constraint}`, {scene}: {queries} queries, any planner solved {solvable}\n\n{markdown_table(rows)}"
-        )
+        parts.append(f"`{constraint}`, {scene}: {counted(case)}\n\n{markdown_table(case_cells(case))}")
     return "\n\n".join(parts) + "\n"
+
+
+def case_cells(case: pd.DataFrame) -> Cells:
+    """The planners under one constraint in one scene, from the summary's rows of these."""
+    return [COLUMNS, *(_cells(row) for row in case.to_dict("records"))]
+
+
+def counted(case: pd.DataFrame) -> str:
+    """How many queries a case has, and how many of them any planner solved."""
+    return f"{int(case['queries'].max())} queries, any planner solved {int(case['solvable'].max())}"
 
 
 def overview_markdown(summary: pd.DataFrame, in_python: Collection[str] = ()) -> str:
@@ -61,15 +76,25 @@ def overview_markdown(summary: pd.DataFrame, in_python: Collection[str] = ()) ->
     """
     parts = []
     for scene, case in summary.groupby("scene", sort=False):
-        rows = [OVERVIEW, *(_overview_cells(row, in_python) for row in case.to_dict("records"))]
+        rows = overview_cells(case, in_python)
         queries, solvable = int(case["queries"].max()), int(case["solvable"].max())
         head = f"Scene `{scene}`, all constraints: {queries} queries, of which any planner solved {solvable}."
         parts.append(f"{head}\n\n{markdown_table(rows)}")
     return "\n\n".join([*parts, *([PYTHON_NOTE] if in_python else [])]) + "\n"
 
 
+def overview_cells(case: pd.DataFrame, in_python: Collection[str] = ()) -> Cells:
+    """The planners in one scene, the queries of all constraints together."""
+    return [OVERVIEW, *(_overview_cells(row, in_python) for row in case.to_dict("records"))]
+
+
 def table_i_markdown(rows: pd.DataFrame) -> str:
     """The paper's Table I beside the same planners' rows of one constraint and scene."""
+    return f"{markdown_table(table_i_cells(rows))}\n\n{TABLE_I_NOTE}\n"
+
+
+def table_i_cells(rows: pd.DataFrame) -> Cells:
+    """The same, its header first."""
     head = (
         "method", "paper: shortest", "average ± std", "×", "time [s]", "here: shortest", "average ± std", "×",
         "time [s]", "valid", "rows",
@@ -77,7 +102,7 @@ def table_i_markdown(rows: pd.DataFrame) -> str:
     valid = rows[rows["valid"]]
     lengths = {name: valid[valid["planner"] == name]["latent_length"] for name in PUBLISHED}
     planner = valid[valid["planner"] == "planner"]
-    cells: list[Sequence[str]] = [head]
+    cells: Cells = [head]
     for name, (shortest, average, spread, seconds) in PUBLISHED.items():
         own, found = rows[rows["planner"] == name], lengths[name]
         if own.empty:
@@ -92,24 +117,44 @@ def table_i_markdown(rows: pd.DataFrame) -> str:
                 str(len(own)),
             )
         )  # fmt: skip
-    return f"{markdown_table(cells)}\n\n{TABLE_I_NOTE}\n"
+    return cells
 
 
 def ahead_markdown(table: pd.DataFrame) -> str:
     """Every case and budget in which a peer is ahead of the planner, or that there is none."""
-    case = ["constraint", "scene", "budget_s"]
-    worst = table.groupby(case, sort=False)["verdict"].agg(set)
+    rows = ahead_cells(table)
+    return f"{ahead_told(table)}\n" + (f"\n{markdown_table(rows)}\n" if len(rows) > 1 else "")
+
+
+def ahead_told(table: pd.DataFrame) -> str:
+    """In how many cases of constraint, scene and budget the planner is first, and in how many a peer."""
+    worst = _verdicts(table)
     neither = int((worst == {"neither"}).sum())
     lost = int(worst.map(lambda verdicts: "ahead" in verdicts).sum())
-    line = (
+    return (
         "Within a time budget the planner is first or tied on p95 of the length (failures infinite; where both are, on "
         f"success) in {len(worst) - neither - lost} of {len(worst)} cases of constraint, scene and budget; in {lost} a "
         f"peer is ahead, in {neither} no planner has any path yet."
     )
-    behind = table[table["verdict"] == "ahead"]
-    if behind.empty:
-        return f"{line}\n"
-    rows: list[Sequence[str]] = [
+
+
+def verdict_cells(table: pd.DataFrame) -> Cells:
+    """The same for each budget: how many cases of constraint and scene have which verdict."""
+    rows: Cells = [("time budget [s]", "planner first or tied", "a peer ahead", "no path of any planner yet", "of")]
+    for budget, found in _verdicts(table).groupby("budget_s", sort=True):
+        lost, neither = (int(found.map(is_so).sum()) for is_so in (lambda v: "ahead" in v, lambda v: v == {"neither"}))
+        rows.append((f"{budget:g}", *map(str, (len(found) - lost - neither, lost, neither, len(found)))))
+    return rows
+
+
+def _verdicts(table: pd.DataFrame) -> "pd.Series[Any]":
+    """What is said of any peer in each case and budget."""
+    return table.groupby(["constraint", "scene", "budget_s"], sort=False)["verdict"].agg(set)
+
+
+def ahead_cells(table: pd.DataFrame) -> Cells:
+    """Every peer that is ahead of the planner in a case, within a budget."""
+    rows: Cells = [
         ("constraint", "scene", "budget [s]", "peer ahead", "its p95", "the planner's", "its success", "the planner's")
     ]
     rows += [
@@ -119,14 +164,19 @@ def ahead_markdown(table: pd.DataFrame) -> str:
             _fixed(row["peer_ratio_p95"], 3), _fixed(row["ratio_p95"], 3), _share(row["peer_success"]),
             _share(row["success"]),
         )
-        for row in behind.to_dict("records")
+        for row in table[table["verdict"] == "ahead"].to_dict("records")
     ]  # fmt: skip
-    return f"{line}\n\n{markdown_table(rows)}\n"
+    return rows
 
 
 def repeated_markdown(table: pd.DataFrame) -> str:
     """Two runs of the same rows, planner by planner."""
-    rows: list[Sequence[str]] = [REPEAT]
+    return f"{markdown_table(repeated_cells(table))}\n"
+
+
+def repeated_cells(table: pd.DataFrame) -> Cells:
+    """The same, its header first."""
+    rows: Cells = [REPEAT]
     for row in table.to_dict("records"):
         times = [
             f"{_milli(row[f'{run}_s'])} [{_milli(row[f'{run}_low_s'])}, {_milli(row[f'{run}_high_s'])}]"
@@ -138,12 +188,17 @@ def repeated_markdown(table: pd.DataFrame) -> str:
                 f"{row['length_difference']:.1e}", *times, "yes" if row["overlap"] else "no",
             )
         )  # fmt: skip
-    return f"{markdown_table(rows)}\n"
+    return rows
 
 
 def break_even_markdown(table: pd.DataFrame) -> str:
     """From how many queries on training pays against each planner."""
-    rows: list[Sequence[str]] = [BREAK_EVEN]
+    return f"{markdown_table(break_even_cells(table))}\n"
+
+
+def break_even_cells(table: pd.DataFrame) -> Cells:
+    """The same, its header first."""
+    rows: Cells = [BREAK_EVEN]
     for row in table.to_dict("records"):
         pays = row["break_even"]
         rows.append(
@@ -152,7 +207,7 @@ def break_even_markdown(table: pd.DataFrame) -> str:
                 _share(row["success"]), "–" if pd.isna(pays) else "never" if pays == np.inf else f"{pays:,.0f} queries",
             )
         )  # fmt: skip
-    return f"{markdown_table(rows)}\n"
+    return rows
 
 
 def _overview_cells(row: Mapping[Any, Any], in_python: Collection[str]) -> tuple[str, ...]:
@@ -190,7 +245,12 @@ def _fixed(value: float, digits: int) -> str:
 
 
 def _milli(value: float) -> str:
-    return "–" if pd.isna(value) else ("∞" if value == float("inf") else f"{1e3 * value:.3g}")
+    """Seconds in milliseconds: three digits, or all of a larger number's."""
+    if pd.isna(value):
+        return "–"
+    if value == float("inf"):
+        return "∞"
+    return f"{1e3 * value:,.0f}" if value >= 0.1 else f"{1e3 * value:.3g}"
 
 
 def _share(value: float) -> str:

@@ -27,14 +27,20 @@ from constraint_geodesics.geometry.analytic import Sphere, Torus
 from constraint_geodesics.geometry.level_sets import LevelSet
 from constraint_geodesics.geometry.manifold import pullback_metric
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.palette import BLACK as BLACK
+from constraint_geodesics.palette import BLUE as BLUE
+from constraint_geodesics.palette import GOAL as GOAL
+from constraint_geodesics.palette import GREEN as GREEN
+from constraint_geodesics.palette import GREY as GREY
+from constraint_geodesics.palette import LIGHT as LIGHT
+from constraint_geodesics.palette import ORANGE as ORANGE
+from constraint_geodesics.palette import PURPLE as PURPLE
+from constraint_geodesics.palette import SKY, YELLOW, planner_colour
+from constraint_geodesics.palette import START as START
+from constraint_geodesics.palette import VERMILION as VERMILION
 
 DPI = 120
 
-# Okabe and Ito's colours, which colour-blind people tell apart; the recordings use the same ones
-BLACK, ORANGE, SKY, GREEN = "#222222", "#E69F00", "#56B4E9", "#009E73"
-BLUE, VERMILION, PURPLE, YELLOW = "#0072B2", "#D55E00", "#CC79A7", "#F0E442"
-GREY, LIGHT = "#8A8A8A", "#E4E4E4"
-START, GOAL = GREEN, VERMILION
 COMPONENTS = (SKY, PURPLE, BLUE, YELLOW, GREEN)
 """Colours of a sub-manifold's components, the largest first; the smaller ones behind them share one."""
 REST = "#6B6B6B"
@@ -55,17 +61,21 @@ class PlannerStyle:
     """How one planner is shown, in every figure alike."""
 
     label: str
-    colour: str
     marker: str
+
+    @property
+    def colour(self) -> str:
+        """That of the planner on every page and in every recording."""
+        return planner_colour(self.label)
 
 
 PLANNERS = {
-    "prm": PlannerStyle("PRM", PURPLE, "s"),
-    "rrt_star": PlannerStyle("RRT*", SKY, "^"),
-    "birrt": PlannerStyle("BiRRT", BLUE, "v"),
-    "straight_latent_line": PlannerStyle("straight latent line", BLACK, "D"),
-    "random_curves": PlannerStyle("random curves", GREY, "P"),
-    "learned_geodesic": PlannerStyle("learned geodesic", ORANGE, "o"),
+    "prm": PlannerStyle("PRM", "s"),
+    "rrt_star": PlannerStyle("RRT*", "^"),
+    "birrt": PlannerStyle("BiRRT", "v"),
+    "straight_latent_line": PlannerStyle("straight latent line", "D"),
+    "random_curves": PlannerStyle("random curves", "P"),
+    "learned_geodesic": PlannerStyle("learned geodesic", "o"),
 }
 """The planners of a table, in the order they are shown."""
 
@@ -159,10 +169,11 @@ def geodesics_in_plane(panels: Mapping[str, tuple[GridSubmanifold, LatentCurves]
     for axes, (name, (plane, curves)) in zip(_row_of_axes(figure, len(panels)), panels.items(), strict=True):
         axes.pcolormesh(plane.first_axis, plane.second_axis, plane.inclusion.T, cmap=NEAR, vmin=0, rasterized=True)
         _draw_components(axes, plane)
-        axes.plot(*curves.straight.T, color=BLACK, linestyle="--", linewidth=1.2, label="straight latent line")
+        style = PLANNERS["straight_latent_line"]
+        axes.plot(*curves.straight.T, color=style.colour, linestyle="--", linewidth=1.6, label=style.label, zorder=3)
         for k, curve in enumerate(curves.learned):
             label = "learned geodesic, one a seed" if k == 0 else None
-            axes.plot(*curve.T, color=ORANGE, linewidth=2.0, label=label)
+            axes.plot(*curve.T, color=PLANNERS["learned_geodesic"].colour, linewidth=2.0, label=label)
         _draw_ends(axes, curves.straight[0], curves.straight[-1])
         count = len(curves.learned)
         axes.set_title(f"{name}: {count} {_plural('geodesic', count)} found")
@@ -386,7 +397,7 @@ def _draw_variance(axes: Axes, metrics: Mapping[str, Mapping[str, Mapping[str, f
     shown = {
         "with_variance": ("with", ORANGE),
         "without_variance": ("without", BLUE),
-        "straight_latent_line": ("line", GREY),
+        "straight_latent_line": ("line", PLANNERS["straight_latent_line"].colour),
     }
     for k, (variant, (label, colour)) in enumerate(shown.items()):
         x = np.arange(len(metrics)) + 0.8 * ((k + 0.5) / len(shown) - 0.5)
@@ -429,7 +440,7 @@ def planner_comparison(table: pd.DataFrame) -> Figure:
         for edge in range(1, len(constraints)):
             axes.axhline(edge - 0.5, color=LIGHT, linewidth=0.8)
     success.set_yticklabels(constraints)
-    figure.legend(*success.get_legend_handles_labels(), loc="outside upper center", ncols=5, fontsize=8, frameon=False)
+    figure.legend(*success.get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize=8, frameon=False)
     return _tidied(figure)
 
 

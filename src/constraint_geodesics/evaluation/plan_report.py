@@ -4,12 +4,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from constraint_geodesics.evaluation.blocks import Block, Look, Recorded, in_checkout, runs_link
 from constraint_geodesics.evaluation.figures import PLANNERS
 from constraint_geodesics.evaluation.plan_benchmark import BAND_AFTER, MULTI_START, PARTS, TANGENT
 from constraint_geodesics.evaluation.policy_benchmark import DESCENT, ONE_SEED, POLICIES, RANDOM, SEPARATE, STRAIGHT
 from constraint_geodesics.evaluation.policy_tasks import JOINTS, LEARNED
-from constraint_geodesics.evaluation.results import Block, markdown_table, read_metrics, short
+from constraint_geodesics.evaluation.results import markdown_table, read_metrics, short
 from constraint_geodesics.params import Params
 from constraint_geodesics.paths import Layout
 
@@ -48,12 +50,14 @@ def plan_blocks(params: Params, layout: Layout) -> list[Block]:
         f"{batch['per_second']:.0f} without the check. The planner's paths come from "
         f"{_sources(rows['planner'])}; ratios are over each planner's own valid paths, but in the column with failures"
     )
-    blocks = [Block(f"{name}, whole and in parts", note, PLAN_COLUMNS, [_plan_row(*row) for row in rows.items()])]
+    look = Look(runs_link("benchmark_plans", name))
+    title, cells = f"{name}, whole and in parts", [_plan_row(*row) for row in rows.items()]
+    blocks = [Block(title, note, PLAN_COLUMNS, cells, planners=list(rows), looks=[look] * len(rows))]
     unseen = [
-        (f"{constraint}, {found[0]}", found[1])
+        (constraint, planner, found)
         for constraint in params.plans.unseen
-        for found in plans[constraint].items()
-        if found[0] in COMPARED
+        for planner, found in plans[constraint].items()
+        if planner in COMPARED
     ]
     if unseen:
         counted = ", ".join(f"{c} {_solvable(plans[c])}" for c in params.plans.unseen)
@@ -62,7 +66,10 @@ def plan_blocks(params: Params, layout: Layout) -> list[Block]:
             f"solved of the queries that any planner solved: {counted}"
         )
         header = ("constraint, planner", *PLAN_COLUMNS[1:])
-        blocks.append(Block("Unseen constraints", note, header, [_plan_row(*row) for row in unseen]))
+        cells = [_plan_row(f"{constraint}, {planner}", found) for constraint, planner, found in unseen]
+        planners = [planner for _, planner, _ in unseen]
+        looks = [look] * len(unseen)
+        blocks.append(Block("Unseen constraints", note, header, cells, planners=planners, looks=looks))
     return blocks
 
 
@@ -71,7 +78,8 @@ def policy_blocks(params: Params, layout: Layout) -> list[Block]:
     found = read_metrics(layout.report("benchmark_policies", params.geodesics.searched[0]))
     names = [name for name in (params.plans.constraint, *params.plans.unseen) if name in found]
     named = [f"{method}, {chart}" for method in METHODS for chart in (LEARNED, JOINTS)]
-    return [_policy_block(name, _ordered(found[name], named)) for name in names]
+    look = Look(runs_link("benchmark_policies", params.geodesics.searched[0]))
+    return [_policy_block(name, _ordered(found[name], named), look) for name in names]
 
 
 def execution_block(params: Params, layout: Layout) -> Block:
@@ -92,7 +100,21 @@ def execution_block(params: Params, layout: Layout) -> Block:
         ]
         for kind, row in kinds.items()
     ]  # fmt: skip
-    return Block("Execution", note, EXECUTION_COLUMNS, rows)
+    link, recorded = runs_link("execute_paths", params.plans.constraint), _executed(params, layout)
+    looks = [Look(link, recorded.get(kind, ())) for kind in kinds]
+    return Block("Execution", note, EXECUTION_COLUMNS, rows, planners=list(kinds), looks=looks)
+
+
+def _executed(params: Params, layout: Layout) -> dict[str, list[Recorded]]:
+    """The recorded executions of each kind of path."""
+    rows, found = (
+        pd.read_csv(layout.report("execute_paths", params.plans.constraint, "csv")),
+        dict[str, list[Recorded]](),
+    )
+    for row in rows[rows["recording"].notna()].to_dict("records"):
+        told = f"query {row['query']}: {row['status']}, {row['kept']} of {row['spheres']} spheres kept"
+        found.setdefault(str(row["kind"]), []).append(Recorded(in_checkout(row["recording"]), told))
+    return found
 
 
 def plans_markdown(params: Params, layout: Layout) -> str:
@@ -134,7 +156,7 @@ def _solvable(rows: Mapping[str, Mapping[str, Any]]) -> str:
     return f"{first['solvable']} of {first['queries']}"
 
 
-def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]]) -> Block:
+def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]], look: Look) -> Block:
     first = next(iter(rows.values()))
     note = (
         f"{first['queries']} queries, {first['solvable']} of which have a curve of the family; ratios over the "
@@ -148,7 +170,8 @@ def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]]) -> Blo
         ]
         for method, row in rows.items()
     ]  # fmt: skip
-    return Block(f"{constraint}, proposals", note, POLICY_COLUMNS, cells)
+    looks = [look] * len(rows)
+    return Block(f"{constraint}, proposals", note, POLICY_COLUMNS, cells, planners=list(rows), looks=looks)
 
 
 def _number(value: float | None, form: str) -> str:

@@ -32,20 +32,6 @@ class ReportError(ValueError):
     """A file that the report needs is missing or can't be used; the message is one line with its name."""
 
 
-@dataclass(frozen=True)
-class Block:
-    """A table of the report: a title, how to read it, its header, and its rows of texts.
-
-    groups: titles over the columns after the first, each with the number of columns it spans.
-    """
-
-    title: str
-    note: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    groups: Sequence[tuple[str, int]] = ()
-
-
 def searched_items(params: Params) -> list[tuple[str, str]]:
     """The pairs (manifold, constraint) whose geodesics were searched."""
     geodesics = params.geodesics

@@ -61,6 +61,7 @@ class PathRecorder:
         file = self.folder / case.constraint / f"{case.scene}-query{case.query}-{plain}.rrd"
         row = {**asdict(measures), "planner": planner, "query": case.query, "seed": seed}
         text = f"{status_text(row, case.constraint)}\n- scene `{case.scene}`"
-        record = PathRecord(planner, case.constraint, case.query, seed, joints, text)
-        record_path(file, record, manifold, scene.workcell, frames=self.frames)
-        return file.relative_to(self.root).as_posix() if file.is_relative_to(self.root) else file.as_posix()
+        record = PathRecord(planner, case.constraint, case.query, seed, joints, text, scene=case.scene)
+        record_path(file, record, manifold, scene.workcell, frames=self.frames, meshes=False)
+        file, root = file.resolve(), self.root.resolve()  # the root is mostly given as the folder one is in
+        return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.as_posix()

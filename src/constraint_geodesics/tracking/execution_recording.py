@@ -1,7 +1,6 @@
 """Rerun recordings of executed paths: the robot, the cup and its spheres over the time of the execution.
 
-The second part of recording.py, and with it the only importer of rerun; recordings of both kinds are read, compared
-and opened by the functions there.
+The second part of recording.py; recordings of both kinds are read, compared and opened by the same functions.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,22 +15,27 @@ from jaxtyping import Float
 from rerun.chunk import Chunk
 from scipy.spatial.transform import Rotation
 
+from constraint_geodesics.palette import BLUE, SKY, VERMILION, planner_colour
 from constraint_geodesics.robot.bullet import Solid
 from constraint_geodesics.robot.execution import CupSettings, Execution
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.tracking.recording import (
+    About,
     Frames,
     RecordingError,
+    about_chunk,
     arranged,
     colours,
+    digest,
     joint_chunks,
+    joint_panel,
     moving,
-    robot_chunks,
+    rgb,
     scalars,
+    scene_chunks,
     scene_panel,
     static,
     tool_chunks,
-    workcell_chunks,
     write_recording,
 )
 
@@ -40,7 +44,7 @@ TIME = "time"
 
 _BESIDE_CUP_M = (0.25, -0.25, 0.15)
 """From where the cup is looked at, seen from its centre."""
-_CUP, _TILT, _KEPT = (86, 180, 233, 60), (213, 94, 0), (0, 114, 178)
+_CUP, _TILT, _KEPT = (*rgb(SKY), 60), rgb(VERMILION), rgb(BLUE)
 
 
 @dataclass(frozen=True)
@@ -59,47 +63,45 @@ class ExecutionRecord:
         """Of its file among those of one constraint."""
         return f"query{self.query}-{self.kind.replace(' ', '-')}"
 
-    @property
-    def recording_id(self) -> str:
-        """The same for the same kind, constraint and query."""
-        return f"{self.constraint}-{self.name}-executed"
 
-
-def record_execution(file: Path, record: ExecutionRecord, robot: SerialRobot, workcell: Sequence[Solid]) -> None:
+def record_execution(
+    file: Path, record: ExecutionRecord, robot: SerialRobot, workcell: Sequence[Solid], *, meshes: bool = True
+) -> None:
     """Write the recording of one execution, its blueprint inside.
 
-    Raises RecordingError if the execution is not one of this robot and cup, or a mesh of the robot or a body is
-    missing.
+    meshes: as for `record_path`.
+    Raises RecordingError if the execution is not one of this robot and cup, or a mesh that is to be written is missing.
     """
     execution = _checked(record, robot)
     frames = Frames(
         execution.joints, robot.forward(execution.joints)[0], None, rr.TimeColumn(TIME, duration=execution.times)
     )
     chunks = [
-        *robot_chunks(robot, frames),
-        *(chunk for body in workcell for chunk in workcell_chunks(body)),
-        *tool_chunks(frames),
+        *scene_chunks(robot, workcell, frames, meshes=meshes),
+        *tool_chunks(frames, rgb(planner_colour(record.kind))),
         *_cup_chunks(execution, record.cup, frames.time),
         *_sphere_chunks(execution, record.cup, frames.time),
         *_series_chunks(execution, record.cup, frames.time),
-        *joint_chunks(robot.joint_names, frames),
+        *joint_chunks(robot, frames),
+        about_chunk(About(record.kind, record.constraint, query=record.query, executed=True)),
         static("status", rr.TextDocument(_status(record), media_type=rr.MediaType.MARKDOWN)),
         static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP),
     ]
     name = f"{record.constraint}, query {record.query}: {record.kind}, executed"
-    write_recording(file, record.recording_id, name, chunks, _blueprint(frames, execution.spheres))
+    own = f"{record.constraint}-{record.name}-executed-{digest(frames)}"
+    write_recording(file, own, name, chunks, _blueprint(frames, execution.spheres))
 
 
 def record_executions(
     folder: Path, records: Sequence[ExecutionRecord | None], robot: SerialRobot, workcell: Sequence[Solid]
 ) -> list[str]:
-    """Record executions, one file each; returns the file of each, or "" where there is None."""
+    """Record executions, one file each without meshes; returns the file of each, or "" where there is None."""
     folder.mkdir(parents=True, exist_ok=True)
     files = []
     for record in records:
         file = "" if record is None else (folder / f"{record.name}.rrd").as_posix()
         if record is not None:
-            record_execution(Path(file), record, robot, workcell)
+            record_execution(Path(file), record, robot, workcell, meshes=False)
         files.append(file)
     return files
 
@@ -124,7 +126,7 @@ def _cup_rotations(execution: Execution) -> Float[np.ndarray, "F 3 3"]:
 
 
 def _checked(record: ExecutionRecord, robot: SerialRobot) -> Execution:
-    execution, name = record.execution, record.recording_id
+    execution, name = record.execution, f"{record.constraint}-{record.name}"
     frames, spheres = len(execution.times), record.cup.spheres
     for what, values, shape in (
         ("joints", execution.joints, (frames, robot.dof)),
@@ -186,13 +188,25 @@ def _blueprint(frames: Frames, spheres: int) -> Any:
         eye_controls=rrb.EyeControls3D(position=_BESIDE_CUP_M, look_target=(0.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)),
         line_grid=rrb.LineGrid3D(visible=False),
     )  # fmt: skip
-    tilted = rrb.ScalarAxis(range=(0.0, 180.0))
-    counted = rrb.ScalarAxis(range=(0.0, 1.1 * spheres))
     right = rrb.Vertical(
         cup,
+        *cup_panels(spheres),
+        joint_panel(),
+        row_shares=[2.5, 1.0, 1.0, 1.5],
+    )
+    return arranged(scene_panel(frames, "cup", "spheres"), right, execution_time())
+
+
+def cup_panels(spheres: float) -> list[Any]:
+    """The cup's tilt, and how many of its spheres are still in it."""
+    tilted = rrb.ScalarAxis(range=(0.0, 180.0))
+    counted = rrb.ScalarAxis(range=(0.0, 1.1 * spheres))
+    return [
         rrb.TimeSeriesView(origin="cup_tilt", name="Tilt of the cup [deg]", axis_y=tilted),
         rrb.TimeSeriesView(origin="cup_spheres", name="Spheres in the cup", axis_y=counted),
-        row_shares=[2.5, 1.0, 1.0],
-    )
-    time = rrb.TimePanel(state="collapsed", timeline=TIME, playback_speed=1.0, play_state="playing", loop_mode="all")
-    return arranged(scene_panel(frames, "cup", "spheres"), right, time)
+    ]
+
+
+def execution_time() -> Any:
+    """The time panel of executions: they play as fast as they were executed."""
+    return rrb.TimePanel(state="collapsed", timeline=TIME, playback_speed=1.0, play_state="playing", loop_mode="all")

@@ -1,13 +1,15 @@
 """Rerun recordings: one file a path, with the robot moving, what the constraint says and the curve in latent space.
 
-The only importer of rerun, with its second part, execution_recording.py, for which the functions further down without
-an underscore are there.  A recording holds no wall-clock time, so that equal paths give equal recordings.
+The first importer of rerun; the others are execution_recording.py, for which the functions further down without an
+underscore are there, overlay.py, which puts recordings together, and viewer.py, which opens them.  A recording holds
+no wall-clock time, so that equal paths give equal recordings.
 """
 
 import contextlib
+import hashlib
 import math
 import os
-import socket
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -23,18 +25,41 @@ from jaxtyping import Float, Shaped
 from rerun.chunk import Chunk, RrdReader
 from rerun.urdf import UrdfTree
 
+from constraint_geodesics import palette
+from constraint_geodesics.certification.certifier import Limits
 from constraint_geodesics.constraints.vector import AXES, ConstraintManifold
-from constraint_geodesics.robot.bullet import Box, Solid, Sphere
+from constraint_geodesics.robot.bullet import Box, Solid, Sphere, data_path
 from constraint_geodesics.robot.kinematics import SerialRobot, rotation_from_rpy
 
 APPLICATION = "constraint_geodesics"
 TIMELINE = "frame"
-LOOPBACK = "127.0.0.1"
+ABOUT = "about"
+"""The entity that says where a recording comes from."""
+LOWEST_VIOLATION = 1e-12
+"""Violations below this [rad or m] are shown as this, as there is no logarithm of 0."""
 
-_ROOT_FRAME = "tf#/"  # Rerun's name for the frame of the root entity
-_START, _GOAL, _NOW, _TRACE = (0, 158, 115), (213, 94, 0), (0, 114, 178), (230, 159, 0)
-_BOX, _OUTSIDE, _INK, _PAPER = (150, 150, 150), (200, 200, 200), (30, 30, 30), (255, 255, 255)
-_PALETTE = ((86, 180, 233), (230, 159, 0), (204, 121, 167), (0, 114, 178), (240, 228, 66), _START, _GOAL)
+ROOT_FRAME = "tf#/"
+"""Rerun's name for the frame of the root entity."""
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """A colour of the palette as Rerun takes it."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+LIMIT = rgb(palette.VERMILION)
+"""Of the lines that a series must not cross."""
+_START, _GOAL, _NOW, _INK = (rgb(colour) for colour in (palette.START, palette.GOAL, palette.BLUE, palette.BLACK))
+_BOX, _OUTSIDE, _PAPER = (150, 150, 150), (200, 200, 200), (255, 255, 255)
+_PALETTE = tuple(
+    rgb(colour)
+    for colour in (
+        palette.SKY, palette.ORANGE, palette.PURPLE, palette.BLUE, palette.YELLOW, palette.GREEN, palette.VERMILION,
+    )
+)  # fmt: skip
+_OLD_ID = re.compile(
+    r"(?P<constraint>.+)-query(?P<query>\d+)-(?P<planner>.+?)(-seed(?P<seed>\d+)|-(?P<executed>executed))$"
+)
 
 
 class RecordingError(ValueError):
@@ -66,11 +91,28 @@ class PathRecord:
     """Configurations along the path [rad or m], the latent curve's points in the same order."""
     text: str
     latent: LatentView | None = None
+    scene: str = ""
+    """What stands round the robot beside its workcell, where that has a name."""
+    tolerance: float = Limits.violation_tolerance
+    """What the judge grants a violation [rad or m]."""
 
     @property
-    def recording_id(self) -> str:
-        """The same for the same planner, constraint, query and seed."""
+    def name(self) -> str:
+        """For people; two paths may share it."""
         return f"{self.constraint}-query{self.query}-{self.planner}-seed{self.seed}"
+
+
+@dataclass(frozen=True)
+class About:
+    """Where a recording comes from; what it does not say is "" or None."""
+
+    planner: str = ""
+    """Or what was executed."""
+    constraint: str = ""
+    scene: str = ""
+    query: int | None = None
+    seed: int | None = None
+    executed: bool = False
 
 
 @dataclass(frozen=True)
@@ -87,6 +129,7 @@ class RecordingSummary:
     tool_ends: Float[np.ndarray, "2 3"]
     """First and last point of the tool's trace in the base frame [m]."""
     has_blueprint: bool
+    about: About
 
 
 @dataclass(frozen=True)
@@ -113,36 +156,59 @@ class _Series:
 
 
 def record_path(
-    file: Path, path: PathRecord, manifold: ConstraintManifold, workcell: Sequence[Solid], *, frames: int
-) -> None:
+    file: Path, path: PathRecord, manifold: ConstraintManifold, workcell: Sequence[Solid], *, frames: int,
+    meshes: bool = True,
+) -> None:  # fmt: skip
     """Write the recording of one path, its blueprint inside.
 
-    Raises RecordingError if the path is not one of the manifold's robot or a mesh of the robot or a body is missing.
+    meshes: with those of the robot and the bodies, to be opened anywhere; without them the file is a tenth as large and
+    names the URDFs that `geodesics replay` adds them from.
+    Raises RecordingError if the path is not one of the manifold's robot or a mesh that is to be written is missing.
     """
-    sampled = _sample(path, manifold, frames)
-    series = _series(manifold, sampled.joints)
+    record_frames(file, path, sample(path, manifold, frames), manifold, workcell, meshes=meshes)
+
+
+def record_frames(
+    file: Path, path: PathRecord, sampled: Frames, manifold: ConstraintManifold, workcell: Sequence[Solid], *,
+    meshes: bool,
+) -> None:  # fmt: skip
+    """Write the recording of a path that is sampled already."""
+    series = [*_residuals(manifold, sampled.joints), *_violations(manifold, sampled.joints, path.tolerance)]
+    robot = manifold.robot
     chunks = [
-        *robot_chunks(manifold.robot, sampled),
-        *(chunk for body in workcell for chunk in workcell_chunks(body)),
-        *tool_chunks(sampled),
+        *scene_chunks(robot, workcell, sampled, meshes=meshes),
+        *tool_chunks(sampled, rgb(palette.planner_colour(path.planner))),
         *_series_chunks(series, sampled),
-        *joint_chunks(manifold.robot.joint_names, sampled),
+        *joint_chunks(robot, sampled),
         *_latent_chunks(path.latent, sampled),
+        about_chunk(About(path.planner, path.constraint, path.scene, path.query, path.seed)),
         static("status", rr.TextDocument(path.text, media_type=rr.MediaType.MARKDOWN)),
         static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP),
     ]
     name = f"{path.constraint}, query {path.query}: {path.planner}, seed {path.seed}"
-    write_recording(file, path.recording_id, name, chunks, _blueprint(path, sampled, series))
+    write_recording(file, f"{path.name}-{digest(sampled)}", name, chunks, _blueprint(path, sampled, series))
 
 
-def write_recording(file: Path, recording_id: str, name: str, chunks: Sequence[Chunk], blueprint: Any) -> None:
-    """Write chunks and a blueprint as one recording."""
+def digest(sampled: Frames) -> str:
+    """Of the joints: recordings of equal paths have equal ids, and the viewer takes no two others for one."""
+    return hashlib.sha256(np.ascontiguousarray(sampled.joints).tobytes()).hexdigest()[:8]
+
+
+def about_chunk(about: About) -> Chunk:
+    """Where the recording comes from."""
+    known = {name: value for name, value in vars(about).items() if value is not None}
+    return static(ABOUT, rr.AnyValues(**known))
+
+
+def write_recording(file: Path, recording_id: str, name: str, chunks: Sequence[Chunk], blueprint: Any = None) -> None:
+    """Write chunks, and a blueprint where there is one, as one recording; without a name it is a part of another."""
     file.parent.mkdir(parents=True, exist_ok=True)
     # the properties would hold the time of writing
     stream = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
     with stream:
         stream.save(file, default_blueprint=blueprint)
-        stream.send_recording_name(name)
+        if name:
+            stream.send_recording_name(name)
         rr.send_chunks(chunks, recording=stream)
 
 
@@ -151,25 +217,49 @@ def read_recording(file: Path) -> RecordingSummary:
 
     Raises RecordingError if it is not a recording of one path.
     """
-    try:
-        reader = RrdReader(_existing(file))
-        stores = reader.recordings()
-        if len(stores) != 1:
-            raise RecordingError(f"{file}: holds {len(stores)} recordings, not one")
-        chunks = reader.stream().to_chunks()
-    except RuntimeError as error:
-        raise RecordingError(f"{file}: not a recording: {error}") from None
+    stored, chunks, blueprint = read_chunks(file)
     joints = _column(file, chunks, "/joints", "Scalars:scalars")
     trace = _column(file, chunks, "/tool/trace", "LineStrips3D:strips")[0][0]
     return RecordingSummary(
-        application_id=stores[0].application_id,
-        recording_id=stores[0].recording_id,
+        application_id=stored.application_id,
+        recording_id=stored.recording_id,
         entity_paths=tuple(sorted({chunk.entity_path for chunk in chunks})),
-        meshes=sum(_has(chunk, "Asset3D:blob") for chunk in chunks),
+        meshes=sum(has(chunk, "Asset3D:blob") for chunk in chunks),
         joints=np.array(joints, dtype=float),
         tool_ends=np.array([trace[0], trace[-1]], dtype=float),
-        has_blueprint=bool(reader.blueprints()),
+        has_blueprint=blueprint,
+        about=about_of(stored.recording_id, chunks),
     )
+
+
+def read_chunks(file: Path) -> tuple[Any, list[Chunk], bool]:
+    """The one store of a file, its chunks, and whether there is a blueprint.
+
+    Raises RecordingError if it is not a recording, or holds several.
+    """
+    try:
+        reader = RrdReader(existing(file))
+        stores = reader.recordings()
+        if len(stores) != 1:
+            raise RecordingError(f"{file}: holds {len(stores)} recordings, not one")
+        return stores[0], reader.stream().to_chunks(), bool(reader.blueprints())
+    except RuntimeError as error:
+        raise RecordingError(f"{file}: not a recording: {error}") from None
+
+
+def about_of(recording_id: str, chunks: Sequence[Chunk]) -> About:
+    """What a recording says of itself; of one from before it did, what its id says."""
+    for chunk in chunks:
+        if chunk.entity_path == f"/{ABOUT}":
+            row = chunk.to_record_batch().to_pylist()[0]
+            return About(**{name: row[name][0] for name in vars(About()) if name in row})
+    if found := _OLD_ID.match(recording_id):
+        seed = found["seed"]
+        return About(
+            found["planner"], found["constraint"], query=int(found["query"]), seed=None if seed is None else int(seed),
+            executed=found["executed"] is not None,
+        )  # fmt: skip
+    return About()
 
 
 def same_recordings(a: Path, b: Path) -> bool:
@@ -178,32 +268,17 @@ def same_recordings(a: Path, b: Path) -> bool:
     Raises RecordingError if a file is missing.
     """
     result = subprocess.run(
-        _rerun("rrd", "compare", "--unordered", str(_existing(a)), str(_existing(b))), capture_output=True, check=False
+        rerun_command("rrd", "compare", "--unordered", str(existing(a)), str(existing(b))),
+        capture_output=True,
+        check=False,
     )
     return result.returncode == 0
 
 
-def open_recordings(files: Sequence[Path], *, web: bool) -> int:
-    """Show recordings until the viewer is closed, in a window or (web) served to a browser on this machine alone.
-
-    Prints the address to open.  Returns the viewer's exit code.  Raises RecordingError if a file is missing.
-    """
-    shown = [str(_existing(file)) for file in files]
-    port, page = _free_port(9876), _free_port(9090)
-    # without --bind the viewer listens on every address, the window's one too
-    options = ["--bind", LOOPBACK, "--port", str(port)]
-    if web:
-        options += ["--serve-web", "--web-viewer-port", str(page)]
-        print(f"http://{LOOPBACK}:{page}?url=rerun%2Bhttp://{LOOPBACK}:{port}/proxy", flush=True)
-    else:
-        print(f"rerun+http://{LOOPBACK}:{port}/proxy", flush=True)
-    return subprocess.call(_rerun(*options, *shown))
-
-
-def _sample(path: PathRecord, manifold: ConstraintManifold, frames: int) -> Frames:
-    """The path at points of equal joint arc length."""
+def sample(path: PathRecord, manifold: ConstraintManifold, frames: int) -> Frames:
+    """The path at points of equal joint arc length.  Raises RecordingError if it is not one of the robot."""
     joints = np.asarray(path.joints, dtype=float)
-    name, dof = path.recording_id, manifold.robot.dof
+    name, dof = path.name, manifold.robot.dof
     if joints.ndim != 2 or len(joints) < 2 or joints.shape[1] != dof:
         raise RecordingError(f"{name}: joints of shape {joints.shape}: must be (T, {dof}) with T of 2 or more")
     if not np.isfinite(joints).all():
@@ -224,14 +299,26 @@ def _interpolate(at: np.ndarray, length: np.ndarray, values: np.ndarray) -> np.n
     return np.stack([np.interp(at, length, column) for column in values.T], axis=1)
 
 
-def robot_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
-    """The robot's visual geometry, its fixed joints, and its moving joints over the timeline.
+def scene_chunks(robot: SerialRobot, workcell: Sequence[Solid], sampled: Frames, *, meshes: bool) -> Iterator[Chunk]:
+    """The robot over the timeline and the workcell, with their meshes or with the names of their URDFs alone.
 
-    Raises RecordingError if a mesh is missing.
+    Raises RecordingError if a mesh that is asked for is missing.
     """
-    tree, geometry = _load_urdf(robot.urdf, "/robot", None)
-    yield from geometry
-    yield static("transforms/base", rr.Transform3D(parent_frame=_ROOT_FRAME, child_frame=tree.root_link().name))
+    yield from _robot_chunks(robot, sampled)
+    for body in workcell:
+        yield from _body_chunks(body)
+    if meshes:
+        yield from mesh_chunks(robot.urdf, "/robot")
+        for body in workcell:
+            if not isinstance(body, (Box, Sphere)):
+                yield from mesh_chunks(body.urdf, _entity("workcell", body.name), f"{body.name}/")
+
+
+def _robot_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
+    """The robot's fixed joints, and its moving ones over the timeline."""
+    tree = UrdfTree.from_file_path(robot.urdf)
+    yield static("robot", rr.AnyValues(urdf=urdf_name(robot.urdf)))
+    yield static("transforms/base", rr.Transform3D(parent_frame=ROOT_FRAME, child_frame=tree.root_link().name))
     for joint in tree.joints():
         entity = _entity("transforms", joint.name)
         if joint.name in robot.joint_names:
@@ -241,8 +328,8 @@ def robot_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
             yield static(entity, joint.compute_transform(0.0, clamp=False))
 
 
-def workcell_chunks(body: Solid) -> Iterator[Chunk]:
-    """A body of the workcell at its place.  Raises RecordingError if a mesh is missing."""
+def _body_chunks(body: Solid) -> Iterator[Chunk]:
+    """A body of the workcell at its place."""
     entity = _entity("workcell", body.name)
     if isinstance(body, Box):
         yield static(
@@ -262,34 +349,45 @@ def workcell_chunks(body: Solid) -> Iterator[Chunk]:
             ),
         )  # fmt: skip
         return
-    tree, geometry = _load_urdf(body.urdf, entity, f"{body.name}/")
-    yield from geometry
+    tree = UrdfTree.from_file_path(body.urdf, frame_prefix=f"{body.name}/")
+    yield static(entity, rr.AnyValues(urdf=urdf_name(body.urdf), frame_prefix=f"{body.name}/"))
     yield static(
         _entity("transforms", body.name, "base"),
         rr.Transform3D(
             translation=body.position, mat3x3=rotation_from_rpy(np.array(body.rpy)),
-            parent_frame=_ROOT_FRAME, child_frame=f"{body.name}/{tree.root_link().name}",
+            parent_frame=ROOT_FRAME, child_frame=f"{body.name}/{tree.root_link().name}",
         ),
     )  # fmt: skip
     for joint in tree.joints():
         yield static(_entity("transforms", body.name, joint.name), joint.compute_transform(0.0, clamp=False))
 
 
-def _load_urdf(urdf: Path, entity: str, frame_prefix: str | None) -> tuple[UrdfTree, list[Chunk]]:
-    """The tree and the chunks of its visual geometry; collision hulls drawn over it would flicker."""
+def urdf_name(urdf: Path) -> str:
+    """A URDF as params.yaml names it: within pybullet_data, within this checkout, or by its whole path."""
+    for folder in (data_path().resolve(), Path.cwd()):
+        if urdf.resolve().is_relative_to(folder):
+            return urdf.resolve().relative_to(folder).as_posix()
+    return urdf.resolve().as_posix()
+
+
+def mesh_chunks(urdf: Path, entity: str, frame_prefix: str | None = None) -> list[Chunk]:
+    """The visual geometry of a URDF below an entity; collision hulls drawn over it would flicker.
+
+    Raises RecordingError if a mesh is missing.
+    """
     with _package_path(urdf):
         tree = UrdfTree.from_file_path(urdf, frame_prefix=frame_prefix)
         stream = tree.stream(include_joint_transforms=False)
         chunks = [chunk.with_entity_path(f"{entity}{chunk.entity_path}") for chunk in stream]
     chunks = [chunk for chunk in chunks if "/collision_geometries/" not in chunk.entity_path]
     # Rerun only warns of a mesh that it can't find, and leaves its entity with a pose alone
-    placed = {chunk.entity_path for chunk in chunks if _has(chunk, "InstancePoses3D:translations")}
-    drawn = {chunk.entity_path for chunk in chunks if not _has(chunk, "InstancePoses3D:", "CoordinateFrame:")}
+    placed = {chunk.entity_path for chunk in chunks if has(chunk, "InstancePoses3D:translations")}
+    drawn = {chunk.entity_path for chunk in chunks if not has(chunk, "InstancePoses3D:", "CoordinateFrame:")}
     if missing := sorted(path.split("/visual_geometries/")[-1] for path in placed - drawn):
         raise RecordingError(f"{urdf}: no mesh could be read for {', '.join(missing)}")
     if not drawn:
         raise RecordingError(f"{urdf}: has no visual geometry")
-    return tree, chunks
+    return chunks
 
 
 @contextlib.contextmanager
@@ -308,18 +406,18 @@ def _package_path(urdf: Path) -> Iterator[None]:
             os.environ[name] = before
 
 
-def tool_chunks(sampled: Frames) -> Iterator[Chunk]:
+def tool_chunks(sampled: Frames, colour: tuple[int, int, int]) -> Iterator[Chunk]:
     """The tool's trace with its ends, and where it is."""
     tool = sampled.tool
     size = rr.Radius.ui_points
-    yield static("tool/trace", rr.LineStrips3D([tool], colors=[_TRACE], radii=[size(2.0)]))
-    for name, point, colour in (("start", tool[0], _START), ("goal", tool[-1], _GOAL)):
-        yield static(f"tool/{name}", rr.Points3D([point], colors=[colour], radii=[size(7.0)], labels=[name]))
-    yield static("tool/position", rr.Points3D.from_fields(colors=[_NOW], radii=[size(5.0)]))
+    yield static("tool/trace", rr.LineStrips3D([tool], colors=[colour], radii=[size(2.0)]))
+    for name, point, own in (("start", tool[0], _START), ("goal", tool[-1], _GOAL)):
+        yield static(f"tool/{name}", rr.Points3D([point], colors=[own], radii=[size(7.0)], labels=[name]))
+    yield static("tool/position", rr.Points3D.from_fields(colors=[_INK], radii=[size(5.0)]))
     yield moving("tool/position", rr.Points3D.columns(positions=tool), sampled.time)
 
 
-def _series(manifold: ConstraintManifold, joints: np.ndarray) -> list[_Series]:
+def _residuals(manifold: ConstraintManifold, joints: np.ndarray) -> list[_Series]:
     """Held positions each by itself [mm]; held angles that share one tolerance together, as the constraint does."""
     residual, tolerance = manifold.residual(joints), manifold.tolerance
     series = [
@@ -334,18 +432,45 @@ def _series(manifold: ConstraintManifold, joints: np.ndarray) -> list[_Series]:
     return series
 
 
+def _violations(manifold: ConstraintManifold, joints: np.ndarray, tolerance: float) -> list[_Series]:
+    """What is beyond the constraint's own tolerance, as a power of ten: the judge's limit is far below a pixel else."""
+    if not any(manifold.held):
+        return []
+    values = np.log10(np.maximum(manifold.violation(joints), LOWEST_VIOLATION))
+    return [_Series("violation", "log10 rad or m", values, math.log10(tolerance))]
+
+
 def _series_chunks(series: Sequence[_Series], sampled: Frames) -> Iterator[Chunk]:
     for one in series:
-        entity = _entity("constraint", one.unit, one.name)
-        names = [f"{one.name} [{one.unit}]", f"limit of {one.name} [{one.unit}]"]
-        yield static(entity, rr.SeriesLines(names=names, colors=[_NOW, _GOAL], widths=[2.0, 1.0]))
+        entity = one.name if one.name == "violation" else _entity("constraint", one.unit, one.name)
+        names = [one.name, f"limit of {one.name}"]  # the panel says the unit
+        yield static(entity, rr.SeriesLines(names=names, colors=[_NOW, LIMIT], widths=[2.0, 1.0]))
         yield scalars(entity, np.stack([one.values, np.full_like(one.values, one.limit)], axis=1), sampled.time)
 
 
-def joint_chunks(names: Sequence[str], sampled: Frames) -> Iterator[Chunk]:
-    """Joint positions as series."""
-    yield static("joints", rr.SeriesLines(names=list(names), colors=colours(np.arange(len(names)))))
+def joint_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
+    """Joint positions as series, [rad or m] with the limits beside them, and as shares of each joint's range."""
+    own, names = colours(np.arange(robot.dof)), list(robot.joint_names)
+    yield static("joints", rr.SeriesLines(names=names, colors=own))
+    yield static("joints", rr.AnyValues(lower=robot.lower.tolist(), upper=robot.upper.tolist()))
     yield scalars("joints", sampled.joints, sampled.time)
+    share = range_share(sampled.joints, robot.lower, robot.upper)
+    ends = np.broadcast_to([1.0, -1.0], (len(share), 2))
+    yield static(
+        "joint_range",
+        rr.SeriesLines(
+            names=[*names, "upper limit", "lower limit"], colors=np.concatenate([own, [LIMIT, LIMIT]]),
+            widths=[1.5] * robot.dof + [1.0, 1.0],
+        ),
+    )  # fmt: skip
+    yield scalars("joint_range", np.concatenate([share, ends], axis=1), sampled.time)
+
+
+def range_share(
+    joints: Float[np.ndarray, "frames D"], lower: Float[np.ndarray, "D"], upper: Float[np.ndarray, "D"]
+) -> Float[np.ndarray, "frames D"]:
+    """Where each joint is within its range: -1 at its lower limit, 1 at its upper one."""
+    return np.asarray((2.0 * joints - lower - upper) / (upper - lower))
 
 
 def _latent_chunks(latent: LatentView | None, sampled: Frames) -> Iterator[Chunk]:
@@ -403,12 +528,17 @@ def colours(values: np.ndarray) -> np.ndarray:
 
 def _blueprint(path: PathRecord, sampled: Frames, series: Sequence[_Series]) -> Any:
     right: list[Any] = [] if path.latent is None else [_latent_panel(path.latent)]
-    right += [_series_panel(unit, series) for unit in ("deg", "mm") if any(one.unit == unit for one in series)]
+    right += [_residual_panel(unit, series) for unit in ("deg", "mm") if any(one.unit == unit for one in series)]
+    right += [violation_panel() for one in series if one.name == "violation"]
     shares = [2.5 if isinstance(panel, rrb.Spatial2DView) else 1.0 for panel in right]
-    right.append(rrb.TimeSeriesView(origin="joints", name="Joint positions [rad or m]"))
-    shares.append(1.5)  # its legend names every joint
-    time = rrb.TimePanel(state="collapsed", timeline=TIMELINE, fps=30.0, play_state="playing", loop_mode="all")
-    return arranged(scene_panel(sampled), rrb.Vertical(*right, row_shares=shares), time)
+    right.append(joint_panel())
+    shares.append(1.8)  # its legend names every joint
+    return arranged(scene_panel(sampled), rrb.Vertical(*right, row_shares=shares), path_time())
+
+
+def path_time() -> Any:
+    """The time panel of paths."""
+    return rrb.TimePanel(state="collapsed", timeline=TIMELINE, fps=30.0, play_state="playing", loop_mode="all")
 
 
 def arranged(scene: Any, right: Any, time: Any) -> Any:
@@ -426,33 +556,65 @@ def arranged(scene: Any, right: Any, time: Any) -> Any:
 
 def scene_panel(sampled: Frames, *more: str) -> Any:
     """The robot in its workcell with its tool's trace, and what lies below more entities."""
-    reach = float(np.linalg.norm(sampled.tool, axis=1).max())
+    shown = ("robot", "workcell", "tool", "transforms", *more)
+    return scene_view("Robot", shown, float(np.linalg.norm(sampled.tool, axis=1).max()))
+
+
+def scene_view(name: str, entities: Sequence[str], reach_m: float) -> Any:
+    """What lies below some entities, seen from beyond the robot's reach."""
     eye = rrb.EyeControls3D(
-        position=(1.7 * reach, -1.7 * reach, 1.3 * reach), look_target=(0.0, 0.0, 0.4 * reach), eye_up=(0.0, 0.0, 1.0)
-    )
+        position=(1.2 * reach_m, -1.2 * reach_m, 0.9 * reach_m), look_target=(0.0, 0.0, 0.45 * reach_m),
+        eye_up=(0.0, 0.0, 1.0),
+    )  # fmt: skip
     # a grid at z = 0 would flicker with the top of a table there
     return rrb.Spatial3DView(
-        origin="/", name="Robot", eye_controls=eye,
-        contents=[f"+ /{entity}/**" for entity in ("robot", "workcell", "tool", "transforms", *more)],
+        origin="/", name=name, eye_controls=eye, contents=[f"+ /{entity}/**" for entity in entities],
         line_grid=rrb.LineGrid3D(visible=False),
     )  # fmt: skip
 
 
-def _series_panel(unit: str, series: Sequence[_Series]) -> Any:
+def _residual_panel(unit: str, series: Sequence[_Series]) -> Any:
     shown = [one for one in series if one.unit == unit]
-    # a scale of at least one unit: an exactly held axis would otherwise show rounding errors only
-    top = 1.2 * max(1.0, *(max(one.limit, float(one.values.max())) for one in shown))
+    return residual_panel(unit, max(max(one.limit, float(one.values.max())) for one in shown))
+
+
+def residual_panel(unit: str, largest: float) -> Any:
+    """What the constraint bounds, on a scale of at least one unit: an exactly held axis has rounding errors only."""
+    axis = rrb.ScalarAxis(range=(0.0, 1.2 * max(1.0, largest)))
+    return rrb.TimeSeriesView(origin=f"constraint/{unit}", name=f"Constraint residual [{unit}]", axis_y=axis)
+
+
+def violation_panel(*, legend: bool = True) -> Any:
+    """Powers of ten, up to ten rad."""
+    axis, words = rrb.ScalarAxis(range=(math.log10(LOWEST_VIOLATION) - 0.5, 1.0)), rrb.PlotLegend(visible=legend)
     return rrb.TimeSeriesView(
-        origin=f"constraint/{unit}", name=f"Constraint residual [{unit}]", axis_y=rrb.ScalarAxis(range=(0.0, top))
+        origin="violation", name="Violation beyond the tolerance [log10 rad or m]", axis_y=axis, plot_legend=words
+    )
+
+
+def joint_panel() -> Any:
+    """All joints as shares of their range, and behind that in their own units."""
+    return rrb.Tabs(range_panel(), rrb.TimeSeriesView(origin="joints", name="Joint positions [rad or m]"), active_tab=0)
+
+
+def range_panel(*, legend: bool = True) -> Any:
+    """All joints as shares of their range."""
+    axis, words = rrb.ScalarAxis(range=(-1.1, 1.1)), rrb.PlotLegend(visible=legend)
+    return rrb.TimeSeriesView(
+        origin="joint_range", name="Joints within their limits (±1)", axis_y=axis, plot_legend=words
     )
 
 
 def _latent_panel(latent: LatentView) -> Any:
-    low, high = _latent_bounds(latent)
+    return latent_view_of(latent.axis_names, *_latent_bounds(latent))
+
+
+def latent_view_of(axis_names: Sequence[str], low: np.ndarray, high: np.ndarray) -> Any:
+    """The latent plane between two corners."""
     room = 0.1 * (high - low)  # for the axes' names
     low, high = low - room, high + room
     return rrb.Spatial2DView(
-        origin="latent", name=f"Latent space: {latent.axis_names[0]}, {latent.axis_names[1]}", background=_PAPER,
+        origin="latent", name=f"Latent space: {', '.join(axis_names)}", background=_PAPER,
         visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),
     )  # fmt: skip
 
@@ -477,7 +639,8 @@ def scalars(entity: str, values: Float[np.ndarray, "frames k"], time: rr.TimeCol
     return moving(entity, rr.Scalars.columns(scalars=values), time)
 
 
-def _has(chunk: Chunk, *components: str) -> bool:
+def has(chunk: Chunk, *components: str) -> bool:
+    """Whether a chunk holds any of the components."""
     names = chunk.to_record_batch().schema.names
     return any(name.startswith(component) for name in names for component in components)
 
@@ -485,26 +648,19 @@ def _has(chunk: Chunk, *components: str) -> bool:
 def _column(file: Path, chunks: Sequence[Chunk], entity: str, component: str) -> list[Any]:
     """One component of one entity, row by row, as lists."""
     for chunk in chunks:
-        if chunk.entity_path == entity and _has(chunk, component):
+        if chunk.entity_path == entity and has(chunk, component):
             return list(chunk.to_record_batch().column(component).to_pylist())
     raise RecordingError(f"{file}: has no {component} at {entity}: not a recording of a path")
 
 
-def _rerun(*arguments: str) -> list[str]:
+def rerun_command(*arguments: str) -> list[str]:
+    """Rerun's own command, of this environment."""
     # python -m rerun_cli would return 0 whatever the tool says
     return [sys.executable, "-m", "rerun", *arguments]
 
 
-def _existing(file: Path) -> Path:
+def existing(file: Path) -> Path:
+    """The file itself.  Raises RecordingError if there is none."""
     if not file.is_file():
         raise RecordingError(f"{file}: no such recording")
     return file
-
-
-def _free_port(preferred: int) -> int:
-    """The preferred port of this machine, or another if it is taken."""
-    for port in (preferred, 0):
-        with socket.socket() as probe, contextlib.suppress(OSError):
-            probe.bind((LOOPBACK, port))
-            return int(probe.getsockname()[1])
-    raise RecordingError("there is no free port on this machine")

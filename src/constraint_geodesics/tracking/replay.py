@@ -1,5 +1,6 @@
 """Recordings of the paths that a table reports, one file a path."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from sklearn.decomposition import PCA
 
+from constraint_geodesics.certification.certifier import Limits
 from constraint_geodesics.constraints.submanifold import GridSubmanifold, Submanifold
 from constraint_geodesics.constraints.vector import ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
@@ -15,8 +17,8 @@ from constraint_geodesics.params import RecordingParams
 from constraint_geodesics.robot.bullet import Solid
 from constraint_geodesics.tracking.recording import LatentView, PathRecord, record_path
 
-GRID_POINTS = 100
-"""Points a side of a latent grid in a recording: finer ones cost megabytes and show nothing more."""
+GRID_POINTS = 80
+"""At most so many points a side of a latent grid in a recording: finer ones are larger and show nothing more."""
 
 
 def record_rows(
@@ -24,7 +26,10 @@ def record_rows(
     chart: LearnedManifold, manifold: ConstraintManifold, submanifold: Submanifold, workcell: Sequence[Solid],
     params: RecordingParams,
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """Record the paths of the first queries; returns the rows with the file of each, or "", as `recording`."""
+    """Record the paths of the first queries, without meshes.
+
+    Returns the rows with the file of each, or "", as `recording`.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     named = []
     for row, joints in zip(rows, paths, strict=True):
@@ -35,7 +40,7 @@ def record_rows(
             record = PathRecord(
                 row["planner"], constraint, row["query"], row["seed"], joints, status_text(row, constraint), latent
             )
-            record_path(file, record, manifold, workcell, frames=params.frames)
+            record_path(file, record, manifold, workcell, frames=params.frames, meshes=False)
         named.append({**row, "recording": file.as_posix() if recorded else ""})
     return named
 
@@ -51,7 +56,7 @@ def latent_view(submanifold: Submanifold, chart: LearnedManifold, joints: Float[
     """The sub-manifold and an encoded path: the latent plane itself, or its first two principal axes."""
     curve = chart.encode(joints)
     if isinstance(submanifold, GridSubmanifold):
-        stride = max(len(submanifold.first_axis) // GRID_POINTS, 1)
+        stride = math.ceil(len(submanifold.first_axis) / GRID_POINTS)
         first, second = submanifold.first_axis[::stride], submanifold.second_axis[::stride]
         points = np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1).reshape(-1, 2)
         values = submanifold.inclusion[::stride, ::stride].reshape(-1)
@@ -63,12 +68,14 @@ def latent_view(submanifold: Submanifold, chart: LearnedManifold, joints: Float[
 
 def status_text(row: Mapping[str, Any], constraint: str) -> str:
     """What a viewer is told of the path."""
+    allowed = Limits.violation_tolerance
     verdict = "valid" if row["valid"] else f"not valid: {row['reason']}"
     return "\n".join(
         (
             f"**{row['planner']}**, constraint `{constraint}`, query {row['query']}, seed {row['seed']}", "",
             f"- {verdict}",
             f"- joint length {row['length_rad']:.3f} rad, tool {row['tool_length_m']:.3f} m",
-            f"- largest violation {np.degrees(row['max_violation_rad']):.4f}°, {1e3 * row['max_violation_m']:.4f} mm",
+            f"- largest violation {np.degrees(row['max_violation_rad']):.4f}°, {1e3 * row['max_violation_m']:.4f} mm "
+            f"(the judge allows {np.degrees(allowed):.4f}°, {1e3 * allowed:.4f} mm)",
         )
     )  # fmt: skip

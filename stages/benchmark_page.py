@@ -1,0 +1,17 @@
+"""Stage: the benchmark's page that opens offline, from the tables and figures of the stages before it."""
+
+import sys
+
+from constraint_geodesics.cli import run_stage
+from constraint_geodesics.evaluation.benchmark_page import write_benchmark_page
+from constraint_geodesics.params import Params
+from constraint_geodesics.paths import Layout
+
+
+def main(params: Params, layout: Layout) -> None:
+    """Write reports/benchmark.html."""
+    write_benchmark_page(params, layout)
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])
