@@ -6,7 +6,8 @@ FILE ?=
 FIRST_START = 1.329923 -0.584036 -3.766650 -2.008429 0.728803 -2.581396
 FIRST_GOAL = 1.071549 -0.217480 -1.682647 -2.906655 -0.337949 1.348704
 
-.PHONY: help env plan repro smoke bench bench-quick bench-geometry test lint format results readme ui replay clean
+.PHONY: help env plan repro smoke bench bench-quick bench-geometry test lint format results readme \
+	docs notebook plots experiments ui replay clean test-browser screenshots
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
@@ -52,6 +53,18 @@ bench-geometry: env  ## time the geometry core again, after whatever it needs; w
 test: env  ## run the tests, the whole pipeline on small parameters among them
 	python -m pytest -n 2 --dist loadgroup
 
+.venv/browser: tests/browser/requirements.lock .venv/installed
+	.venv/bin/python -m pip install --quiet --disable-pip-version-check -r tests/browser/requirements.lock
+	@touch $@
+
+test-browser: env .venv/browser  ## MLflow's dashboard, Rerun's viewer and the report in headless Chromium (minutes)
+	@python tests/browser/chromium.py
+	GEODESICS_BROWSER=1 python -m pytest tests/browser
+
+screenshots: env .venv/browser  ## make the documentation's pictures again, from this checkout's runs and recordings
+	@python tests/browser/chromium.py
+	python -m tests.browser.screenshots
+
 lint: env  ## format, lint, types, import directions
 	ruff format --check .
 	ruff check .
@@ -67,6 +80,28 @@ results: env  ## print the result table
 
 readme: env  ## write README's tables and numbers again from the reports
 	python tests/readme.py
+
+DOCS := .geodesics/docs-venv
+FROM ?= HEAD
+TO ?= workspace
+
+$(DOCS)/installed: docs/requirements.lock | .venv/installed
+	.venv/bin/python -m venv $(DOCS)
+	$(DOCS)/bin/python -m pip install --quiet --disable-pip-version-check -r docs/requirements.lock
+	@touch $@
+
+docs: $(DOCS)/installed  ## the documentation as a site that opens offline: .geodesics/site/index.html
+	$(DOCS)/bin/mkdocs build --strict --quiet
+	@echo "Open .geodesics/site/index.html"
+
+notebook: env $(DOCS)/installed  ## run docs/first_path.ipynb again and store what it prints and draws
+	$(DOCS)/bin/python docs/make/notebook.py
+
+plots: env $(DOCS)/installed  ## learning curves of two commits, a line a seed, offline: make plots FROM=HEAD~1 TO=workspace
+	$(DOCS)/bin/python docs/make/plots.py $(FROM) $(TO)
+
+experiments: env  ## run the experiments of docs/experiments.md in a copy and write their tables there (half an hour)
+	python docs/make/experiments.py
 
 ui: env  ## MLflow's dashboard, on this machine only
 	geodesics ui

@@ -47,7 +47,8 @@ def main(params: Params, layout: Layout, analytic: str) -> None:
         learning = [{"seed": result.seed, **row} for result in results for row in result.policy.curve]
         write_table(learning, layout.report(STAGE, f"{analytic}-learning", "csv"))
         figures = {name: [result.figures()[name] for result in results] for name in first.figures()}
-        run.report(figures, layout.report(STAGE, analytic))
+        means = {f"{name}_mean": float(np.mean(values)) for name, values in figures.items()}  # DVC compares no lists
+        run.report(figures | means, layout.report(STAGE, analytic))
         for task in tasks:  # finished: the next run of this stage starts from nothing
             shutil.rmtree(task.scratch, ignore_errors=True)
 

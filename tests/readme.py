@@ -1,7 +1,9 @@
-"""README's tables and numbers from the reports: `python tests/readme.py` writes them, tests/test_readme.py compares."""
+"""README's and docs' tables and numbers from the reports: `python tests/readme.py` writes them, tests compare."""
 
+import csv
 import json
 import re
+from collections import defaultdict
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -43,5 +45,27 @@ def _requoted(found: re.Match[str]) -> str:
     return f"{shown}{between}<!-- from {file} {key} {scale} {digits} -->"
 
 
+TIMES = re.compile(r"<!-- stage_times -->.*?<!-- /stage_times -->", re.S)
+TIMES_PAGE = ROOT / "docs" / "experiments.md"
+
+
+def with_stage_times(text: str) -> str:
+    """A page's text with how long each stage took when it last ran, items of a stage together."""
+    seconds: dict[str, list[float]] = defaultdict(list)
+    with (ROOT / "reports" / "stage_times.csv").open() as file:
+        for row in csv.DictReader(file):
+            seconds[row["stage"].split()[0]].append(float(row["seconds"]))
+    head = "| stage | items | an item [s] | together [s] |\n|---|---:|---:|---:|"
+    lines = [f"| `{name}` | {len(own)} | {_range(own)} | {sum(own):.0f} |" for name, own in sorted(seconds.items())]
+    table = "\n".join([head, *lines])
+    return TIMES.sub(lambda _: f"<!-- stage_times -->\n{table}\n<!-- /stage_times -->", text)
+
+
+def _range(values: list[float]) -> str:
+    low, high = (f"{value:.0f}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
+
+
 if __name__ == "__main__":
+    TIMES_PAGE.write_text(with_stage_times(TIMES_PAGE.read_text()))
     (ROOT / "README.md").write_text(filled((ROOT / "README.md").read_text()))

@@ -20,6 +20,8 @@ from constraint_geodesics.compute import ComputeError, parallel_map
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.learning.dataset import draw_shard, shard_tasks
 from constraint_geodesics.params import ComputeParams, Params
+from constraint_geodesics.progress import waiting
+from constraint_geodesics.threads import ONE_THREAD
 
 TWO = ComputeParams(backend="loky", workers=2)
 ONE = ComputeParams(backend="loky", workers=1)
@@ -227,3 +229,55 @@ def test_progress_on_a_terminal_is_a_bar() -> None:
     assert "label [free]" in shown
     assert "━" in shown
     assert "2/2" in shown
+
+
+def test_waiting_is_seen_on_a_terminal_alone(capfd: pytest.CaptureFixture[str]) -> None:
+    with waiting("loading the planner"):
+        pass
+    assert capfd.readouterr() == ("", "")
+    program = (
+        "from constraint_geodesics.progress import progress, waiting\n"
+        "with waiting('loading [it]'):\n"
+        "    with progress('a bar within', 2) as advance:\n"
+        "        advance(); advance()\n"
+    )
+    ours, theirs = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
+    subprocess.run([sys.executable, "-c", program], stderr=theirs, env=environment, check=True)
+    os.close(theirs)
+    shown = os.read(ours, 100_000).decode()
+    os.close(ours)
+    assert "loading [it]" in shown
+    before, bar = shown.split("a bar within", 1)
+    assert "loading [it]" in before
+    assert "loading [it]" not in bar.split("2/2")[0], "it gives way to the bar"
+
+
+STAGE = """
+import numpy as np, torch
+from threadpoolctl import threadpool_info
+from constraint_geodesics import cli
+
+def main(params, layout):
+    values = np.random.default_rng(0).normal(size=(700, 700))
+    single = torch.from_numpy(values.astype(np.float32))
+    print(repr([float((values @ values).sum()), float((single @ single).sum()), float(single.sum())]))
+    print(torch.get_num_threads(), {pool["num_threads"] for pool in threadpool_info()})
+
+cli.note_stage_time = lambda *_: None
+cli.run_stage(main, [])
+"""
+
+
+def test_a_stage_computes_the_same_whatever_number_of_threads_it_is_started_with() -> None:
+    """`make` sets one; a bare `dvc repro` leaves it to the machine."""
+    answers = set()
+    for number in ("1", "2", ""):
+        environment = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
+        environment |= {"OMP_NUM_THREADS": number, "MKL_NUM_THREADS": number} if number else {}
+        command = [sys.executable, "-c", STAGE]
+        root = Path(__file__).parents[1]
+        done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=True)
+        answers.add(done.stdout)
+    assert len(answers) == 1
+    assert answers.pop().splitlines()[1] == "1 {1}"

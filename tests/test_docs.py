@@ -1,14 +1,21 @@
-"""What the documentation says can be done is done here: its code runs, its commands parse, its names exist."""
+"""What the documentation says can be done is done here: its code runs, its commands parse, its names exist.
 
+That its commands run is in tests/test_docs_commands.py.
+"""
+
+import json
 import re
 import shlex
 import shutil
+import subprocess
 import sys
 import tomllib
 from functools import cache
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import pytest
 import typer
 import yaml
@@ -17,12 +24,15 @@ from dvc.dependency.param import ParamsDependency
 from dvc.repo import Repo
 from dvc.utils.hydra import apply_overrides
 from mlflow.utils.search_utils import SearchUtils
-from typer.testing import CliRunner
 
 from constraint_geodesics import cli
+from constraint_geodesics.bundle import PACKAGED
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.params import load_params
 from constraint_geodesics.peers import KINDS
+from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.registry import register_planner
+from tests.readme import TIMES_PAGE, with_stage_times
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "constraint_geodesics"
@@ -50,8 +60,20 @@ def commands(page: str) -> list[list[str]]:
 
 
 def words_of(block: str) -> list[list[str]]:
-    lines = [shlex.split(line, comments=True) for line in block.replace("\\\n", " ").splitlines()]
-    return [line[next(k for k, word in enumerate(line) if not re.match(r"[A-Z_]+=", word)) :] for line in lines if line]
+    """The words of every command of a block; a quoted text may go on over line ends."""
+    found, text = [], ""
+    for line in block.replace("\\\n", " ").splitlines():
+        text += line
+        try:
+            words = shlex.split(text, comments=True)
+        except ValueError:  # its quotation is not closed yet
+            text += "\n"
+            continue
+        text = ""
+        if words:
+            found.append(words[next(k for k, word in enumerate(words) if not re.match(r"[A-Z_]+=", word)) :])
+    assert not text, text
+    return found
 
 
 def having(language: str) -> list[str]:
@@ -96,7 +118,60 @@ def test_the_extensions_work(monkeypatch, tmp_path) -> None:
 
 @pytest.mark.parametrize("page", [page for page in having("python") if page not in ("first_path.md", "extend.md")])
 def test_the_other_code_runs(page, monkeypatch, tmp_path) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    if "models:/" in PAGES[page]:  # what a run of the pipeline leaves in the registry
+        with tracked_stage("build_planner", "planner", {}, [], experiment="built", root=tmp_path) as stage:
+            example = {"start": [0.0] * 6, "goal": [0.1] * 6, "constraint": "free"}
+            register_planner(stage, PACKAGED, PACKAGE / "served_model.py", example)
     run(page, monkeypatch, tmp_path)
+
+
+def test_every_table_of_times_is_the_report_s() -> None:
+    """`make readme` writes it."""
+    text = TIMES_PAGE.read_text()
+    assert with_stage_times(text) == text
+    assert "| `train_manifold` | 2 |" in text
+
+
+# The notebook
+
+NOTEBOOK = ROOT / "docs" / "first_path.ipynb"
+
+
+def cells(kind: str) -> list[dict[str, Any]]:
+    return [cell for cell in json.loads(NOTEBOOK.read_text())["cells"] if cell["cell_type"] == kind]
+
+
+def printed(cell: dict[str, Any]) -> str:
+    return "".join("".join(output["text"]) for output in cell["outputs"] if output["output_type"] == "stream")
+
+
+def test_the_notebook_s_cells_run_and_print_what_is_stored(monkeypatch, tmp_path, capsys) -> None:
+    """`make notebook` runs it in Jupyter and stores the outputs; here the same cells run without it."""
+    monkeypatch.chdir(tmp_path)
+    matplotlib.use("Agg")
+    names: dict[str, Any] = {"__name__": "notebook"}
+    for cell in cells("code"):
+        exec(compile("".join(cell["source"]), NOTEBOOK.name, "exec"), names)
+        assert rounded(capsys.readouterr().out) == rounded(printed(cell))
+    assert names["path"].status == "solved"
+    assert names["certificate"].valid
+    for file in ("path.png", "path.rrd"):
+        assert (tmp_path / file).is_file()
+
+
+def rounded(text: str) -> str:
+    """Without the last digits of its numbers, which another processor may round otherwise."""
+    return re.sub(r"\d+(?:\.\d+)?(?:e-?\d+)?", lambda number: f"{float(number.group()):.1e}", text)
+
+
+def test_the_notebook_holds_its_pictures_and_is_small() -> None:
+    pictures = [output for cell in cells("code") for output in cell["outputs"] if "image/png" in output.get("data", {})]
+    assert len(pictures) == 2
+    assert NOTEBOOK.stat().st_size < 200_000
+    assert [cell["execution_count"] for cell in cells("code")] == list(range(1, len(cells("code")) + 1))
+    told = "".join("".join(cell["source"]) for cell in cells("markdown"))
+    assert set(re.findall(r"\]\(([^)#]+)", told)) <= set(PAGES)
 
 
 @pytest.mark.parametrize("page", having("yaml"))
@@ -131,18 +206,14 @@ def test_every_command_of_ours_parses(page) -> None:
 
 @every_page
 def test_every_option_that_the_text_names_exists(page) -> None:
-    known = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
+    program = typer.main.get_command(cli.app)
     for code in inline(page):
         if not code.startswith("geodesics "):
             continue
-        _, name, *words = shlex.split(code)
-        options = {option for parameter in known[name].params for option in parameter.opts}
-        assert {word for word in words if word.startswith("--")} <= options, code
-
-
-@pytest.mark.parametrize("words", [["constraints"], ["params", str(ROOT / "params.yaml")]])
-def test_the_quick_commands_run(words) -> None:
-    assert CliRunner().invoke(cli.app, words).exit_code == 0
+        words = shlex.split(code)[1:]
+        named = program if words[0].startswith("-") else program.commands[words[0]]  # type: ignore[attr-defined]
+        options = {option for parameter in named.params for option in parameter.opts}
+        assert {word for word in words if word.startswith("--")} <= options | {"--help"}, code
 
 
 @pytest.mark.parametrize("page", having("bash"))
@@ -156,7 +227,6 @@ def test_every_target_of_make_exists(page) -> None:
 # Experiments
 
 
-@cache
 def pipeline(folder: Path, overrides: tuple[str, ...]) -> dict[str, tuple[str, dict[str, Any], set[str]]]:
     """Each stage's command, values of its parameters and the stages it depends on, as DVC reads dvc.yaml."""
     folder.mkdir()
@@ -183,6 +253,12 @@ def pipeline(folder: Path, overrides: tuple[str, ...]) -> dict[str, tuple[str, d
         )
         for stage in repo.index.stages
     }
+
+
+@pytest.fixture(scope="module")
+def committed(tmp_path_factory) -> dict[str, tuple[str, dict[str, Any], set[str]]]:
+    """The pipeline without any change."""
+    return pipeline(tmp_path_factory.mktemp("pipeline") / "before", ())
 
 
 def looked_up(values: Any, key: str) -> Any:
@@ -216,12 +292,14 @@ EXPERIMENTS = experiments()
 @pytest.mark.parametrize(
     ("overrides", "targets", "after"), EXPERIMENTS, ids=[overrides[0].split("=")[0] for overrides, _, _ in EXPERIMENTS]
 )
-def test_an_experiment_changes_what_exists_and_runs_what_its_page_says(overrides, targets, after, tmp_path) -> None:
+def test_an_experiment_changes_what_exists_and_runs_what_its_page_says(
+    overrides, targets, after, committed, tmp_path
+) -> None:
     for override in overrides:
         key = override.split("=")[0]
         if not key.startswith("+"):
             looked_up(PARAMS, key)
-    before, now = pipeline(tmp_path / "before", ()), pipeline(tmp_path / "now", tuple(overrides))
+    before, now = committed, pipeline(tmp_path / "now", tuple(overrides))
     assert set(targets) <= set(now)
 
     @cache
@@ -244,8 +322,8 @@ def test_every_experiment_of_its_page_says_what_runs() -> None:
 
 
 @pytest.mark.parametrize("page", having("bash"))
-def test_every_command_of_dvc_parses_and_its_targets_exist(page, tmp_path) -> None:
-    known = set(pipeline(tmp_path / "before", ())) | {"draw_benchmark_queries", "label_joints"}
+def test_every_command_of_dvc_parses_and_its_targets_exist(page, committed) -> None:
+    known = set(committed) | {"draw_benchmark_queries", "label_joints"}
     for program, *words in commands(page):
         if program != "dvc":
             continue
@@ -263,7 +341,7 @@ def test_every_command_of_dvc_parses_and_its_targets_exist(page, tmp_path) -> No
 def test_every_link_leads_somewhere(page) -> None:
     for target in re.findall(r"\]\(([^)]+)\)", prose(page)):
         file, _, heading = target.partition("#")
-        assert not file or file in PAGES, target
+        assert not file or file in PAGES or (ROOT / "docs" / file).is_file(), target
         if heading:
             titles = re.findall(r"^#+ (.*)$", prose(file or page), re.M)
             slugs = {re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", title).strip().lower()) for title in titles}
@@ -298,6 +376,10 @@ def test_every_filter_is_one_that_mlflow_understands(page) -> None:
 # The site
 
 
+MKDOCS = ROOT / ".geodesics" / "docs-venv" / "bin" / "mkdocs"
+NOTEBOOK_PAGE = "first_path_notebook.md"
+
+
 def test_the_site_has_every_page_and_loads_nothing_from_the_net() -> None:
     text = (ROOT / "mkdocs.yml").read_text()
     site = yaml.safe_load(text)
@@ -307,13 +389,95 @@ def test_the_site_has_every_page_and_loads_nothing_from_the_net() -> None:
             return [entry]
         return [page for each in (entry.values() if isinstance(entry, dict) else entry) for page in pages(each)]
 
-    assert sorted(pages(site["nav"])) == sorted(PAGES)
+    assert sorted(pages(site["nav"])) == sorted([*PAGES, NOTEBOOK_PAGE])
     assert site["theme"]["highlightjs"] is False
     assert site["plugins"] == []
     assert "//" not in text
     for page, content in PAGES.items():
         assert "<script" not in content, page
         assert set(re.findall(r"https?://([^/\s`:]+)", content)) <= {"127.0.0.1"}, page
+
+
+class Loaded(HTMLParser):
+    """What a browser opens for a page by itself: every address but those of links."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        names = ("src", "href", "srcset", "data", "poster") if tag != "a" else ()
+        self.addresses += [value for name, value in attrs if name in names and value]
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+@pytest.mark.skipif(not MKDOCS.is_file(), reason="no mkdocs: `make docs` installs it")
+def test_the_site_builds_strictly_and_opens_from_disk(tmp_path) -> None:
+    command = [str(MKDOCS), "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    assert {page.with_suffix(".md").name for page in tmp_path.glob("*.html")} == {*PAGES, NOTEBOOK_PAGE, "404.md"}
+    for page in tmp_path.glob("*.html"):
+        if page.name == "404.html":  # for servers
+            continue
+        parsed = Loaded()
+        parsed.feed(page.read_text())
+        for address in parsed.addresses:
+            inside = address.partition("#")[0].partition("?")[0]
+            assert address.startswith("data:image/") or (tmp_path / inside).is_file(), (page.name, address)
+    for style in tmp_path.rglob("*.css"):
+        for address in re.findall(r"""(?:url\(|@import)\s*["']?([^"')\s]+)""", style.read_text()):
+            inside = style.parent / address.partition("#")[0].partition("?")[0]
+            assert address.startswith(("data:", "#")) or inside.is_file(), (style.name, address)
+    parsed = Loaded()
+    parsed.feed((tmp_path / "method.html").read_text())
+    assert "σ(z)⁻² = Σ_k w_k exp(−½ ‖z − c_k‖² / h_k²)" in parsed.text, "equations are text: nothing renders them"
+
+
+@pytest.mark.skipif(not MKDOCS.is_file(), reason="no mkdocs: `make docs` installs it")
+@pytest.mark.parametrize(
+    "bad", ["<script src='//host/x.js'></script>", "<style>a {background: url(//host/x.png)}</style>"]
+)
+def test_a_page_that_loads_something_from_the_net_fails_the_build(bad, tmp_path) -> None:
+    shutil.copytree(ROOT / "docs", tmp_path / "docs")
+    shutil.copy(ROOT / "mkdocs.yml", tmp_path)
+    with (tmp_path / "docs" / "limits.md").open("a") as page:
+        page.write(f"\n{bad}\n")
+    built = subprocess.run(
+        [str(MKDOCS), "build", "--strict"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert built.returncode != 0
+    assert "would load //host/x" in built.stderr
+
+
+def pins(file: str) -> dict[str, str]:
+    lines = (ROOT / file).read_text().lower().splitlines()
+    return dict(line.split("==") for line in lines if line and not line.startswith("#"))
+
+
+def test_the_documentation_s_packages_are_pinned_and_agree_with_the_project_s() -> None:
+    """The notebook's kernel has both."""
+    ours, theirs = pins("docs/requirements.lock"), pins("requirements.lock")
+    assert {"mkdocs", "ipykernel", "nbclient", "vl-convert-python"} <= set(ours)
+    assert not {"mkdocs", "ipykernel"} & set(theirs)
+    assert {name: ours[name] for name in set(ours) & set(theirs)} == {
+        name: theirs[name] for name in set(ours) & set(theirs)
+    }
+
+
+def test_the_plots_that_dvc_names_are_of_files_that_stages_write() -> None:
+    plots = yaml.safe_load((ROOT / "dvc.yaml").read_text())["plots"]
+    template = json.loads((ROOT / ".dvc" / "plots" / "seeds.json").read_text())
+    assert template["facet"]["field"] == "panel"
+    for plot in plots:
+        ((title, settings),) = plot.items()
+        assert settings["template"] == "seeds", title
+        for file, column in settings["y"].items():
+            header = (ROOT / file).read_text().splitlines()[0].split(",")
+            assert {settings["x"], column} <= set(header), file
 
 
 def test_the_citation_is_of_this_version() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import yaml
+from dvc.utils.hydra import apply_overrides
 
 from constraint_geodesics.params import ParamsError, load_params
 
@@ -54,6 +55,33 @@ def test_a_bad_parameter_is_named_in_one_line(tmp_path: Path, change: Change, pa
 
 def test_the_committed_parameters_are_good() -> None:
     assert load_params(ROOT / "params.yaml").constraints["level_cup"].axes == (0, 0, 0, 1, 1, 0)
+
+
+@pytest.mark.parametrize(("written", "meant"), [("2e-05", 2e-5), ("1E-6", 1e-6), ("3e2", 300.0), ("2.5e-5", 2.5e-5)])
+def test_a_number_with_an_exponent_is_one_without_a_point_too(tmp_path: Path, written: str, meant: float) -> None:
+    file = tmp_path / "params.yaml"
+    text = (ROOT / "params.yaml").read_text()
+    assert text.count("  accuracy: 0.00001 ") == 1
+    file.write_text(text.replace("  accuracy: 0.00001 ", f"  accuracy: {written} "))
+    assert load_params(file).planner.accuracy == meant
+
+
+def test_what_an_experiment_sets_is_read_as_dvc_wrote_it(tmp_path: Path) -> None:
+    file = tmp_path / "params.yaml"
+    file.write_text((ROOT / "params.yaml").read_text())
+    apply_overrides(file, ["planner.accuracy=0.00001", "geodesics.ppo.learning_rate_end=1e-06"])
+    assert "1e-05" in file.read_text()  # text in YAML 1.1
+    params = load_params(file)
+    assert (params.planner.accuracy, params.geodesics.ppo.learning_rate_end) == (1e-5, 1e-6)
+
+
+@pytest.mark.parametrize("text", ["labels: [1", "labels: {}\nlabels: {}\n", "\tlabels: 1"])
+def test_what_is_no_yaml_is_said_in_one_line(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "params.yaml"
+    file.write_text(text)
+    with pytest.raises(ParamsError, match="not YAML") as caught:
+        load_params(file)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("stage", ["label_joints.py level_cup", "train_geodesics.py planner level_cup", "report.py"])

@@ -12,11 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from constraint_geodesics import completion
 from constraint_geodesics.params import Params, ParamsError, load_params
 from constraint_geodesics.paths import Layout
+from constraint_geodesics.progress import waiting
+from constraint_geodesics.threads import ONE_THREAD, one_thread
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from constraint_geodesics.tracking.catalogue import Entry, Wanted
 
 WRONG_USAGE = 2
 NO_PATH = 3
@@ -29,6 +34,7 @@ app = typer.Typer(
 
 def main() -> None:
     """Entry point of the command: an error of the user's is one line, not a traceback."""
+    os.environ.update(ONE_THREAD)  # before anything heavy is loaded: answers are the same whoever calls
     try:
         app()
     except (ValueError, OSError, RuntimeError) as error:
@@ -38,13 +44,16 @@ def main() -> None:
 def run_stage(stage: Callable[..., None], arguments: Sequence[str]) -> None:
     """Run one stage in this checkout: check params.yaml first, and report a bad input in one line.
 
+    What runs in this process computes on one thread, libraries that are loaded already too, so that results are those
+    of `make`; more cores are used by `parallel_map`.
     arguments: the names after (params, layout), as dvc.yaml passes them; each must be one that params.yaml has.
     """
     began = time.perf_counter()
     try:
         params = load_params()
         _check_names(params, stage, arguments)
-        stage(params, Layout(), *arguments)
+        with one_thread(), waiting(" ".join([Path(sys.argv[0]).stem, *arguments])):
+            stage(params, Layout(), *arguments)
         note_stage_time(Layout().stage_times, Path(sys.argv[0]).stem, arguments, time.perf_counter() - began)
     except (ValueError, OSError, RuntimeError) as error:
         if os.environ.get("GEODESICS_TRACEBACK"):
@@ -131,7 +140,10 @@ def list_constraints(
 def plan(
     start: Annotated[str, typer.Option(help='Start configuration: the joints in rad, as in "0.1 -0.5 …".')],
     goal: Annotated[str, typer.Option(help="Goal configuration [rad].")],
-    constraint: Annotated[str, typer.Option(help="A name that `geodesics constraints` lists.")],
+    constraint: Annotated[
+        str,
+        typer.Option(help="A name that `geodesics constraints` lists.", shell_complete=completion.planned_constraints),
+    ],
     out: Annotated[Path | None, typer.Option(help="Write the path here, as CSV.")] = None,
     record: Annotated[Path | None, typer.Option(help="Write a Rerun recording here.")] = None,
     picture: Annotated[Path | None, typer.Option(help="Draw the path here, as PNG.")] = None,
@@ -150,7 +162,7 @@ def plan(
 
     try:
         first, last = _joints(start, "--start"), _joints(goal, "--goal")
-        with Planner.load(planner) as loaded:
+        with waiting(what_takes_time()), Planner.load(planner) as loaded:
             path = loaded.plan(first, last, constraint, budget_s=budget)
             source = loaded.source
     except (BundleError, PlannerError) as error:
@@ -171,17 +183,22 @@ def plan(
 def check(
     file: Annotated[Path, typer.Argument(help="A path as CSV: a header, then one row of joints [rad] a line.")],
     constraint: Annotated[
-        str | None, typer.Option(help="A name that `geodesics constraints` lists; by default what the file says.")
+        str | None,
+        typer.Option(
+            help="A name that `geodesics constraints` lists; by default what the file says.",
+            shell_complete=completion.planned_constraints,
+        ),
     ] = None,
     planner: Annotated[str | None, typer.Option(help="Where robot and workcell come from, as for `plan`.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the certificate as one JSON object.")] = False,
 ) -> None:
-    """Certify anybody's path.  Exit code 0: it keeps every promise; 2: wrong usage; 3: it breaks the one named."""
+    """Certify anybody's path, between whatever ends it has.  Exit code 0: valid; 2: wrong usage; 3: what it breaks."""
     from constraint_geodesics.bundle import BundleError
     from constraint_geodesics.planner import PlannerError, check_path
 
     try:
-        certificate = check_path(file, constraint, planner)
+        with waiting(what_takes_time()):
+            certificate = check_path(file, constraint, planner)
     except (BundleError, PlannerError) as error:
         raise SystemExit(_complain(error, WRONG_USAGE)) from None
     broken = certificate.violation
@@ -199,6 +216,23 @@ def check(
     raise SystemExit(0 if broken is None else NO_PATH)
 
 
+KERNELS = (
+    "robot/kernels", "robot/clearance", "constraints/kernels", "certification/kernels", "geometry/timing",
+    "geodesics/band_kernels",
+)  # fmt: skip
+"""Modules that numba compiles before the first path; their code is kept beside them, until they change."""
+
+
+def what_takes_time(package: Path = Path(__file__).parent) -> str:
+    """What a planner's user waits for: the compiler where a kernel has no compiled code yet."""
+    for name in KERNELS:
+        source = package / f"{name}.py"
+        kept = (source.parent / "__pycache__").glob(f"{source.stem}.*.nbi")
+        if not any(cache.stat().st_mtime >= source.stat().st_mtime for cache in kept):
+            return "compiling the numerical kernels, once for this environment: a minute or two"
+    return "loading the planner"
+
+
 def _joints(text: str, option: str) -> list[float]:
     from constraint_geodesics.planner import PlannerError
 
@@ -212,9 +246,15 @@ def _joints(text: str, option: str) -> list[float]:
 def bench(
     queries: Annotated[int, typer.Option(help="Queries of each constraint and scene.", min=1)] = 1,
     seeds: Annotated[int, typer.Option(help="Seeds of each planner that chance plays a part in.", min=1)] = 1,
-    constraint: Annotated[list[str] | None, typer.Option(help="One of params.yaml's; by default all.")] = None,
+    constraint: Annotated[
+        list[str] | None,
+        typer.Option(help="One of params.yaml's; by default all.", shell_complete=completion.listed_constraints),
+    ] = None,
     planner: Annotated[
-        list[str] | None, typer.Option(help="One of params.yaml's bench.planners; by default all.")
+        list[str] | None,
+        typer.Option(
+            help="One of params.yaml's bench.planners; by default all.", shell_complete=completion.benchmarked_planners
+        ),
     ] = None,
     longest: Annotated[float, typer.Option(help="Leave out planners that are given more seconds a query.")] = 2.0,
     out: Annotated[Path, typer.Option(help="Folder of rows, table and summary.")] = Path(".geodesics/bench"),
@@ -270,29 +310,92 @@ def show_results(
 
 @app.command("replay")
 def replay(
-    files: Annotated[list[Path] | None, typer.Argument(help="Recordings to open; none lists them.")] = None,
-    web: Annotated[bool, typer.Option(help="Open in a browser on this machine instead of a window.")] = False,
+    recordings: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Files to open, or their numbers in the list; none lists them.", shell_complete=completion.recordings
+        ),
+    ] = None,
+    constraint: Annotated[
+        str | None, typer.Option(help="Only of this constraint.", shell_complete=completion.listed_constraints)
+    ] = None,
+    query: Annotated[int | None, typer.Option(help="Only of this query.", min=0)] = None,
+    planner: Annotated[list[str] | None, typer.Option(help="Only of this planner; may be given several times.")] = None,
+    scene: Annotated[str | None, typer.Option(help="Only in this scene of the benchmark.")] = None,
+    seed: Annotated[list[int] | None, typer.Option(help="Only of this seed; may be given several times.")] = None,
+    beside: Annotated[
+        bool, typer.Option("--side-by-side", help="A view for each recording, instead of one over the other.")
+    ] = False,
+    web: Annotated[bool, typer.Option("--web", help="Open in a browser on this machine instead of a window.")] = False,
+    web_port: Annotated[int, typer.Option(help="Port of the page on 127.0.0.1.", min=1, max=65535)] = 9090,
+    save: Annotated[Path | None, typer.Option(help="Write what would be opened as one file, to hand on.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the list as one JSON object.")] = False,
 ) -> None:
-    """Replay recorded paths in Rerun; without a file, list the recordings."""
-    if as_json and files:
-        raise SystemExit(_complain(ValueError("--json prints the list of recordings: give no file"), WRONG_USAGE))
-    if not files:
-        found = recordings_of(Layout())
-        if not found:
-            raise FileNotFoundError("data/recordings: no recordings yet; run `make repro`")
-        if as_json:
-            print(json.dumps({"recordings": [str(file) for file in found]}))
-            return
-        print("\n".join(map(str, found)))
-        print(f"\nOpen one with: geodesics replay {found[0]}")
-        return
-    for file in files:
-        if not file.is_file():
-            raise FileNotFoundError(f"{file}: no such recording")
-    from constraint_geodesics.tracking.recording import open_recordings
+    """Replay recorded paths in Rerun, several at once over each other; without any, list the recordings.
 
-    raise SystemExit(open_recordings(files, web=web))
+    With --constraint, --query and --planner what fits is opened; with fewer of them the list is narrowed.
+    """
+    from constraint_geodesics.tracking.catalogue import Wanted, as_records
+
+    wanted = Wanted(constraint, scene, query, tuple(planner or ()), tuple(seed or ()))
+    if recordings and (as_json or wanted != Wanted()):
+        words = "--json prints the list of recordings" if as_json else "--constraint, --query, ... choose from the list"
+        raise SystemExit(_complain(ValueError(f"{words}: give no file"), WRONG_USAGE))
+    if as_json:
+        print(json.dumps({"recordings": as_records(_listed(wanted))}))
+        return
+    files = _named(recordings) if recordings else _chosen(_listed(wanted), wanted)
+    if not files:
+        return
+    from constraint_geodesics.tracking.viewer import open_recordings, save_recordings
+
+    if save is not None:
+        save_recordings(files, save, beside=beside)
+        print(f"{save}: open it with geodesics replay {save}")
+        return
+    raise SystemExit(open_recordings(files, web=web, beside=beside, web_port=web_port))
+
+
+def _listed(wanted: "Wanted") -> "list[Entry]":
+    """The recordings of this checkout that are as asked for."""
+    from constraint_geodesics.tracking.catalogue import catalogue, narrowed, read_entry
+
+    entries = catalogue(Path(), read_entry)
+    if not entries:
+        raise FileNotFoundError("data/recordings: no recordings yet; run `make plan` for one, or `make repro` for all")
+    return narrowed(entries, wanted)
+
+
+def _named(words: Sequence[str]) -> list[Path]:
+    """The files that some words name, by themselves or by their numbers in the list."""
+    from constraint_geodesics.tracking.catalogue import Wanted, by_words
+
+    for word in words:
+        if not word.isdigit() and not Path(word).is_file():
+            raise FileNotFoundError(f"{word}: no such recording; `geodesics replay` lists those there are")
+    numbers = [word for word in words if not Path(word).is_file()]
+    files = {entry.number: Path(entry.file) for entry in (by_words(_listed(Wanted()), numbers) if numbers else [])}
+    return [Path(word) if Path(word).is_file() else files[int(word)] for word in words]
+
+
+def _chosen(listed: "list[Entry]", wanted: "Wanted") -> list[Path]:
+    """What is opened of the list: what was asked for, or what a person at the terminal chooses; piped, nothing."""
+    from constraint_geodesics.tracking.catalogue import as_table, by_words, one_of_each
+
+    if wanted.one_problem:
+        chosen = one_of_each(listed, wanted)
+        names = ", ".join(f"{entry.number} ({entry.planner})" for entry in chosen)
+        print(f"opening {names} of the {len(listed)} that fit", file=sys.stderr)
+        return [Path(entry.file) for entry in chosen]
+    print(as_table(listed))
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        print(f"\nOpen one with: geodesics replay {listed[0].number}")
+        return []
+    try:
+        answer = input("\nWhich to open? Numbers, for example 1 7; Enter for none: ")
+    except EOFError:
+        return []
+    return [Path(entry.file) for entry in by_words(listed, answer.replace(",", " ").split())]
 
 
 @app.command("ui")
@@ -313,8 +416,9 @@ def _records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
 
 def recordings_of(layout: Layout) -> list[Path]:
     """All recordings of this checkout, learned paths that keep a cup level first."""
-    found = (layout.root / "data" / "recordings").rglob("*.rrd")
-    return sorted(found, key=lambda file: ("planner-level_cup/query0-learned" not in file.as_posix(), file.as_posix()))
+    from constraint_geodesics.tracking.catalogue import catalogue, read_entry
+
+    return [layout.root / entry.file for entry in catalogue(layout.root, read_entry)]
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ same on any backend and with any number of workers.
 import asyncio
 import os
 import reprlib
-import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -22,6 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from constraint_geodesics.params import ComputeParams
 from constraint_geodesics.progress import progress
+from constraint_geodesics.threads import ONE_THREAD, one_thread, set_torch_threads
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-"""Read by the libraries that a task is the first to load."""
 DASK_CONNECT_S = 5
 DASK_WORKERS_S = 10
 WATCH_S = 1.0
@@ -82,7 +80,7 @@ class _Task(Generic[Item, Result]):
         # never undone: a Dask worker may run other tasks beside this one
         os.environ.update(ONE_THREAD)
         threadpool_limits(1)
-        _set_torch_threads(1)
+        set_torch_threads(1)
         return self(index, item)
 
     def below(self, parent: int, index: int, item: Item) -> tuple[int, Result]:
@@ -114,33 +112,9 @@ def _outcomes(
 
 def _in_process(task: _Task[Item, Result], items: Sequence[Item]) -> Generator[tuple[int, Result], None, None]:
     for index, item in enumerate(items):
-        with _one_thread():
+        with one_thread():
             outcome = task(index, item)
         yield outcome
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """What a worker process keeps, for one task inside this process."""
-    before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
-    torch_threads = sys.modules["torch"].get_num_threads() if "torch" in sys.modules else None
-    os.environ.update(ONE_THREAD)
-    try:
-        with threadpool_limits(1):
-            _set_torch_threads(1)
-            yield
-    finally:
-        for name in ONE_THREAD:
-            del os.environ[name]
-        os.environ.update(before)
-        if torch_threads is not None:
-            _set_torch_threads(torch_threads)
-
-
-def _set_torch_threads(count: int) -> None:
-    """Torch's own count, where a task has loaded torch; loading it for this alone would take seconds."""
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(count)
 
 
 def _on_loky(

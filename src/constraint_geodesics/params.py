@@ -4,8 +4,9 @@ import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -389,16 +390,21 @@ def load_params(path: Path = Path("params.yaml")) -> Params:
     Raises ParamsError, one line: the file, the entry, its value and what is allowed.
     """
     try:
-        raw = yaml.safe_load(path.read_text())
+        raw = _yaml(path.read_text())
     except OSError as error:
         raise ParamsError(f"{path}: {error.strerror}") from None
-    except yaml.YAMLError as error:
+    except YAMLError as error:
         raise ParamsError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
     try:
         # in JSON's strict mode lists may become tuples, but neither "5" nor true becomes a number
         return Params.model_validate_json(json.dumps(raw, default=str), strict=True)
     except ValidationError as error:
         raise ParamsError(f"{path}: {_one_line(error)}") from None
+
+
+def _yaml(text: str) -> Any:
+    """YAML 1.2, read as DVC reads and writes it: 2e-05 is a number there, which YAML 1.1 takes for a text."""
+    return YAML(typ="safe", pure=True).load(text)
 
 
 def _one_line(error: ValidationError) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 LINE_EVERY_S = 15.0
 
@@ -24,6 +24,41 @@ def progress(description: str, total: int) -> AbstractContextManager[Callable[[]
 
 
 @contextmanager
+def waiting(description: str) -> Iterator[None]:
+    """Show that work whose length nobody knows goes on: on a terminal a line with the time it took so far, which goes
+    when the work is done and gives way to a bar of `progress` within it; elsewhere nothing.  An empty description shows
+    nothing.
+    """
+    if not description or not sys.stderr.isatty():
+        yield
+        return
+    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as line:
+        line.add_task(description, total=None)
+        _waiting.append(line)
+        try:
+            yield
+        finally:
+            _waiting.remove(line)
+
+
+_waiting: list[Progress] = []
+"""The lines that are shown now: a terminal has one bottom, which the bar within them needs."""
+
+
+@contextmanager
+def _given_way() -> Iterator[None]:
+    lines = tuple(_waiting)
+    for line in lines:
+        line.stop()
+    try:
+        yield
+    finally:
+        for line in lines:
+            line.start()
+
+
+@contextmanager
 def _bar(description: str, total: int) -> Iterator[Callable[[], None]]:
     columns = (
         TextColumn("{task.description}", markup=False),
@@ -33,7 +68,7 @@ def _bar(description: str, total: int) -> Iterator[Callable[[], None]]:
         TextColumn("{task.fields[left]}"),
     )
     start = time.monotonic()
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with _given_way(), Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(description, total=total, left="")
         done = 0
 
