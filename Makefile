@@ -38,7 +38,7 @@ repro: env  ## run all stages that are out of date, then print the results
 smoke: env  ## the same pipeline on small parameters, in a copy of this checkout
 	python tests/pipeline/smoke.py .geodesics/smoke
 
-bench: env  ## all planners on all queries (hours; go on after an interruption by calling it again), tables, figures
+bench: env  ## all planners on all queries (an hour or two; go on after an interruption by calling it again), tables, figures
 	geodesics params
 	dvc repro stages/dvc.yaml
 

@@ -46,7 +46,6 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "dvc params diff": (EXPERIMENT, '"dvc", "params", "diff"'),
     "dvc plots diff": (EXPERIMENT, '"dvc", "plots", "diff"'),
     "dvc repro": ("tests/pipeline/smoke.py", '"repro"'),
-    "git diff": (EXPERIMENT, '"git", "diff"'),
     "git restore": (EXPERIMENT, '"git", "restore"'),
     "git status": (EXPERIMENT, '"git", "status"'),
     "mlflow models": (REGISTRY, '"mlflow", "models", "serve"'),

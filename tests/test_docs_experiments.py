@@ -33,6 +33,11 @@ def test_every_marker_of_the_page_has_its_commands(script) -> None:
     assert sections["exp_show"].commands == ()
 
 
+def test_every_marker_of_the_page_has_its_output() -> None:
+    for name, below in re.findall(r"<!-- output: (\w+) -->\n(.*?)(?=<!-- output|\Z)", PAGE, re.S):
+        assert re.match(r"\n```text\n\S", below), name
+
+
 def test_a_record_is_of_the_commands_and_of_what_they_run_on(script) -> None:
     section, other = script.sections(PAGE)[:2]
     assert len({section.key("a"), section.key("b"), other.key("a")}) == 3

@@ -112,6 +112,8 @@ def run(section: Section) -> dict[str, str]:
         trained |= "Running stage" in said(shlex.split(command), CLONE)
     took = time.monotonic() - began
     printed = {command: said(shlex.split(command), CLONE).rstrip() for command in section.shown}
+    if silent := [command for command, text in printed.items() if not text]:
+        raise SystemExit(f"error: it prints nothing: {silent[0]}")
     return printed | ({"took": f"{took:.0f}"} if trained else {})
 
 
@@ -152,7 +154,7 @@ def filled(page: str, outputs: dict[str, dict[str, str]]) -> str:
             return found.group(0)
         printed = dict(outputs[found.group(1)])
         took = printed.pop("took", None)
-        tables = [f"```text\n{text}\n```\n" for text in printed.values() if text]
+        tables = [f"```text\n{text}\n```\n" for text in printed.values()]
         time_taken = [f"`dvc exp run` took {took} s on {os.cpu_count()} cores.\n"] if took else []
         return "\n".join([f"<!-- output: {found.group(1)} -->\n", *tables, *time_taken, "<!-- /output -->\n"])
 

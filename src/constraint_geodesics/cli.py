@@ -322,6 +322,7 @@ def replay(
     query: Annotated[int | None, typer.Option(help="Only of this query.", min=0)] = None,
     planner: Annotated[list[str] | None, typer.Option(help="Only of this planner; may be given several times.")] = None,
     scene: Annotated[str | None, typer.Option(help="Only in this scene of the benchmark.")] = None,
+    manifold: Annotated[str | None, typer.Option(help="Only of paths searched on this learned manifold.")] = None,
     seed: Annotated[list[int] | None, typer.Option(help="Only of this seed; may be given several times.")] = None,
     beside: Annotated[
         bool, typer.Option("--side-by-side", help="A view for each recording, instead of one over the other.")
@@ -337,7 +338,7 @@ def replay(
     """
     from constraint_geodesics.tracking.catalogue import Wanted, as_records
 
-    wanted = Wanted(constraint, scene, query, tuple(planner or ()), tuple(seed or ()))
+    wanted = Wanted(constraint, scene, query, tuple(planner or ()), tuple(seed or ()), manifold)
     if recordings and (as_json or wanted != Wanted()):
         words = "--json prints the list of recordings" if as_json else "--constraint, --query, ... choose from the list"
         raise SystemExit(_complain(ValueError(f"{words}: give no file"), WRONG_USAGE))
@@ -399,12 +400,15 @@ def _chosen(listed: "list[Entry]", wanted: "Wanted") -> list[Path]:
 
 
 @app.command("ui")
-def ui(port: Annotated[int, typer.Option(help="Port on 127.0.0.1.", min=1, max=65535)] = 5000) -> None:
-    """Open MLflow's dashboard for this checkout, on this machine only."""
+def ui(
+    port: Annotated[int, typer.Option(help="Port on 127.0.0.1.", min=1, max=65535)] = 5000,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the address as one JSON object.")] = False,
+) -> None:
+    """Open MLflow's dashboard for this checkout, on this machine only; it runs until it is stopped."""
     from constraint_geodesics.tracking.experiment import ui_command
 
-    command = ui_command(Path().resolve(), port)
-    print(f"http://127.0.0.1:{port}  (stop with Ctrl-C)", flush=True)
+    command, address = ui_command(Path().resolve(), port), f"http://127.0.0.1:{port}"
+    print(json.dumps({"address": address}) if as_json else f"{address}  (stop with Ctrl-C)", flush=True)
     os.execvp(command[0], command)
 
 

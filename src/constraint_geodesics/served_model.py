@@ -5,6 +5,7 @@ beside it are safetensors, whose checksums are verified.  Not to be imported: im
 """
 
 import json
+import threading
 from collections.abc import Hashable, Mapping
 from typing import Any
 
@@ -14,6 +15,7 @@ import pandas as pd
 
 from constraint_geodesics.constraints.vector import Constraint
 from constraint_geodesics.planner import Path, Planner
+from constraint_geodesics.threads import one_thread
 
 
 class ServedPlanner(mlflow.pyfunc.PythonModel):
@@ -22,10 +24,12 @@ class ServedPlanner(mlflow.pyfunc.PythonModel):
     def load_context(self, context: Any) -> None:
         """Load the planner whose files lie with the model."""
         self.planner = Planner.load(context.artifacts["planner"])
+        self.free = threading.Lock()  # the server answers on several threads, and there is one world for collisions
 
     def predict(self, context: Any, model_input: pd.DataFrame, params: dict[str, Any] | None = None) -> Any:  # noqa: ARG002
         """One answer a row, a query that has no path among them: status and explanation say why."""
-        return [self.answer(row) for row in model_input.to_dict("records")]
+        with self.free, one_thread():
+            return [self.answer(row) for row in model_input.to_dict("records")]
 
     def answer(self, row: Mapping[Hashable, Any]) -> dict[str, Any]:
         """The path's summary with its rows [rad] and their times [s]; a bad query is an answer as well."""

@@ -176,7 +176,7 @@ def two_seeds(browser: "Browser", dashboard: str) -> bytes:
 
 
 def constraints(browser: "Browser", dashboard: str) -> bytes:
-    search = "tags.stage = 'train_geodesics' and tags.item LIKE 'planner-%' and tags.child IS NULL"
+    search = "tags.stage = 'train_geodesics' and tags.manifold = 'planner' and tags.child IS NULL"
     figures = ("success_mean", "success_at_random_mean", "queries_connected", "seeds/success_std")
     columns = ["tags.`constraint`", *(f"metrics.`{name}`" for name in figures)]
     sort = {"orderByKey": columns[1], "orderByAsc": "false"}
@@ -264,12 +264,12 @@ def copied_dashboard() -> Iterator[str]:
 # Rerun
 
 
-def rerun(files: Sequence[Path], colours: Sequence[str], height: int = 800) -> Callable[["Browser", str], bytes]:
-    """The viewer with some recordings, paused on the way."""
+def rerun(files: Sequence[str | Path], colours: Sequence[str], height: int = 800) -> Callable[["Browser", str], bytes]:
+    """The viewer with some recordings, paused on the way; files: their paths, or words that choose them."""
 
     def take(browser: "Browser", dashboard: str) -> bytes:
         for file in files:
-            if not file.is_file():
+            if isinstance(file, Path) and not file.is_file():
                 raise MissingRunError(f"{file.relative_to(ROOT)}: no such recording: make repro")
         command = [sys.executable, "-m", "constraint_geodesics.cli", "replay", "--web", *map(str, files)]
         with (
@@ -289,10 +289,10 @@ def drawn(page: "Page", colour: str) -> bool:
     return int(having(scene_of(picture(page)), colour).sum()) >= CURVE_PIXELS
 
 
-LEARNED = RECORDINGS / "train_geodesics" / "planner-level_cup" / "query0-learned_geodesic-seed0.rrd"
-BIRRT = RECORDINGS / "benchmark_planners" / "level_cup_relaxed" / "query0-birrt-seed0.rrd"
-RELAXED = RECORDINGS / "train_geodesics" / "planner-level_cup_relaxed" / "query0-learned_geodesic-seed0.rrd"
+LEARNED = RECORDINGS / "train_geodesics" / "planner-level_cup" / "query1-learned_geodesic-seed0.rrd"
 EXECUTED = RECORDINGS / "execute_paths" / "level_cup" / "query0-planned-path.rrd"
+BOTH = re.findall(r"^geodesics replay (--constraint .*birrt)$", (ROOT / "README.md").read_text(), re.M)[0].split()
+"""What README tells to open."""
 
 SHOTS = {
     "mlflow_two_rewards": Shot(
@@ -321,7 +321,7 @@ SHOTS = {
     ),
     "rerun_two_recordings": Shot(
         "Rerun with a learned geodesic and BiRRT's path of one query over each other, each in its planner's colour",
-        rerun([RELAXED, BIRRT], [planner_colour("learned_geodesic"), planner_colour("birrt")]),
+        rerun(BOTH, [planner_colour("learned_geodesic"), planner_colour("birrt")]),
     ),
 }
 

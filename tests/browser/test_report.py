@@ -1,6 +1,7 @@
 """The report's page as a person sees it who has no network: on a desk, on a telephone, by day and by night."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 Opened = tuple["Page", Traffic]
-REPORT = ROOT / "reports" / "index.html"
+PAGES = [ROOT / "reports" / name for name in ("index.html", "benchmark.html")]
 DESK, TELEPHONE = {"width": 1280, "height": 900}, {"width": 390, "height": 844}
 READABLE = 4.5
 """The contrast that WCAG's level AA asks of text."""
@@ -44,20 +45,25 @@ def by(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
+@pytest.fixture(params=PAGES, ids=lambda page: page.stem)
+def report(request: pytest.FixtureRequest) -> Path:
+    return Path(request.param)
+
+
 @pytest.fixture
-def opened(browser: "Browser", by: str) -> Iterator[Opened]:
+def opened(browser: "Browser", by: str, report: Path) -> Iterator[Opened]:
     with visit(browser, viewport=DESK, color_scheme=by) as (page, traffic):
         page.context.set_offline(True)
-        page.goto(REPORT.as_uri())
+        page.goto(report.as_uri())
         page.wait_for_load_state("networkidle")
         yield page, traffic
 
 
-def test_the_page_is_whole_without_a_network(opened: Opened) -> None:
+def test_the_page_is_whole_without_a_network(opened: Opened, report: Path) -> None:
     page, traffic = opened
     assert not traffic.outside
     assert all(url.startswith(("file:", "data:")) for url in traffic.local)
-    assert {url for url in traffic.local if url.startswith("file:")} == {REPORT.as_uri()}, "it is one file"
+    assert {url for url in traffic.local if url.startswith("file:")} == {report.as_uri()}, "it is one file"
     assert not traffic.errors
     page.evaluate("document.querySelectorAll('details').forEach(part => { part.open = true; })")
     page.evaluate("Promise.all([...document.images].map(image => { image.loading = 'eager'; return image.decode(); }))")
@@ -66,9 +72,9 @@ def test_the_page_is_whole_without_a_network(opened: Opened) -> None:
     assert all(width > 0 for _, width in widths), widths
 
 
-def test_nothing_has_to_be_pushed_aside_on_a_telephone(browser: "Browser", by: str) -> None:
+def test_nothing_has_to_be_pushed_aside_on_a_telephone(browser: "Browser", by: str, report: Path) -> None:
     with visit(browser, viewport=TELEPHONE, color_scheme=by, is_mobile=True, has_touch=True) as (page, _):
-        page.goto(REPORT.as_uri())
+        page.goto(report.as_uri())
         page.evaluate("document.querySelectorAll('details').forEach(part => { part.open = true; })")
         whole, seen = page.evaluate("[document.scrollingElement.scrollWidth, document.scrollingElement.clientWidth]")
         assert whole <= seen == TELEPHONE["width"]

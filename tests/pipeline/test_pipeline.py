@@ -1,5 +1,6 @@
 """The whole pipeline, from the first configuration to the report, and what it promises about running again."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -14,6 +15,7 @@ import yaml
 from mlflow.tracking import MlflowClient
 
 from constraint_geodesics.evaluation.benchmark import read_table
+from constraint_geodesics.tracking.experiment import fetch_artifacts
 from constraint_geodesics.tracking.recording import read_recording, same_recordings
 from tests.pipeline import smoke
 
@@ -75,6 +77,36 @@ def test_recordings_replay_the_path(finished: Path) -> None:
     assert summary.has_blueprint
 
 
+def test_readme_s_replay_opens_valid_paths_of_both_planners(finished: Path) -> None:
+    (command,) = re.findall(r"^(geodesics replay --constraint .*birrt)$", (smoke.ROOT / "README.md").read_text(), re.M)
+    replay, asked = [sys.executable, "-m", "constraint_geodesics.cli", "replay"], command.split()[2:]
+    run = {"cwd": finished, "env": smoke.environment(finished), "capture_output": True, "text": True}
+    done = subprocess.run([*replay, *asked, "--save", ".geodesics/both.rrd"], **run, check=False)
+    assert done.returncode == 0, done.stderr
+    numbers = re.findall(r"(\d+) \((?:learned_geodesic|birrt)\)", done.stderr)
+    listed = subprocess.run([*replay, *asked[:4], "--json"], **run, check=True)
+    entries = {str(entry["number"]): entry for entry in json.loads(listed.stdout)["recordings"]}
+    assert [entries[number]["planner"] for number in numbers] == ["learned_geodesic", "birrt"]
+    assert entries[numbers[0]]["manifold"] == "planner"
+    for number in numbers:
+        same = [entry for entry in entries.values() if entry["planner"] == entries[number]["planner"]]
+        assert entries[number]["valid"] or not any(entry["valid"] for entry in same)
+
+
+def test_recordings_share_their_meshes(finished: Path) -> None:
+    sizes = {file: file.stat().st_size for file in (finished / "data/recordings").rglob("*.rrd")}
+    assert len(sizes) > 10
+    assert max(sizes.values()) <= 300_000
+
+
+def test_the_built_planner_is_the_registered_champion(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(finished)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    with fetch_artifacts("models:/constraint_geodesics@champion") as registered:
+        for name in ("planner.json", "manifold.safetensors", "policies.safetensors", "roadmaps.safetensors"):
+            assert (registered / name).read_bytes() == (finished / "data/planner" / name).read_bytes()
+
+
 def test_runs_are_grouped_in_mlflow(finished: Path) -> None:
     client = MlflowClient(f"sqlite:///{finished / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("constraint_geodesics")
@@ -85,6 +117,9 @@ def test_runs_are_grouped_in_mlflow(finished: Path) -> None:
     children = [run for run in runs if run.data.tags.get("mlflow.parentRunId") == parent.info.run_id]
     assert len(children) == 2
     assert "seeds/success_mean" in parent.data.metrics
+    assert parent.data.tags.items() >= {"constraint": "level_cup", "manifold": "planner"}.items()
+    assert {run.data.tags["recording"] for run in children} == {LEARNED, LEARNED.replace("seed0", "seed1")}
+    assert len(client.get_metric_history(parent.info.run_id, "seeds/saving_mean")) > 1
     assert parent.data.tags["dvc_stage"] == "train_geodesics@planner-level_cup"
     assert {run.info.status for run in runs} == {"FINISHED"}
 

@@ -228,6 +228,36 @@ def test_at_a_terminal_the_command_asks(checkout: Path) -> None:
         assert said in text
 
 
+def entry(number: int, planner: str, valid: bool, scene: str = "", query: int = 0, manifold: str = "") -> Entry:
+    return Entry(number, "slide", scene, planner, query, 0, 4.5, valid, f"{number}.rrd", manifold)
+
+
+def test_a_path_that_the_judge_accepts_is_opened_before_one_that_it_does_not() -> None:
+    """The paper's latent plane has paths of the same names, which keep no constraint."""
+    learned = [entry(1, "learned_geodesic", False, manifold="paper"), entry(2, "learned_geodesic", True)]
+    wanted = Wanted("slide", None, 0, ("learned_geodesic", "birrt"))
+    assert [e.number for e in one_of_each([*learned, entry(3, "birrt", True)], wanted)] == [2, 3]
+    assert [e.number for e in narrowed(learned, Wanted(manifold="paper"))] == [1]
+
+
+def test_a_planner_without_a_path_of_the_query_is_named() -> None:
+    entries = [entry(1, "learned_geodesic", True), entry(2, "birrt", True), entry(3, "planner", True, "table")]
+    with pytest.raises(CatalogueError, match="planner has no path of the query"):
+        one_of_each(entries, Wanted("slide", None, 0, ("learned_geodesic", "birrt", "planner")))
+
+
+def test_the_manifold_that_people_use_comes_before_the_papers(checkout: Path) -> None:
+    for manifold in ("paper", "planner"):
+        file = f"data/recordings/train_geodesics/{manifold}-slide/query0-learned_geodesic-seed0.rrd"
+        rows = [row("learned_geodesic", 0, 0, file, manifold == "planner", manifold=manifold)]
+        write_table(Path(f"reports/train_geodesics/{manifold}-slide.csv"), rows)
+        Path(file).parent.mkdir(parents=True)
+        Path(file).write_bytes(b"RRF2")
+    entries = catalogue(Path(), unread)
+    assert [e.manifold for e in entries if "-slide" in e.file] == ["planner", "paper"]
+    assert "paper" in as_table(entries)
+
+
 def test_one_command_opens_the_learned_path_over_the_sampled_one(checkout, geodesics, scene, params) -> None:
     """As README has it, saved instead of shown."""
     joints = np.linspace([0.0, -0.5, -1.0, 0.0, 0.5, 0.0], [0.3, -0.5, -1.0, 0.4, 0.5, 0.0], 5)

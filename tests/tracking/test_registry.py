@@ -9,12 +9,14 @@ import sys
 import time
 import urllib.request
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from constraint_geodesics import Planner
 from constraint_geodesics.bundle import PACKAGED
@@ -114,6 +116,9 @@ def test_a_model_has_a_signature_an_example_and_nothing_pickled(root: Path) -> N
     files = {file.name for file in model.parent.rglob("*") if file.is_file()}
     assert {"served_model.py", "input_example.json", "planner.json", "manifold.safetensors"} <= files
     assert not [name for name in files if name.endswith((".pkl", ".pickle"))]
+    needed = (model.parent / "requirements.txt").read_text().split()
+    assert f"torch=={torch.__version__.split('+')[0]}" in [line.split("+")[0] for line in needed]
+    assert not [line for line in needed if line.startswith("constraint")], "no index has it, or another's"
     for name in ("start", "goal", "constraint", "status", "joints", "times"):
         assert f'"name": "{name}"' in model.read_text()
 
@@ -121,8 +126,10 @@ def test_a_model_has_a_signature_an_example_and_nothing_pickled(root: Path) -> N
 def test_mlflow_serves_the_planner(root: Path) -> None:
     (model,) = (root / "mlartifacts").rglob("MLmodel")
     rows = [QUERY, QUERY | {"constraint": "nothing"}, QUERY | {"constraint": '{"axes": [0, 0, 0, 1, 1, 0]}'}]
-    with served(model.parent) as address:
+    with served(model.parent) as address, ThreadPoolExecutor(4) as pool:
         path, unknown, own = ask(address, rows)
+        at_once = list(pool.map(lambda _: ask(address, [QUERY])[0], range(8)))
+    assert all(answer["joints"] == path["joints"] for answer in at_once), "requests do not disturb each other"
     assert path["status"] == own["status"] == "solved"
     np.testing.assert_allclose([path["joints"][0], path["joints"][-1]], [QUERY["start"], QUERY["goal"]], atol=1e-6)
     assert len(path["times"]) == len(path["joints"]) == path["rows"]

@@ -14,7 +14,7 @@ from constraint_geodesics.paths import Layout
 RECORDINGS = PurePosixPath("data/recordings")
 FOLDERS = (RECORDINGS, PurePosixPath("first_path"))
 """Where recordings lie, relative to the checkout."""
-HEADINGS = ("#", "constraint", "scene", "planner", "query", "seed", "length [rad]", "valid", "file")
+HEADINGS = ("#", "constraint", "scene", "manifold", "planner", "query", "seed", "length [rad]", "valid", "file")
 
 
 class CatalogueError(ValueError):
@@ -38,6 +38,8 @@ class Entry:
     valid: bool | None
     file: str
     """Relative to the checkout."""
+    manifold: str = ""
+    """The learned one that the path was searched on, if it was."""
 
     @property
     def problem(self) -> tuple[str, str, int]:
@@ -54,6 +56,7 @@ class Wanted:
     query: int | None = None
     planners: tuple[str, ...] = ()
     seeds: tuple[int, ...] = ()
+    manifold: str | None = None
 
     @property
     def one_problem(self) -> bool:
@@ -97,11 +100,16 @@ def read_entry(file: Path) -> Entry:
 def _rows(layout: Layout) -> Iterator[Entry]:
     """Learned paths that keep a cup level first, then by stage."""
     reports = layout.root / "reports"
-    learned = sorted((reports / "train_geodesics").glob("*.csv"), key=lambda f: (f.name != "planner-level_cup.csv", f))
+    learned = sorted((reports / "train_geodesics").glob("*.csv"), key=_first_to_see)
     for file in (*learned, *sorted((reports / "benchmark_planners").glob("*.csv")), layout.benchmark_table,
                  *sorted((reports / "execute_paths").glob("*.csv"))):  # fmt: skip
         rows = [_entry(row, file.stem) for row in _named(file)]
         yield from sorted(rows, key=lambda entry: (*entry.problem, not entry.planner.startswith("learned")))
+
+
+def _first_to_see(table: Path) -> tuple[bool, bool, str]:
+    """Before the paper's latent plane, whose paths do not keep the constraint, comes the manifold that people use."""
+    return table.name != "planner-level_cup.csv", not table.name.startswith("planner-"), table.name
 
 
 def _named(file: Path) -> Iterator[Mapping[str, str]]:
@@ -118,7 +126,7 @@ def _entry(row: Mapping[str, str], table: str) -> Entry:
     return Entry(
         0, row.get("constraint") or table, row.get("scene", ""), row.get("planner") or row.get("kind", ""),
         int(row["query"]), int(seed) if seed else None, length if math.isfinite(length) else None,
-        valid == "True" if valid else None, within_checkout(row["recording"]),
+        valid == "True" if valid else None, within_checkout(row["recording"]), row.get("manifold", ""),
     )  # fmt: skip
 
 
@@ -137,6 +145,7 @@ def narrowed(entries: Sequence[Entry], wanted: Wanted) -> list[Entry]:
     for what, values, own in (
         ("constraint", () if wanted.constraint is None else (plain(wanted.constraint),), lambda e: plain(e.constraint)),
         ("scene", () if wanted.scene is None else (plain(wanted.scene),), lambda e: plain(e.scene)),
+        ("manifold", () if wanted.manifold is None else (plain(wanted.manifold),), lambda e: plain(e.manifold)),
         ("query", () if wanted.query is None else (str(wanted.query),), lambda e: str(e.query)),
         ("planner", tuple(plain(name) for name in wanted.planners), lambda e: plain(e.planner)),
         ("seed", tuple(str(seed) for seed in wanted.seeds), lambda e: str(e.seed)),
@@ -154,15 +163,23 @@ def narrowed(entries: Sequence[Entry], wanted: Wanted) -> list[Entry]:
 def one_of_each(entries: Sequence[Entry], wanted: Wanted) -> list[Entry]:
     """What is opened at once: the first recording of each planner that is asked for, or each of the seeds asked for.
 
-    They are taken from the one problem that most of the planners have a path of, the first such in the list.
+    They are taken from the one problem that most of the planners have a path of, the first such in the list; a path
+    that the judge accepts comes before one that it does not.
+    Raises CatalogueError if a planner has none there.
     """
     order = [plain(name) for name in wanted.planners]
     problems: dict[tuple[str, str, int], list[Entry]] = {}
     for entry in entries:
         problems.setdefault(entry.problem, []).append(entry)
     most = max(problems.values(), key=lambda own: len({plain(entry.planner) for entry in own}))
+    if missing := sorted(set(order) - {plain(entry.planner) for entry in most}):
+        where = f" in scene {most[0].scene}" if most[0].scene else ""
+        raise CatalogueError(
+            f"{missing[0]} has no path of the query that the others have{where}: queries are others in each scene; "
+            f"choose with --scene, or open files"
+        )
     firsts: dict[tuple[str, int | None], Entry] = {}
-    for entry in most:
+    for entry in sorted(most, key=lambda entry: entry.valid is False):
         firsts.setdefault((plain(entry.planner), entry.seed if wanted.seeds else None), entry)
     return sorted(firsts.values(), key=lambda entry: order.index(plain(entry.planner)))
 
@@ -194,7 +211,8 @@ def _cells(entry: Entry) -> tuple[str, ...]:
     length = "" if entry.length_rad is None else f"{entry.length_rad:.3f}"
     valid = {None: "", True: "yes", False: "no"}[entry.valid]
     numbers = ("" if value is None else str(value) for value in (entry.query, entry.seed))
-    return (str(entry.number), entry.constraint, entry.scene, entry.planner, *numbers, length, valid, entry.file)
+    about = (str(entry.number), entry.constraint, entry.scene, entry.manifold, entry.planner)
+    return (*about, *numbers, length, valid, entry.file)
 
 
 def as_records(entries: Sequence[Entry]) -> list[dict[str, object]]:

@@ -327,7 +327,9 @@ def ui_command(root: Path, port: int) -> list[str]:
     """
     uri = tracking_uri(root)
     if uri.startswith("http"):
-        raise TrackingError(f"MLFLOW_TRACKING_URI={uri}: this server shows its runs itself, open it in a browser")
+        raise TrackingError(
+            f"MLFLOW_TRACKING_URI={_without_password(uri)}: this server shows its runs itself, open it in a browser"
+        )
     database = _sqlite_file(uri)
     artifacts = _artifact_folder(database) if database else root.resolve() / "mlartifacts"
     # the job runner serves language models; without it the dashboard starts and stops in half the time
@@ -408,7 +410,11 @@ def explained(uri: str) -> Iterator[None]:
         yield
     except (mlflow_module().MlflowException, SQLAlchemyError, OSError, ImportError) as error:
         message = f"MLflow store {uri}: {' '.join(str(error).split())[:300]}"
-        raise TrackingError(re.sub(r"//[^/@]*@", "//", message)) from error  # an address may hold a password
+        raise TrackingError(_without_password(message)) from error
+
+
+def _without_password(text: str) -> str:
+    return re.sub(r"//[^/@]*@", "//", text)
 
 
 def _open_store(uri: str, experiment: str) -> tuple["MlflowClient", str]:

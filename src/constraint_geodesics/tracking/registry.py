@@ -9,8 +9,11 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+from packaging.requirements import Requirement
 
 from constraint_geodesics.tracking.experiment import (
     CHAMPION,
@@ -87,9 +90,15 @@ def saved_model(folder: Path, code: Path, example: Mapping[str, Any]) -> Iterato
         pyfunc.save_model(
             target, python_model=str(code), artifacts={FILES: str(files)},
             signature=ModelSignature(asked, answered), input_example=pd.DataFrame([dict(example)]),
-            pip_requirements=["constraint-geodesics"],
+            pip_requirements=installed_requirements(),
         )  # fmt: skip
         yield target
+
+
+def installed_requirements() -> list[str]:
+    """The packages that this one needs, as they are installed; not itself, which no index has."""
+    needed = (Requirement(text) for text in metadata.requires("constraint-geodesics") or ())
+    return [f"{each.name}=={metadata.version(each.name)}" for each in needed if not each.marker]
 
 
 def folder_digest(folder: Path) -> str:
