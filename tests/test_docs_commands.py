@@ -48,8 +48,8 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "dvc repro": ("tests/pipeline/smoke.py", '"repro"'),
     "git restore": (EXPERIMENT, '"git", "restore"'),
     "git status": (EXPERIMENT, '"git", "status"'),
-    "mlflow models": (REGISTRY, '"mlflow", "models", "serve"'),
-    "curl": (REGISTRY, "/invocations"),
+    "mlflow models": (REGISTRY, "mlflow models serve"),
+    "curl": (REGISTRY, "curl"),
     "source": ("tests/test_doctor.py", "source .venv/bin/activate"),
     "export": (REGISTRY, "MLFLOW_TRACKING_URI"),
 }

@@ -2,10 +2,12 @@
 
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 import urllib.request
 from collections.abc import Iterator
@@ -17,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tests.tracking.test_experiment import dashboard
 
 from constraint_geodesics import Planner
 from constraint_geodesics.bundle import PACKAGED
@@ -123,12 +126,15 @@ def test_a_model_has_a_signature_an_example_and_nothing_pickled(root: Path) -> N
         assert f'"name": "{name}"' in model.read_text()
 
 
-def test_mlflow_serves_the_planner(root: Path) -> None:
-    (model,) = (root / "mlartifacts").rglob("MLmodel")
-    rows = [QUERY, QUERY | {"constraint": "nothing"}, QUERY | {"constraint": '{"axes": [0, 0, 0, 1, 1, 0]}'}]
-    with served(model.parent) as address, ThreadPoolExecutor(4) as pool:
-        path, unknown, own = ask(address, rows)
-        at_once = list(pool.map(lambda _: ask(address, [QUERY])[0], range(8)))
+def test_the_champion_is_served_as_its_page_says(root: Path) -> None:
+    page = (ROOT / "docs" / "mlflow.md").read_text()
+    (serve,) = re.findall(r"^(mlflow models serve .*)$", page, re.M)
+    (body,) = re.findall(r"^curl \S+ .*? -d '(.*?)'$", page, re.M | re.S)
+    with dashboard(root) as runs, served(serve.split(), runs) as address, ThreadPoolExecutor(4) as pool:
+        (path,) = ask(address, body)
+        at_once = list(pool.map(lambda _: ask(address, body)[0], range(8)))
+        others = [QUERY | {"constraint": "nothing"}, QUERY | {"constraint": '{"axes": [0, 0, 0, 1, 1, 0]}'}]
+        unknown, own = ask(address, json.dumps({"dataframe_records": others}))
     assert all(answer["joints"] == path["joints"] for answer in at_once), "requests do not disturb each other"
     assert path["status"] == own["status"] == "solved"
     np.testing.assert_allclose([path["joints"][0], path["joints"][-1]], [QUERY["start"], QUERY["goal"]], atol=1e-6)
@@ -138,32 +144,34 @@ def test_mlflow_serves_the_planner(root: Path) -> None:
 
 
 @contextmanager
-def served(model: Path) -> Iterator[str]:
+def served(command: list[str], runs: str) -> Iterator[str]:
+    """What a command serves, on a free port; runs: the address of the dashboard."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    command = [sys.executable, "-m", "mlflow", "models", "serve", "-m", str(model), "--env-manager", "local"]
-    command += ["--host", "127.0.0.1", "--port", str(port)]
-    environment = {**os.environ, "MLFLOW_DISABLE_TELEMETRY": "true", "PATH": f"{Path(sys.executable).parent}:/usr/bin"}
-    log = (model.parent / "serve.log").open("w")
-    server = subprocess.Popen(command, stdout=log, stderr=log, env=environment, start_new_session=True)
-    try:
-        deadline = time.monotonic() + 90
-        while time.monotonic() < deadline and server.poll() is None:
-            try:
-                urllib.request.urlopen(f"http://127.0.0.1:{port}/ping")
-                break
-            except OSError:
-                time.sleep(0.2)
-        yield f"http://127.0.0.1:{port}"
-    finally:
-        os.killpg(server.pid, 15)
-        server.wait(20)
-        log.close()
+    assert command[command.index("--host") + 1] == "127.0.0.1"
+    command[command.index("--port") + 1] = str(port)
+    environment = {
+        **os.environ, "MLFLOW_TRACKING_URI": runs, "MLFLOW_DISABLE_TELEMETRY": "true",
+        "PATH": f"{Path(sys.executable).parent}:/usr/bin",
+    }  # fmt: skip
+    with tempfile.TemporaryFile() as log:
+        server = subprocess.Popen(command, stdout=log, stderr=log, env=environment, start_new_session=True)
+        try:
+            deadline = time.monotonic() + 90
+            while time.monotonic() < deadline and server.poll() is None:
+                try:
+                    urllib.request.urlopen(f"http://127.0.0.1:{port}/ping")
+                    break
+                except OSError:
+                    time.sleep(0.2)
+            yield f"http://127.0.0.1:{port}"
+        finally:
+            os.killpg(server.pid, 15)
+            server.wait(20)
 
 
-def ask(address: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    body = json.dumps({"dataframe_records": rows}).encode()
-    request = urllib.request.Request(f"{address}/invocations", body, {"Content-Type": "application/json"})
+def ask(address: str, body: str) -> list[dict[str, Any]]:
+    request = urllib.request.Request(f"{address}/invocations", body.encode(), {"Content-Type": "application/json"})
     answer: list[dict[str, Any]] = json.loads(urllib.request.urlopen(request, timeout=120).read())["predictions"]
     return answer
