@@ -42,7 +42,6 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "dvc exp run": (EXPERIMENT, '"dvc", "exp", "run"'),
     "dvc exp show": (EXPERIMENT, '"dvc", "exp", "show"'),
     "dvc metrics diff": (EXPERIMENT, '"dvc", "metrics", "diff"'),
-    "dvc metrics show": (EXPERIMENT, '"dvc", "metrics", "show"'),
     "dvc params diff": (EXPERIMENT, '"dvc", "params", "diff"'),
     "dvc plots diff": (EXPERIMENT, '"dvc", "plots", "diff"'),
     "dvc repro": ("tests/pipeline/smoke.py", '"repro"'),

@@ -70,7 +70,6 @@ def test_an_experiment_is_run_compared_brought_back_and_undone(committed: Path) 
     assert after != before
     assert "geodesics.reward.form" in ran(committed, of_the_page("dvc", "params", "diff"))
     assert "mean_ratio_mean" in ran(committed, of_the_page("dvc", "metrics", "diff", holding="sphere"))
-    ran(committed, [*of_the_page("dvc", "metrics", "show"), REPORT])
     assert NAME in ran(committed, of_the_page("dvc", "exp", "show"))
     assert "geodesics.reward.form" in ran(committed, of_the_page("dvc", "exp", "diff"))
     ran(committed, of_the_page("dvc", "plots", "diff"))
