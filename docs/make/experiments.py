@@ -154,7 +154,7 @@ def filled(page: str, outputs: dict[str, dict[str, str]]) -> str:
             return found.group(0)
         printed = dict(outputs[found.group(1)])
         took = printed.pop("took", None)
-        tables = [f"```text\n{text}\n```\n" for text in printed.values()]
+        tables = [f"```text\n{text}\n```\n" for text in printed.values() if text]
         time_taken = [f"`dvc exp run` took {took} s on {os.cpu_count()} cores.\n"] if took else []
         return "\n".join([f"<!-- output: {found.group(1)} -->\n", *tables, *time_taken, "<!-- /output -->\n"])
 

@@ -236,15 +236,17 @@ def own_form() -> str:
 
 
 def keep_newest(dashboard: str, form: str | None = None) -> None:
-    """Remove from the copy what repeats a newer run, and (form given) what has another form of the reward."""
+    """Remove from the copy what repeats another run, those of the pipeline before those of an experiment and newer
+    before older ones, and (form given) experiments and what has another form of the reward.
+    """
     found = runs_found(dashboard, "tags.stage = 'train_geodesics'")
     forms = {run["info"]["run_id"]: form_of(run) for run in found}
     seen = set()
-    for run in found:
+    for run in sorted(found, key=lambda run: "dvc_experiment" in tags_of(run)):
         tags, name = tags_of(run), run["info"]["run_id"]
         own = forms[name] or forms.get(tags.get("mlflow.parentRunId", ""))  # children of old runs do not say it
         key = (tags["item"], tags.get("child"), own)
-        if key in seen or form not in (None, own):
+        if key in seen or (form is not None and (form != own or "dvc_experiment" in tags)):
             asked(dashboard, "runs/delete", {"run_id": name})
         seen.add(key)
 
