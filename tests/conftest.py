@@ -14,8 +14,15 @@ from constraint_geodesics.learning.training import train_manifold
 from constraint_geodesics.params import Params, load_params
 from constraint_geodesics.robot.bullet import Box, data_path
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
+from tests.kernels import compile_kernels
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Before several workers start."""
+    if getattr(session.config.option, "numprocesses", None):
+        compile_kernels()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

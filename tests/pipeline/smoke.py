@@ -38,6 +38,7 @@ SMALL: dict[str, Any] = {
     "plans": {"queries": 3, "seeds": [0], "peers": ["birrt"], "starts": 4, "batch": 4},
     "execution": {"queries": 1, "spheres": 4},
     "benchmark": {"seeds": [0], "rrt_star_iterations": 40, "prm_iterations": 50},
+    "recording": {"queries": 2},
     "bench": {"queries": 2},
 }
 QUICK: dict[str, Any] = {
