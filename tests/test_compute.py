@@ -214,18 +214,24 @@ def test_progress_in_a_log_is_a_line_a_quarter(
     assert capfd.readouterr().err == ""
 
 
-def test_progress_on_a_terminal_is_a_bar() -> None:
-    program = (
-        "from constraint_geodesics.compute import parallel_map\n"
-        "from constraint_geodesics.params import ComputeParams\n"
-        "parallel_map(abs, [1, 2], ComputeParams(backend='loky', workers=1), description='label [free]')\n"
-    )
+def on_a_terminal(program: str) -> str:
+    """What a program's standard error shows on a terminal."""
     ours, theirs = pty.openpty()
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
     subprocess.run([sys.executable, "-c", program], stderr=theirs, env=environment, check=True)
     os.close(theirs)
     shown = os.read(ours, 100_000).decode()
     os.close(ours)
+    return shown
+
+
+def test_progress_on_a_terminal_is_a_bar() -> None:
+    program = (
+        "from constraint_geodesics.compute import parallel_map\n"
+        "from constraint_geodesics.params import ComputeParams\n"
+        "parallel_map(abs, [1, 2], ComputeParams(backend='loky', workers=1), description='label [free]')\n"
+    )
+    shown = on_a_terminal(program)
     assert "label [free]" in shown
     assert "━" in shown
     assert "2/2" in shown
@@ -241,12 +247,7 @@ def test_waiting_is_seen_on_a_terminal_alone(capfd: pytest.CaptureFixture[str]) 
         "    with progress('a bar within', 2) as advance:\n"
         "        advance(); advance()\n"
     )
-    ours, theirs = pty.openpty()
-    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
-    subprocess.run([sys.executable, "-c", program], stderr=theirs, env=environment, check=True)
-    os.close(theirs)
-    shown = os.read(ours, 100_000).decode()
-    os.close(ours)
+    shown = on_a_terminal(program)
     assert "loading [it]" in shown
     before, bar = shown.split("a bar within", 1)
     assert "loading [it]" in before
