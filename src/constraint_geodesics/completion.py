@@ -10,8 +10,6 @@ from typing import Any
 from click import Context, Parameter
 from click.shell_completion import CompletionItem
 
-from constraint_geodesics.tracking.catalogue import FOLDERS
-
 PIPELINE = Path("data") / "planner" / "planner.json"
 PACKAGED = Path(__file__).parent / "pretrained" / "planner.json"
 
@@ -40,7 +38,7 @@ def benchmarked_planners(context: Context, parameter: Parameter, incomplete: str
 def recordings(context: Context, parameter: Parameter, incomplete: str) -> list[CompletionItem]:
     """Recordings of this checkout, and those in the folder that the word names."""
     del context, parameter
-    made = [str(file) for folder in FOLDERS for file in sorted(Path(folder).rglob("*.rrd"))]
+    made = [str(file) for folder in ("data/recordings", "first_path") for file in sorted(Path(folder).rglob("*.rrd"))]
     folder = incomplete[: incomplete.rfind("/") + 1]
     near = [folder + file.name for file in sorted(Path(folder or ".").glob("*.rrd"))]
     return _items(dict.fromkeys([*made, *near], ""), incomplete)

@@ -3,6 +3,15 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+RECORDINGS = "data/recordings"
+"""Where the stages' recordings lie, relative to the checkout."""
+
+
+def in_checkout(recording: str) -> str:
+    """Where a recording lies in any checkout: a table may have come from another folder, with that one's name."""
+    before, found, after = recording.partition(f"{RECORDINGS}/")
+    return found + after if found else before
+
 
 @dataclass(frozen=True)
 class Layout:

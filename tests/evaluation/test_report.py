@@ -16,7 +16,7 @@ from tests.evaluation.plan_fixtures import write_plan_reports
 
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.constraints.submanifold import extract, save_submanifold, submanifold_figures
-from constraint_geodesics.evaluation.blocks import Recorded, in_checkout
+from constraint_geodesics.evaluation.blocks import Recorded
 from constraint_geodesics.evaluation.figures import PLANNERS
 from constraint_geodesics.evaluation.report import write_report
 from constraint_geodesics.evaluation.report_figures import latent_curves
@@ -36,7 +36,7 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.vae import JointVae
 from constraint_geodesics.palette import planner_colour
 from constraint_geodesics.params import load_params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.paths import Layout, in_checkout
 
 CONSTRAINTS, SEEDS, QUERIES = ("free", "level_cup", "slide"), (0, 1), 3
 HELD_OUT = {"joint_error_mean_deg": 12.5, "tool_error_median_mm": 233.0, "deviation_median_deg": 1.0}

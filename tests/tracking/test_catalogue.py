@@ -15,6 +15,7 @@ from tests.test_cli_plan import COMMAND, called, strict
 
 from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.params import Params
+from constraint_geodesics.paths import in_checkout
 from constraint_geodesics.tracking.catalogue import (
     CatalogueError,
     Entry,
@@ -26,7 +27,6 @@ from constraint_geodesics.tracking.catalogue import (
     one_of_each,
     plain,
     read_entry,
-    within_checkout,
 )
 from constraint_geodesics.tracking.recording import PathRecord, record_path
 
@@ -165,8 +165,8 @@ def test_names_and_places() -> None:
         "rrt_star_1_s",
         "rrt_star",
     ]
-    assert within_checkout("/a/b/data/recordings/x/y.rrd") == "data/recordings/x/y.rrd"
-    assert within_checkout("elsewhere/y.rrd") == "elsewhere/y.rrd"
+    assert in_checkout("/a/b/data/recordings/x/y.rrd") == "data/recordings/x/y.rrd"
+    assert in_checkout("elsewhere/y.rrd") == "elsewhere/y.rrd"
 
 
 def test_the_command_prints_the_list_and_its_json(checkout, geodesics) -> None:

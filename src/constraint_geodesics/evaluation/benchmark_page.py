@@ -21,11 +21,11 @@ from constraint_geodesics.evaluation.benchmark_report import (
     table_i_cells,
     verdict_cells,
 )
-from constraint_geodesics.evaluation.blocks import Block, Look, Recorded, in_checkout
+from constraint_geodesics.evaluation.blocks import Block, Look, Recorded
 from constraint_geodesics.evaluation.page import Picture, Section, write_page
 from constraint_geodesics.evaluation.results import ReportError, fixed
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.paths import Layout, in_checkout
 
 Case = tuple[str, str, str]
 """Constraint, scene and planner."""

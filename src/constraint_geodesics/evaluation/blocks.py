@@ -11,7 +11,6 @@ DASHBOARD = "http://127.0.0.1:5000"
 """Where `make ui` shows the runs, on this machine alone."""
 EXPERIMENT = 1
 """MLflow's number of the pipeline's experiment: the first in a new store, behind MLflow's own 0."""
-RECORDINGS = "data/recordings/"
 
 
 @dataclass(frozen=True)
@@ -90,9 +89,3 @@ def runs_link(stage: str, item: str) -> str:
     compared = "LIKE" if "%" in item else "="
     wanted = f"tags.stage = '{stage}' and tags.item {compared} '{item}'"
     return f"{DASHBOARD}/#/experiments/{EXPERIMENT}/runs?searchFilter={quote(wanted, safe='')}"
-
-
-def in_checkout(recording: str) -> str:
-    """Where a recording lies in any checkout: a table may have come from another folder, with that one's name."""
-    before, found, after = recording.partition(RECORDINGS)
-    return found + after if found else before

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from constraint_geodesics.evaluation.blocks import Block, Look, Recorded, in_checkout, runs_link
+from constraint_geodesics.evaluation.blocks import Block, Look, Recorded, runs_link
 from constraint_geodesics.evaluation.figures import PLANNERS
 from constraint_geodesics.evaluation.plan_benchmark import BAND_AFTER, MULTI_START, PARTS, TANGENT
 from constraint_geodesics.evaluation.policy_benchmark import DESCENT, ONE_SEED, POLICIES, RANDOM, SEPARATE, STRAIGHT
 from constraint_geodesics.evaluation.policy_tasks import JOINTS, LEARNED
 from constraint_geodesics.evaluation.results import markdown_table, read_metrics, short
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.paths import Layout, in_checkout
 
 PLAN_COLUMNS = (
     "planner", "solved", "claimed, not valid", "length / best known, median", "p95", "p95, failures as ∞",

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from constraint_geodesics.evaluation.blocks import Block, Look, Recorded, in_checkout, runs_link
+from constraint_geodesics.evaluation.blocks import Block, Look, Recorded, runs_link
 from constraint_geodesics.evaluation.figures import PLANNERS, VARIANTS
 from constraint_geodesics.evaluation.results import (
     COLUMNS,
@@ -22,7 +22,7 @@ from constraint_geodesics.evaluation.results import (
     table_cells,
 )
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.paths import Layout, in_checkout
 
 PUBLISHED = {
     "prm": (499.42, 530.89, 24.43, 9.75, 1.53),

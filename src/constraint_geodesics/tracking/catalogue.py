@@ -7,12 +7,11 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.paths import RECORDINGS, Layout, in_checkout
 
-RECORDINGS = PurePosixPath("data/recordings")
-FOLDERS = (RECORDINGS, PurePosixPath("first_path"))
+FOLDERS = (RECORDINGS, "first_path")
 """Where recordings lie, relative to the checkout."""
 HEADINGS = ("#", "constraint", "scene", "manifold", "planner", "query", "seed", "length [rad]", "valid", "file")
 
@@ -126,17 +125,8 @@ def _entry(row: Mapping[str, str], table: str) -> Entry:
     return Entry(
         0, row.get("constraint") or table, row.get("scene", ""), row.get("planner") or row.get("kind", ""),
         int(row["query"]), int(seed) if seed else None, length if math.isfinite(length) else None,
-        valid == "True" if valid else None, within_checkout(row["recording"]), row.get("manifold", ""),
+        valid == "True" if valid else None, in_checkout(row["recording"]), row.get("manifold", ""),
     )  # fmt: skip
-
-
-def within_checkout(recording: str) -> str:
-    """A recording as it is called in this checkout, though its row was written in another one by its whole path."""
-    parts = PurePosixPath(recording).parts
-    for k in range(len(parts) - 1):
-        if PurePosixPath(*parts[k : k + 2]) == RECORDINGS:
-            return PurePosixPath(*parts[k:]).as_posix()
-    return recording
 
 
 def narrowed(entries: Sequence[Entry], wanted: Wanted) -> list[Entry]:
