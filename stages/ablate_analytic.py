@@ -1,14 +1,21 @@
-"""Stage: policy search where the answer is known, with the reward as printed and with other curve families."""
+"""Stage: policy search where the answer is known, with the reward as printed and with other curve
+families.
+"""
 
 import shutil
 import sys
 
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.compute import parallel_map
-from constraint_geodesics.evaluation.ablation import by_variant, family_ratios, policy_variants, variant_task
-from constraint_geodesics.evaluation.analytic_search import run_analytic
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.studies.ablation import (
+    by_variant,
+    family_ratios,
+    policy_variants,
+    variant_task,
+)
+from constraint_geodesics.studies.analytic_search import run_analytic
 from constraint_geodesics.tracking.experiment import tracked_stage
 
 STAGE = "ablate_analytic"
@@ -17,20 +24,32 @@ STAGE = "ablate_analytic"
 def main(params: Params, layout: Layout, analytic: str) -> None:
     """Write reports/ablate_analytic/<analytic>.json."""
     settings = params.geodesics.model_copy(update={"steps": params.geodesics.analytic_steps})
-    with tracked_stage(STAGE, analytic, settings, [], experiment=params.tracking.experiment, root=layout.root) as run:
-        cases = [(variant, seed) for variant in policy_variants(settings) for seed in settings.seeds]
+    with tracked_stage(
+        STAGE, analytic, settings, [], experiment=params.tracking.experiment, root=layout.root
+    ) as run:
+        cases = [
+            (variant, seed) for variant in policy_variants(settings) for seed in settings.seeds
+        ]
         tasks = [
             variant_task(
-                analytic, variant, settings, seed, layout.scratch(STAGE, f"{analytic}-{variant}-{seed}"),
+                analytic,
+                variant,
+                settings,
+                seed,
+                layout.scratch(STAGE, f"{analytic}-{variant}-{seed}"),
                 run.child(f"{variant}, seed {seed}", {"variant": variant, "seed": seed}),
             )
             for variant, seed in cases
-        ]  # fmt: skip
-        results = parallel_map(run_analytic, tasks, params.compute, description=f"ablation {analytic}")
+        ]
+        results = parallel_map(
+            run_analytic, tasks, params.compute, description=f"ablation {analytic}"
+        )
         ratios: dict[str, list[float]] = {}
         for (variant, _), result in zip(cases, results, strict=True):
             ratios.setdefault(variant, []).append(result.figures()["mean_ratio"])
-        run.report(by_variant(ratios, family_ratios(analytic, settings)), layout.report(STAGE, analytic))
+        run.report(
+            by_variant(ratios, family_ratios(analytic, settings)), layout.report(STAGE, analytic)
+        )
         for task in tasks:  # finished: the next run of this stage starts from nothing
             shutil.rmtree(task.scratch, ignore_errors=True)
 

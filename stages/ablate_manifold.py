@@ -1,14 +1,16 @@
-"""Stage: geodesics on a learned manifold with other curve families, and without the variance term of its metric."""
+"""Stage: geodesics on a learned manifold with other curve families, and without the variance term
+of its metric.
+"""
 
 import sys
 
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.constraints.scene import Scene
-from constraint_geodesics.evaluation.ablation import LearnedAblation
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.studies.ablation import LearnedAblation
 from constraint_geodesics.tracking.experiment import tracked_stage
 
 STAGE = "ablate_manifold"
@@ -19,13 +21,20 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
     source = layout.joints("free")
     with (
         tracked_stage(
-            STAGE, manifold, params.geodesics, [source], experiment=params.tracking.experiment, root=layout.root
+            STAGE,
+            manifold,
+            params.geodesics,
+            [source],
+            experiment=params.tracking.experiment,
+            root=layout.root,
         ) as run,
         Scene.from_params(params).world() as world,
     ):
         chart = LearnedManifold.load(layout.manifold(manifold))
         joints = read_joints(source).free_joints
-        ablation = LearnedAblation(chart, joints, params.geodesics, params.geometry.pairs, world.free)
+        ablation = LearnedAblation(
+            chart, joints, params.geodesics, params.geometry.pairs, world.free
+        )
         run.report(ablation.figures(), layout.report(STAGE, manifold))
 
 

@@ -5,15 +5,15 @@ import sys
 from dataclasses import replace
 
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.constraints.scene import Scene
-from constraint_geodesics.evaluation.geodesic_search import geodesic_problem, write_table
-from constraint_geodesics.evaluation.geometry_benchmark import GeometryBenchmark, policy_search_figures
 from constraint_geodesics.geodesics.policy_search import load_policy
 from constraint_geodesics.geodesics.problem import ChartProblem, Samples
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.studies.geodesic_search import geodesic_problem, write_table
+from constraint_geodesics.studies.geometry import GeometryBenchmark, policy_search_figures
 from constraint_geodesics.tracking.experiment import tracked_stage
 
 STAGE = "benchmark_geometry"
@@ -24,19 +24,30 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     sources = [layout.joints("free"), layout.joints(constraint)]
     chart, settings = LearnedManifold.load(layout.manifold(manifold)), params.geodesics
     constrained = Scene.from_params(params).manifold(params.constraints[constraint])
-    searched = geodesic_problem(params, chart, constrained, read_joints(sources[1]).free_joints, manifold)
+    searched = geodesic_problem(
+        params, chart, constrained, read_joints(sources[1]).free_joints, manifold
+    )
     retracted = replace(searched, retract=True)
-    plain = ChartProblem(chart, retracted.curve, Samples(chart.encode(read_joints(sources[0]).free_joints)))
+    plain = ChartProblem(
+        chart, retracted.curve, Samples(chart.encode(read_joints(sources[0]).free_joints))
+    )
     names = [str(name) for name in settings.analytic]
     with tracked_stage(
         STAGE, manifold, settings, sources, experiment=params.tracking.experiment, root=layout.root
     ) as run:
         benchmark = GeometryBenchmark(plain, retracted, settings, params.geometry)
-        figures = benchmark.figures({name: load_policy(layout.analytic(name), settings.seeds[0]) for name in names})
-        trained = {name: json.loads(layout.report("train_analytic", name).read_text()) for name in names}
+        figures = benchmark.figures(
+            {name: load_policy(layout.analytic(name), settings.seeds[0]) for name in names}
+        )
+        trained = {
+            name: json.loads(layout.report("train_analytic", name).read_text()) for name in names
+        }
         figures["policy_search"] = policy_search_figures(trained)
         write_table(benchmark.quadrature_rows(), layout.report(STAGE, "quadrature", "csv"))
-        run.report({"manifold": manifold, "constraint": constraint, **figures}, layout.root / "reports/geometry.json")
+        run.report(
+            {"manifold": manifold, "constraint": constraint, **figures},
+            layout.root / "reports/geometry.json",
+        )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
-"""Stage: the benchmark's page that opens offline, from the tables and figures of the stages before it."""
+"""Stage: the benchmark's page that opens offline, from the tables and figures of the stages before
+it.
+"""
 
 import sys
 
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.evaluation.benchmark_page import write_benchmark_page
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.report.benchmark_page import write_benchmark_page
 
 
 def main(params: Params, layout: Layout) -> None:

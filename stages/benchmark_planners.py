@@ -2,18 +2,22 @@
 
 import sys
 
+from constraint_geodesics.benchmark.planner_benchmark import (
+    PlannerTask,
+    planner_figures,
+    run_planner,
+)
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.compute import parallel_map
-from constraint_geodesics.constraints.scene import Scene
-from constraint_geodesics.constraints.submanifold import load_submanifold
-from constraint_geodesics.evaluation.geodesic_search import write_table
-from constraint_geodesics.evaluation.planner_benchmark import PlannerTask, planner_figures, run_planner
 from constraint_geodesics.learning.dataset import read_queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.learning.submanifold import load_submanifold
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.recording.replay import record_rows, save_paths
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.studies.geodesic_search import write_table
 from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
-from constraint_geodesics.tracking.replay import record_rows, save_paths
 
 STAGE = "benchmark_planners"
 
@@ -27,21 +31,36 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     queries, shown = read_queries(source), params.geodesics.searched[0]
     about = subject_of(params, constraint=constraint)
     with tracked_stage(
-        STAGE, constraint, settings, [source], experiment=params.tracking.experiment, root=layout.root, subject=about
+        STAGE,
+        constraint,
+        settings,
+        [source],
+        experiment=params.tracking.experiment,
+        root=layout.root,
+        subject=about,
     ) as run:
         tasks = [
             PlannerTask(planner, seed, scene, manifold, charts, queries, settings, params.judge)
             for planner in settings.planners
             for seed in settings.seeds
         ]
-        results = parallel_map(run_planner, tasks, params.compute, description=f"planners {constraint}")
+        results = parallel_map(
+            run_planner, tasks, params.compute, description=f"planners {constraint}"
+        )
         rows = [row for result in results for row in result.rows]
         paths = [path for result in results for path in result.paths]
         save_paths(rows, paths, layout.benchmark(constraint))
         rows = record_rows(
-            layout.recordings(STAGE, constraint), rows, paths, constraint, charts[shown], manifold,
-            load_submanifold(layout.submanifold(shown, constraint)), scene.workcell, params.recording,
-        )  # fmt: skip
+            layout.recordings(STAGE, constraint),
+            rows,
+            paths,
+            constraint,
+            charts[shown],
+            manifold,
+            load_submanifold(layout.submanifold(shown, constraint)),
+            scene.workcell,
+            params.recording,
+        )
         run.recordings(rows)
         write_table(rows, layout.report(STAGE, constraint, "csv"), constraint=constraint)
         run.report(planner_figures(results), layout.report(STAGE, constraint))

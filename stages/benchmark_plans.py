@@ -1,39 +1,48 @@
-"""Stage: the planner, its parts and its peers on queries that no training saw, unseen constraints among them."""
+"""Stage: the planner, its parts and its peers on queries that no training saw, unseen constraints
+among them.
+"""
 
 import sys
 
 import pandas as pd
 
-from constraint_geodesics.bundle import read_bundle
-from constraint_geodesics.cli import run_stage
-from constraint_geodesics.constraints.scene import constraint_from
-from constraint_geodesics.constraints.vector import ConstraintManifold
-from constraint_geodesics.evaluation.machine import machine
-from constraint_geodesics.evaluation.plan_benchmark import (
+from constraint_geodesics.benchmark.plan_benchmark import (
     batch_rate,
     figures_of,
     plan_rows,
     plan_table,
     save_arrays,
 )
+from constraint_geodesics.bundle import read_bundle
+from constraint_geodesics.cli import run_stage
+from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.learning.dataset import draw_queries, write_queries
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.planner import Planner
+from constraint_geodesics.scene.scene import constraint_from
 from constraint_geodesics.tracking.experiment import tracked_stage
 
 STAGE = "benchmark_plans"
 
 
 def main(params: Params, layout: Layout) -> None:
-    """Write data/plans/ (queries and valid paths), the rows of each constraint and the figures of all."""
+    """Write data/plans/ (queries and valid paths), the rows of each constraint and the figures of
+    all.
+    """
     settings, tables, batches = params.plans, [], {}
     layout.report(STAGE, "plans").parent.mkdir(parents=True, exist_ok=True)
     names = [settings.constraint, *settings.unseen]
     described = {**params.constraints, **settings.unseen}
     with (
         tracked_stage(
-            STAGE, settings.constraint, settings, [], experiment=params.tracking.experiment, root=layout.root
+            STAGE,
+            settings.constraint,
+            settings,
+            [],
+            experiment=params.tracking.experiment,
+            root=layout.root,
         ) as run,
         Planner(read_bundle(layout.planner), "the pipeline's outputs") as planner,
     ):

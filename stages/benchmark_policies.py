@@ -1,17 +1,19 @@
-"""Stage: what policies propose, against straight line, descent, random curves and the best of their family."""
+"""Stage: what policies propose, against straight line, descent, random curves and the best of their
+family.
+"""
 
 import sys
 
 import pandas as pd
 
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.compute import parallel_map
-from constraint_geodesics.constraints.scene import Scene
-from constraint_geodesics.evaluation.policy_benchmark import policy_table
-from constraint_geodesics.evaluation.policy_tasks import PolicyTask, policy_figures, run_policies
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.studies.policy_benchmark import policy_table
+from constraint_geodesics.studies.policy_tasks import PolicyTask, policy_figures, run_policies
 from constraint_geodesics.tracking.experiment import tracked_stage
 
 STAGE = "benchmark_policies"
@@ -25,16 +27,32 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
     shared = [layout.policies(manifold)]
     tasks = [
         PolicyTask(
-            name, scene, scene.manifold(constraint), chart, params.policy_settings(), layout.policies(manifold),
-            layout.geodesics(manifold, name) if name in seen else None, params.plans.queries, params.plans.seed,
+            name,
+            scene,
+            scene.manifold(constraint),
+            chart,
+            params.policy_settings(),
+            layout.policies(manifold),
+            layout.geodesics(manifold, name) if name in seen else None,
+            params.plans.queries,
+            params.plans.seed,
         )
         for name, constraint in described.items()
-    ]  # fmt: skip
+    ]
     with tracked_stage(
-        STAGE, manifold, params.policies, shared, experiment=params.tracking.experiment, root=layout.root
+        STAGE,
+        manifold,
+        params.policies,
+        shared,
+        experiment=params.tracking.experiment,
+        root=layout.root,
     ) as run:
-        rows = parallel_map(run_policies, tasks, params.compute, description=f"policies' proposals {manifold}")
-        table = pd.concat([policy_table(r).assign(constraint=t.name) for t, r in zip(tasks, rows, strict=True)])
+        rows = parallel_map(
+            run_policies, tasks, params.compute, description=f"policies' proposals {manifold}"
+        )
+        table = pd.concat(
+            [policy_table(r).assign(constraint=t.name) for t, r in zip(tasks, rows, strict=True)]
+        )
         for task, own in zip(tasks, rows, strict=True):
             file = layout.report(STAGE, f"{manifold}-{task.name}", "csv")
             file.parent.mkdir(parents=True, exist_ok=True)

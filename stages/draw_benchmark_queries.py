@@ -5,31 +5,38 @@ import sys
 import numpy as np
 from jaxtyping import Float
 
+from constraint_geodesics.benchmark.judge import judge_limits
+from constraint_geodesics.benchmark.queries import draw_cases
+from constraint_geodesics.benchmark.runner import write_cases
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.constraints.scene import Scene
-from constraint_geodesics.evaluation.benchmark import write_cases
-from constraint_geodesics.evaluation.benchmark_queries import draw_cases
-from constraint_geodesics.evaluation.metrics import judge_limits
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
-from constraint_geodesics.peers import PeerBuilder
-from constraint_geodesics.planners.path_planner import PlanningProblem
-from constraint_geodesics.robot.clearance import clearance_model
+from constraint_geodesics.peers.registry import PeerBuilder
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.problem import PlanningProblem
+from constraint_geodesics.scene.clearance import clearance_model
+from constraint_geodesics.scene.scene import Scene
 
 
 def main(params: Params, layout: Layout, constraint: str) -> None:
-    """Write data/benchmark_queries/<constraint>.csv: spheres stand on the shortest path of several planners."""
+    """Write data/benchmark_queries/<constraint>.csv: spheres stand on the shortest path of several
+    planners.
+    """
     settings, scene = params.bench, Scene.from_params(params)
     manifold = scene.manifold(params.constraints[constraint])
     with (
-        PeerBuilder(params, layout.root)(settings.placed_by, scene, constraint, manifold) as (planners, _),
+        PeerBuilder(params, layout.root)(settings.placed_by, scene, constraint, manifold) as (
+            planners,
+            _,
+        ),
         Certifier(scene, judge_limits(params.judge)) as certifier,
         scene.world() as world,
     ):
         clearance = clearance_model(scene.robot, scene.workcell)
 
-        def plan(start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]) -> Float[np.ndarray, "T D"]:
+        def plan(
+            start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]
+        ) -> Float[np.ndarray, "T D"]:
             problem = PlanningProblem(start, goal, manifold, world.is_free, clearance)
             shortest, length = np.empty((0, len(start))), np.inf
             for planner in planners.values():
@@ -41,7 +48,9 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
                     shortest, length = joints, certificate.length_rad
             return shortest
 
-        cases = draw_cases(scene, manifold, constraint, settings.queries, settings.radius_m, plan, settings.seed)
+        cases = draw_cases(
+            scene, manifold, constraint, settings.queries, settings.radius_m, plan, settings.seed
+        )
     write_cases(cases, layout.benchmark_queries(constraint))
 
 

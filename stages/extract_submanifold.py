@@ -1,14 +1,16 @@
-"""Stage: find the part of one learned manifold on which one constraint holds; the manifold is used as it is."""
+"""Stage: find the part of one learned manifold on which one constraint holds; the manifold is used
+as it is.
+"""
 
 import sys
 
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.constraints.scene import Scene
-from constraint_geodesics.constraints.submanifold import extract, save_submanifold, submanifold_figures
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.learning.submanifold import extract, save_submanifold, submanifold_figures
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 
 STAGE = "extract_submanifold"
@@ -37,7 +39,9 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         free, on_constraint = (read_joints(source).free_joints for source in sources)
         found = extract(chart, constrained, free, on_constraint, world.free, params.submanifold)
         save_submanifold(found, layout.submanifold(manifold, constraint))
-        figures = submanifold_figures(found, chart, constrained, free, on_constraint, params.submanifold)
+        figures = submanifold_figures(
+            found, chart, constrained, free, on_constraint, params.submanifold
+        )
         run.report(figures, layout.report(STAGE, item))
 
 

@@ -1,10 +1,10 @@
-"""Stage: draw the configurations of one constraint, label them with PyBullet, and draw its queries."""
+"""Stage: draw the configurations of one constraint, label them with PyBullet, and draw its
+queries.
+"""
 
 import sys
 
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.compute import parallel_map
-from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.learning.dataset import (
     data_card,
     draw_queries,
@@ -14,7 +14,9 @@ from constraint_geodesics.learning.dataset import (
     write_queries,
 )
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 
 STAGE = "label_joints"
@@ -26,14 +28,30 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     manifold = scene.manifold(params.constraints[constraint])
     labels = params.labels
     rows = labels.free_rows if constraint == "free" else labels.constrained_rows
-    settings, about = {"rows": rows, "labels": labels.model_dump()}, subject_of(params, constraint=constraint)
+    settings, about = (
+        {"rows": rows, "labels": labels.model_dump()},
+        subject_of(params, constraint=constraint),
+    )
     with tracked_stage(
-        STAGE, constraint, settings, [], experiment=params.tracking.experiment, root=layout.root, subject=about
+        STAGE,
+        constraint,
+        settings,
+        [],
+        experiment=params.tracking.experiment,
+        root=layout.root,
+        subject=about,
     ) as run:
         tasks = shard_tasks(scene, manifold, constraint, rows, labels.shard_rows, labels.seed)
         shards = parallel_map(draw_shard, tasks, params.compute, description=f"label {constraint}")
-        queries = draw_queries(scene, manifold, constraint, params.queries.count, params.queries.seed)
-        card = {"constraint": constraint, "robot": scene.robot.name, "seed": str(labels.seed), "rows": str(rows)}
+        queries = draw_queries(
+            scene, manifold, constraint, params.queries.count, params.queries.seed
+        )
+        card = {
+            "constraint": constraint,
+            "robot": scene.robot.name,
+            "seed": str(labels.seed),
+            "rows": str(rows),
+        }
         write_joints(shards, layout.joints(constraint), card)
         write_queries(queries, layout.queries(constraint))
         run.report(data_card(shards), layout.report(STAGE, constraint))

@@ -1,4 +1,6 @@
-"""Stage: how planning, curve lengths and training grow with what is asked; a few minutes on one thread."""
+"""Stage: how planning, curve lengths and training grow with what is asked; a few minutes on one
+thread.
+"""
 
 import sys
 from pathlib import Path
@@ -6,12 +8,20 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from constraint_geodesics.benchmark.runner import write_table
 from constraint_geodesics.bundle import read_bundle
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.constraints.scene import Scene, find_urdf
-from constraint_geodesics.evaluation.benchmark import write_table
-from constraint_geodesics.evaluation.figures import save_png
-from constraint_geodesics.evaluation.growth import (
+from constraint_geodesics.learning.dataset import read_joints
+from constraint_geodesics.params import Params
+from constraint_geodesics.peers.registry import PeerBuilder
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import run_header
+from constraint_geodesics.planner import Planner
+from constraint_geodesics.report.figures import save_png
+from constraint_geodesics.report.growth_figure import growth_figure
+from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
+from constraint_geodesics.scene.scene import Scene, find_urdf
+from constraint_geodesics.studies.growth import (
     CONSTRAINT,
     BandAndTrees,
     GrowthSizes,
@@ -20,14 +30,6 @@ from constraint_geodesics.evaluation.growth import (
     slopes,
     slopes_markdown,
 )
-from constraint_geodesics.evaluation.growth_figure import growth_figure
-from constraint_geodesics.evaluation.machine import run_header
-from constraint_geodesics.learning.dataset import read_joints
-from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
-from constraint_geodesics.peers import PeerBuilder
-from constraint_geodesics.planner import Planner
-from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
 
 STAGE = "measure_growth"
 SEVEN_JOINTS = ("kuka_iiwa/model.urdf", "lbr_iiwa_link_7")
@@ -38,14 +40,20 @@ IN_BATCHES = PEERS[1]
 
 
 def configurations(file: Path, robot: SerialRobot, count: int) -> Float[np.ndarray, "n D"]:
-    """Free configurations of the data; where there are fewer than `count`, random ones, which take the same time."""
+    """Free configurations of the data; where there are fewer than `count`, random ones, which take
+    the same time.
+    """
     drawn = read_joints(file).free_joints if file.is_file() else np.empty((0, robot.dof))
     return drawn if len(drawn) >= count else robot.sample(count, np.random.default_rng(0))
 
 
 def main(params: Params, layout: Layout) -> None:
     """Write growth.csv, slopes.csv, growth.md and growth.png in reports/growth/."""
-    folder, sizes, scene = layout.root / "reports" / "growth", GrowthSizes(), Scene.from_params(params)
+    folder, sizes, scene = (
+        layout.root / "reports" / "growth",
+        GrowthSizes(),
+        Scene.from_params(params),
+    )
     manifold = scene.manifold(params.constraints[CONSTRAINT])
     with (
         Planner(read_bundle(layout.planner), str(layout.planner)) as planner,
@@ -53,14 +61,22 @@ def main(params: Params, layout: Layout) -> None:
     ):
 
         def batch(starts: Float[np.ndarray, "B D"], goals: Float[np.ndarray, "B D"]) -> list[bool]:
-            return [path.status == "solved" for path in planner.plan_batch(starts, goals, manifold.constraint)]
+            return [
+                path.status == "solved"
+                for path in planner.plan_batch(starts, goals, manifold.constraint)
+            ]
 
         own = BandAndTrees(planner.band)
         subject = Subject(
-            params, scene, load_robot(find_urdf(SEVEN_JOINTS[0]), SEVEN_JOINTS[1]), {own.name: own, **peers},
-            batch, IN_BATCHES, configurations(layout.joints("free"), scene.robot, max(sizes.rows)),
+            params,
+            scene,
+            load_robot(find_urdf(SEVEN_JOINTS[0]), SEVEN_JOINTS[1]),
+            {own.name: own, **peers},
+            batch,
+            IN_BATCHES,
+            configurations(layout.joints("free"), scene.robot, max(sizes.rows)),
             layout.scratch(STAGE, CONSTRAINT),
-        )  # fmt: skip
+        )
         table = measure_growth(subject, sizes)
     fits, about = slopes(table), run_header(layout.root)
     write_table(table, folder / "growth.csv", about)

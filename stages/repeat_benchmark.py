@@ -1,27 +1,34 @@
-"""Stage: part of the benchmark once more, held against the first time: lengths, validity, and times."""
+"""Stage: part of the benchmark once more, held against the first time: lengths, validity, and
+times.
+"""
 
 import shutil
 import sys
 
-from constraint_geodesics.benchmark_blocks import answered, blocks_of, ends_by_counting
+from constraint_geodesics.benchmark.entries import answered, blocks_of, ends_by_counting
+from constraint_geodesics.benchmark.runner import read_table
+from constraint_geodesics.benchmark.statistics import repeated
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.evaluation.benchmark import read_table
-from constraint_geodesics.evaluation.benchmark_report import repeated_markdown
-from constraint_geodesics.evaluation.benchmark_statistics import repeated
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.report.benchmark_tables import repeated_markdown
 
 STAGE = "repeat_benchmark"
 SEEDS = 2
 
 
 def main(params: Params, layout: Layout) -> None:
-    """Write repeat.csv and repeat.md in reports/benchmark_repeat/: planners whose search no clock ends."""
+    """Write repeat.csv and repeat.md in reports/benchmark_repeat/: planners whose search no clock
+    ends.
+    """
     folder, scratch = layout.root / "reports" / "benchmark_repeat", layout.scratch(STAGE, "rows")
     shutil.rmtree(scratch, ignore_errors=True)
     again = {
         name: peer.model_copy(
-            update={"queries": min(peer.queries, params.bench.repeated), "seeds": min(peer.seeds, SEEDS)}
+            update={
+                "queries": min(peer.queries, params.bench.repeated),
+                "seeds": min(peer.seeds, SEEDS),
+            }
         )
         for name, peer in params.bench.planners.items()
         if ends_by_counting(peer)

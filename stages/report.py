@@ -3,9 +3,9 @@
 import sys
 
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.evaluation.report import write_report
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.report.pipeline_page import write_report
 from constraint_geodesics.tracking.experiment import tracked_stage
 
 STAGE = "report"
@@ -13,7 +13,9 @@ STAGE = "report"
 
 def main(params: Params, layout: Layout) -> None:
     """Write reports/table.csv, README's tables (*.md), figures/ and index.html."""
-    sources = [layout.report("benchmark_planners", constraint, "csv") for constraint in params.constraints]
+    sources = [
+        layout.report("benchmark_planners", constraint, "csv") for constraint in params.constraints
+    ]
     with tracked_stage(
         STAGE, STAGE, params.judge, sources, experiment=params.tracking.experiment, root=layout.root
     ) as run:

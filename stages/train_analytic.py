@@ -6,17 +6,17 @@ import sys
 import numpy as np
 
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.compute import parallel_map
-from constraint_geodesics.evaluation.analytic_search import (
+from constraint_geodesics.geodesics.policy_search import save_policy
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.studies.analytic_search import (
     MANIFOLDS,
     AnalyticTask,
     curve_family,
     run_analytic,
 )
-from constraint_geodesics.evaluation.geodesic_search import write_table
-from constraint_geodesics.geodesics.policy_search import save_policy
-from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.studies.geodesic_search import write_table
 from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 
 STAGE = "train_analytic"
@@ -27,27 +27,44 @@ def main(params: Params, layout: Layout, analytic: str) -> None:
     settings = params.geodesics.model_copy(update={"steps": params.geodesics.analytic_steps})
     about = subject_of(params, manifold=analytic, reward=settings.reward)
     with tracked_stage(
-        STAGE, analytic, settings, [], experiment=params.tracking.experiment, root=layout.root, subject=about
+        STAGE,
+        analytic,
+        settings,
+        [],
+        experiment=params.tracking.experiment,
+        root=layout.root,
+        subject=about,
     ) as run:
         tasks = [
             AnalyticTask(
-                analytic, curve_family(MANIFOLDS[analytic].manifold.dim, settings), settings, seed,
+                analytic,
+                curve_family(MANIFOLDS[analytic].manifold.dim, settings),
+                settings,
+                seed,
                 layout.scratch(STAGE, f"{analytic}-{seed}"),
                 run.child(f"seed {seed}", {"seed": seed}),
             )
             for seed in settings.seeds
-        ]  # fmt: skip
-        results = parallel_map(run_analytic, tasks, params.compute, description=f"policy search {analytic}")
-        run.summarise([result.figures() for result in results], [result.policy.curve for result in results])
+        ]
+        results = parallel_map(
+            run_analytic, tasks, params.compute, description=f"policy search {analytic}"
+        )
+        run.summarise(
+            [result.figures() for result in results], [result.policy.curve for result in results]
+        )
         folder = layout.analytic(analytic)
         for result in results:
             save_policy(result.policy, folder, result.seed)
         first = results[0]
         np.savez_compressed(folder / "curves.npz", sampled=first.sampled, learned=first.learned)
-        learning = [{"seed": result.seed, **row} for result in results for row in result.policy.curve]
+        learning = [
+            {"seed": result.seed, **row} for result in results for row in result.policy.curve
+        ]
         write_table(learning, layout.report(STAGE, f"{analytic}-learning", "csv"))
         figures = {name: [result.figures()[name] for result in results] for name in first.figures()}
-        means = {f"{name}_mean": float(np.mean(values)) for name, values in figures.items()}  # DVC compares no lists
+        means = {
+            f"{name}_mean": float(np.mean(values)) for name, values in figures.items()
+        }  # DVC compares no lists
         run.report(figures | means, layout.report(STAGE, analytic))
         for task in tasks:  # finished: the next run of this stage starts from nothing
             shutil.rmtree(task.scratch, ignore_errors=True)

@@ -1,13 +1,20 @@
-"""Stage: train one policy a seed on one manifold under one constraint, and search the queries' geodesics with each."""
+"""Stage: train one policy a seed on one manifold under one constraint, and search the queries'
+geodesics with each.
+"""
 
 import shutil
 import sys
 
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.compute import parallel_map
-from constraint_geodesics.constraints.scene import Scene
-from constraint_geodesics.constraints.submanifold import load_submanifold
-from constraint_geodesics.evaluation.geodesic_search import (
+from constraint_geodesics.learning.dataset import read_joints, read_queries
+from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.learning.submanifold import load_submanifold
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.recording.replay import record_rows
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.studies.geodesic_search import (
     PLANNER,
     SeedTask,
     connected_queries,
@@ -18,51 +25,79 @@ from constraint_geodesics.evaluation.geodesic_search import (
     straight_rows,
     write_table,
 )
-from constraint_geodesics.learning.dataset import read_joints, read_queries
-from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
 from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
-from constraint_geodesics.tracking.replay import record_rows
 
 STAGE = "train_geodesics"
 
 
 def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None:
     """Write data/geodesics/<manifold>-<constraint>/, its recordings, rows and figures."""
-    item, sources = f"{manifold}-{constraint}", [layout.joints(constraint), layout.queries(constraint)]
+    item, sources = (
+        f"{manifold}-{constraint}",
+        [layout.joints(constraint), layout.queries(constraint)],
+    )
     scene = Scene.from_params(params)
     constrained = scene.manifold(params.constraints[constraint])
     chart = LearnedManifold.load(layout.manifold(manifold))
-    problem = geodesic_problem(params, chart, constrained, read_joints(sources[0]).free_joints, manifold)
+    problem = geodesic_problem(
+        params, chart, constrained, read_joints(sources[0]).free_joints, manifold
+    )
     queries = read_queries(sources[1])
     submanifold = load_submanifold(layout.submanifold(manifold, constraint))
     with scene.world() as world:
-        connected, connection_s = connected_queries(submanifold, problem, queries, world.free, params.submanifold)
+        connected, connection_s = connected_queries(
+            submanifold, problem, queries, world.free, params.submanifold
+        )
     settings = params.policy_settings(separate=True) if problem.retract else params.geodesics
     about = subject_of(params, constraint=constraint, manifold=manifold, reward=settings.reward)
     with tracked_stage(
-        STAGE, item, settings, sources, experiment=params.tracking.experiment, root=layout.root, subject=about
+        STAGE,
+        item,
+        settings,
+        sources,
+        experiment=params.tracking.experiment,
+        root=layout.root,
+        subject=about,
     ) as run:
         tasks = [
             SeedTask(
-                problem, scene, settings, params.judge, manifold, queries, connected, connection_s, seed,
-                layout.scratch(STAGE, f"{item}-{seed}"), run.child(f"seed {seed}", {"seed": seed}),
+                problem,
+                scene,
+                settings,
+                params.judge,
+                manifold,
+                queries,
+                connected,
+                connection_s,
+                seed,
+                layout.scratch(STAGE, f"{item}-{seed}"),
+                run.child(f"seed {seed}", {"seed": seed}),
             )
             for seed in settings.seeds
-        ]  # fmt: skip
+        ]
         results = parallel_map(run_seed, tasks, params.compute, description=f"policy search {item}")
-        run.summarise([result.figures() for result in results], [result.policy.curve for result in results])
+        run.summarise(
+            [result.figures() for result in results], [result.policy.curve for result in results]
+        )
         save_seeds(results, queries, layout, STAGE, manifold, constraint)
         rows, paths = straight_rows(tasks[0])
         rows += [row for result in results for row in result.rows]
         paths += [path for result in results for path in result.paths]
         rows = record_rows(
-            layout.recordings(STAGE, item), rows, paths, constraint, chart, constrained, submanifold, scene.workcell,
+            layout.recordings(STAGE, item),
+            rows,
+            paths,
+            constraint,
+            chart,
+            constrained,
+            submanifold,
+            scene.workcell,
             params.recording,
-        )  # fmt: skip
+        )
         run.recordings(rows, shown=PLANNER)
-        write_table(rows, layout.report(STAGE, item, "csv"), manifold=manifold, constraint=constraint)
+        write_table(
+            rows, layout.report(STAGE, item, "csv"), manifold=manifold, constraint=constraint
+        )
         run.report(geodesic_figures(results, connected), layout.report(STAGE, item))
         for task in tasks:  # finished: the next run of this stage starts from nothing
             shutil.rmtree(task.scratch, ignore_errors=True)

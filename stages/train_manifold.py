@@ -5,11 +5,11 @@ import sys
 import pandas as pd
 
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.constraints.scene import robot_from
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.training import train_manifold
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.scene.scene import robot_from
 from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 
 STAGE = "train_manifold"
@@ -20,11 +20,21 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
     source = layout.joints("free")
     settings, about = params.manifolds[manifold], subject_of(params, manifold=manifold)
     with tracked_stage(
-        STAGE, manifold, {}, [source], experiment=params.tracking.experiment, root=layout.root, subject=about
+        STAGE,
+        manifold,
+        {},
+        [source],
+        experiment=params.tracking.experiment,
+        root=layout.root,
+        subject=about,
     ) as run:
         joints = read_joints(source).free_joints
         trained = train_manifold(
-            joints, robot_from(params.robot), settings, layout.scratch(STAGE, manifold), run.metric_logger()
+            joints,
+            robot_from(params.robot),
+            settings,
+            layout.scratch(STAGE, manifold),
+            run.metric_logger(),
         )
         trained.manifold.save(layout.manifold(manifold))
         run.report({"rows": len(joints), **trained.metrics}, layout.report(STAGE, manifold))

@@ -4,14 +4,19 @@ import shutil
 import sys
 
 from constraint_geodesics.cli import run_stage
-from constraint_geodesics.compute import parallel_map
-from constraint_geodesics.constraints.scene import Scene
-from constraint_geodesics.evaluation.geodesic_search import TrainingTask, shared_problem, train_seed, write_table
 from constraint_geodesics.geodesics.policy_search import save_policy
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.studies.geodesic_search import (
+    TrainingTask,
+    shared_problem,
+    train_seed,
+    write_table,
+)
 from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 
 STAGE = "train_policies"
@@ -21,22 +26,41 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
     """Write data/policies/<manifold>/, learning curves and figures."""
     scene, settings = Scene.from_params(params), params.policy_settings()
     sources = [layout.joints(name) for name in params.constraints]
-    manifolds = {name: scene.manifold(constraint) for name, constraint in params.constraints.items()}
+    manifolds = {
+        name: scene.manifold(constraint) for name, constraint in params.constraints.items()
+    }
     joints = {name: read_joints(layout.joints(name)).free_joints for name in params.constraints}
-    problem = shared_problem(params, LearnedManifold.load(layout.manifold(manifold)), manifolds, joints, manifold)
+    problem = shared_problem(
+        params, LearnedManifold.load(layout.manifold(manifold)), manifolds, joints, manifold
+    )
     about = subject_of(params, manifold=manifold, reward=settings.reward)
     with tracked_stage(
-        STAGE, manifold, settings, sources, experiment=params.tracking.experiment, root=layout.root, subject=about
+        STAGE,
+        manifold,
+        settings,
+        sources,
+        experiment=params.tracking.experiment,
+        root=layout.root,
+        subject=about,
     ) as run:
         tasks = [
             TrainingTask(
-                problem, settings, seed, layout.scratch(STAGE, f"{manifold}-{seed}"),
+                problem,
+                settings,
+                seed,
+                layout.scratch(STAGE, f"{manifold}-{seed}"),
                 run.child(f"seed {seed}", {"seed": seed}),
             )
             for seed in settings.seeds
-        ]  # fmt: skip
-        policies = parallel_map(train_seed, tasks, params.compute, description=f"policies {manifold}")
-        learning = [{"seed": task.seed, **row} for task, p in zip(tasks, policies, strict=True) for row in p.curve]
+        ]
+        policies = parallel_map(
+            train_seed, tasks, params.compute, description=f"policies {manifold}"
+        )
+        learning = [
+            {"seed": task.seed, **row}
+            for task, p in zip(tasks, policies, strict=True)
+            for row in p.curve
+        ]
         for task, policy in zip(tasks, policies, strict=True):
             save_policy(policy, layout.policies(manifold), task.seed)
         write_table(learning, layout.report(STAGE, f"{manifold}-learning", "csv"))

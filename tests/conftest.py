@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.training import train_manifold
 from constraint_geodesics.params import Params, load_params
-from constraint_geodesics.robot.bullet import Box, data_path
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.world import Box, data_path
 from tests.kernels import compile_kernels
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -71,9 +71,15 @@ class Trained:
 
 @pytest.fixture(scope="session")
 def trained(scene: Scene, params: Params, tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    frame = draw_shard(ShardTask(scene, scene.manifold(params.constraints["free"]), 4000, (1,))).frame
+    frame = draw_shard(
+        ShardTask(scene, scene.manifold(params.constraints["free"]), 4000, (1,))
+    ).frame
     joints = joints_of(frame)[free_rows(frame)]
-    small = params.manifolds["planner"].model_copy(update={"epochs": 4, "variance_epochs": 2, "variance_centres": 64})
+    small = params.manifolds["planner"].model_copy(
+        update={"epochs": 4, "variance_epochs": 2, "variance_centres": 64}
+    )
     folder = tmp_path_factory.mktemp("manifold")
-    chart = train_manifold(joints, scene.robot, small, folder, lambda *_: None, progress=False).manifold
+    chart = train_manifold(
+        joints, scene.robot, small, folder, lambda *_: None, progress=False
+    ).manifold
     return Trained(chart, joints)

@@ -1,4 +1,6 @@
-"""The planner of the files that come with the package, loaded once for all tests that use it, and queries for it."""
+"""The planner of the files that come with the package, loaded once for all tests that use it, and
+queries for it.
+"""
 
 from functools import cache
 
@@ -7,12 +9,12 @@ import numpy as np
 from constraint_geodesics import bundle
 from constraint_geodesics.bundle import Bundle, read_bundle
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.constraints.retraction import retract
-from constraint_geodesics.constraints.vector import ConstraintManifold
+from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.planner import Planner
-from constraint_geodesics.planners.path_planner import PlannedPath, PlanningProblem
-from constraint_geodesics.robot.bullet import World
-from constraint_geodesics.robot.clearance import clearance_model
+from constraint_geodesics.problem import PlannedPath, PlanningProblem
+from constraint_geodesics.scene.clearance import clearance_model
+from constraint_geodesics.scene.world import World
 
 NAMES = ("free", "level_cup", "level_cup_relaxed", "slide", "fixed_orientation", "tool_down")
 
@@ -33,7 +35,9 @@ def manifold_of(planner: Planner, name: str) -> ConstraintManifold:
 
 @cache
 def nodes_of(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes of a graph, on the constraint to rounding, free and within the limits, and their components."""
+    """Nodes of a graph, on the constraint to rounding, free and within the limits, and their
+    components.
+    """
     planner = packaged_planner()
     roadmap = planner.bundle.roadmaps[name]
     joints = retract(manifold_of(planner, name), roadmap.joints[:300]).joints
@@ -42,7 +46,9 @@ def nodes_of(name: str) -> tuple[np.ndarray, np.ndarray]:
     return joints[kept], roadmap.labels[:300][kept]
 
 
-def pairs_of(name: str, count: int, seed: int, *, joined: bool = True) -> list[tuple[np.ndarray, np.ndarray]]:
+def pairs_of(
+    name: str, count: int, seed: int, *, joined: bool = True
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Starts and goals in one component of the graph, or in two."""
     joints, labels = nodes_of(name)
     rng = np.random.default_rng(seed)
@@ -59,7 +65,10 @@ def problems(world: World, name: str, count: int) -> list[PlanningProblem]:
     planner = packaged_planner()
     clearance = clearance_model(planner.scene.robot, planner.scene.workcell)
     manifold = manifold_of(planner, name)
-    return [PlanningProblem(a, b, manifold, world.is_free, clearance) for a, b in pairs_of(name, count, 3)]
+    return [
+        PlanningProblem(a, b, manifold, world.is_free, clearance)
+        for a, b in pairs_of(name, count, 3)
+    ]
 
 
 def assert_sound(path: PlannedPath, asked: PlanningProblem, certifier: Certifier) -> None:

@@ -1,4 +1,6 @@
-"""README's and docs' tables and numbers from the reports: `python tests/readme.py` writes them, tests compare."""
+"""README's and docs' tables and numbers from the reports: `python tests/readme.py` writes them,
+tests compare.
+"""
 
 import csv
 import json
@@ -60,7 +62,10 @@ def with_stage_times(text: str) -> str:
             if stage != CONTINUED:
                 seconds[stage].append(float(row["seconds"]))
     head = "| stage | items | an item [s] | together [s] |\n|---|---:|---:|---:|"
-    lines = [f"| `{name}` | {len(own)} | {_range(own)} | {sum(own):.0f} |" for name, own in sorted(seconds.items())]
+    lines = [
+        f"| `{name}` | {len(own)} | {_range(own)} | {sum(own):.0f} |"
+        for name, own in sorted(seconds.items())
+    ]
     table = "\n".join([head, *lines])
     return TIMES.sub(lambda _: f"<!-- stage_times -->\n{table}\n<!-- /stage_times -->", text)
 

@@ -21,9 +21,9 @@ from constraint_geodesics.bundle import (
     open_bundle,
     read_bundle,
 )
-from constraint_geodesics.geodesics.roadmap import Roadmap
 from constraint_geodesics.geometry.graph import components
 from constraint_geodesics.planner import Planner
+from constraint_geodesics.search.roadmap import Roadmap
 from tests.planner_fixtures import packaged_bundle
 
 ARRAYS = (MANIFOLD, POLICIES, ROADMAPS)
@@ -65,7 +65,9 @@ def test_the_packaged_bundle_holds_what_a_planner_needs(packaged: Bundle) -> Non
     for roadmap in packaged.roadmaps.values():
         assert len(roadmap.joints) >= 500
         assert roadmap.edges.max() < len(roadmap.joints)
-        np.testing.assert_array_equal(roadmap.labels, components(len(roadmap.joints), roadmap.edges))
+        np.testing.assert_array_equal(
+            roadmap.labels, components(len(roadmap.joints), roadmap.edges)
+        )
         straight = np.linalg.norm(np.diff(roadmap.joints[roadmap.edges], axis=1)[:, 0], axis=1)
         assert (roadmap.lengths >= straight * (1.0 - 1e-5)).all(), "stored in single precision"
 
@@ -84,7 +86,9 @@ def test_what_is_written_is_read_again(packaged: Bundle, tmp_path) -> None:
     assert set(again.roadmaps) == set(packaged.roadmaps)
     for name, roadmap in packaged.roadmaps.items():
         for field in ("joints", "edges", "lengths", "labels"):
-            np.testing.assert_array_equal(getattr(again.roadmaps[name], field), getattr(roadmap, field))
+            np.testing.assert_array_equal(
+                getattr(again.roadmaps[name], field), getattr(roadmap, field)
+            )
     again.write(tmp_path / "two")
     for name in FILES:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
@@ -104,7 +108,9 @@ def test_a_graph_of_many_nodes_keeps_its_edges(packaged: Bundle, tmp_path) -> No
 
 
 def test_writing_over_a_bundle_leaves_the_new_one(packaged: Bundle, folder) -> None:
-    changed = replace(packaged, planner=packaged.planner.model_copy(update={"roadmap_nodes": 123}), roadmaps={})
+    changed = replace(
+        packaged, planner=packaged.planner.model_copy(update={"roadmap_nodes": 123}), roadmaps={}
+    )
     changed.write(folder)
     again = read_bundle(folder)
     assert again.planner.roadmap_nodes == 123
@@ -146,7 +152,9 @@ def test_a_folder_that_is_none_is_refused(tmp_path, folder) -> None:
     assert CARD in refused(folder / CARD)
 
 
-@pytest.mark.parametrize("text", ["[]", "null", "3", '"planner"', "{}", "{", "", "\x00", '{"format": 1}'])
+@pytest.mark.parametrize(
+    "text", ["[]", "null", "3", '"planner"', "{}", "{", "", "\x00", '{"format": 1}']
+)
 def test_a_card_that_is_none_is_refused(folder, text) -> None:
     (folder / CARD).write_text(text)
     assert CARD in refused(folder)
@@ -162,7 +170,9 @@ def test_another_format_is_refused_by_its_number(folder) -> None:
     assert re.search(r"format 2.*format 1", refused(folder))
 
 
-@pytest.mark.parametrize("entry", ["robot", "workcell", "constraints", "planner", "judge", "format", "sha256"])
+@pytest.mark.parametrize(
+    "entry", ["robot", "workcell", "constraints", "planner", "judge", "format", "sha256"]
+)
 def test_a_card_without_an_entry_is_refused(folder, entry) -> None:
     card = json.loads((folder / CARD).read_text())
     del card[entry]

@@ -1,4 +1,6 @@
-"""`--json` of `params`, `results`, `replay` and `bench`: one strict object, and the exit codes as without it."""
+"""`--json` of `params`, `results`, `replay` and `bench`: one strict object, and the exit codes as
+without it.
+"""
 
 import shutil
 from pathlib import Path
@@ -8,9 +10,9 @@ import pytest
 import yaml
 
 from constraint_geodesics import bundle
-from constraint_geodesics.evaluation.benchmark import TABLE, Case, write_cases
+from constraint_geodesics.benchmark.runner import TABLE, Case, write_cases
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.paths import Layout
+from constraint_geodesics.pipeline.layout import Layout
 from tests.planner_fixtures import packaged_bundle, pairs_of
 from tests.test_cli_plan import called, strict
 
@@ -52,12 +54,16 @@ def test_results_are_json(geodesics, tmp_path) -> None:
     code, out, err = geodesics("results", "--json")
     assert (code, err) == (0, "")
     rows = strict(out)["rows"]
-    names, *lines = [line.split(",") for line in (ROOT / "reports" / "table.csv").read_text().splitlines()]
+    names, *lines = [
+        line.split(",") for line in (ROOT / "reports" / "table.csv").read_text().splitlines()
+    ]
     assert len(rows) == len(lines) > 10
     for row, cells in zip(rows, lines, strict=True):
         assert list(row) == names
         for value, cell in zip(row.values(), cells, strict=True):
-            assert (value is None) if cell == "" else str(value) == cell or float(value) == float(cell)
+            assert (
+                (value is None) if cell == "" else str(value) == cell or float(value) == float(cell)
+            )
 
 
 def test_recordings_are_listed_as_json(geodesics, tmp_path) -> None:
@@ -69,7 +75,9 @@ def test_recordings_are_listed_as_json(geodesics, tmp_path) -> None:
     assert (code, err) == (0, "")
     (row,) = strict(out)["recordings"]
     assert (row["number"], row["file"]) == (1, str(file.relative_to(tmp_path)))
-    assert row["query"] is row["seed"] is row["length_rad"] is row["valid"] is None, "it is no recording"
+    assert row["query"] is row["seed"] is row["length_rad"] is row["valid"] is None, (
+        "it is no recording"
+    )
     code, out, err = geodesics("replay", "--json", str(file))
     assert (code, out) == (2, "")
     assert err.startswith("error: --json prints the list")
@@ -81,7 +89,9 @@ def test_the_benchmarks_summary_is_json(geodesics, tmp_path) -> None:
     peers = parameters["bench"]["planners"]
     few = {"straight + band": peers["straight + band"], "RRT* 10 s": peers["RRT* 10 s"]}
     parameters["bench"] |= {"planners": few, "recorded": []}
-    parameters["constraints"] = {name: parameters["constraints"][name] for name in ("free", "level_cup")}
+    parameters["constraints"] = {
+        name: parameters["constraints"][name] for name in ("free", "level_cup")
+    }
     parameters["geodesics"]["illustrated_constraints"] = ["level_cup"]
     parameters["plans"]["constraint"] = "level_cup"
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(parameters))

@@ -1,4 +1,6 @@
-"""The commands `plan`, `check` and `constraints`: exit codes, one line for an error, strict JSON, files."""
+"""The commands `plan`, `check` and `constraints`: exit codes, one line for an error, strict JSON,
+files.
+"""
 
 import json
 import re
@@ -12,7 +14,7 @@ import pytest
 
 from constraint_geodesics import bundle, cli
 from constraint_geodesics.planner import read_path
-from constraint_geodesics.tracking.recording import read_recording
+from constraint_geodesics.recording.recording import read_recording
 from tests.planner_fixtures import NAMES, nodes_of, packaged_bundle, packaged_planner, pairs_of
 
 COMMAND = str(Path(sys.executable).parent / "geodesics")
@@ -83,9 +85,20 @@ def saved(tmp_path_factory) -> Path:
 def test_a_path_is_planned_and_its_files_are_written(command, query, tmp_path) -> None:
     csv, rrd, png = (tmp_path / "new" / f"path.{kind}" for kind in ("csv", "rrd", "png"))
     code, out, err = command(
-        "plan", "--start", query[0], "--goal", query[1], "--constraint", "level_cup",
-        "--out", str(csv), "--record", str(rrd), "--picture", str(png),
-    )  # fmt: skip
+        "plan",
+        "--start",
+        query[0],
+        "--goal",
+        query[1],
+        "--constraint",
+        "level_cup",
+        "--out",
+        str(csv),
+        "--record",
+        str(rrd),
+        "--picture",
+        str(png),
+    )
     assert code == 0
     assert out.startswith("solved: ")
     assert out.count("\n") == 1
@@ -103,16 +116,26 @@ def test_a_path_is_planned_and_its_files_are_written(command, query, tmp_path) -
 
 
 def test_an_answer_is_one_json_object(command, query, tmp_path) -> None:
-    code, out, _ = command("plan", "--start", query[0], "--goal", query[1], "--constraint", "level_cup", "--json")
+    code, out, _ = command(
+        "plan", "--start", query[0], "--goal", query[1], "--constraint", "level_cup", "--json"
+    )
     assert code == 0
     answer = strict(out)
     assert answer["status"] == "solved"
     assert answer["constraint"] == "level_cup"
     assert 0.0 <= answer["violation_bound_rad"] <= 1e-4
     code, out, _ = command(
-        "plan", "--start", query[0], "--goal", TOUCHES_ITSELF, "--constraint", "free", "--json",
-        "--out", str(tmp_path / "path.csv"),
-    )  # fmt: skip
+        "plan",
+        "--start",
+        query[0],
+        "--goal",
+        TOUCHES_ITSELF,
+        "--constraint",
+        "free",
+        "--json",
+        "--out",
+        str(tmp_path / "path.csv"),
+    )
     assert code == 3
     answer = strict(out)
     assert answer["status"] == "in_collision"
@@ -128,22 +151,35 @@ def test_an_answer_is_one_json_object(command, query, tmp_path) -> None:
         (TOUCHES_ITSELF, "free", "in_collision"),
     ],
 )
-def test_no_path_is_code_three_and_a_line_that_says_why(command, query, start, constraint, status) -> None:
-    code, out, err = command("plan", f"--start={start}", "--goal", query[1], "--constraint", constraint)
+def test_no_path_is_code_three_and_a_line_that_says_why(
+    command, query, start, constraint, status
+) -> None:
+    code, out, err = command(
+        "plan", f"--start={start}", "--goal", query[1], "--constraint", constraint
+    )
     assert code == 3
     assert out.startswith(f"{status}: ")
     assert out.count("\n") == 1
     assert "error" not in err
 
 
-def test_configurations_are_numbers_with_spaces_or_commas_negative_ones_first(command, query) -> None:
+def test_configurations_are_numbers_with_spaces_or_commas_negative_ones_first(
+    command, query
+) -> None:
     q = nodes_of("free")[0]
     start = q[np.argmax(q[:, 0] < 0.0)]
     assert start[0] < 0.0
     answers = []
     spaces, commas, both = (mark.join(words_of(start).split()) for mark in (" ", ",", ", "))
-    for option in (["--start", spaces], [f"--start={spaces}"], ["--start", commas], [f"--start={both}"]):
-        code, out, err = command("plan", *option, "--goal", query[1], "--constraint", "free", "--json")
+    for option in (
+        ["--start", spaces],
+        [f"--start={spaces}"],
+        ["--start", commas],
+        [f"--start={both}"],
+    ):
+        code, out, err = command(
+            "plan", *option, "--goal", query[1], "--constraint", "free", "--json"
+        )
         assert code == 0, err
         answers.append(strict(out)["length_rad"])
     assert len(set(answers)) == 1
@@ -153,13 +189,40 @@ def test_configurations_are_numbers_with_spaces_or_commas_negative_ones_first(co
     ("words", "said"),
     [
         (("--start", "1 2 3", "--goal", "0 0 0 0 0 0", "--constraint", "free"), r"start.*\(3,\)"),
-        (("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 0 0", "--constraint", "free"), r"goal.*\(7,\)"),
-        (("--start", "0 0 0 0 0 zero", "--goal", "0 0 0 0 0 0", "--constraint", "free"), "--start '0 0 0 0 0 zero'"),
+        (
+            ("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 0 0", "--constraint", "free"),
+            r"goal.*\(7,\)",
+        ),
+        (
+            ("--start", "0 0 0 0 0 zero", "--goal", "0 0 0 0 0 0", "--constraint", "free"),
+            "--start '0 0 0 0 0 zero'",
+        ),
         (("--start", "", "--goal", "0 0 0 0 0 0", "--constraint", "free"), r"start.*\(0,\)"),
-        (("--start", "nan 0 0 0 0 0", "--goal", "0 0 0 0 0 0", "--constraint", "free"), r"start\[0\] is not finite"),
-        (("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 inf", "--constraint", "free"), r"goal\[5\] is not finite"),
-        (("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 0", "--constraint", "cup"), "'cup'.*level_cup"),
-        (("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 0", "--constraint", "free", "--budget", "0"), "budget_s = 0"),
+        (
+            ("--start", "nan 0 0 0 0 0", "--goal", "0 0 0 0 0 0", "--constraint", "free"),
+            r"start\[0\] is not finite",
+        ),
+        (
+            ("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 inf", "--constraint", "free"),
+            r"goal\[5\] is not finite",
+        ),
+        (
+            ("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 0", "--constraint", "cup"),
+            "'cup'.*level_cup",
+        ),
+        (
+            (
+                "--start",
+                "0 0 0 0 0 0",
+                "--goal",
+                "0 0 0 0 0 0",
+                "--constraint",
+                "free",
+                "--budget",
+                "0",
+            ),
+            "budget_s = 0",
+        ),
     ],
     ids=("three", "seven", "word", "nothing", "nan", "inf", "name", "budget"),
 )
@@ -194,9 +257,16 @@ def test_a_planner_that_is_none_is_one_line(command, tmp_path) -> None:
 def test_a_file_that_can_not_be_written_is_one_line(command, query, tmp_path) -> None:
     (tmp_path / "file").write_text("")
     code, _, err = command(
-        "plan", "--start", query[0], "--goal", query[1], "--constraint", "free",
-        "--out", str(tmp_path / "file" / "path"),
-    )  # fmt: skip
+        "plan",
+        "--start",
+        query[0],
+        "--goal",
+        query[1],
+        "--constraint",
+        "free",
+        "--out",
+        str(tmp_path / "file" / "path"),
+    )
     assert code in (1, 2)
     assert str(tmp_path / "file") in error_line(err)
 
@@ -256,7 +326,9 @@ def test_a_collision_is_json_as_well(command, tmp_path) -> None:
         (9, "0,0,0", "line 9: 3 numbers under 7 names"),
     ],
 )
-def test_a_corrupted_file_is_code_two_and_names_the_line(command, saved, tmp_path, line, text, said) -> None:
+def test_a_corrupted_file_is_code_two_and_names_the_line(
+    command, saved, tmp_path, line, text, said
+) -> None:
     lines = saved.read_text().splitlines()
     lines[line - 1] = text
     broken = tmp_path / "broken.csv"
@@ -282,7 +354,10 @@ def test_wrong_usage_of_check_is_code_two(command, saved, tmp_path) -> None:
 
 
 def test_a_reference_in_a_file_that_is_no_pose_is_code_two(command, saved, tmp_path) -> None:
-    about = '# constraint: {"axes": [0,0,0,1,1,0], "tolerance": [0,0,0,0,0,0], "reference": {"position_m": [0,0,0], '
+    about = (
+        '# constraint: {"axes": [0,0,0,1,1,0], "tolerance": [0,0,0,0,0,0], '
+        '"reference": {"position_m": [0,0,0], '
+    )
     lines = saved.read_text().splitlines()
     lines[0] = about + '"rotation": [[2,0,0],[0,1,0],[0,0,1]]}}'
     (tmp_path / "broken.csv").write_text("\n".join(lines))
@@ -307,11 +382,21 @@ def test_the_installed_command_answers(query, tmp_path) -> None:
     """In processes of its own: a path, and wrong usage."""
     given = ("--planner", str(bundle.PACKAGED))
     runs = {
-        0: ("plan", f"--start={query[0]}", f"--goal={query[1]}", "--constraint", "level_cup", "--json", *given),
+        0: (
+            "plan",
+            f"--start={query[0]}",
+            f"--goal={query[1]}",
+            "--constraint",
+            "level_cup",
+            "--json",
+            *given,
+        ),
         2: ("check", "nowhere.csv", *given),
     }
     for code, words in runs.items():
-        done = subprocess.run([COMMAND, *words], capture_output=True, text=True, cwd=tmp_path, check=False)
+        done = subprocess.run(
+            [COMMAND, *words], capture_output=True, text=True, cwd=tmp_path, check=False
+        )
         assert done.returncode == code, done.stderr
         assert "Traceback" not in done.stderr
         if code == 0:
@@ -323,7 +408,9 @@ def test_the_installed_command_answers(query, tmp_path) -> None:
 
 def test_a_budget_is_used(command, query) -> None:
     words = ("--start", query[0], "--goal", query[1], "--constraint", "level_cup", "--json")
-    first, longer = (strict(command("plan", *words, *more)[1]) for more in ((), ("--budget", "0.2")))
+    first, longer = (
+        strict(command("plan", *words, *more)[1]) for more in ((), ("--budget", "0.2"))
+    )
     assert longer["planning_time_s"] >= 0.2
     assert longer["length_rad"] <= first["length_rad"]
 
@@ -337,7 +424,9 @@ def test_a_budget_is_used(command, query) -> None:
     ],
 )
 def test_what_bench_does_not_know_is_one_line(monkeypatch, capfd, tmp_path, words, said) -> None:
-    monkeypatch.setattr(sys, "argv", ["geodesics", "bench", "--out", str(tmp_path / "bench"), *words])
+    monkeypatch.setattr(
+        sys, "argv", ["geodesics", "bench", "--out", str(tmp_path / "bench"), *words]
+    )
     with pytest.raises(SystemExit) as stop:
         cli.main()
     assert stop.value.code == 1

@@ -1,4 +1,5 @@
-"""What the documentation says can be done is done here: its code runs, its commands parse, its names exist.
+"""What the documentation says can be done is done here: its code runs, its commands parse, its
+names exist.
 
 That its commands run is in tests/test_docs_commands.py.
 """
@@ -27,9 +28,9 @@ from mlflow.utils.search_utils import SearchUtils
 
 from constraint_geodesics import cli
 from constraint_geodesics.bundle import PACKAGED
-from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.params import load_params
-from constraint_geodesics.peers import KINDS
+from constraint_geodesics.peers.registry import KINDS
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.tracking.experiment import tracked_stage
 from constraint_geodesics.tracking.registry import register_planner
 from tests.readme import TIMES_PAGE, with_stage_times
@@ -51,7 +52,10 @@ def prose(page: str) -> str:
 
 def inline(page: str) -> list[str]:
     """Code between backticks in the text, over line ends too."""
-    return [" ".join(code.split()) for _, code in re.findall(r"(?<!`)(`+)(?!`)(.+?)(?<!`)\1(?!`)", prose(page), re.S)]
+    return [
+        " ".join(code.split())
+        for _, code in re.findall(r"(?<!`)(`+)(?!`)(.+?)(?<!`)\1(?!`)", prose(page), re.S)
+    ]
 
 
 def commands(page: str) -> list[list[str]]:
@@ -71,7 +75,9 @@ def words_of(block: str) -> list[list[str]]:
             continue
         text = ""
         if words:
-            found.append(words[next(k for k, word in enumerate(words) if not re.match(r"[A-Z_]+=", word)) :])
+            found.append(
+                words[next(k for k, word in enumerate(words) if not re.match(r"[A-Z_]+=", word)) :]
+            )
     assert not text, text
     return found
 
@@ -84,7 +90,9 @@ def having(language: str) -> list[str]:
 
 
 def run(page: str, monkeypatch, folder: Path) -> dict[str, Any]:
-    """All Python of one page, one block after another; where it reads params.yaml, in the checkout."""
+    """All Python of one page, one block after another; where it reads params.yaml, in the
+    checkout.
+    """
     code = blocks(page, "python")
     monkeypatch.chdir(ROOT if any("params.yaml" in block for block in code) else folder)
     names: dict[str, Any] = {"__name__": "example"}
@@ -116,11 +124,15 @@ def test_the_extensions_work(monkeypatch, tmp_path) -> None:
     assert names["verdict"].valid
 
 
-@pytest.mark.parametrize("page", [page for page in having("python") if page not in ("first_path.md", "extend.md")])
+@pytest.mark.parametrize(
+    "page", [page for page in having("python") if page not in ("first_path.md", "extend.md")]
+)
 def test_the_other_code_runs(page, monkeypatch, tmp_path) -> None:
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     if "models:/" in PAGES[page]:  # what a run of the pipeline leaves in the registry
-        with tracked_stage("build_planner", "planner", {}, [], experiment="built", root=tmp_path) as stage:
+        with tracked_stage(
+            "build_planner", "planner", {}, [], experiment="built", root=tmp_path
+        ) as stage:
             example = {"start": [0.0] * 6, "goal": [0.1] * 6, "constraint": "free"}
             register_planner(stage, PACKAGED, PACKAGE / "served_model.py", example)
     run(page, monkeypatch, tmp_path)
@@ -143,11 +155,15 @@ def cells(kind: str) -> list[dict[str, Any]]:
 
 
 def printed(cell: dict[str, Any]) -> str:
-    return "".join("".join(output["text"]) for output in cell["outputs"] if output["output_type"] == "stream")
+    return "".join(
+        "".join(output["text"]) for output in cell["outputs"] if output["output_type"] == "stream"
+    )
 
 
 def test_the_notebook_s_cells_run_and_print_what_is_stored(monkeypatch, tmp_path, capsys) -> None:
-    """`make notebook` runs it in Jupyter and stores the outputs; here the same cells run without it."""
+    """`make notebook` runs it in Jupyter and stores the outputs; here the same cells run without
+    it.
+    """
     monkeypatch.chdir(tmp_path)
     matplotlib.use("Agg")
     names: dict[str, Any] = {"__name__": "notebook"}
@@ -166,10 +182,17 @@ def rounded(text: str) -> str:
 
 
 def test_the_notebook_holds_its_pictures_and_is_small() -> None:
-    pictures = [output for cell in cells("code") for output in cell["outputs"] if "image/png" in output.get("data", {})]
+    pictures = [
+        output
+        for cell in cells("code")
+        for output in cell["outputs"]
+        if "image/png" in output.get("data", {})
+    ]
     assert len(pictures) == 2
     assert NOTEBOOK.stat().st_size < 200_000
-    assert [cell["execution_count"] for cell in cells("code")] == list(range(1, len(cells("code")) + 1))
+    assert [cell["execution_count"] for cell in cells("code")] == list(
+        range(1, len(cells("code")) + 1)
+    )
     told = "".join("".join(cell["source"]) for cell in cells("markdown"))
     assert set(re.findall(r"\]\(([^)#]+)", told)) <= set(PAGES)
 
@@ -227,8 +250,12 @@ def test_every_target_of_make_exists(page) -> None:
 # Experiments
 
 
-def pipeline(folder: Path, overrides: tuple[str, ...]) -> dict[str, tuple[str, dict[str, Any], set[str]]]:
-    """Each stage's command, values of its parameters and the stages it depends on, as DVC reads dvc.yaml."""
+def pipeline(
+    folder: Path, overrides: tuple[str, ...]
+) -> dict[str, tuple[str, dict[str, Any], set[str]]]:
+    """Each stage's command, values of its parameters and the stages it depends on, as DVC reads
+    dvc.yaml.
+    """
     folder.mkdir()
     for name in ("dvc.yaml", "params.yaml"):
         shutil.copy(ROOT / name, folder)
@@ -278,7 +305,9 @@ def experiments() -> list[tuple[list[str], list[str], str]]:
     """Of every experiment its overrides, its targets, and the text up to the next block."""
     found = []
     for page in having("bash"):
-        for block, after in re.findall(r"^```bash\n(.*?)^```\n(.*?)(?=^```|\Z)", PAGES[page], re.S | re.M):
+        for block, after in re.findall(
+            r"^```bash\n(.*?)^```\n(.*?)(?=^```|\Z)", PAGES[page], re.S | re.M
+        ):
             for words in words_of(block):
                 if words[:3] == ["dvc", "exp", "run"]:
                     told = as_dvc_reads(words[1:])
@@ -290,7 +319,9 @@ EXPERIMENTS = experiments()
 
 
 @pytest.mark.parametrize(
-    ("overrides", "targets", "after"), EXPERIMENTS, ids=[overrides[0].split("=")[0] for overrides, _, _ in EXPERIMENTS]
+    ("overrides", "targets", "after"),
+    EXPERIMENTS,
+    ids=[overrides[0].split("=")[0] for overrides, _, _ in EXPERIMENTS],
 )
 def test_an_experiment_changes_what_exists_and_runs_what_its_page_says(
     overrides, targets, after, committed, tmp_path
@@ -304,7 +335,11 @@ def test_an_experiment_changes_what_exists_and_runs_what_its_page_says(
 
     @cache
     def touched(name: str) -> bool:
-        return name not in before or now[name][:2] != before[name][:2] or any(map(touched, now[name][2]))
+        return (
+            name not in before
+            or now[name][:2] != before[name][:2]
+            or any(map(touched, now[name][2]))
+        )
 
     def needed(name: str) -> set[str]:
         return {name}.union(*map(needed, now[name][2]))
@@ -344,7 +379,10 @@ def test_every_link_leads_somewhere(page) -> None:
         assert not file or file in PAGES or (ROOT / "docs" / file).is_file(), target
         if heading:
             titles = re.findall(r"^#+ (.*)$", prose(file or page), re.M)
-            slugs = {re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", title).strip().lower()) for title in titles}
+            slugs = {
+                re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", title).strip().lower())
+                for title in titles
+            }
             assert heading in slugs, target
 
 
@@ -361,13 +399,19 @@ def test_every_file_that_the_text_names_exists(page) -> None:
 def test_every_parameter_that_the_text_names_exists(page) -> None:
     for code in inline(page):
         key = code.split(":")[0]
-        if re.fullmatch(r"[a-z_]+(\.\w+)+", key) and key.split(".")[0] in PARAMS and not key.endswith((".py", ".json")):
+        if (
+            re.fullmatch(r"[a-z_]+(\.\w+)+", key)
+            and key.split(".")[0] in PARAMS
+            and not key.endswith((".py", ".json"))
+        ):
             looked_up(PARAMS, key)
 
 
 @every_page
 def test_every_filter_is_one_that_mlflow_understands(page) -> None:
-    filters = blocks(page, "sql") + re.findall(r"`+ ?((?:tags|attributes|metrics)\.[^|]+?) ?`+ \|$", prose(page), re.M)
+    filters = blocks(page, "sql") + re.findall(
+        r"`+ ?((?:tags|attributes|metrics)\.[^|]+?) ?`+ \|$", prose(page), re.M
+    )
     assert filters or page not in ("mlflow.md", "experiments.md")
     for text in filters:
         assert SearchUtils.parse_search_filter(text.strip()), text
@@ -387,7 +431,11 @@ def test_the_site_has_every_page_and_loads_nothing_from_the_net() -> None:
     def pages(entry: Any) -> list[str]:
         if isinstance(entry, str):
             return [entry]
-        return [page for each in (entry.values() if isinstance(entry, dict) else entry) for page in pages(each)]
+        return [
+            page
+            for each in (entry.values() if isinstance(entry, dict) else entry)
+            for page in pages(each)
+        ]
 
     assert sorted(pages(site["nav"])) == sorted([*PAGES, NOTEBOOK_PAGE])
     assert site["theme"]["highlightjs"] is False
@@ -419,7 +467,11 @@ def test_the_site_builds_strictly_and_opens_from_disk(tmp_path) -> None:
     command = [str(MKDOCS), "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
     built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
-    assert {page.with_suffix(".md").name for page in tmp_path.glob("*.html")} == {*PAGES, NOTEBOOK_PAGE, "404.md"}
+    assert {page.with_suffix(".md").name for page in tmp_path.glob("*.html")} == {
+        *PAGES,
+        NOTEBOOK_PAGE,
+        "404.md",
+    }
     for page in tmp_path.glob("*.html"):
         if page.name == "404.html":  # for servers
             continue
@@ -427,19 +479,25 @@ def test_the_site_builds_strictly_and_opens_from_disk(tmp_path) -> None:
         parsed.feed(page.read_text())
         for address in parsed.addresses:
             inside = address.partition("#")[0].partition("?")[0]
-            assert address.startswith("data:image/") or (tmp_path / inside).is_file(), (page.name, address)
+            assert address.startswith("data:image/") or (tmp_path / inside).is_file(), (
+                page.name,
+                address,
+            )
     for style in tmp_path.rglob("*.css"):
         for address in re.findall(r"""(?:url\(|@import)\s*["']?([^"')\s]+)""", style.read_text()):
             inside = style.parent / address.partition("#")[0].partition("?")[0]
             assert address.startswith(("data:", "#")) or inside.is_file(), (style.name, address)
     parsed = Loaded()
     parsed.feed((tmp_path / "method.html").read_text())
-    assert "σ(z)⁻² = Σ_k w_k exp(−½ ‖z − c_k‖² / h_k²)" in parsed.text, "equations are text: nothing renders them"
+    assert "σ(z)⁻² = Σ_k w_k exp(−½ ‖z − c_k‖² / h_k²)" in parsed.text, (
+        "equations are text: nothing renders them"
+    )
 
 
 @pytest.mark.skipif(not MKDOCS.is_file(), reason="no mkdocs: `make docs` installs it")
 @pytest.mark.parametrize(
-    "bad", ["<script src='//host/x.js'></script>", "<style>a {background: url(//host/x.png)}</style>"]
+    "bad",
+    ["<script src='//host/x.js'></script>", "<style>a {background: url(//host/x.png)}</style>"],
 )
 def test_a_page_that_loads_something_from_the_net_fails_the_build(bad, tmp_path) -> None:
     shutil.copytree(ROOT / "docs", tmp_path / "docs")
@@ -447,7 +505,11 @@ def test_a_page_that_loads_something_from_the_net_fails_the_build(bad, tmp_path)
     with (tmp_path / "docs" / "limits.md").open("a") as page:
         page.write(f"\n{bad}\n")
     built = subprocess.run(
-        [str(MKDOCS), "build", "--strict"], cwd=tmp_path, capture_output=True, text=True, check=False
+        [str(MKDOCS), "build", "--strict"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert built.returncode != 0
     assert "would load //host/x" in built.stderr

@@ -1,4 +1,6 @@
-"""Every command that README and the documentation print is run: here, or by the test that is named here."""
+"""Every command that README and the documentation print is run: here, or by the test that is named
+here.
+"""
 
 import os
 import re
@@ -17,11 +19,15 @@ from tests.planner_fixtures import packaged_planner
 from tests.test_cli_plan import called
 from tests.test_docs import ROOT, words_of
 
-TEXTS = {"README.md": ROOT / "README.md"} | {page.name: page for page in sorted((ROOT / "docs").glob("*.md"))}
+TEXTS = {"README.md": ROOT / "README.md"} | {
+    page.name: page for page in sorted((ROOT / "docs").glob("*.md"))
+}
 HERE = "here"
 """As the page prints it, in a new folder."""
 MAKE = "make -n"
-"""What `make` would do is printed by make itself; what a target runs is a command of ours with a test of its own."""
+"""What `make` would do is printed by make itself; what a target runs is a command of ours with a
+test of its own.
+"""
 EXPERIMENT = "tests/pipeline/test_experiment.py"
 REGISTRY = "tests/tracking/test_registry.py"
 COVERED: dict[str, str | tuple[str, str]] = {
@@ -32,7 +38,7 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "geodesics doctor": HERE,
     "geodesics results": HERE,
     "geodesics replay": HERE,
-    "geodesics replay FILE": ("tests/tracking/test_recording.py", "open_recordings"),
+    "geodesics replay FILE": ("tests/recording/test_recording.py", "open_recordings"),
     "geodesics bench": ("tests/test_cli_json.py", '"bench"'),
     "geodesics ui": ("tests/tracking/test_experiment.py", "ui_command"),
     "make": MAKE,
@@ -64,7 +70,10 @@ def kind_of(words: list[str]) -> str:
     """The name of a command in COVERED."""
     if words[:2] == ["geodesics", "replay"] and words[2:]:
         return "geodesics replay FILE"
-    length = {"geodesics": 2, "dvc": 3 if words[1:2] in (["exp"], ["metrics"], ["params"], ["plots"]) else 2}
+    length = {
+        "geodesics": 2,
+        "dvc": 3 if words[1:2] in (["exp"], ["metrics"], ["params"], ["plots"]) else 2,
+    }
     return " ".join(words[: length.get(words[0], 2 if words[0] in ("git", "mlflow") else 1)])
 
 
@@ -131,18 +140,31 @@ def test_a_command_of_ours_does_what_its_page_says(words, folder, monkeypatch, c
         if option in given:
             assert (folder / given[given.index(option) + 1]).stat().st_size > 1000
     expected = {
-        "constraints": "level_cup", "plan": "solved", "check": "valid", "params": "ok", "results": "planner",
+        "constraints": "level_cup",
+        "plan": "solved",
+        "check": "valid",
+        "params": "ok",
+        "results": "planner",
         "replay": "path.rrd",
-    }  # fmt: skip
+    }
     assert expected[words[1]] in out
 
 
-TARGETS = sorted({tuple(words) for name in TEXTS for words in [*EVERY[name], *in_text(name)] if words[0] == "make"})
+TARGETS = sorted(
+    {
+        tuple(words)
+        for name in TEXTS
+        for words in [*EVERY[name], *in_text(name)]
+        if words[0] == "make"
+    }
+)
 
 
 @pytest.mark.parametrize("words", TARGETS, ids=" ".join)
 def test_make_knows_what_to_do(words) -> None:
-    done = subprocess.run([words[0], "-n", *words[1:]], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [words[0], "-n", *words[1:]], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip()
 
@@ -165,12 +187,15 @@ def complete(line: str, folder: Path, count: int = 3) -> list[str]:
     program = (
         'source "$2"; IFS=$\'\\t\' read -r -a COMP_WORDS <<< "$1"; '
         "[[ $1 == *$'\\t' ]] && COMP_WORDS+=(''); "
-        'COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); _geodesics_completion geodesics; printf "%s\\n" "${COMPREPLY[@]}"'
+        "COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); _geodesics_completion geodesics; "
+        'printf "%s\\n" "${COMPREPLY[@]}"'
     )
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     environment = os.environ | {"PATH": path, "PYTHONPATH": str(ROOT / "src")}
     command = ["bash", "--norc", "-c", program, "bash", line, str(the_shell_s_script())]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
     assert done.stderr == ""
     assert done.returncode == 0
     return [line for line in done.stdout.splitlines() if line]
@@ -179,10 +204,14 @@ def complete(line: str, folder: Path, count: int = 3) -> list[str]:
 @cache
 def the_shell_s_script() -> Path:
     """What `--install-completion` would put into the shell's start-up."""
-    program = "import sys; sys.argv = ['geodesics']; from constraint_geodesics import cli; cli.main()"
+    program = (
+        "import sys; sys.argv = ['geodesics']; from constraint_geodesics import cli; cli.main()"
+    )
     environment = os.environ | {"_GEODESICS_COMPLETE": "source_bash"}
     command = [sys.executable, "-c", program]
-    script = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+    script = subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=True
+    ).stdout
     file = Path(tempfile.mkdtemp()) / "geodesics.bash"
     file.write_text(script)
     return file
@@ -200,7 +229,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(("line", "proposed"), CASES.items(), ids=[line.replace("\t", " ") for line in CASES])
+@pytest.mark.parametrize(
+    ("line", "proposed"), CASES.items(), ids=[line.replace("\t", " ") for line in CASES]
+)
 def test_bash_completes_names(line, proposed, folder) -> None:
     (folder / "other").mkdir(exist_ok=True)
     (folder / "other" / "a b.rrd").touch()
@@ -215,7 +246,9 @@ def test_a_planner_s_own_constraints_are_proposed(folder, tmp_path) -> None:
 
 
 def test_names_are_proposed_where_files_are_missing_or_broken(tmp_path) -> None:
-    assert complete("geodesics\tplan\t--constraint\ttool", tmp_path) == ["tool_down"], "those of the package"
+    assert complete("geodesics\tplan\t--constraint\ttool", tmp_path) == ["tool_down"], (
+        "those of the package"
+    )
     assert complete("geodesics\tbench\t--planner\t", tmp_path) == []
     (tmp_path / "params.yaml").write_text("bench: [")
     assert complete("geodesics\tbench\t--planner\t", tmp_path) == []
@@ -227,9 +260,12 @@ def test_completion_loads_nothing_heavy(folder) -> None:
         " COMP_WORDS='geodesics\\nplan\\n--constraint\\nlevel'); sys.argv = ['geodesics']\n"
         "from constraint_geodesics import cli\n"
         "try:\n    cli.main()\n"
-        "finally:\n    print(sorted({'torch', 'numpy', 'mlflow', 'pandas', 'rerun', 'dvc'} & set(sys.modules)))\n"
+        "finally:\n    print(sorted({'torch', 'numpy', 'mlflow', 'pandas', 'rerun', 'dvc'} & "
+        "set(sys.modules)))\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], cwd=folder, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=folder, capture_output=True, text=True, check=False
+    )
     assert done.stdout.splitlines()[-1] == "[]", done.stdout + done.stderr
     assert "level_cup" in done.stdout
 
@@ -271,5 +307,7 @@ def test_the_first_call_is_known_by_the_kernels_that_are_not_compiled(tmp_path) 
 
 
 def test_after_a_plan_its_kernels_are_compiled() -> None:
-    packaged_planner().plan(*([float(word) for word in text.split()] for text in ELLIPSIS.values()), "level_cup")
+    packaged_planner().plan(
+        *([float(word) for word in text.split()] for text in ELLIPSIS.values()), "level_cup"
+    )
     assert cli.what_takes_time() == "loading the planner"

@@ -1,4 +1,6 @@
-"""The script that fills the outputs of docs/experiments.md takes its commands from the page, and changes no more."""
+"""The script that fills the outputs of docs/experiments.md takes its commands from the page, and
+changes no more.
+"""
 
 import importlib.util
 import re

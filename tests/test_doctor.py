@@ -1,4 +1,6 @@
-"""`geodesics doctor` on conditions made for real: a failure is found and its mend named, a sound state left alone."""
+"""`geodesics doctor` on conditions made for real: a failure is found and its mend named, a sound
+state left alone.
+"""
 
 import ast
 import fcntl
@@ -23,13 +25,13 @@ from mlflow import MlflowClient
 from mlflow.exceptions import MlflowException
 
 from constraint_geodesics import bundle
-from constraint_geodesics.constraints.scene import find_urdf
 from constraint_geodesics.doctor.checkout import check_disk
 from constraint_geodesics.doctor.report import CHECKS, COLOURS, Finding, as_text, examine, exit_code
 from constraint_geodesics.doctor.runs import check_pipeline
 from constraint_geodesics.doctor.surroundings import Surroundings, numbers, versions_in
-from constraint_geodesics.robot.bullet import data_path
 from constraint_geodesics.robot.kinematics import RobotError
+from constraint_geodesics.scene.scene import find_urdf
+from constraint_geodesics.scene.world import data_path
 from tests.test_cli_plan import strict
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -37,7 +39,11 @@ PACKAGE = Path(bundle.__file__).parent
 SOURCES = PACKAGE.parent
 HERE = replace(
     Surroundings.here(),
-    environ={name: value for name, value in os.environ.items() if not name.startswith(("MLFLOW_", "DVC_", "GIT_"))},
+    environ={
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("MLFLOW_", "DVC_", "GIT_"))
+    },
 )
 
 
@@ -56,25 +62,35 @@ def only(findings: list[Finding], status: str) -> Finding:
 
 def with_environ(**changes: str | None) -> Surroundings:
     changed = {**HERE.environ, **changes}
-    return replace(HERE, environ={name: value for name, value in changed.items() if value is not None})
+    return replace(
+        HERE, environ={name: value for name, value in changed.items() if value is not None}
+    )
 
 
 def run(
     *command: str | Path, folder: Path, environ: Mapping[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [str(word) for word in command], cwd=folder, env=dict(HERE.environ if environ is None else environ),
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        [str(word) for word in command],
+        cwd=folder,
+        env=dict(HERE.environ if environ is None else environ),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 def distribution(site: Path, name: str, version: str, url: str | None = None) -> None:
-    """What pip leaves of an installed package; url: of one that is installed from a folder, to be changed there."""
+    """What pip leaves of an installed package; url: of one that is installed from a folder, to be
+    changed there.
+    """
     folder = site / f"{name.replace('-', '_')}-{version}.dist-info"
     folder.mkdir(parents=True)
     (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
     if url is not None:
-        (folder / "direct_url.json").write_text(json.dumps({"dir_info": {"editable": True}, "url": url}))
+        (folder / "direct_url.json").write_text(
+            json.dumps({"dir_info": {"editable": True}, "url": url})
+        )
 
 
 def checkout(folder: Path) -> Path:
@@ -97,17 +113,27 @@ def test_the_checkouts_own_environment_is_pointed_at(tmp_path) -> None:
     assert only(look("python", tmp_path, replace(HERE, python=(3, 12, 1))), "problem").mend == (
         "source .venv/bin/activate"
     )
-    assert only(look("python", tmp_path, replace(HERE, python=(3, 11, 9))), "ok").message == "3.11.9"
+    assert (
+        only(look("python", tmp_path, replace(HERE, python=(3, 11, 9))), "ok").message == "3.11.9"
+    )
 
 
 def test_an_older_python_can_read_the_module() -> None:
-    """All that is imported, which annotates with what that Python does not have but never evaluates it."""
+    """All that is imported, which annotates with what that Python does not have but never evaluates
+    it.
+    """
     files = list((PACKAGE / "doctor").glob("*.py"))
     assert len(files) > 5
     for file in (PACKAGE / "__init__.py", *files):
         tree = ast.parse(file.read_text(), feature_version=(3, 8))
-        future = [node for node in tree.body if isinstance(node, ast.ImportFrom) and node.module == "__future__"]
-        assert file.name == "__init__.py" or [name.name for name in future[0].names] == ["annotations"]
+        future = [
+            node
+            for node in tree.body
+            if isinstance(node, ast.ImportFrom) and node.module == "__future__"
+        ]
+        assert file.name == "__init__.py" or [name.name for name in future[0].names] == [
+            "annotations"
+        ]
 
 
 def test_it_runs_without_any_package(tmp_path) -> None:
@@ -115,22 +141,39 @@ def test_it_runs_without_any_package(tmp_path) -> None:
     shutil.copy(ROOT / "requirements.lock", tmp_path)
     shutil.copy(ROOT / "params.yaml", tmp_path)
     environ = {**HERE.environ, "PYTHONPATH": str(SOURCES)}
-    done = run(sys.executable, "-S", "-m", "constraint_geodesics.doctor", "--json", folder=tmp_path, environ=environ)
+    done = run(
+        sys.executable,
+        "-S",
+        "-m",
+        "constraint_geodesics.doctor",
+        "--json",
+        folder=tmp_path,
+        environ=environ,
+    )
     assert done.stderr == ""
     assert done.returncode == 1
     answer = json.loads(done.stdout)
     assert answer["ok"] is False
     findings = {entry["check"]: entry for entry in answer["findings"]}
     count = len((ROOT / "requirements.lock").read_text().splitlines())
-    assert findings["packages"]["message"].startswith(f"{count} of {count} are missing: aiohappyeyeballs, aiohttp, ")
+    assert findings["packages"]["message"].startswith(
+        f"{count} of {count} are missing: aiohappyeyeballs, aiohttp, "
+    )
     assert findings["packages"]["message"].endswith(f"and {count - 4} more")
     assert "neither in this checkout nor in pybullet_data" in findings["robot"]["message"]
-    assert not [entry for entry in answer["findings"] if "could not be looked at" in entry["message"]]
+    assert not [
+        entry for entry in answer["findings"] if "could not be looked at" in entry["message"]
+    ]
 
 
 def test_packages_are_compared_with_the_lock(tmp_path) -> None:
     site = tmp_path / "site"
-    for name, version in (("torch", "2.13.0+cpu"), ("Ruamel_Yaml", "0.19.1"), ("numpy", "1.26.4"), ("extra", "1")):
+    for name, version in (
+        ("torch", "2.13.0+cpu"),
+        ("Ruamel_Yaml", "0.19.1"),
+        ("numpy", "1.26.4"),
+        ("extra", "1"),
+    ):
         distribution(site, name, version)
     here = replace(HERE, installed=versions_in([str(site)]))
     lock = tmp_path / "requirements.lock"
@@ -143,7 +186,9 @@ def test_packages_are_compared_with_the_lock(tmp_path) -> None:
     assert missing.status == other.status == "problem"
     assert missing.mend == "python -m pip install -r requirements.lock"
     lock.write_text("torch==2.12.0\n")
-    assert "torch 2.13.0+cpu, not 2.12.0" in only(look("packages", tmp_path, here), "problem").message
+    assert (
+        "torch 2.13.0+cpu, not 2.12.0" in only(look("packages", tmp_path, here), "problem").message
+    )
 
 
 def test_of_two_versions_the_one_that_python_finds_counts(tmp_path) -> None:
@@ -152,19 +197,31 @@ def test_of_two_versions_the_one_that_python_finds_counts(tmp_path) -> None:
     (tmp_path / "first" / "scipy-1.17.1.dist-info").mkdir()  # broken: nothing in it
     folders = [str(tmp_path / "first"), str(tmp_path / "second")]
     assert versions_in(folders) == {"numpy": "2.4.6"}
-    ask = f"from constraint_geodesics.doctor.surroundings import versions_in; print(versions_in({folders}))"
-    environ = {**HERE.environ, "PYTHONPATH": str(SOURCES)}  # a package of MLflow's replaces Python's own way to look
-    assert run(sys.executable, "-S", "-c", ask, folder=tmp_path, environ=environ).stdout == "{'numpy': '2.4.6'}\n"
+    ask = (
+        f"from constraint_geodesics.doctor.surroundings import versions_in; "
+        f"print(versions_in({folders}))"
+    )
+    environ = {
+        **HERE.environ,
+        "PYTHONPATH": str(SOURCES),
+    }  # a package of MLflow's replaces Python's own way to look
+    assert (
+        run(sys.executable, "-S", "-c", ask, folder=tmp_path, environ=environ).stdout
+        == "{'numpy': '2.4.6'}\n"
+    )
 
 
 @pytest.mark.parametrize(
     ("installed", "parts"),
     [
         ({"torch": "2.13.0+cu130"}, ("2.13.0+cu130:",)),
-        ({"torch": "2.13.0", "nvidia-cublas": "13.0", "triton": "3.6"}, ("and 2 packages", "-y nvidia-cublas triton")),
+        (
+            {"torch": "2.13.0", "nvidia-cublas": "13.0", "triton": "3.6"},
+            ("and 2 packages", "-y nvidia-cublas triton"),
+        ),
         ({"torch": "2.13.0+rocm7.0"}, ("2.13.0+rocm7.0",)),
     ],
-)  # fmt: skip
+)
 def test_torch_for_a_graphics_card_is_noted(tmp_path, installed, parts) -> None:
     (tmp_path / "requirements.lock").write_text("torch==2.13.0\n")
     found = only(look("torch", tmp_path, replace(HERE, installed=installed)), "note")
@@ -189,7 +246,9 @@ def in_checkout(root: Path, site: Path, package: Path | None = None) -> Surround
 def test_a_moved_checkout_is_recognised(tmp_path) -> None:
     old, site = checkout(tmp_path / "old place"), tmp_path / "site"
     distribution(site, "constraint-geodesics", "0.1.0", old.as_uri())
-    assert only(look("install", old, in_checkout(old, site)), "ok").message.startswith("constraint_geodesics from")
+    assert only(look("install", old, in_checkout(old, site)), "ok").message.startswith(
+        "constraint_geodesics from"
+    )
     new = old.rename(tmp_path / "new")
     found = only(look("install", new, in_checkout(new, site)), "problem")
     assert f"from {old}, which is no longer there" in found.message
@@ -205,7 +264,10 @@ def test_the_package_of_another_checkout_is_recognised(tmp_path) -> None:
     assert found.mend == "python -m pip install --no-deps --editable ."
     found = only(look("install", own, in_checkout(own, site)), "note")
     assert f"from {other}, another checkout; only PYTHONPATH" in found.message
-    found = only(look("install", other, in_checkout(other, site, own / "src" / "constraint_geodesics")), "problem")
+    found = only(
+        look("install", other, in_checkout(other, site, own / "src" / "constraint_geodesics")),
+        "problem",
+    )
     assert found.mend == "unset PYTHONPATH"
 
 
@@ -262,7 +324,9 @@ def test_a_checkout_without_git_is_recognised(tmp_path) -> None:
     found = only(look("git", root, here), "problem")
     assert "no git repository" in found.message
     assert "dvc config core.no_scm true" in found.mend
-    assert only(look("git", root, with_environ(PATH=str(tmp_path))), "problem").mend == "install git"
+    assert (
+        only(look("git", root, with_environ(PATH=str(tmp_path))), "problem").mend == "install git"
+    )
     run("git", "init", "--quiet", folder=root)
     assert only(look("git", root, here), "ok").message == f"a repository in {root}"
 
@@ -270,7 +334,9 @@ def test_a_checkout_without_git_is_recognised(tmp_path) -> None:
 def test_a_checkout_of_another_user_is_recognised(tmp_path) -> None:
     root = checkout(tmp_path)
     run("git", "init", "--quiet", folder=root)
-    here = with_environ(GIT_TEST_ASSUME_DIFFERENT_OWNER="1", HOME=str(tmp_path), GIT_CONFIG_NOSYSTEM="1")
+    here = with_environ(
+        GIT_TEST_ASSUME_DIFFERENT_OWNER="1", HOME=str(tmp_path), GIT_CONFIG_NOSYSTEM="1"
+    )
     found = only(look("git", root, here), "problem")
     assert found.mend == f"git config --global --add safe.directory {root}"
     run(*found.mend.split(), folder=root, environ=here.environ)
@@ -280,7 +346,11 @@ def test_a_checkout_of_another_user_is_recognised(tmp_path) -> None:
 def test_a_folder_that_can_not_be_written_and_a_full_disk_are_recognised(tmp_path) -> None:
     assert only(look("disk", tmp_path), "ok").message.endswith("GB free")
     assert not list(tmp_path.iterdir())
-    assert [f for f in look("disk", Path("/proc")) if f.status == "problem" and "/proc can't be written" in f.message]
+    assert [
+        f
+        for f in look("disk", Path("/proc"))
+        if f.status == "problem" and "/proc can't be written" in f.message
+    ]
     (full,) = check_disk(tmp_path, HERE, least=10**18)
     assert full[0] == "problem"
     assert full[1].endswith("GB free, where a run needs 1000000000")
@@ -313,18 +383,29 @@ def test_a_urdf_that_is_nowhere_is_recognised(tmp_path, monkeypatch) -> None:
 
 
 def test_missing_meshes_are_recognised(tmp_path) -> None:
-    """The URDF alone, then with its meshes beside it, in a folder above it, and without one of them."""
+    """The URDF alone, then with its meshes beside it, in a folder above it, and without one of
+    them.
+    """
     name = "robots/arm/arm.urdf"
     root = robot_checkout(tmp_path, name)
     (root / name).parent.mkdir(parents=True)
     shutil.copy(data_path() / "xarm" / "xarm6_robot.urdf", root / name)
     found = only(look("robot", root), "problem")
-    assert re.search(r"14 of its meshes are missing: package://xarm_description/.* and 10 more$", found.message)
-    meshes = Path(shutil.copytree(data_path() / "xarm" / "xarm_description", root / "robots" / "xarm_description"))
+    assert re.search(
+        r"14 of its meshes are missing: package://xarm_description/.* and 10 more$", found.message
+    )
+    meshes = Path(
+        shutil.copytree(
+            data_path() / "xarm" / "xarm_description", root / "robots" / "xarm_description"
+        )
+    )
     assert only(look("robot", root), "ok").message.startswith(f"{name} with 14 meshes")
     (meshes / "meshes" / "xarm6" / "visual" / "link3.stl").unlink()
     found = only(look("robot", root), "problem")
-    assert "1 of its meshes are missing: package://xarm_description/meshes/xarm6/visual/link3.stl" in found.message
+    assert (
+        "1 of its meshes are missing: package://xarm_description/meshes/xarm6/visual/link3.stl"
+        in found.message
+    )
     assert str(root / name) in found.mend
 
 
@@ -354,7 +435,11 @@ OUTER = (
 def kernel_checkout(root: Path) -> Path:
     package = checkout(root) / "src" / "constraint_geodesics"
     (package / "__init__.py").write_text("")
-    for name, text in (("low/inner.py", INNER.format(1)), ("high/outer.py", OUTER), ("high/alone.py", INNER.format(0))):
+    for name, text in (
+        ("low/inner.py", INNER.format(1)),
+        ("high/outer.py", OUTER),
+        ("high/alone.py", INNER.format(0)),
+    ):
         (package / name).parent.mkdir(exist_ok=True)
         (package / name).write_text(text)
     return package
@@ -374,7 +459,10 @@ def test_a_stale_kernel_is_recognised_and_mended(tmp_path) -> None:
     (package / "low" / "inner.py").write_text(INNER.format(2))
     assert answer() == "20", "numba's own check does not see it"
     found = only(look("kernels", tmp_path), "problem")
-    assert found.message == "2 of 4 files of compiled kernels are older than low/inner.py, which they call"
+    assert (
+        found.message
+        == "2 of 4 files of compiled kernels are older than low/inner.py, which they call"
+    )
     subprocess.run(found.mend, shell=True, check=True, cwd=tmp_path)
     assert only(look("kernels", tmp_path), "ok")
     assert answer() == "30"
@@ -406,7 +494,10 @@ def test_caches_that_numba_drops_itself_are_well(tmp_path) -> None:
 def test_no_display_is_noted(tmp_path) -> None:
     none = replace(with_environ(DISPLAY=None, WAYLAND_DISPLAY=None), platform="linux")
     assert "--web" in only(look("display", tmp_path, none), "note").mend
-    for there in (with_environ(DISPLAY=":0"), with_environ(DISPLAY="", WAYLAND_DISPLAY="wayland-0")):
+    for there in (
+        with_environ(DISPLAY=":0"),
+        with_environ(DISPLAY="", WAYLAND_DISPLAY="wayland-0"),
+    ):
         assert only(look("display", tmp_path, replace(there, platform="linux")), "ok")
     assert only(look("display", tmp_path, replace(none, platform="darwin")), "ok")
 
@@ -451,7 +542,10 @@ def test_another_rerun_on_the_path_is_noted(tmp_path) -> None:
     other = tmp_path / "rerun"
     other.write_text("#!/bin/sh\necho 'rerun-cli 0.22.1 [rustc 1.81.0] x86_64-unknown-linux-gnu'\n")
     other.chmod(0o755)
-    found = only(look("recordings", tmp_path, with_environ(PATH=f"{tmp_path}:{HERE.environ['PATH']}")), "note")
+    found = only(
+        look("recordings", tmp_path, with_environ(PATH=f"{tmp_path}:{HERE.environ['PATH']}")),
+        "note",
+    )
     assert f"{other} of version 0.22.1, but this environment has {rr.__version__}" in found.message
     own = with_environ(PATH=f"{HERE.prefix / 'bin'}:{tmp_path}")
     assert only(look("recordings", tmp_path, own), "ok")
@@ -486,8 +580,21 @@ def test_a_store_of_this_mlflow_is_well(store, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("version", "parts"),
     [
-        ("451aebb31d03", ("of an older MLflow", "cp mlflow.db mlflow.db.old && mlflow db upgrade sqlite:///mlflow.db")),
-        ("ffffffffffff", ("a newer one wrote it", "pip install --upgrade mlflow", "mv mlflow.db mlflow.db.newer")),
+        (
+            "451aebb31d03",
+            (
+                "of an older MLflow",
+                "cp mlflow.db mlflow.db.old && mlflow db upgrade sqlite:///mlflow.db",
+            ),
+        ),
+        (
+            "ffffffffffff",
+            (
+                "a newer one wrote it",
+                "pip install --upgrade mlflow",
+                "mv mlflow.db mlflow.db.newer",
+            ),
+        ),
     ],
 )
 def test_a_store_of_another_schema_is_recognised(store, tmp_path, version, parts) -> None:
@@ -511,8 +618,12 @@ def test_a_broken_store_is_recognised(store, tmp_path) -> None:
     found = only(look("mlflow", tmp_path), "problem")
     assert re.search("damaged|can't be read: .*malformed", found.message)
     file.write_bytes(b"<<<<<<< HEAD\n" * 1000)
-    assert "can't be read: file is not a database" in only(look("mlflow", tmp_path), "problem").message
-    assert only(look("mlflow", tmp_path), "problem").mend.startswith("mv mlflow.db mlflow.db.broken")
+    assert (
+        "can't be read: file is not a database" in only(look("mlflow", tmp_path), "problem").message
+    )
+    assert only(look("mlflow", tmp_path), "problem").mend.startswith(
+        "mv mlflow.db mlflow.db.broken"
+    )
 
 
 def test_a_store_in_use_is_no_broken_one(store, tmp_path) -> None:
@@ -539,11 +650,16 @@ def test_runs_in_files_are_noted(tmp_path, monkeypatch) -> None:
 @pytest.mark.parametrize(
     ("uri", "said"),
     [
-        ("localhost:5000", "no kind"), ("./mlruns", "refuses to keep runs in files"), ("http://", "no server"),
-        ("file:///tmp/mlruns", "refuses to keep runs in files"), ("http://127.0.0.1:99999", "Port out of range"),
-        ("sqlite://mlflow.db", "three slashes"), ("sqlite:", "no kind"), ("postgres://me:secret@host/runs", "no kind"),
+        ("localhost:5000", "no kind"),
+        ("./mlruns", "refuses to keep runs in files"),
+        ("http://", "no server"),
+        ("file:///tmp/mlruns", "refuses to keep runs in files"),
+        ("http://127.0.0.1:99999", "Port out of range"),
+        ("sqlite://mlflow.db", "three slashes"),
+        ("sqlite:", "no kind"),
+        ("postgres://me:secret@host/runs", "no kind"),
     ],
-)  # fmt: skip
+)
 def test_an_address_that_mlflow_can_not_use_is_recognised(tmp_path, uri, said) -> None:
     found = only(look("mlflow", tmp_path, with_environ(MLFLOW_TRACKING_URI=uri)), "problem")
     assert found.message.startswith(f"MLFLOW_TRACKING_URI={uri.replace('me:secret@', '')}: ")
@@ -551,7 +667,9 @@ def test_an_address_that_mlflow_can_not_use_is_recognised(tmp_path, uri, said) -
     assert "secret" not in found.message
 
 
-@pytest.mark.parametrize("uri", ["http://127.0.0.1:5000", "https://runs", "postgresql+psycopg2://me:secret@host/runs"])
+@pytest.mark.parametrize(
+    "uri", ["http://127.0.0.1:5000", "https://runs", "postgresql+psycopg2://me:secret@host/runs"]
+)
 def test_an_address_that_mlflow_can_use_is_well(tmp_path, uri) -> None:
     found = only(look("mlflow", tmp_path, with_environ(MLFLOW_TRACKING_URI=uri)), "ok")
     assert "secret" not in found.message
@@ -563,7 +681,9 @@ def test_an_address_that_mlflow_can_use_is_well(tmp_path, uri) -> None:
 PIPELINE = """\
 stages:
   draw:
-    cmd: mkdir -p data/drawn/{one,two} && cp params.yaml data/drawn/one/p && cp draw.py data/drawn/two/p
+    cmd: >-
+      mkdir -p data/drawn/{one,two} && cp params.yaml data/drawn/one/p &&
+      cp draw.py data/drawn/two/p
     params: [count]
     deps: [draw.py]
     outs: [data/drawn/one, data/drawn/two]
@@ -575,7 +695,10 @@ stages:
       - reports/shown.md:
           cache: false
 """
-BESIDE = "stages:\n  measure:\n    wdir: ..\n    cmd: cp draw.py slow.txt\n    deps: [draw.py]\n    outs: [slow.txt]\n"
+BESIDE = (
+    "stages:\n  measure:\n    wdir: ..\n    cmd: cp draw.py slow.txt\n    deps: "
+    "[draw.py]\n    outs: [slow.txt]\n"
+)
 
 
 def dvc(root: Path, *words: str) -> None:
@@ -628,7 +751,10 @@ def test_a_fresh_clone_is_not_called_changed(pipeline, tmp_path) -> None:
     clone = tmp_path / "clone"
     run("git", "clone", "--quiet", pipeline, clone, folder=tmp_path)
     found = only(look("pipeline", clone), "note")
-    assert found.message == "outputs of 2 stages are not here, as in a fresh clone; planning works without"
+    assert (
+        found.message
+        == "outputs of 2 stages are not here, as in a fresh clone; planning works without"
+    )
     assert found.mend == "make repro"
     (clone / "draw.py").write_text("# 2\n")
     changed, absent = look("pipeline", clone)
@@ -670,7 +796,9 @@ def test_a_pipeline_beside_the_main_one_is_noted(ran) -> None:
 
 
 def test_a_lock_file_broken_by_a_merge_is_recognised(ran) -> None:
-    (ran / "dvc.lock").write_text("<<<<<<< HEAD\nschema: '2.0'\n=======\nschema: '2.0'\n>>>>>>> other\n")
+    (ran / "dvc.lock").write_text(
+        "<<<<<<< HEAD\nschema: '2.0'\n=======\nschema: '2.0'\n>>>>>>> other\n"
+    )
     found = only(look("pipeline", ran), "problem")
     assert "DVC can't read dvc.lock" in found.message
     run(*found.mend.split(), folder=ran)
@@ -684,7 +812,10 @@ def test_dvc_at_work_or_too_slow_is_noted(ran) -> None:
     with (ran / ".dvc" / "tmp" / "lock").open("r+") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         (found,) = look("pipeline", ran)
-    assert (found.status, found.message) == ("note", "DVC is at work here: the stages were not looked at")
+    assert (found.status, found.message) == (
+        "note",
+        "DVC is at work here: the stages were not looked at",
+    )
 
 
 def test_without_a_pipeline_nothing_is_said(tmp_path) -> None:
@@ -705,7 +836,10 @@ def test_a_check_that_fails_is_a_problem_and_the_others_go_on(tmp_path) -> None:
 
 
 def test_the_text_is_aligned_and_coloured_on_demand() -> None:
-    findings = [Finding("disk", "ok", "82 GB free", ""), Finding("packages", "problem", "2 are missing", "make env")]
+    findings = [
+        Finding("disk", "ok", "82 GB free", ""),
+        Finding("packages", "problem", "2 are missing", "make env"),
+    ]
     assert as_text(findings).splitlines() == [
         "ok       disk:     82 GB free",
         "problem  packages: 2 are missing",
@@ -718,7 +852,9 @@ def test_the_text_is_aligned_and_coloured_on_demand() -> None:
 
 def command(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
     environ = {**HERE.environ, "PYTHONPATH": str(SOURCES)}
-    return run(sys.executable, "-m", "constraint_geodesics.cli", *words, folder=folder, environ=environ)
+    return run(
+        sys.executable, "-m", "constraint_geodesics.cli", *words, folder=folder, environ=environ
+    )
 
 
 def test_the_command_tells_by_its_exit_code(tmp_path) -> None:

@@ -1,4 +1,6 @@
-"""One colour a planner: that of palette.py, in every figure and table, and far enough from the other families'."""
+"""One colour a planner: that of palette.py, in every figure and table, and far enough from the
+other families'.
+"""
 
 import itertools
 from pathlib import Path
@@ -7,26 +9,41 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from constraint_geodesics.evaluation.benchmark_figures import DASHES, styles_of
-from constraint_geodesics.evaluation.figures import PLANNERS
-from constraint_geodesics.evaluation.growth_figure import FAMILIES as GROWING
-from constraint_geodesics.evaluation.plan_benchmark import BAND_AFTER, MULTI_START, PARTS, TANGENT
-from constraint_geodesics.evaluation.plan_report import METHODS
+from constraint_geodesics.benchmark.plan_benchmark import BAND_AFTER, MULTI_START, PARTS, TANGENT
 from constraint_geodesics.palette import FAMILIES, GREY, planner_colour, planner_family
 from constraint_geodesics.params import load_params
+from constraint_geodesics.report.benchmark_figures import DASHES, styles_of
+from constraint_geodesics.report.figures import PLANNERS
+from constraint_geodesics.report.growth_figure import FAMILIES as GROWING
+from constraint_geodesics.report.plan_report import METHODS
 
 PARAMS = load_params(Path(__file__).parents[1] / "params.yaml")
 SHOWN = {
-    *PARAMS.bench.planners, *PARAMS.benchmark.planners, *PARAMS.plans.parts, *PARAMS.plans.peers, *PARTS, *METHODS,
-    BAND_AFTER, MULTI_START, TANGENT, *PLANNERS, *(style.label for style in PLANNERS.values()),
-}  # fmt: skip
+    *PARAMS.bench.planners,
+    *PARAMS.benchmark.planners,
+    *PARAMS.plans.parts,
+    *PARAMS.plans.peers,
+    *PARTS,
+    *METHODS,
+    BAND_AFTER,
+    MULTI_START,
+    TANGENT,
+    *PLANNERS,
+    *(style.label for style in PLANNERS.values()),
+}
 """Every planner that a table, a figure or a recording names."""
 
 
 def seen(colour, without):
-    """A colour as who has no cones of one kind sees it: Viénot, Brettel and Mollon, Color Res. Appl., 1999."""
-    linear = np.array([c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(colour)])
-    cones = np.array([[17.8824, 43.5161, 4.11935], [3.45565, 27.1554, 3.86714], [0.0299566, 0.184309, 1.46709]])
+    """A colour as who has no cones of one kind sees it: Viénot, Brettel and Mollon, Color Res.
+    Appl., 1999.
+    """
+    linear = np.array(
+        [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(colour)]
+    )
+    cones = np.array(
+        [[17.8824, 43.5161, 4.11935], [3.45565, 27.1554, 3.86714], [0.0299566, 0.184309, 1.46709]]
+    )
     reduced = {
         "protan": np.array([[0, 2.02344, -2.52581], [0, 1, 0], [0, 0, 1]]),
         "deutan": np.array([[1, 0, 0], [0.494207, 0, 1.24827], [0, 0, 1]]),

@@ -28,14 +28,38 @@ BAD: list[tuple[Change, tuple[str, ...]]] = [
     (lambda p: p["labels"].update(free_row=5), ("labels.free_row=5", "no such parameter")),
     (lambda p: p["labels"].update(free_rows="60"), ("labels.free_rows='60'", "integer")),
     (lambda p: p["labels"].update(free_rows=True), ("labels.free_rows=True", "integer")),
-    (lambda p: p["labels"].update(free_rows=0), ("labels.free_rows=0", "greater than or equal to 1")),
-    (lambda p: p["manifolds"]["paper"].update(beta=float("nan")), ("manifolds.paper.beta=nan", "finite")),
-    (lambda p: p["constraints"]["slide"].update(axes=[0, 0, 2, 1, 1, 0]), ("constraints.slide.axes.2=2", "0 or 1")),
-    (lambda p: p["constraints"]["slide"].update(tolerance=[0, 0, -1, 0, 0, 0]), ("constraints.slide.tolerance.2=-1",)),
-    (lambda p: p["constraints"]["slide"].update(tolerance=[1, 0, 0, 0, 0, 0]), ("constraints.slide", "axis is free")),
-    (lambda p: p["constraints"]["slide"].update(reference=None), ("constraints.slide", "reference")),
-    (lambda p: p["geodesics"].update(searched=["planer"]), ("geodesics.searched='planer'", "must be one of")),
-    (lambda p: p["geodesics"]["reward"].update(form="best"), ("geodesics.reward.form='best'", "'corrected'")),
+    (
+        lambda p: p["labels"].update(free_rows=0),
+        ("labels.free_rows=0", "greater than or equal to 1"),
+    ),
+    (
+        lambda p: p["manifolds"]["paper"].update(beta=float("nan")),
+        ("manifolds.paper.beta=nan", "finite"),
+    ),
+    (
+        lambda p: p["constraints"]["slide"].update(axes=[0, 0, 2, 1, 1, 0]),
+        ("constraints.slide.axes.2=2", "0 or 1"),
+    ),
+    (
+        lambda p: p["constraints"]["slide"].update(tolerance=[0, 0, -1, 0, 0, 0]),
+        ("constraints.slide.tolerance.2=-1",),
+    ),
+    (
+        lambda p: p["constraints"]["slide"].update(tolerance=[1, 0, 0, 0, 0, 0]),
+        ("constraints.slide", "axis is free"),
+    ),
+    (
+        lambda p: p["constraints"]["slide"].update(reference=None),
+        ("constraints.slide", "reference"),
+    ),
+    (
+        lambda p: p["geodesics"].update(searched=["planer"]),
+        ("geodesics.searched='planer'", "must be one of"),
+    ),
+    (
+        lambda p: p["geodesics"]["reward"].update(form="best"),
+        ("geodesics.reward.form='best'", "'corrected'"),
+    ),
     (lambda p: p["geodesics"]["reward"].update(length_weight=0.9), ("geodesics.reward", "(0, 1]")),
     (lambda p: p["compute"].update(backend="dask"), ("compute", "dask_address")),
     (lambda p: p.pop("judge"), ("judge is missing",)),
@@ -44,7 +68,9 @@ BAD: list[tuple[Change, tuple[str, ...]]] = [
 
 
 @pytest.mark.parametrize(("change", "parts"), BAD)
-def test_a_bad_parameter_is_named_in_one_line(tmp_path: Path, change: Change, parts: tuple[str, ...]) -> None:
+def test_a_bad_parameter_is_named_in_one_line(
+    tmp_path: Path, change: Change, parts: tuple[str, ...]
+) -> None:
     with pytest.raises(ParamsError) as caught:
         load_params(changed(tmp_path, change))
     message = str(caught.value)
@@ -57,8 +83,12 @@ def test_the_committed_parameters_are_good() -> None:
     assert load_params(ROOT / "params.yaml").constraints["level_cup"].axes == (0, 0, 0, 1, 1, 0)
 
 
-@pytest.mark.parametrize(("written", "meant"), [("2e-05", 2e-5), ("1E-6", 1e-6), ("3e2", 300.0), ("2.5e-5", 2.5e-5)])
-def test_a_number_with_an_exponent_is_one_without_a_point_too(tmp_path: Path, written: str, meant: float) -> None:
+@pytest.mark.parametrize(
+    ("written", "meant"), [("2e-05", 2e-5), ("1E-6", 1e-6), ("3e2", 300.0), ("2.5e-5", 2.5e-5)]
+)
+def test_a_number_with_an_exponent_is_one_without_a_point_too(
+    tmp_path: Path, written: str, meant: float
+) -> None:
     file = tmp_path / "params.yaml"
     text = (ROOT / "params.yaml").read_text()
     assert text.count("  accuracy: 0.00001 ") == 1
@@ -84,14 +114,18 @@ def test_what_is_no_yaml_is_said_in_one_line(tmp_path: Path, text: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("stage", ["label_joints.py level_cup", "train_geodesics.py planner level_cup", "report.py"])
+@pytest.mark.parametrize(
+    "stage", ["label_joints.py level_cup", "train_geodesics.py planner level_cup", "report.py"]
+)
 def test_a_stage_stops_before_any_work(tmp_path: Path, stage: str) -> None:
     changed(tmp_path, lambda p: p["geodesics"]["ppo"].update(gamma=1.5))
     script, *names = stage.split()
     command = [sys.executable, str(ROOT / "stages" / script), *names]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 2
-    assert result.stderr == ("error: params.yaml: geodesics.ppo.gamma=1.5: input should be less than or equal to 1\n")
+    assert result.stderr == (
+        "error: params.yaml: geodesics.ppo.gamma=1.5: input should be less than or equal to 1\n"
+    )
     assert [file.name for file in tmp_path.iterdir()] == ["params.yaml"]
 
 

@@ -1,4 +1,6 @@
-"""What a user is promised of a planned path, of a refusal, and of the files a path is written to."""
+"""What a user is promised of a planned path, of a refusal, and of the files a path is written
+to.
+"""
 
 import hashlib
 import json
@@ -15,13 +17,13 @@ import pytest
 
 from constraint_geodesics import Constraint, Planner, Pose, bundle
 from constraint_geodesics.certification.certifier import Certifier, Limits
-from constraint_geodesics.constraints.retraction import retract
-from constraint_geodesics.constraints.vector import ConstraintError, ConstraintManifold
+from constraint_geodesics.constraints.pose import ConstraintError, ConstraintManifold
+from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.params import SphereParams
 from constraint_geodesics.planner import Path as PlannedPath
 from constraint_geodesics.planner import PlannerError, check_path, read_path
-from constraint_geodesics.planners.geodesic import Answer, Parts, Task, candidates, refined, rows_of
-from constraint_geodesics.tracking.recording import read_recording
+from constraint_geodesics.recording.recording import read_recording
+from constraint_geodesics.search.candidates import Answer, Parts, Task, candidates, refined, rows_of
 from tests.planner_fixtures import (
     NAMES,
     manifold_of,
@@ -56,7 +58,9 @@ def planner() -> Planner:
 def certifier(planner):
     """A judge of its own, that looks at collisions more often than the planner's."""
     acceleration = packaged_bundle().planner.acceleration_rad_s2
-    limits = Limits(collision_spacing_rad=0.03, acceleration_rad_s2=(acceleration,) * planner.scene.robot.dof)
+    limits = Limits(
+        collision_spacing_rad=0.03, acceleration_rad_s2=(acceleration,) * planner.scene.robot.dof
+    )
     with Certifier(planner.scene, limits) as judge:
         yield judge
 
@@ -100,10 +104,14 @@ def test_a_path_keeps_every_promise(planner, certifier, name) -> None:
         assert certificate.valid, certificate.violation
         assert path.certificate is not None
         assert path.certificate.valid
-        assert path.length_rad == pytest.approx(np.linalg.norm(np.diff(path.joints, axis=0), axis=1).sum(), rel=1e-12)
+        assert path.length_rad == pytest.approx(
+            np.linalg.norm(np.diff(path.joints, axis=0), axis=1).sum(), rel=1e-12
+        )
         assert path.length_rad >= np.linalg.norm(last - first) - 1e-12
         assert manifold.violation(path.joints).max() <= path.max_violation_rad + 1e-6
-        assert path.max_violation_rad <= path.violation_bound_rad <= judged.violation_tolerance == 1e-4
+        assert (
+            path.max_violation_rad <= path.violation_bound_rad <= judged.violation_tolerance == 1e-4
+        )
         assert path.planning_time_s > 0.0
         assert 0.0 <= path.collision_time_s <= path.planning_time_s
 
@@ -204,7 +212,9 @@ def test_a_turn_from_limit_to_limit_is_planned(planner) -> None:
     path = planner.plan(start, goal, "level_cup")
     assert path.status == "solved"
     assert path.length_rad == pytest.approx(robot.upper[0] - robot.lower[0], rel=1e-6)
-    np.testing.assert_allclose(path.joints[:, 1:], np.tile(start[1:], (len(path.joints), 1)), atol=1e-6)
+    np.testing.assert_allclose(
+        path.joints[:, 1:], np.tile(start[1:], (len(path.joints), 1)), atol=1e-6
+    )
 
 
 def test_ends_beside_the_constraint_within_its_tolerance_are_taken(planner) -> None:
@@ -236,7 +246,11 @@ def test_refinement_shortens_a_way_over_the_graph(planner, name) -> None:
 
 def test_the_same_query_gives_the_same_bytes(planner) -> None:
     """In this process after many others, and in a fresh one."""
-    queries = [(name, *ends) for name in ("level_cup", "slide", "free") for ends in pairs_of(name, 2, seed=7)]
+    queries = [
+        (name, *ends)
+        for name in ("level_cup", "slide", "free")
+        for ends in pairs_of(name, 2, seed=7)
+    ]
     script = (
         "import hashlib, json, sys\n"
         "from constraint_geodesics import Planner\n"
@@ -247,7 +261,11 @@ def test_the_same_query_gives_the_same_bytes(planner) -> None:
     )
     as_json = json.dumps([(name, start.tolist(), goal.tolist()) for name, start, goal in queries])
     fresh = subprocess.run(
-        [sys.executable, "-c", script, str(bundle.PACKAGED)], input=as_json, capture_output=True, text=True, check=True
+        [sys.executable, "-c", script, str(bundle.PACKAGED)],
+        input=as_json,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     own = []
     for name, start, goal in reversed(queries):
@@ -266,7 +284,11 @@ def test_a_batch_is_planned_like_its_queries(planner) -> None:
     assert paths[-1].status == "not_connected"
     for path, start, goal in zip(paths, starts, goals, strict=True):
         alone = planner.plan(start, goal, "slide")
-        assert (path.status, path.explanation, path.source) == (alone.status, alone.explanation, alone.source)
+        assert (path.status, path.explanation, path.source) == (
+            alone.status,
+            alone.explanation,
+            alone.source,
+        )
         assert path.joints.tobytes() == alone.joints.tobytes()
         assert path.times.tobytes() == alone.times.tobytes()
     assert planner.plan_batch(starts[:0], goals[:0], "slide") == []
@@ -285,7 +307,9 @@ def test_a_batch_of_unequal_shapes_is_refused(planner) -> None:
 
 
 def refusals(planner: Planner) -> dict[str, tuple[np.ndarray, np.ndarray, str, str]]:
-    """Queries that can't be answered: start, goal, constraint, and what the explanation must say."""
+    """Queries that can't be answered: start, goal, constraint, and what the explanation must
+    say.
+    """
     good, other = pairs_of("level_cup", 1, seed=9)[0]
     tilted, beyond = good.copy(), good.copy()
     tilted[4] += 0.3
@@ -304,7 +328,15 @@ def refusals(planner: Planner) -> dict[str, tuple[np.ndarray, np.ndarray, str, s
 
 
 @pytest.mark.parametrize(
-    "status", ["start_violates", "goal_violates", "out_of_limits", "in_collision", "not_connected", "not_found"]
+    "status",
+    [
+        "start_violates",
+        "goal_violates",
+        "out_of_limits",
+        "in_collision",
+        "not_connected",
+        "not_found",
+    ],
 )
 def test_what_can_not_be_planned_is_said(planner, tmp_path, status) -> None:
     start, goal, name, expected = refusals(planner)[status]
@@ -400,7 +432,11 @@ def test_ends_that_can_not_be_meant_are_misuse(planner, end, said) -> None:
 @pytest.mark.parametrize("name", ["levelcup", "", None, 3, (0, 0, 0, 1, 1, 0)])
 def test_names_that_do_not_exist_are_misuse(planner, name) -> None:
     good = nodes_of("free")[0][0]
-    for ask in (lambda: planner.plan(good, good, name), lambda: planner.prepare(name), lambda: planner.nodes(name)):
+    for ask in (
+        lambda: planner.plan(good, good, name),
+        lambda: planner.prepare(name),
+        lambda: planner.nodes(name),
+    ):
         with pytest.raises(PlannerError, match="must be one of.*level_cup") as error:
             ask()
         assert one_line(str(error.value))
@@ -467,7 +503,10 @@ def test_without_a_reference_the_axes_are_held_where_the_start_has_them(planner)
         np.testing.assert_array_equal(path.constraint.reference.position, position)
         np.testing.assert_array_equal(path.constraint.reference.rotation, rotation)
         assert np.abs(robot.forward(path.joints)[0][:, 2] - position[2]).max() <= 1e-4
-        assert np.abs(robot.forward(path.at(np.linspace(0, 1, 50)))[0][:, 2] - position[2]).max() <= 1e-6
+        assert (
+            np.abs(robot.forward(path.at(np.linspace(0, 1, 50)))[0][:, 2] - position[2]).max()
+            <= 1e-6
+        )
         assert path.constraint_name == "the constraint on z"
     assert found >= 4
     away = goals[0].copy()
@@ -505,7 +544,9 @@ def test_the_answer_does_not_depend_on_earlier_queries() -> None:
     near = nodes_of("level_cup")[0][0]
     with Planner(replace(packaged_bundle(), planner=settings), "a bundle of its own") as own:
         never = Constraint((0, 0, 0, 1, 1, 0), reference=Pose(*own.scene.robot.forward(near)))
-        drawn = retract(ConstraintManifold(own.scene.robot, never), near + np.linspace(-0.6, 0.6, 5)[:, None])
+        drawn = retract(
+            ConstraintManifold(own.scene.robot, never), near + np.linspace(-0.6, 0.6, 5)[:, None]
+        )
         goals = [q for q in drawn.joints if np.linalg.norm(q - near) > 0.1]
         no_line = Parts(straight=False)
         first = [own.plan(near, goal, never, parts=no_line) for goal in goals]
@@ -558,7 +599,9 @@ def test_a_reference_that_is_no_pose_is_refused(position, rotation) -> None:
 
 def test_a_reference_may_be_given_as_lists(planner) -> None:
     start, goal = pairs_of("free", 1, seed=14)[0]
-    wide = Constraint((1, 0, 1, 0, 0, 0), (10.0, 0, 10.0, 0, 0, 0), Pose([0.0, 0.0, 0.0], np.eye(3).tolist()))
+    wide = Constraint(
+        (1, 0, 1, 0, 0, 0), (10.0, 0, 10.0, 0, 0, 0), Pose([0.0, 0.0, 0.0], np.eye(3).tolist())
+    )
     assert planner.plan(start, goal, wide).status == "solved"
 
 
@@ -572,12 +615,21 @@ def test_a_saved_path_is_read_to_the_last_bit(tmp_path) -> None:
         joints, times, constraint = read_path(tmp_path / "new" / f"{name}.csv")
         assert joints.tobytes() == path.joints.tobytes()
         assert times.tobytes() == path.times.tobytes()
-        assert (constraint.axes, constraint.tolerance) == (path.constraint.axes, path.constraint.tolerance)
+        assert (constraint.axes, constraint.tolerance) == (
+            path.constraint.axes,
+            path.constraint.tolerance,
+        )
         if name == "free":
             assert constraint.reference is None
         else:
-            assert constraint.reference.position.tobytes() == path.constraint.reference.position.tobytes()
-            assert constraint.reference.rotation.tobytes() == path.constraint.reference.rotation.tobytes()
+            assert (
+                constraint.reference.position.tobytes()
+                == path.constraint.reference.position.tobytes()
+            )
+            assert (
+                constraint.reference.rotation.tobytes()
+                == path.constraint.reference.rotation.tobytes()
+            )
 
 
 def test_a_saved_path_is_certified_by_itself(planner, tmp_path) -> None:
@@ -588,7 +640,9 @@ def test_a_saved_path_is_certified_by_itself(planner, tmp_path) -> None:
         assert certificate.valid
         assert certificate.length_rad == path.length_rad
         assert certificate.violation_bound == path.violation_bound_rad
-    assert check_path(tmp_path / "path.csv", "level_cup", bundle.PACKAGED).valid, "what slides is level"
+    assert check_path(tmp_path / "path.csv", "level_cup", bundle.PACKAGED).valid, (
+        "what slides is level"
+    )
     other = check_path(tmp_path / "path.csv", "tool_down", bundle.PACKAGED)
     assert other.violation.kind == "constraint"
     with pytest.raises(PlannerError, match="there is no constraint 'cup'"):
@@ -621,7 +675,11 @@ def test_a_path_of_somebody_else_may_lack_times_and_constraint(tmp_path) -> None
         (1, "# constraint: {", "line 1: not a constraint"),
         (1, "# constraint: [1]", "line 1: not a constraint"),
         (1, '# constraint: {"axes": [0, 0, 0, 0, 0, 0]}', "line 1: not a constraint"),
-        (1, '# constraint: {"axes": [2], "tolerance": [0], "reference": null}', "line 1: not a constraint"),
+        (
+            1,
+            '# constraint: {"axes": [2], "tolerance": [0], "reference": null}',
+            "line 1: not a constraint",
+        ),
         (5, "0,0,0,zero,0,0,0", "line 5: not a row of numbers"),
         (5, "0,0,0,,0,0,0", "line 5: not a row of numbers"),
         (7, "0,0,0,0,0,0", "line 7: 6 numbers under 7 names"),
@@ -652,7 +710,11 @@ def test_columns_are_the_joints_that_their_names_say(planner, tmp_path, change) 
     path.save(tmp_path / "path.csv")
     about, header, *rows = (tmp_path / "path.csv").read_text().splitlines()
     names = header.split(",")
-    headers = {"reversed": [",".join([names[0], *names[:0:-1]])], "foreign": ["time_s,a,b,c,d,e,f"], "none": []}
+    headers = {
+        "reversed": [",".join([names[0], *names[:0:-1]])],
+        "foreign": ["time_s,a,b,c,d,e,f"],
+        "none": [],
+    }
     (tmp_path / "path.csv").write_text("\n".join([about, *headers[change], *rows]))
     with pytest.raises(PlannerError):
         read_path(tmp_path / "path.csv", planner.scene.robot.joint_names)
@@ -664,7 +726,9 @@ def test_a_recording_holds_the_path(tmp_path) -> None:
     recording = read_recording(tmp_path / "path.rrd")
     assert recording.joints.shape == (5, 6)
     np.testing.assert_allclose(recording.joints[[0, -1]], path.joints[[0, -1]], atol=1e-6)
-    np.testing.assert_allclose(recording.tool_ends, path.scene.robot.forward(path.joints[[0, -1]])[0], atol=1e-6)
+    np.testing.assert_allclose(
+        recording.tool_ends, path.scene.robot.forward(path.joints[[0, -1]])[0], atol=1e-6
+    )
     assert recording.has_blueprint
 
 
@@ -696,9 +760,12 @@ def test_a_planner_says_where_it_came_from_and_can_be_closed() -> None:
     own.close()
     nobody = np.empty((0, 6))
     for question in (
-        lambda: own.plan([0.0] * 6, [0.1] * 6, "free"), lambda: own.plan_batch(nobody, nobody, "free"),
-        lambda: own.nodes("free"), lambda: own.prepare("free"), own.__enter__,
-    ):  # fmt: skip
+        lambda: own.plan([0.0] * 6, [0.1] * 6, "free"),
+        lambda: own.plan_batch(nobody, nobody, "free"),
+        lambda: own.nodes("free"),
+        lambda: own.prepare("free"),
+        own.__enter__,
+    ):
         with pytest.raises(PlannerError, match="closed"):
             question()
 
@@ -811,7 +878,11 @@ def around(planner: Planner, name: str, seed: int) -> tuple[Planner, np.ndarray,
         workcell = planner.bundle.workcell.model_copy(update={"spheres": {"ball": ball}})
         other = Planner(replace(planner.bundle, workcell=workcell), "with a sphere")
         with other.scene.world() as world:
-            if world.is_free(start) and world.is_free(goal) and world.first_collision(free.joints) is not None:
+            if (
+                world.is_free(start)
+                and world.is_free(goal)
+                and world.first_collision(free.joints) is not None
+            ):
                 return other, start, goal
         other.close()
     raise AssertionError("no query leaves room for a sphere")
@@ -825,7 +896,9 @@ def test_a_sphere_that_no_graph_knows_is_gone_round(planner, name) -> None:
         assert path.status == "solved", path.explanation
         assert path.certificate is not None
         assert path.certificate.valid
-        alone = other.plan(start, goal, name, parts=Parts(straight=False, policy=False, graph=False))
+        alone = other.plan(
+            start, goal, name, parts=Parts(straight=False, policy=False, graph=False)
+        )
         assert (alone.status, alone.source) == ("solved", "tree"), alone.explanation
 
 

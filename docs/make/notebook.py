@@ -1,7 +1,7 @@
 """Run docs/first_path.ipynb and store its outputs: `make notebook`.
 
-The kernel is the documentation's Python with the project's packages before its own, so nothing of Jupyter is needed
-beside the project.
+The kernel is the documentation's Python with the project's packages before its own, so nothing of
+Jupyter is needed beside the project.
 """
 
 import os
@@ -24,11 +24,15 @@ class _Manager(AsyncKernelManager):
     @property
     def kernel_spec(self) -> KernelSpec:
         """The one kernel."""
-        return KernelSpec(argv=[sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"])
+        return KernelSpec(
+            argv=[sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
+        )
 
 
 def main() -> None:
-    """Run every cell from the start; write the notebook with what was printed and drawn, without times of the run."""
+    """Run every cell from the start; write the notebook with what was printed and drawn, without
+    times of the run.
+    """
     packages = next((ROOT / ".venv" / "lib").glob("python*/site-packages"))
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(packages)]),

@@ -1,4 +1,5 @@
-"""The plots that dvc.yaml names, of several commits in one page that opens offline: `make plots FROM=… TO=…`.
+"""The plots that dvc.yaml names, of several commits in one page that opens offline: `make plots
+FROM=… TO=…`.
 
 DVC's own page loads its chart library from the net; here the same library stands in the page.
 """
@@ -43,7 +44,16 @@ def main(revisions: list[str]) -> int:
     with tempfile.TemporaryDirectory() as folder:
         frame = Path(folder) / "page.html"
         frame.write_text(page_of(revisions))
-        command = ["dvc", "plots", "diff", *revisions, "--html-template", str(frame), "-o", str(FOLDER)]
+        command = [
+            "dvc",
+            "plots",
+            "diff",
+            *revisions,
+            "--html-template",
+            str(frame),
+            "-o",
+            str(FOLDER),
+        ]
         done = subprocess.run([*command, "--targets", *titles], cwd=ROOT, check=False)
     return done.returncode
 

@@ -1,4 +1,6 @@
-"""MkDocs calls this: the notebook becomes a page, and a page that would load something from the net is an error."""
+"""MkDocs calls this: the notebook becomes a page, and a page that would load something from the net
+is an error.
+"""
 
 import json
 import re
@@ -11,7 +13,14 @@ from mkdocs.structure.files import File
 
 NOTEBOOK = "first_path.ipynb"
 PAGE = "first_path_notebook.md"
-LOADING = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link": "href", "object": "data"}
+LOADING = {
+    "script": "src",
+    "img": "src",
+    "iframe": "src",
+    "source": "src",
+    "link": "href",
+    "object": "data",
+}
 """Elements that a browser loads something for, and the attribute that says what."""
 
 
@@ -28,7 +37,9 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def on_post_build(config: Any) -> None:
-    """Raise PluginError, which fails the build, for the first thing that would come from the net."""
+    """Raise PluginError, which fails the build, for the first thing that would come from the
+    net.
+    """
     for file in sorted(Path(config["site_dir"]).rglob("*")):
         if file.suffix in (".html", ".css", ".js"):
             for address in loaded_from_the_net(file.read_text(), file.suffix):

@@ -3,8 +3,8 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from constraint_geodesics.constraints.vector import Constraint as Constraint
-    from constraint_geodesics.constraints.vector import Pose as Pose
+    from constraint_geodesics.constraints.pose import Constraint as Constraint
+    from constraint_geodesics.constraints.pose import Pose as Pose
     from constraint_geodesics.planner import Path as Path
     from constraint_geodesics.planner import Planner as Planner
 
@@ -12,11 +12,13 @@ __all__ = ["Constraint", "Path", "Planner", "Pose"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import what users import when it is asked for: a stage must not wait for a planner it does not use."""
+    """Import what users import when it is asked for: a stage must not wait for a planner it does
+    not use.
+    """
     if name in ("Constraint", "Pose"):
-        from constraint_geodesics.constraints import vector
+        from constraint_geodesics.constraints import pose
 
-        return getattr(vector, name)
+        return getattr(pose, name)
     if name in ("Planner", "Path"):
         from constraint_geodesics import planner
 

@@ -1,7 +1,9 @@
-"""The planner's files: networks, graphs and settings of one run, small enough to travel with the package.
+"""The planner's files: networks, graphs and settings of one run, small enough to travel with the
+package.
 
-A folder with planner.json (robot, workcell, constraints, settings, and the SHA-256 of every other file),
-manifold.safetensors, policies.safetensors and roadmaps.safetensors.  Nothing in it is code, nothing is unpickled.
+A folder with planner.json (robot, workcell, constraints, settings, and the SHA-256 of every other
+file), manifold.safetensors, policies.safetensors and roadmaps.safetensors.  Nothing in it is code,
+nothing is unpickled.
 """
 
 import hashlib
@@ -16,7 +18,6 @@ from pydantic import ValidationError
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from constraint_geodesics.geodesics.roadmap import Roadmap
 from constraint_geodesics.geometry.graph import components
 from constraint_geodesics.params import (
     ConstraintParams,
@@ -26,11 +27,15 @@ from constraint_geodesics.params import (
     RobotParams,
     WorkcellParams,
 )
+from constraint_geodesics.search.roadmap import Roadmap
 
 FORMAT = 1
 CARD, MANIFOLD, POLICIES, ROADMAPS = (
-    "planner.json", "manifold.safetensors", "policies.safetensors", "roadmaps.safetensors",
-)  # fmt: skip
+    "planner.json",
+    "manifold.safetensors",
+    "policies.safetensors",
+    "roadmaps.safetensors",
+)
 PIPELINE = Path("data/planner")
 """Where the pipeline leaves the planner's files, in a checkout."""
 PACKAGED = Path(__file__).parent / "pretrained"
@@ -43,7 +48,9 @@ class BundleError(ValueError):
 
 @dataclass(frozen=True)
 class Bundle:
-    """What a planner is made of: parameters, and the arrays of its networks; roadmaps by constraint."""
+    """What a planner is made of: parameters, and the arrays of its networks; roadmaps by
+    constraint.
+    """
 
     robot: RobotParams
     workcell: WorkcellParams
@@ -56,21 +63,31 @@ class Bundle:
     roadmaps: Mapping[str, Roadmap]
 
     def write(self, folder: Path) -> None:
-        """Write all files; the card last, so that an interrupted write leaves no bundle that looks whole."""
+        """Write all files; the card last, so that an interrupted write leaves no bundle that looks
+        whole.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         (folder / CARD).unlink(missing_ok=True)
-        contents = {MANIFOLD: save(dict(self.manifold)), POLICIES: save(dict(self.policies)), ROADMAPS: self._graphs()}
+        contents = {
+            MANIFOLD: save(dict(self.manifold)),
+            POLICIES: save(dict(self.policies)),
+            ROADMAPS: self._graphs(),
+        }
         for name, content in contents.items():
             (folder / name).write_bytes(content)
         card: dict[str, Any] = {
             "format": FORMAT,
             "robot": self.robot.model_dump(mode="json"),
             "workcell": self.workcell.model_dump(mode="json"),
-            "constraints": {name: c.model_dump(mode="json") for name, c in self.constraints.items()},
+            "constraints": {
+                name: c.model_dump(mode="json") for name, c in self.constraints.items()
+            },
             "planner": self.planner.model_dump(mode="json"),
             "policy": self.policy.model_dump(mode="json"),
             "judge": self.judge.model_dump(mode="json"),
-            "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
+            "sha256": {
+                name: hashlib.sha256(content).hexdigest() for name, content in contents.items()
+            },
         }
         card["sha256"][CARD] = card_digest(card)
         (folder / CARD).write_text(json.dumps(card, indent=1) + "\n")
@@ -79,16 +96,19 @@ class Bundle:
         arrays: dict[str, np.ndarray] = {}
         for name, roadmap in self.roadmaps.items():
             arrays[f"{name}/joints"] = roadmap.joints.astype(np.float32)
-            arrays[f"{name}/edges"] = roadmap.edges.astype(np.uint16 if len(roadmap.joints) < 2**16 else np.uint32)
+            arrays[f"{name}/edges"] = roadmap.edges.astype(
+                np.uint16 if len(roadmap.joints) < 2**16 else np.uint32
+            )
             arrays[f"{name}/lengths"] = roadmap.lengths.astype(np.float32)
         return save(arrays)
 
 
 def open_bundle(source: str | Path | None = None) -> tuple[Bundle, str]:
-    """A bundle and where it came from: a folder, an MLflow address (models:/… or runs:/…), or by default the pipeline's
-    outputs in this checkout, else the files that come with the package.
+    """A bundle and where it came from: a folder, an MLflow address (models:/… or runs:/…), or by
+    default the pipeline's outputs in this checkout, else the files that come with the package.
 
-    Raises BundleError if the files are missing or altered, TrackingError if MLflow does not have them.
+    Raises BundleError if the files are missing or altered, TrackingError if MLflow does not have
+    them.
     """
     if source is None:
         if (PIPELINE / CARD).is_file():
@@ -108,11 +128,17 @@ def read_bundle(folder: Path) -> Bundle:
     Raises BundleError if a file is missing, altered (its checksum differs), or of another format.
     """
     card = _card(folder)
-    arrays = {name: _arrays(folder / name, card["sha256"].get(name)) for name in (MANIFOLD, POLICIES, ROADMAPS)}
+    arrays = {
+        name: _arrays(folder / name, card["sha256"].get(name))
+        for name in (MANIFOLD, POLICIES, ROADMAPS)
+    }
     try:
         alone = set(_named(arrays[ROADMAPS])) - set(card["constraints"])
         if alone:
-            raise BundleError(f"{folder / ROADMAPS}: graphs of {sorted(alone)}, which are no constraints of {CARD}")
+            raise BundleError(
+                f"{folder / ROADMAPS}: graphs of {sorted(alone)}, which are no constraints of "
+                f"{CARD}"
+            )
         return Bundle(
             RobotParams.model_validate(card["robot"]),
             WorkcellParams.model_validate(card["workcell"]),
@@ -125,7 +151,9 @@ def read_bundle(folder: Path) -> Bundle:
             {name: _roadmap(arrays[ROADMAPS], name) for name in _named(arrays[ROADMAPS])},
         )
     except (AttributeError, KeyError, TypeError, ValidationError) as error:
-        raise BundleError(f"{folder / CARD}: not a planner's card: {' '.join(str(error).split())[:200]}") from None
+        raise BundleError(
+            f"{folder / CARD}: not a planner's card: {' '.join(str(error).split())[:200]}"
+        ) from None
 
 
 def _card(folder: Path) -> dict[str, Any]:
@@ -136,7 +164,11 @@ def _card(folder: Path) -> dict[str, Any]:
         raise BundleError(f"{folder}: there is no {CARD}: not a folder of a planner") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise BundleError(f"{file}: not JSON: {error}") from None
-    if not isinstance(card, dict) or card.get("format") != FORMAT or not isinstance(card.get("sha256"), dict):
+    if (
+        not isinstance(card, dict)
+        or card.get("format") != FORMAT
+        or not isinstance(card.get("sha256"), dict)
+    ):
         written = card.get("format") if isinstance(card, dict) else None
         raise BundleError(f"{file}: format {written}: this version reads format {FORMAT}")
     if card["sha256"].get(CARD) != card_digest(card):
@@ -170,4 +202,6 @@ def _named(arrays: Mapping[str, np.ndarray]) -> list[str]:
 def _roadmap(arrays: Mapping[str, np.ndarray], name: str) -> Roadmap:
     joints = arrays[f"{name}/joints"].astype(np.float64)
     edges = arrays[f"{name}/edges"].astype(np.int64)
-    return Roadmap(joints, edges, arrays[f"{name}/lengths"].astype(np.float64), components(len(joints), edges))
+    return Roadmap(
+        joints, edges, arrays[f"{name}/lengths"].astype(np.float64), components(len(joints), edges)
+    )

@@ -1,4 +1,6 @@
-"""What the shell proposes when Tab is pressed: names read from small files, without loading anything heavy."""
+"""What the shell proposes when Tab is pressed: names read from small files, without loading
+anything heavy.
+"""
 
 import json
 import os
@@ -14,31 +16,45 @@ PIPELINE = Path("data") / "planner" / "planner.json"
 PACKAGED = Path(__file__).parent / "pretrained" / "planner.json"
 
 
-def planned_constraints(context: Context, parameter: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Constraints that the planner knows by name: that of --planner, the pipeline's, or the package's."""
+def planned_constraints(
+    context: Context, parameter: Parameter, incomplete: str
+) -> list[CompletionItem]:
+    """Constraints that the planner knows by name: that of --planner, the pipeline's, or the
+    package's.
+    """
     del parameter
     named = Path(str(context.params.get("planner") or "")) / "planner.json"
     card = next((file for file in (named, PIPELINE, PACKAGED) if file.is_file()), None)
     return _items(_described(_json(card).get("constraints")), incomplete)
 
 
-def listed_constraints(context: Context, parameter: Parameter, incomplete: str) -> list[CompletionItem]:
+def listed_constraints(
+    context: Context, parameter: Parameter, incomplete: str
+) -> list[CompletionItem]:
     """Constraints of params.yaml."""
     del context, parameter
     return _items(_described(_params().get("constraints")), incomplete)
 
 
-def benchmarked_planners(context: Context, parameter: Parameter, incomplete: str) -> list[CompletionItem]:
+def benchmarked_planners(
+    context: Context, parameter: Parameter, incomplete: str
+) -> list[CompletionItem]:
     """Planners of the benchmark."""
     del context, parameter
     planners = (_params().get("bench") or {}).get("planners") or {}
-    return _items({name: str(entry.get("kind", "")) for name, entry in planners.items()}, incomplete)
+    return _items(
+        {name: str(entry.get("kind", "")) for name, entry in planners.items()}, incomplete
+    )
 
 
 def recordings(context: Context, parameter: Parameter, incomplete: str) -> list[CompletionItem]:
     """Recordings of this checkout, and those in the folder that the word names."""
     del context, parameter
-    made = [str(file) for folder in ("data/recordings", "first_path") for file in sorted(Path(folder).rglob("*.rrd"))]
+    made = [
+        str(file)
+        for folder in ("data/recordings", "first_path")
+        for file in sorted(Path(folder).rglob("*.rrd"))
+    ]
     folder = incomplete[: incomplete.rfind("/") + 1]
     near = [folder + file.name for file in sorted(Path(folder or ".").glob("*.rrd"))]
     return _items(dict.fromkeys([*made, *near], ""), incomplete)
@@ -49,11 +65,17 @@ def _described(entries: Any) -> dict[str, str]:
 
 
 def _items(names: Mapping[str, str], incomplete: str) -> list[CompletionItem]:
-    return [CompletionItem(_typed(name), help=about) for name, about in names.items() if name.startswith(incomplete)]
+    return [
+        CompletionItem(_typed(name), help=about)
+        for name, about in names.items()
+        if name.startswith(incomplete)
+    ]
 
 
 def _typed(name: str) -> str:
-    """As it must stand on bash's line, which takes a proposal as it is; other shells quote it themselves."""
+    """As it must stand on bash's line, which takes a proposal as it is; other shells quote it
+    themselves.
+    """
     if os.environ.get("_GEODESICS_COMPLETE") != "complete_bash" or _inside_quotes():
         return name
     return re.sub(r"([^\w@%+=:,./-])", r"\\\1", name)
@@ -71,7 +93,9 @@ def _json(file: Path | None) -> Any:
 
 
 def _params() -> Any:
-    """params.yaml as it stands: a file with a mistake in it still has names to propose, if it is YAML."""
+    """params.yaml as it stands: a file with a mistake in it still has names to propose, if it is
+    YAML.
+    """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 

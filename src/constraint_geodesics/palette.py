@@ -1,5 +1,5 @@
-"""Colours that colour-blind people tell apart (Okabe and Ito's), and the one that each planner has everywhere: in the
-figures, on the report's pages and in Rerun.
+"""Colours that colour-blind people tell apart (Okabe and Ito's), and the one that each planner has
+everywhere: in the figures, on the report's pages and in Rerun.
 """
 
 BLACK, ORANGE, SKY, GREEN = "#222222", "#E69F00", "#56B4E9", "#009E73"
@@ -10,23 +10,47 @@ START, GOAL = GREEN, VERMILION
 
 FAMILIES = (
     (
-        ORANGE, "this planner, its parts and policies",
-        ("planner", "planned", "learned", "without", "nothing learned", "trees + band", "band and trees", "graph",
-         "policy", "policies", "separate policies"),
+        ORANGE,
+        "this planner, its parts and policies",
+        (
+            "planner",
+            "planned",
+            "learned",
+            "without",
+            "nothing learned",
+            "trees + band",
+            "band and trees",
+            "graph",
+            "policy",
+            "policies",
+            "separate policies",
+        ),
     ),
-    (VERMILION, "latent geodesics, graph and grid", ("straight latent line", "gradient geodesic", "latent g")),
+    (
+        VERMILION,
+        "latent geodesics, graph and grid",
+        ("straight latent line", "gradient geodesic", "latent g"),
+    ),
     (GREEN, "straight line and elastic band", ("straight", "band from")),
     (BLACK, "trajectory optimisation", ("slsqp", "trust-constr")),
     (BLUE, "BiRRT", ("birrt",)),
     (PURPLE, "PRM", ("prm",)),
     (SKY, "RRT*", ("rrt*", "informed rrt*")),
-    (GREY, "random curves, descent, Bayesian optimisation", ("random curves", "descent", "bayesian")),
-)  # fmt: skip
-"""Colour, name and first words of the planners of each family; within a family they differ by line style or marker."""
+    (
+        GREY,
+        "random curves, descent, Bayesian optimisation",
+        ("random curves", "descent", "bayesian"),
+    ),
+)
+"""Colour, name and first words of the planners of each family; within a family they differ by line
+style or marker.
+"""
 
 
 def planner_family(planner: str) -> int | None:
-    """Place in FAMILIES of a planner, given as a table or a recording names it; None for one that is in none."""
+    """Place in FAMILIES of a planner, given as a table or a recording names it; None for one that
+    is in none.
+    """
     words = planner.lower().replace("_", " ").replace("rrt star", "rrt*")
     return next((k for k, (_, _, first) in enumerate(FAMILIES) if words.startswith(first)), None)
 

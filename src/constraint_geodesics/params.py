@@ -20,7 +20,9 @@ Bit = Literal[0, 1]
 
 
 class ParamsError(ValueError):
-    """params.yaml can't be used; the message is one line with the entry, its value and what is allowed."""
+    """params.yaml can't be used; the message is one line with the entry, its value and what is
+    allowed.
+    """
 
 
 class _Record(BaseModel):
@@ -119,7 +121,9 @@ class ConstraintParams(_Record):
             if tolerance and not held:
                 raise ValueError(f"tolerance[{i}]={tolerance}: must be 0 where the axis is free")
         if any(self.axes) and self.reference is None:
-            raise ValueError("reference=null: a pose is needed to sample configurations that hold an axis")
+            raise ValueError(
+                "reference=null: a pose is needed to sample configurations that hold an axis"
+            )
         return self
 
 
@@ -166,7 +170,9 @@ class RewardParams(_Record):
     def _bounded(self) -> "RewardParams":
         total = self.length_weight + self.reduction_weight
         if not 0 < total <= 1 + 1e-9:
-            raise ValueError(f"length_weight + reduction_weight = {total}: must lie in (0, 1], so that |r| ≤ 1")
+            raise ValueError(
+                f"length_weight + reduction_weight = {total}: must lie in (0, 1], so that |r| ≤ 1"
+            )
         return self
 
 
@@ -188,7 +194,9 @@ class PpoParams(_Record):
 
 
 class PolicyParams(_Record):
-    """Policies on a learned manifold whose curves are retracted; what is not here is as in `geodesics`."""
+    """Policies on a learned manifold whose curves are retracted; what is not here is as in
+    `geodesics`.
+    """
 
     steps: Count
     separate_steps: Count
@@ -357,21 +365,35 @@ class Params(_Record):
     tracking: TrackingParams
 
     def policy_settings(self, *, separate: bool = False) -> GeodesicParams:
-        """How policies are trained where curves are retracted: for all constraints together, or one for each."""
+        """How policies are trained where curves are retracted: for all constraints together, or one
+        for each.
+        """
         own = self.policies
         steps = own.separate_steps if separate else own.steps
-        changed = {"steps": steps, "episode_steps": own.episode_steps, "reward": own.reward, "ppo": own.ppo}
+        changed = {
+            "steps": steps,
+            "episode_steps": own.episode_steps,
+            "reward": own.reward,
+            "ppo": own.ppo,
+        }
         return self.geodesics.model_copy(update=changed)
 
     @model_validator(mode="after")
     def _names_exist(self) -> "Params":
         if "free" not in self.constraints or any(self.constraints["free"].axes):
-            raise ValueError("constraints.free: must be there with all axes 0, the manifolds are trained on it")
+            raise ValueError(
+                "constraints.free: must be there with all axes 0, the manifolds are trained on it"
+            )
         if self.plans.constraint not in self.constraints:
-            raise ValueError(f"plans.constraint={self.plans.constraint!r}: must be one of {sorted(self.constraints)}")
+            raise ValueError(
+                f"plans.constraint={self.plans.constraint!r}: must be one of "
+                f"{sorted(self.constraints)}"
+            )
         again = set(self.plans.unseen) & set(self.constraints)
         if again:
-            raise ValueError(f"plans.unseen={sorted(again)}: these are among the constraints that are trained on")
+            raise ValueError(
+                f"plans.unseen={sorted(again)}: these are among the constraints that are trained on"
+            )
         geodesics = self.geodesics
         for entry, names, known in (
             ("searched", geodesics.searched, self.manifolds),
@@ -403,7 +425,9 @@ def load_params(path: Path = Path("params.yaml")) -> Params:
 
 
 def _yaml(text: str) -> Any:
-    """YAML 1.2, read as DVC reads and writes it: 2e-05 is a number there, which YAML 1.1 takes for a text."""
+    """YAML 1.2, read as DVC reads and writes it: 2e-05 is a number there, which YAML 1.1 takes for
+    a text.
+    """
     return YAML(typ="safe", pure=True).load(text)
 
 

@@ -1,5 +1,5 @@
-"""A headless Chromium that reaches this machine's own pages and files alone: `python tests/browser/chromium.py` makes
-sure that there is one.
+"""A headless Chromium that reaches this machine's own pages and files alone: `python
+tests/browser/chromium.py` makes sure that there is one.
 
 The system's browser is driven; Playwright's own downloads are never asked for.
 """
@@ -28,16 +28,20 @@ HERE = "http://127.0.0.1:"
 ROOT = Path(__file__).resolve().parents[2]
 FLAGS = (
     # WebGL without a graphics card
-    "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
     # no name is looked up, whoever asks: what is let through by mistake fails here
     "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
-)  # fmt: skip
+)
 PATIENCE_S = 90
 
 
 @dataclass
 class Traffic:
-    """What a page asked for beyond this machine, none of it let through, and the errors it reported."""
+    """What a page asked for beyond this machine, none of it let through, and the errors it
+    reported.
+    """
 
     outside: list[str] = field(default_factory=list)
     local: list[str] = field(default_factory=list)
@@ -50,7 +54,9 @@ class Traffic:
         return is_local
 
     def note_socket(self, opened: "WebSocket") -> None:
-        """Sockets are not routed as requests are; the browser's own rule keeps them from going anywhere."""
+        """Sockets are not routed as requests are; the browser's own rule keeps them from going
+        anywhere.
+        """
         self.note(opened.url)
 
 
@@ -81,14 +87,19 @@ def chromium() -> "Iterator[Browser]":
 
 @contextlib.contextmanager
 def visit(browser: "Browser", **options: Any) -> "Iterator[tuple[Page, Traffic]]":
-    """A page in a context of its own, with what it asks for; options are those of Playwright's contexts."""
+    """A page in a context of its own, with what it asks for; options are those of Playwright's
+    contexts.
+    """
     traffic = Traffic()
     context = browser.new_context(**options)
     context.set_default_timeout(1e3 * PATIENCE_S)
     _guard(context, traffic)
     page = context.new_page()
     page.on("pageerror", lambda error: traffic.errors.append(str(error)))
-    page.on("console", lambda message: traffic.errors.append(message.text) if message.type == "error" else None)
+    page.on(
+        "console",
+        lambda message: traffic.errors.append(message.text) if message.type == "error" else None,
+    )
     page.on("websocket", traffic.note_socket)
     yield page, traffic
     context.close()
@@ -102,16 +113,23 @@ def _guard(context: "BrowserContext", traffic: Traffic) -> None:
 
 
 @contextlib.contextmanager
-def served(command: Sequence[str], folder: Path, environment: Mapping[str, str] | None = None) -> Iterator[str]:
-    """The address that a command prints when it starts a server, once it answers; the server ends with the context.
+def served(
+    command: Sequence[str], folder: Path, environment: Mapping[str, str] | None = None
+) -> Iterator[str]:
+    """The address that a command prints when it starts a server, once it answers; the server ends
+    with the context.
 
     Raises RuntimeError with what the command said if it ends instead.
     """
     with tempfile.TemporaryFile("w+") as said:
         process = subprocess.Popen(
-            command, cwd=folder, env=dict(environment or os.environ), start_new_session=True,
-            stdout=said, stderr=subprocess.STDOUT,
-        )  # fmt: skip
+            command,
+            cwd=folder,
+            env=dict(environment or os.environ),
+            start_new_session=True,
+            stdout=said,
+            stderr=subprocess.STDOUT,
+        )
         try:
             until(lambda: _answers(_address(process, said)), "the server's address answers")
             yield _address(process, said)
@@ -147,7 +165,9 @@ def free_port() -> int:
 
 
 def until(holds: Any, what: str, every_s: float = 0.5) -> None:
-    """Wait for something that a page does without telling.  Raises AssertionError, saying what did not happen."""
+    """Wait for something that a page does without telling.  Raises AssertionError, saying what did
+    not happen.
+    """
     end = time.monotonic() + PATIENCE_S
     while not holds():
         assert time.monotonic() < end, f"within {PATIENCE_S} s: {what}"

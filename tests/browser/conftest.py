@@ -32,7 +32,9 @@ def browser() -> "Iterator[Browser]":
 
 @pytest.fixture(scope="session")
 def small_checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of this checkout in which one stage has run: policy search on the plane, a child for each of two seeds."""
+    """A copy of this checkout in which one stage has run: policy search on the plane, a child for
+    each of two seeds.
+    """
     folder = tmp_path_factory.mktemp("checkout")
     smoke.copy_checkout(folder)
     smoke.shrink_params(folder)

@@ -12,7 +12,9 @@ if TYPE_CHECKING:
 
 EXPERIMENT = "constraint_geodesics"
 FLAT = {"orderByKey": "tags.`child`", "orderByAsc": "true"}
-"""Sorted by anything but their time, children stand in the table by themselves, not hidden below their parents."""
+"""Sorted by anything but their time, children stand in the table by themselves, not hidden below
+their parents.
+"""
 SIDE_PANEL_CLOSED = (
     "localStorage.setItem('mlflow.assistant.fab.autoOpenedOnFirstLoad_v1', 'true');"
     "localStorage.setItem('mlflow.assistant.panelOpen_v1', 'false');"
@@ -23,7 +25,9 @@ SIDE_PANEL_CLOSED = (
 def asked(dashboard: str, call: str, body: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """An answer of the server's interface for programs."""
     data = None if body is None else json.dumps(body).encode()
-    request = urllib.request.Request(f"{dashboard}/api/2.0/mlflow/{call}", data, {"Content-Type": "application/json"})
+    request = urllib.request.Request(
+        f"{dashboard}/api/2.0/mlflow/{call}", data, {"Content-Type": "application/json"}
+    )
     with urllib.request.urlopen(request, timeout=30) as answer:
         return dict(json.load(answer))
 
@@ -41,8 +45,12 @@ def runs_found(dashboard: str, search: str) -> list[dict[str, Any]]:
 
 
 def runs_address(dashboard: str, search: str, **more: str) -> str:
-    """The page of the runs that a search finds; more: the page's other settings, as it puts them into its address."""
-    query = "&".join(f"{name}={quote(value)}" for name, value in {"searchFilter": search, **more}.items())
+    """The page of the runs that a search finds; more: the page's other settings, as it puts them
+    into its address.
+    """
+    query = "&".join(
+        f"{name}={quote(value)}" for name, value in {"searchFilter": search, **more}.items()
+    )
     return f"{dashboard}/#/experiments/{experiment_id(dashboard)}/runs?{query}"
 
 
@@ -60,5 +68,7 @@ def line_colours(page: "Page") -> set[str]:
     drawn = page.locator("path.js-line").evaluate_all(
         "paths => paths.map(path => [path.getAttribute('d') || '', path.style.stroke])"
     )
-    curves = {colour for outline, colour in drawn if len(set(re.findall(r"[-\d.]+,[-\d.]+", outline))) > 1}
+    curves = {
+        colour for outline, colour in drawn if len(set(re.findall(r"[-\d.]+,[-\d.]+", outline))) > 1
+    }
     return curves - {"rgb(0, 0, 0)"}

@@ -1,10 +1,12 @@
-"""The documentation's pictures of MLflow and Rerun, made from this checkout's runs and recordings: `make screenshots`.
+"""The documentation's pictures of MLflow and Rerun, made from this checkout's runs and recordings:
+`make screenshots`.
 
     python -m tests.browser.screenshots [NAME ...]
 
-A picture stands behind its marker `<!-- screenshot: NAME -->` in docs/*.md; making it again changes nothing else.
-MLflow shows a copy of the runs: of those that repeat one setting the newest alone is kept there, as after a first
-`make repro`, and two that are compared have colours that can be told apart.
+A picture stands behind its marker `<!-- screenshot: NAME -->` in docs/*.md; making it again changes
+nothing else.
+MLflow shows a copy of the runs: of those that repeat one setting the newest alone is kept there, as
+after a first `make repro`, and two that are compared have colours that can be told apart.
 """
 
 import contextlib
@@ -58,12 +60,16 @@ Run = Mapping[str, Any]
 
 
 class MissingRunError(RuntimeError):
-    """What a picture shows is not in the store or among the recordings; the message says which command makes it."""
+    """What a picture shows is not in the store or among the recordings; the message says which
+    command makes it.
+    """
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One picture: what it shows, in words for those who can't see it, and how it is taken as PNG."""
+    """One picture: what it shows, in words for those who can't see it, and how it is taken as
+    PNG.
+    """
 
     alt: str
     take: "Callable[[Browser, str], bytes]"
@@ -90,40 +96,77 @@ class View:
 
 
 def remembered(view: View) -> dict[str, Any]:
-    """What the dashboard keeps in the browser when somebody has chosen columns and charts by hand."""
-    widths = {"attributes.`Run Name`": 260, "runDateAndNestInfo": 115, **dict.fromkeys(view.columns, 168)}
+    """What the dashboard keeps in the browser when somebody has chosen columns and charts by
+    hand.
+    """
+    widths = {
+        "attributes.`Run Name`": 260,
+        "runDateAndNestInfo": 115,
+        **dict.fromkeys(view.columns, 168),
+    }
     return {
         "selectedColumns": list(view.columns),
         "columnOrder": list(widths),
         "columnWidths": widths,
         "runsHiddenMode": "FIRST_10_RUNS" if view.shown is None else "CUSTOM",
         "runsVisibilityMap": {},
-        "compareRunCharts": [_chart(k, kind, metric) for k, (kind, metric) in enumerate(view.charts)] or None,
+        "compareRunCharts": [
+            _chart(k, kind, metric) for k, (kind, metric) in enumerate(view.charts)
+        ]
+        or None,
         "compareRunSections": [
-            {"uuid": "chosen", "name": "Charts", "display": True, "isReordered": False, "deleted": False,
-             "isGenerated": False}
+            {
+                "uuid": "chosen",
+                "name": "Charts",
+                "display": True,
+                "isReordered": False,
+                "deleted": False,
+                "isGenerated": False,
+            }
         ],
         "isAccordionReordered": True,
         "useGroupedValuesInCharts": True,
         "hideEmptyCharts": True,
-        "groupBy": None if view.grouped_by is None else {
-            "aggregateFunction": "average", "groupByKeys": [{"mode": "param", "groupByData": view.grouped_by}]
+        "groupBy": None
+        if view.grouped_by is None
+        else {
+            "aggregateFunction": "average",
+            "groupByKeys": [{"mode": "param", "groupByData": view.grouped_by}],
         },
         "autoRefreshEnabled": False,
-        "globalLineChartConfig": {"xAxisKey": "step", "lineSmoothness": 0, "selectedXAxisMetricKey": ""},
-    }  # fmt: skip
+        "globalLineChartConfig": {
+            "xAxisKey": "step",
+            "lineSmoothness": 0,
+            "selectedXAxisMetricKey": "",
+        },
+    }
 
 
 def _chart(number: int, kind: str, metric: str) -> dict[str, Any]:
     chart = {
-        "uuid": f"chart{number}", "type": kind, "metricKey": metric, "displayName": metric,
-        "metricSectionId": "chosen", "runsCountToCompare": 10, "deleted": False, "isGenerated": False,
-    }  # fmt: skip
+        "uuid": f"chart{number}",
+        "type": kind,
+        "metricKey": metric,
+        "displayName": metric,
+        "metricSectionId": "chosen",
+        "runsCountToCompare": 10,
+        "deleted": False,
+        "isGenerated": False,
+    }
     line = {
-        "lineSmoothness": 0, "xAxisScaleType": "linear", "scaleType": "linear", "range": {}, "xAxisKey": "step",
-        "selectedXAxisMetricKey": "", "yAxisKey": "metric", "yAxisExpressions": [], "ignoreOutliers": False,
-        "useGlobalXaxisKey": True, "useGlobalLineSmoothing": True, "selectedMetricKeys": [metric],
-    }  # fmt: skip
+        "lineSmoothness": 0,
+        "xAxisScaleType": "linear",
+        "scaleType": "linear",
+        "range": {},
+        "xAxisKey": "step",
+        "selectedXAxisMetricKey": "",
+        "yAxisKey": "metric",
+        "yAxisExpressions": [],
+        "ignoreOutliers": False,
+        "useGlobalXaxisKey": True,
+        "useGlobalLineSmoothing": True,
+        "selectedMetricKeys": [metric],
+    }
     return chart | (line if kind == "LINE" else {})
 
 
@@ -187,12 +230,20 @@ def constraints(browser: "Browser", dashboard: str) -> bytes:
 
 def two_rewards(browser: "Browser", dashboard: str) -> bytes:
     search = f"{CUP} and tags.child IS NULL"
-    has_curve = {form_of(run) for run in runs_found(dashboard, search) if SEEDS_CURVE in figures_of(run)}
+    has_curve = {
+        form_of(run) for run in runs_found(dashboard, search) if SEEDS_CURVE in figures_of(run)
+    }
     for form in ("corrected", "printed"):
         if form not in has_curve:
             raise MissingRunError(
-                f"no run of train_geodesics planner-level_cup with policies.reward.form={form} and {SEEDS_CURVE}: "
-                f"{'dvc repro' if form == own_form() else f'dvc exp run -S policies.reward.form={form}'} "
+                f"no run of train_geodesics planner-level_cup with "
+                f"policies.reward.form={form} and {SEEDS_CURVE}: "
+                + (
+                    "dvc repro"
+                    if form == own_form()
+                    else f"dvc exp run -S policies.reward.form={form}"
+                )
+                + " "
                 "--force --single-item train_geodesics@planner-level_cup"
             )
     charts = [("LINE", SEEDS_CURVE), ("BAR", "success_mean"), ("BAR", "final_saving_mean")]
@@ -236,15 +287,18 @@ def own_form() -> str:
 
 
 def keep_newest(dashboard: str, form: str | None = None) -> None:
-    """Remove from the copy what repeats another run, those of the pipeline before those of an experiment and newer
-    before older ones, and (form given) experiments and what has another form of the reward.
+    """Remove from the copy what repeats another run, those of the pipeline before those of an
+    experiment and newer before older ones, and (form given) experiments and what has another form
+    of the reward.
     """
     found = runs_found(dashboard, "tags.stage = 'train_geodesics'")
     forms = {run["info"]["run_id"]: form_of(run) for run in found}
     seen = set()
     for run in sorted(found, key=lambda run: "dvc_experiment" in tags_of(run)):
         tags, name = tags_of(run), run["info"]["run_id"]
-        own = forms[name] or forms.get(tags.get("mlflow.parentRunId", ""))  # children of old runs do not say it
+        own = forms[name] or forms.get(
+            tags.get("mlflow.parentRunId", "")
+        )  # children of old runs do not say it
         key = (tags["item"], tags.get("child"), own)
         if key in seen or (form is not None and (form != own or "dvc_experiment" in tags)):
             asked(dashboard, "runs/delete", {"run_id": name})
@@ -258,7 +312,14 @@ def copied_dashboard() -> Iterator[str]:
         raise MissingRunError("mlflow.db: this checkout has no runs yet: make repro")
     with tempfile.TemporaryDirectory() as folder:
         shutil.copy2(ROOT / "mlflow.db", folder)
-        command = [sys.executable, "-m", "constraint_geodesics.cli", "ui", "--port", str(free_port())]
+        command = [
+            sys.executable,
+            "-m",
+            "constraint_geodesics.cli",
+            "ui",
+            "--port",
+            str(free_port()),
+        ]
         with served(command, Path(folder), smoke.environment(ROOT)) as address:
             yield address
 
@@ -266,14 +327,25 @@ def copied_dashboard() -> Iterator[str]:
 # Rerun
 
 
-def rerun(files: Sequence[str | Path], colours: Sequence[str], height: int = 800) -> Callable[["Browser", str], bytes]:
-    """The viewer with some recordings, paused on the way; files: their paths, or words that choose them."""
+def rerun(
+    files: Sequence[str | Path], colours: Sequence[str], height: int = 800
+) -> Callable[["Browser", str], bytes]:
+    """The viewer with some recordings, paused on the way; files: their paths, or words that choose
+    them.
+    """
 
     def take(browser: "Browser", dashboard: str) -> bytes:
         for file in files:
             if isinstance(file, Path) and not file.is_file():
                 raise MissingRunError(f"{file.relative_to(ROOT)}: no such recording: make repro")
-        command = [sys.executable, "-m", "constraint_geodesics.cli", "replay", "--web", *map(str, files)]
+        command = [
+            sys.executable,
+            "-m",
+            "constraint_geodesics.cli",
+            "replay",
+            "--web",
+            *map(str, files),
+        ]
         with (
             served(command, ROOT, smoke.environment(ROOT)) as address,
             visit(browser, viewport={"width": WIDTH, "height": height}) as (page, _),
@@ -293,36 +365,44 @@ def drawn(page: "Page", colour: str) -> bool:
 
 LEARNED = RECORDINGS / "train_geodesics" / "planner-level_cup" / "query1-learned_geodesic-seed0.rrd"
 EXECUTED = RECORDINGS / "execute_paths" / "level_cup" / "query0-planned-path.rrd"
-BOTH = re.findall(r"^geodesics replay (--constraint .*birrt)$", (ROOT / "README.md").read_text(), re.M)[0].split()
+BOTH = re.findall(
+    r"^geodesics replay (--constraint .*birrt)$", (ROOT / "README.md").read_text(), re.M
+)[0].split()
 """What README tells to open."""
 
 SHOTS = {
     "mlflow_two_rewards": Shot(
-        "MLflow's charts of two runs of train_geodesics planner-level_cup with different rewards: the mean saving of "
+        "MLflow's charts of two runs of train_geodesics planner-level_cup with different "
+        "rewards: the mean saving of "
         "their seeds over the steps, success_mean and final_saving_mean as bars",
         two_rewards,
     ),
     "mlflow_two_seeds": Shot(
-        "MLflow's charts of seeds 0 and 1 of train_geodesics planner-level_cup: saving over the steps as two lines, "
+        "MLflow's charts of seeds 0 and 1 of train_geodesics planner-level_cup: saving over "
+        "the steps as two lines, "
         "final/success and final/length_median_rad as bars",
         two_seeds,
     ),
     "mlflow_constraints": Shot(
-        "MLflow's table of train_geodesics on the planner's manifold, a row a constraint, with success_mean, "
+        "MLflow's table of train_geodesics on the planner's manifold, a row a constraint, "
+        "with success_mean, "
         "success_at_random_mean, queries_connected and seeds/success_std",
         constraints,
     ),
     "rerun_path": Shot(
-        "Rerun with one learned geodesic of the level cup: the arm and its tool's way, the latent space, the "
+        "Rerun with one learned geodesic of the level cup: the arm and its tool's way, the "
+        "latent space, the "
         "constraint's residual and the joints",
         rerun([LEARNED], [planner_colour("learned_geodesic")]),
     ),
     "rerun_execution": Shot(
-        "Rerun with an executed path: the arm, the cup with its spheres from near by, the cup's tilt and the joints",
+        "Rerun with an executed path: the arm, the cup with its spheres from near by, the "
+        "cup's tilt and the joints",
         rerun([EXECUTED], [planner_colour("planner")]),
     ),
     "rerun_two_recordings": Shot(
-        "Rerun with a learned geodesic and BiRRT's path of one query over each other, each in its planner's colour",
+        "Rerun with a learned geodesic and BiRRT's path of one query over each other, each in "
+        "its planner's colour",
         rerun(BOTH, [planner_colour("learned_geodesic"), planner_colour("birrt")]),
     ),
 }
@@ -344,7 +424,9 @@ def compressed(png: bytes) -> bytes:
         )
         if file.tell() <= LARGEST_BYTES:
             return file.getvalue()
-    raise ValueError(f"more than {LARGEST_BYTES} bytes with {COLOURS[-1]} colours: take it of a smaller window")
+    raise ValueError(
+        f"more than {LARGEST_BYTES} bytes with {COLOURS[-1]} colours: take it of a smaller window"
+    )
 
 
 def with_pictures(text: str, alts: Mapping[str, str]) -> str:
@@ -352,14 +434,20 @@ def with_pictures(text: str, alts: Mapping[str, str]) -> str:
     for name, alt in alts.items():
         line = f"![{alt}](images/{name}.png)"
         marker = f"<!-- screenshot: {name} -->"
-        text = re.sub(rf"{marker}(\n+!\[[^]]*\]\(images/{name}\.png\))?", f"{marker}\n\n{line}", text)
+        text = re.sub(
+            rf"{marker}(\n+!\[[^]]*\]\(images/{name}\.png\))?", f"{marker}\n\n{line}", text
+        )
     return text
 
 
 def main(wanted: Sequence[str]) -> int:
     """Take the pictures of some names, or all.  Exit code 1 if one can't be taken."""
     if unknown := set(wanted) - set(SHOTS):
-        print(f"error: there is no picture {', '.join(sorted(unknown))}: there are {', '.join(SHOTS)}", file=sys.stderr)
+        print(
+            f"error: there is no picture {', '.join(sorted(unknown))}: there are "
+            f"{', '.join(SHOTS)}",
+            file=sys.stderr,
+        )
         return 2
     chosen = {name: shot for name, shot in SHOTS.items() if name in wanted or not wanted}
     IMAGES.mkdir(exist_ok=True)
@@ -374,7 +462,10 @@ def main(wanted: Sequence[str]) -> int:
                     keep_newest(dashboard, None if shot.take is two_rewards else own_form())
                 (IMAGES / f"{name}.png").write_bytes(compressed(shot.take(browser, dashboard)))
                 print(f"docs/images/{name}.png  {time.monotonic() - began:.0f} s", flush=True)
-            except (MissingRunError, AssertionError) as error:  # the latter: a page did not show what it should
+            except (
+                MissingRunError,
+                AssertionError,
+            ) as error:  # the latter: a page did not show what it should
                 print(f"{name}: {error}", file=sys.stderr)
                 code = 1
     taken = {name: shot.alt for name, shot in SHOTS.items() if (IMAGES / f"{name}.png").is_file()}

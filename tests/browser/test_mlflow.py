@@ -1,4 +1,6 @@
-"""MLflow's dashboard shows the runs that stages made, and compares them, with nothing asked from elsewhere."""
+"""MLflow's dashboard shows the runs that stages made, and compares them, with nothing asked from
+elsewhere.
+"""
 
 import re
 from collections.abc import Iterator
@@ -7,7 +9,14 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.browser.chromium import Traffic, until, visit
-from tests.browser.dashboard import FLAT, SIDE_PANEL_CLOSED, line_colours, row, runs_address, runs_found
+from tests.browser.dashboard import (
+    FLAT,
+    SIDE_PANEL_CLOSED,
+    line_colours,
+    row,
+    runs_address,
+    runs_found,
+)
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -34,7 +43,9 @@ def test_the_table_has_the_runs_by_name_their_seeds_below_them_and_the_columns_a
     row(page, "train_analytic plane").wait_for()
     page.get_by_test_id("search-box").fill(OF_THE_PLANE)
     page.keyboard.press("Enter")
-    row(page, "train_analytic plane").locator("button").first.click()  # what MLflow hides below the parent
+    row(page, "train_analytic plane").locator(
+        "button"
+    ).first.click()  # what MLflow hides below the parent
     for name in SEEDS:
         row(page, name).wait_for()
     for column in COLUMNS:
@@ -42,8 +53,12 @@ def test_the_table_has_the_runs_by_name_their_seeds_below_them_and_the_columns_a
     found = runs_found(small_dashboard, ITS_SEEDS)
     assert len(found) == len(SEEDS)
     for run in found:
-        ratio = next(entry["value"] for entry in run["data"]["metrics"] if entry["key"] == "final/mean_ratio")
-        cell = page.locator(f'[row-id="{run["info"]["run_id"]}"] [col-id*="final/mean_ratio"]').first
+        ratio = next(
+            entry["value"] for entry in run["data"]["metrics"] if entry["key"] == "final/mean_ratio"
+        )
+        cell = page.locator(
+            f'[row-id="{run["info"]["run_id"]}"] [col-id*="final/mean_ratio"]'
+        ).first
         assert float(cell.inner_text()) == pytest.approx(ratio, rel=0.01)
     assert not traffic.outside
 
@@ -51,27 +66,40 @@ def test_the_table_has_the_runs_by_name_their_seeds_below_them_and_the_columns_a
 def choose_column(page: "Page", name: str) -> None:
     page.get_by_role("button", name="Columns").click()
     page.get_by_placeholder("Search columns").fill(name)
-    page.get_by_role("dialog").locator("[class*=tree-title]").filter(has_text=re.compile(f"^{name}$")).first.click()
+    page.get_by_role("dialog").locator("[class*=tree-title]").filter(
+        has_text=re.compile(f"^{name}$")
+    ).first.click()
     page.keyboard.press("Escape")
-    page.get_by_role("columnheader").filter(has_text=re.compile(rf"^\s*{name}\s*$")).first.wait_for()
+    page.get_by_role("columnheader").filter(
+        has_text=re.compile(rf"^\s*{name}\s*$")
+    ).first.wait_for()
 
 
-def test_two_seeds_are_compared_down_to_their_learning_curves(opened: Opened, small_dashboard: str) -> None:
+def test_two_seeds_are_compared_down_to_their_learning_curves(
+    opened: Opened, small_dashboard: str
+) -> None:
     page, traffic = opened
     compare(page, runs_address(small_dashboard, ITS_SEEDS, **FLAT), SEEDS, "return")
     assert not traffic.outside
 
 
-def test_two_seeds_of_this_checkout_are_compared_as_well(opened: Opened, own_dashboard: str) -> None:
+def test_two_seeds_of_this_checkout_are_compared_as_well(
+    opened: Opened, own_dashboard: str
+) -> None:
     page, traffic = opened
-    search = "tags.stage = 'train_geodesics' and tags.item = 'planner-level_cup' and tags.child LIKE 'seed %'"
+    search = (
+        "tags.stage = 'train_geodesics' and tags.item = 'planner-level_cup' and tags.child "
+        "LIKE 'seed %'"
+    )
     seeds = ("planner-level_cup seed 0", "planner-level_cup seed 1")
     compare(page, runs_address(own_dashboard, search, **FLAT), seeds, "saving")
     assert not traffic.outside
 
 
 def compare(page: "Page", runs: str, names: tuple[str, str], curve: str) -> None:
-    """From the table to the page that compares two runs, and on to a chart of one of their figures."""
+    """From the table to the page that compares two runs, and on to a chart of one of their
+    figures.
+    """
     page.goto(runs)
     for name in names:
         row(page, name).locator("input[type=checkbox]").first.click()
@@ -84,7 +112,9 @@ def compare(page: "Page", runs: str, names: tuple[str, str], curve: str) -> None
         page.get_by_text(re.compile(rf"^{name}.*\({curve}\)$")).first.wait_for()
 
 
-def test_the_charts_lay_the_learning_curves_of_all_seeds_over_each_other(opened: Opened, small_dashboard: str) -> None:
+def test_the_charts_lay_the_learning_curves_of_all_seeds_over_each_other(
+    opened: Opened, small_dashboard: str
+) -> None:
     page, traffic = opened
     page.goto(runs_address(small_dashboard, ITS_SEEDS, compareRunsMode="CHART", **FLAT))
     page.get_by_placeholder("Search metric charts").fill("^return$")

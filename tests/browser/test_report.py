@@ -1,4 +1,6 @@
-"""The report's page as a person sees it who has no network: on a desk, on a telephone, by day and by night."""
+"""The report's page as a person sees it who has no network: on a desk, on a telephone, by day and
+by night.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -63,20 +65,32 @@ def test_the_page_is_whole_without_a_network(opened: Opened, report: Path) -> No
     page, traffic = opened
     assert not traffic.outside
     assert all(url.startswith(("file:", "data:")) for url in traffic.local)
-    assert {url for url in traffic.local if url.startswith("file:")} == {report.as_uri()}, "it is one file"
+    assert {url for url in traffic.local if url.startswith("file:")} == {report.as_uri()}, (
+        "it is one file"
+    )
     assert not traffic.errors
     page.evaluate("document.querySelectorAll('details').forEach(part => { part.open = true; })")
-    page.evaluate("Promise.all([...document.images].map(image => { image.loading = 'eager'; return image.decode(); }))")
+    page.evaluate(
+        "Promise.all([...document.images].map(image => "
+        "{ image.loading = 'eager'; return image.decode(); }))"
+    )
     widths = page.evaluate("[...document.images].map(image => [image.alt, image.naturalWidth])")
     assert widths
     assert all(width > 0 for _, width in widths), widths
 
 
-def test_nothing_has_to_be_pushed_aside_on_a_telephone(browser: "Browser", by: str, report: Path) -> None:
-    with visit(browser, viewport=TELEPHONE, color_scheme=by, is_mobile=True, has_touch=True) as (page, _):
+def test_nothing_has_to_be_pushed_aside_on_a_telephone(
+    browser: "Browser", by: str, report: Path
+) -> None:
+    with visit(browser, viewport=TELEPHONE, color_scheme=by, is_mobile=True, has_touch=True) as (
+        page,
+        _,
+    ):
         page.goto(report.as_uri())
         page.evaluate("document.querySelectorAll('details').forEach(part => { part.open = true; })")
-        whole, seen = page.evaluate("[document.scrollingElement.scrollWidth, document.scrollingElement.clientWidth]")
+        whole, seen = page.evaluate(
+            "[document.scrollingElement.scrollWidth, document.scrollingElement.clientWidth]"
+        )
         assert whole <= seen == TELEPHONE["width"]
 
 
@@ -97,6 +111,8 @@ def contrast(ink: str, ground: str) -> float:
 
 
 def luminance(colour: str) -> float:
-    channels = np.array([float(part) for part in colour.split("(")[1].rstrip(")").split(",")[:3]]) / 255.0
+    channels = (
+        np.array([float(part) for part in colour.split("(")[1].rstrip(")").split(",")[:3]]) / 255.0
+    )
     linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
     return float(linear @ [0.2126, 0.7152, 0.0722])

@@ -1,4 +1,6 @@
-"""Recordings as the web viewer shows them: the arm, its tool's way in its planner's colour, and both moving."""
+"""Recordings as the web viewer shows them: the arm, its tool's way in its planner's colour, and
+both moving.
+"""
 
 import sys
 from pathlib import Path
@@ -8,12 +10,12 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from constraint_geodesics.constraints.scene import Scene
 from constraint_geodesics.palette import GOAL as GOAL_COLOUR
 from constraint_geodesics.palette import START as START_COLOUR
 from constraint_geodesics.palette import planner_colour
 from constraint_geodesics.params import Params
-from constraint_geodesics.tracking.recording import PathRecord, record_path
+from constraint_geodesics.recording.recording import PathRecord, record_path
+from constraint_geodesics.scene.scene import Scene
 from tests.browser.chromium import ROOT, served, until, visit
 from tests.browser.pixels import Picture, having, picture, scene_of
 from tests.pipeline import smoke
@@ -27,11 +29,15 @@ VIEWER_S = 300
 CURVE, ROBOT = 100, 1000
 """So many pixels a curve and an arm have at least."""
 ASKED_IN_VAIN = {"fonts.googleapis.com", "api.github.com", "app.rerun.io", "tel.rerun.io"}
-"""Whom Rerun's page asks for a font, newer versions, examples, and tells of its use; it does without their answers."""
+"""Whom Rerun's page asks for a font, newer versions, examples, and tells of its use; it does
+without their answers.
+"""
 
 
 @pytest.fixture(scope="module")
-def recordings(scene: Scene, params: Params, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def recordings(
+    scene: Scene, params: Params, tmp_path_factory: pytest.TempPathFactory
+) -> list[Path]:
     """The straight joint line, and a way that bends away from it, in free space."""
     folder, t = tmp_path_factory.mktemp("recordings"), np.linspace(0.0, 1.0, 40)[:, None]
     straight = np.array(START) + t * (np.array(GOAL) - np.array(START))
@@ -41,7 +47,9 @@ def recordings(scene: Scene, params: Params, tmp_path_factory: pytest.TempPathFa
         path = PathRecord(planner, "free", 0, 0, joints, f"**{planner}**")
         files.append(folder / f"{planner}.rrd")
         constrained = scene.manifold(params.constraints["free"])
-        record_path(files[-1], path, constrained, scene.workcell, frames=60, meshes=False)  # as the stages do
+        record_path(
+            files[-1], path, constrained, scene.workcell, frames=60, meshes=False
+        )  # as the stages do
     return files
 
 
@@ -52,7 +60,10 @@ def replayed(*files: Path) -> list[str]:
 def scene_shown(page: "Page", address: str, colours: list[str]) -> Picture:
     """The 3D view, once all the colours are in it."""
     page.goto(f"{address}&renderer=webgl")
-    until(lambda: all(curve(scene_of(picture(page)), colour) for colour in colours), f"curves in {colours}")
+    until(
+        lambda: all(curve(scene_of(picture(page)), colour) for colour in colours),
+        f"curves in {colours}",
+    )
     return scene_of(picture(page))
 
 
@@ -61,21 +72,29 @@ def curve(scene: Picture, colour: str) -> bool:
 
 
 @pytest.mark.timeout(VIEWER_S)
-def test_a_recording_shows_the_arm_and_its_tools_way_and_plays(browser: "Browser", recordings: list[Path]) -> None:
+def test_a_recording_shows_the_arm_and_its_tools_way_and_plays(
+    browser: "Browser", recordings: list[Path]
+) -> None:
     with (
         served(replayed(recordings[0]), ROOT, smoke.environment(ROOT)) as address,
         visit(browser, viewport={"width": 1000, "height": 640}) as (page, traffic),
     ):
         shown = scene_shown(page, address, [planner_colour("learned_geodesic")])
         assert arm(shown) >= ROBOT, "its links are in bright colours; table and ground are not"
-        until(lambda: moved(shown, scene_of(picture(page))) >= ROBOT, "the arm is seen in another place")
+        until(
+            lambda: moved(shown, scene_of(picture(page))) >= ROBOT,
+            "the arm is seen in another place",
+        )
         assert {urlsplit(address).hostname for address in traffic.outside} <= ASKED_IN_VAIN
 
 
 def arm(scene: Picture) -> int:
     """Pixels in a bright colour that is not of the tool's way or its ends."""
     bright = np.ptp(scene.astype(int), axis=-1) > 60
-    drawn = [having(scene, colour) for colour in (planner_colour("learned_geodesic"), START_COLOUR, GOAL_COLOUR)]
+    drawn = [
+        having(scene, colour)
+        for colour in (planner_colour("learned_geodesic"), START_COLOUR, GOAL_COLOUR)
+    ]
     return int((bright & ~np.any(drawn, axis=0)).sum())
 
 

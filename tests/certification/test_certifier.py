@@ -1,4 +1,6 @@
-"""The certifier against PyBullet, the project's own constraint, dense sampling, and many kinds of corruption."""
+"""The certifier against PyBullet, the project's own constraint, dense sampling, and many kinds of
+corruption.
+"""
 
 import ast
 import itertools
@@ -11,13 +13,13 @@ import pytest
 
 import constraint_geodesics.certification as package
 from constraint_geodesics.certification.certifier import CertificationError, Certifier, Limits
-from constraint_geodesics.constraints.lift import as_executed, densify
-from constraint_geodesics.constraints.retraction import retract
-from constraint_geodesics.constraints.scene import Scene
-from constraint_geodesics.constraints.vector import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.projection import retract
+from constraint_geodesics.learning.lift import as_executed, densify
 from constraint_geodesics.params import Params
-from constraint_geodesics.robot.bullet import World
 from constraint_geodesics.robot.kinematics import load_robot, rotation_from_rpy
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.world import World
 
 LIMITS = Limits(acceleration_rad_s2=(20.0,) * 6)
 FREE = Constraint((0,) * 6)
@@ -38,11 +40,19 @@ CONSTRAINTS = {
     "mixed": Constraint((0, 1, 1, 1, 0, 0), (0, 0.01, 0, 0.05, 0, 0)),
 }
 GANTRY_JOINTS = [
-    ("fixed", "0 0 1"), ("revolute", "1 1 0"), ("prismatic", "{slide}"), ("fixed", "0 0 1"), ("revolute", "0 0 -1"),
-    ("revolute", "0 1 0"), ("prismatic", "-1 0 0"), ("revolute", "1 -2 3"), ("fixed", "0 0 1"),
-]  # fmt: skip
+    ("fixed", "0 0 1"),
+    ("revolute", "1 1 0"),
+    ("prismatic", "{slide}"),
+    ("fixed", "0 0 1"),
+    ("revolute", "0 0 -1"),
+    ("revolute", "0 1 0"),
+    ("prismatic", "-1 0 0"),
+    ("revolute", "1 -2 3"),
+    ("fixed", "0 0 1"),
+]
 GANTRY_LINK = """
-  <link name="{name}"><inertial><origin xyz="0.02 -0.01 0.03" rpy="{turn} 0.3 0.1"/><mass value="1"/>
+  <link name="{name}"><inertial><origin xyz="0.02 -0.01 0.03" rpy="{turn} 0.3 0.1"/>
+    <mass value="1"/>
     <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>"""
 GANTRY_JOINT = """
   <joint name="joint{i}" type="{kind}"><parent link="link{i}"/><child link="link{next}"/>
@@ -54,8 +64,12 @@ GANTRY_TOOL = f"link{len(GANTRY_JOINTS)}"
 
 
 def write_gantry(folder: Path, slide: str) -> Path:
-    """A URDF of sliding and turning joints about skewed axes, fixed ones among them, and turned inertial frames."""
-    links = [GANTRY_LINK.format(name=f"link{i}", turn=0.4 * i) for i in range(len(GANTRY_JOINTS) + 1)]
+    """A URDF of sliding and turning joints about skewed axes, fixed ones among them, and turned
+    inertial frames.
+    """
+    links = [
+        GANTRY_LINK.format(name=f"link{i}", turn=0.4 * i) for i in range(len(GANTRY_JOINTS) + 1)
+    ]
     joints = [
         GANTRY_JOINT.format(i=i, next=i + 1, kind=kind, axis=axis.format(slide=slide))
         for i, (kind, axis) in enumerate(GANTRY_JOINTS)
@@ -76,12 +90,16 @@ class Question:
     times: object = None
 
     def put_to(self, certifier: Certifier, collisions: bool = True):
-        return certifier.certify(self.joints, self.constraint, self.start, self.goal, self.times, collisions)
+        return certifier.certify(
+            self.joints, self.constraint, self.start, self.goal, self.times, collisions
+        )
 
 
 @pytest.fixture(scope="module")
 def gantry(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return Scene(load_robot(write_gantry(tmp_path_factory.mktemp("gantry"), "0 0.6 0.8"), GANTRY_TOOL))
+    return Scene(
+        load_robot(write_gantry(tmp_path_factory.mktemp("gantry"), "0 0.6 0.8"), GANTRY_TOOL)
+    )
 
 
 @pytest.fixture(params=["scene", "kuka_scene", "gantry"])
@@ -125,21 +143,27 @@ def dense(joints: np.ndarray, count: int) -> np.ndarray:
 
 
 def excesses(manifold: ConstraintManifold, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The project's own excess over the tolerance of each configuration: of the angles [rad], of the positions [m]."""
+    """The project's own excess over the tolerance of each configuration: of the angles [rad], of
+    the positions [m].
+    """
     excess = manifold.inclusion(q)
     shared = len(set(manifold.tolerance[3:][manifold.held[3:]])) == 1
     angles = np.linalg.norm(excess[:, 3:], axis=-1) if shared else excess[:, 3:].max(axis=-1)
     return angles, excess[:, :3].max(axis=-1)
 
 
-def walk(manifold: ConstraintManifold, rows: int, step: float, rng: np.random.Generator) -> np.ndarray:
+def walk(
+    manifold: ConstraintManifold, rows: int, step: float, rng: np.random.Generator
+) -> np.ndarray:
     """A random path along the constraint, about `step` from row to row."""
     path = [retract(manifold, manifold.robot.sample(1, rng)).joints[0]]
     heading = rng.normal(size=manifold.robot.dof)
     while len(path) < rows:
         heading = heading + 0.3 * rng.normal(size=len(heading))
         # a step along the constraint first, so that the row after it is as far away as wanted
-        tangent = retract(manifold, path[-1] + 1e-4 * heading / np.linalg.norm(heading)).joints - path[-1]
+        tangent = (
+            retract(manifold, path[-1] + 1e-4 * heading / np.linalg.norm(heading)).joints - path[-1]
+        )
         path.append(retract(manifold, path[-1] + step * tangent / np.linalg.norm(tangent)).joints)
     return np.array(path)
 
@@ -150,9 +174,9 @@ def walk(manifold: ConstraintManifold, rows: int, step: float, rng: np.random.Ge
 def test_it_shares_no_code_with_the_search() -> None:
     allowed = {
         "constraint_geodesics.certification": {"kernels"},
-        "constraint_geodesics.constraints.scene": {"Scene"},
-        "constraint_geodesics.constraints.vector": {"Constraint", "Pose"},
-        "constraint_geodesics.robot.bullet": {"LoadedChain"},
+        "constraint_geodesics.scene.scene": {"Scene"},
+        "constraint_geodesics.constraints.pose": {"Constraint", "Pose"},
+        "constraint_geodesics.scene.world": {"LoadedChain"},
     }
     sources = sorted(Path(package.__file__).parent.glob("*.py"))
     assert len(sources) == 3
@@ -160,10 +184,19 @@ def test_it_shares_no_code_with_the_search() -> None:
         for node in ast.walk(ast.parse(source.read_text())):
             if isinstance(node, ast.Import):
                 assert {name.name for name in node.names} <= {"numpy", "time"}
-            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("constraint_geodesics"):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith(
+                "constraint_geodesics"
+            ):
                 assert {name.name for name in node.names} <= allowed[str(node.module)]
             if isinstance(node, ast.Attribute):  # of the robot it reads data only
-                assert node.attr not in {"forward", "jacobian", "chain", "manifold", "limit_distance", "sample"}
+                assert node.attr not in {
+                    "forward",
+                    "jacobian",
+                    "chain",
+                    "manifold",
+                    "limit_distance",
+                    "sample",
+                }
 
 
 def test_its_kinematics_are_pybullets(any_scene: Scene) -> None:
@@ -176,18 +209,26 @@ def test_its_kinematics_are_pybullets(any_scene: Scene) -> None:
 
 
 def test_the_constraint_is_measured_as_the_search_measures_it(any_scene: Scene) -> None:
-    """One formulation by quaternions, one by matrices: the same excess at any configuration, near and far."""
+    """One formulation by quaternions, one by matrices: the same excess at any configuration, near
+    and far.
+    """
     rng = np.random.default_rng(1)
     robot = any_scene.robot
     with Certifier(any_scene) as certifier:
         for constraint in CONSTRAINTS.values():
             centre = robot.sample(1, rng)[0]
             held = constraint.relative_to(Pose(*robot.forward(centre)))
-            q = np.concatenate([robot.sample(15, rng), centre + 0.1 * rng.normal(size=(15, robot.dof))])
+            q = np.concatenate(
+                [robot.sample(15, rng), centre + 0.1 * rng.normal(size=(15, robot.dof))]
+            )
             angles, positions = excesses(ConstraintManifold(robot, held), q)
             found = [certifier.certify(np.stack([row, row]), held, collisions=False) for row in q]
-            np.testing.assert_allclose([each.max_violation_rad for each in found], angles, atol=1e-9)
-            np.testing.assert_allclose([each.max_violation_m for each in found], positions, atol=1e-9)
+            np.testing.assert_allclose(
+                [each.max_violation_rad for each in found], angles, atol=1e-9
+            )
+            np.testing.assert_allclose(
+                [each.max_violation_m for each in found], positions, atol=1e-9
+            )
 
 
 def test_a_world_finds_the_first_collision_of_a_batch(scene: Scene) -> None:
@@ -202,8 +243,12 @@ def test_a_world_finds_the_first_collision_of_a_batch(scene: Scene) -> None:
 # The bound between the rows.
 
 
-def check_bound(certifier: Certifier, manifold: ConstraintManifold, path: np.ndarray, count: int) -> tuple[float, ...]:
-    """Bounds and true maxima (sampled) of angles and positions; the bound holds, whatever the path."""
+def check_bound(
+    certifier: Certifier, manifold: ConstraintManifold, path: np.ndarray, count: int
+) -> tuple[float, ...]:
+    """Bounds and true maxima (sampled) of angles and positions; the bound holds, whatever the
+    path.
+    """
     certificate = certifier.certify(path, manifold.constraint, collisions=False)
     angles, positions = (each.max() for each in excesses(manifold, dense(path, count)))
     assert certificate.violation_bound_rad >= angles
@@ -216,7 +261,9 @@ def check_bound(certifier: Certifier, manifold: ConstraintManifold, path: np.nda
 
 @pytest.mark.parametrize("name", CONSTRAINTS)
 @pytest.mark.parametrize("step", [0.01, 0.02, 0.03])
-def test_on_fine_paths_along_the_constraint_the_bound_is_tight(scene, kuka_scene, gantry, name, step) -> None:
+def test_on_fine_paths_along_the_constraint_the_bound_is_tight(
+    scene, kuka_scene, gantry, name, step
+) -> None:
     for any_scene, seed in ((scene, 0), (kuka_scene, 1), (gantry, 2)):
         rng = np.random.default_rng(seed)
         reference = Pose(*any_scene.robot.forward(any_scene.robot.sample(1, rng)[0]))
@@ -230,11 +277,14 @@ def test_on_fine_paths_along_the_constraint_the_bound_is_tight(scene, kuka_scene
 
 
 @pytest.mark.parametrize("name", CONSTRAINTS)
-@pytest.mark.parametrize(("step", "tolerance"), [(0.02, 1e-4), (0.1, 1e-4), (0.5, 10.0), (1.0, 10.0), (7.0, 1e-4)])
+@pytest.mark.parametrize(
+    ("step", "tolerance"), [(0.02, 1e-4), (0.1, 1e-4), (0.5, 10.0), (1.0, 10.0), (7.0, 1e-4)]
+)
 def test_the_bound_holds_on_any_path(scene, kuka_scene, gantry, name, step, tolerance) -> None:
     """Rows off the constraint, steps up to a whole turn, references up to a half turn away.
 
-    With a large tolerance long pieces are not cut, so that the remainder of the interpolation counts.
+    With a large tolerance long pieces are not cut, so that the remainder of the interpolation
+    counts.
     """
     for any_scene, seed in ((scene, 3), (kuka_scene, 4), (gantry, 5)):
         rng = np.random.default_rng(seed)
@@ -245,14 +295,20 @@ def test_the_bound_holds_on_any_path(scene, kuka_scene, gantry, name, step, tole
                 steps *= step / np.linalg.norm(steps, axis=-1, keepdims=True)
                 path = np.cumsum(np.concatenate([robot.sample(1, rng), steps]), axis=0)
                 position, rotation = robot.forward(path[0])
-                reference = Pose(position, rotation_from_rpy(turn * np.eye(3)[rng.integers(3)]) @ rotation)
+                reference = Pose(
+                    position, rotation_from_rpy(turn * np.eye(3)[rng.integers(3)]) @ rotation
+                )
                 manifold = ConstraintManifold(robot, CONSTRAINTS[name].relative_to(reference))
                 check_bound(certifier, manifold, path, 200)
 
 
-@pytest.mark.parametrize("name", ["cone", "swing entries", "rotation", "rotation entries", "twist", "position"])
+@pytest.mark.parametrize(
+    "name", ["cone", "swing entries", "rotation", "rotation entries", "twist", "position"]
+)
 def test_the_interpolations_remainder_counts_where_pieces_are_long(scene, gantry, name) -> None:
-    """Few joints turn far at once, and the tolerance is what the rows need: all of the excess lies between them."""
+    """Few joints turn far at once, and the tolerance is what the rows need: all of the excess lies
+    between them.
+    """
     shape = CONSTRAINTS[name]
     with_entries = "entries" in name or name == "position"
     for any_scene in (scene, gantry):
@@ -262,7 +318,9 @@ def test_the_interpolations_remainder_counts_where_pieces_are_long(scene, gantry
             for _ in range(60):
                 path = robot.sample(1, rng).repeat(2, axis=0)
                 moved = rng.choice(robot.dof, size=rng.integers(1, 3), replace=False)
-                path[1, moved] += rng.uniform(0.5, 2.0, len(moved)) * rng.choice([-1, 1], len(moved))
+                path[1, moved] += rng.uniform(0.5, 2.0, len(moved)) * rng.choice(
+                    [-1, 1], len(moved)
+                )
                 held = shape.relative_to(Pose(*robot.forward(robot.sample(1, rng)[0])))
                 needed = np.abs(ConstraintManifold(robot, held).residual(path))
                 angle = np.linalg.norm(needed[:, 3:], axis=-1).max()
@@ -271,8 +329,12 @@ def test_the_interpolations_remainder_counts_where_pieces_are_long(scene, gantry
                 check_bound(certifier, ConstraintManifold(robot, held), path, 2000)
 
 
-def test_the_bound_is_the_excess_itself_where_the_tool_only_turns_freely(certifier: Certifier, good: Question) -> None:
-    """Turning joint 6 alone keeps the tool's z axis: nothing happens between the rows, however long the way."""
+def test_the_bound_is_the_excess_itself_where_the_tool_only_turns_freely(
+    certifier: Certifier, good: Question
+) -> None:
+    """Turning joint 6 alone keeps the tool's z axis: nothing happens between the rows, however long
+    the way.
+    """
     path = np.repeat(good.start[None], 60, axis=0)
     path[:, 5] += np.linspace(0.0, 3.0, 60) * -np.sign(path[:, 5])
     held = Constraint((0, 0, 0, 1, 1, 0), reference=Pose(np.zeros(3), np.eye(3)))
@@ -286,20 +348,27 @@ def test_the_bound_is_the_excess_itself_where_the_tool_only_turns_freely(certifi
 # Good paths, and twenty-odd ways to spoil one.
 
 
-def test_a_good_path_passes_with_its_measures(scene: Scene, certifier: Certifier, good: Question) -> None:
+def test_a_good_path_passes_with_its_measures(
+    scene: Scene, certifier: Certifier, good: Question
+) -> None:
     certificate = good.put_to(certifier)
     assert certificate.valid
     assert certificate.violation is None
     steps = np.linalg.norm(np.diff(good.joints, axis=0), axis=-1)
     np.testing.assert_allclose(certificate.length_rad, steps.sum())
     np.testing.assert_allclose(certificate.max_step_rad, steps.max())
-    np.testing.assert_allclose(certificate.limit_distance_rad, scene.robot.limit_distance(good.joints).min())
+    np.testing.assert_allclose(
+        certificate.limit_distance_rad, scene.robot.limit_distance(good.joints).min()
+    )
     np.testing.assert_allclose(certificate.duration_s, good.times[-1])
     true = ConstraintManifold(scene.robot, good.constraint).violation(dense(good.joints, 50)).max()
     assert 1e-7 < true <= certificate.violation_bound <= 1.2 * true + 1e-6
     np.testing.assert_allclose(certificate.max_violation, true, rtol=0.05)
     assert certificate.max_violation_m == certificate.violation_bound_m == 0.0
-    assert certificate.collision_checks == np.ceil(steps.sum() / certifier.limits.collision_spacing_rad) + 1
+    assert (
+        certificate.collision_checks
+        == np.ceil(steps.sum() / certifier.limits.collision_spacing_rad) + 1
+    )
     assert 0.0 < certificate.largest_pose_difference < 1e-6
     assert certificate.time_s > 0.0
 
@@ -311,14 +380,22 @@ def test_times_and_ends_and_collisions_are_optional(certifier: Certifier, good: 
     assert certificate.collision_checks == 0
 
 
-def test_without_a_reference_the_start_is_held(scene: Scene, certifier: Certifier, good: Question) -> None:
+def test_without_a_reference_the_start_is_held(
+    scene: Scene, certifier: Certifier, good: Question
+) -> None:
     free_reference = replace(good.constraint, reference=None)
     assert replace(good, constraint=free_reference).put_to(certifier).valid
     tilted = good.joints + np.array([0, 0, 0, 0, 1e-2, 0])
     own = Question(tilted, free_reference).put_to(certifier, collisions=False)
-    held = ConstraintManifold(scene.robot, free_reference.relative_to(Pose(*scene.robot.forward(good.start))))
-    at_start = Question(tilted, free_reference, start=good.start).put_to(certifier, collisions=False)
-    np.testing.assert_allclose(at_start.max_violation, held.violation(dense(tilted, 20)).max(), rtol=1e-2)
+    held = ConstraintManifold(
+        scene.robot, free_reference.relative_to(Pose(*scene.robot.forward(good.start)))
+    )
+    at_start = Question(tilted, free_reference, start=good.start).put_to(
+        certifier, collisions=False
+    )
+    np.testing.assert_allclose(
+        at_start.max_violation, held.violation(dense(tilted, 20)).max(), rtol=1e-2
+    )
     assert own.max_violation < at_start.max_violation
 
 
@@ -423,7 +500,11 @@ CORRUPTIONS: dict[str, tuple[Callable[[Question, Scene], Question], str, int | N
     "goal off by 2e-6": (edited(lambda q: put(q, (-1, 4), q[-1, 4] - 2e-6)), "goal_missed", -1),
     "walked backwards": (edited(lambda q: q[::-1]), "start_missed", 0),
     "cut short": (edited(lambda q: q[:-3]), "goal_missed", -4),
-    "turned as a whole": (edited(lambda q: put(q, (slice(None), 0), q[:, 0] + 1e-3)), "start_missed", 0),
+    "turned as a whole": (
+        edited(lambda q: put(q, (slice(None), 0), q[:, 0] + 1e-3)),
+        "start_missed",
+        0,
+    ),
     "a row outside the limits": (edited(lambda q: put(q, (40, 4), 3.2)), "joint_limits", 40),
     "a joint a turn further": (edited(lambda q: a_turn_further(q, 40, 2)), "joint_limits", 40),
     "a jump": (edited(lambda q: put(q, 40, q[40] * 0.9)), "step", 39),
@@ -436,16 +517,24 @@ CORRUPTIONS: dict[str, tuple[Callable[[Question, Scene], Question], str, int | N
     "another constraint": (other_constraint, "constraint", None),
     "rows too sparse": (sparse, "constraint_between_rows", None),
     "times of other rows": (retimed(lambda t: t[:-1]), "times_shape", None),
-    "a time is missing": (retimed(lambda t: np.where(np.arange(len(t)) == 40, NAN, t)), "times_not_finite", 40),
+    "a time is missing": (
+        retimed(lambda t: np.where(np.arange(len(t)) == 40, NAN, t)),
+        "times_not_finite",
+        40,
+    ),
     "times start late": (retimed(lambda t: t + 0.5), "times_start", 0),
     "times reversed": (retimed(lambda t: t[::-1]), "times_start", 0),
-    "a time twice": (retimed(lambda t: np.where(np.arange(len(t)) == 40, t[39], t)), "times_order", 39),
+    "a time twice": (
+        retimed(lambda t: np.where(np.arange(len(t)) == 40, t[39], t)),
+        "times_order",
+        39,
+    ),
     "times exchanged": (retimed(lambda t: exchanged(t, 40, 41)), "times_order", 40),
     "too fast": (retimed(lambda t: t * 0.02), "velocity", None),
     "too sharp": (sharp, "acceleration", 0),
     "through the table": (through_the_table, "workcell_collision", None),
     "into itself": (into_itself, "self_collision", None),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", CORRUPTIONS)
@@ -471,7 +560,9 @@ def test_the_message_says_where_how_much_and_what_is_allowed(certifier, scene, g
 
 
 def test_the_first_promise_broken_is_reported(certifier, scene, good) -> None:
-    """Each later corruption is hidden by the one before it, and a path with neither is measured all the same."""
+    """Each later corruption is hidden by the one before it, and a path with neither is measured all
+    the same.
+    """
     broken = tilted(2e-4, 40)(good, scene)
     both = replace(broken, times=broken.times * 0.02)
     assert both.put_to(certifier).violation.kind == "constraint"
@@ -503,7 +594,9 @@ def test_the_segment_that_leaves_the_constraint_is_named(certifier, scene, good)
 
 
 def test_a_pose_that_is_not_pybullets_is_reported(tmp_path: Path) -> None:
-    """PyBullet slides by the length of a prismatic axis, which the URDF should have made 1: someone must be wrong."""
+    """PyBullet slides by the length of a prismatic axis, which the URDF should have made 1: someone
+    must be wrong.
+    """
     scene = Scene(load_robot(write_gantry(tmp_path, "0 1 2"), GANTRY_TOOL))
     with Certifier(scene) as certifier:
         path = densify(np.stack([np.zeros(6), np.full(6, 0.3)]), 0.1)
@@ -515,7 +608,9 @@ def test_a_pose_that_is_not_pybullets_is_reported(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["cone", "rotation entries", "mixed"])
 def test_numbers_beyond_all_bounds_are_refused_like_others(certifier, good, name) -> None:
-    """Where differences overflow nothing is known, so nothing small is claimed; an end that is no number is missed."""
+    """Where differences overflow nothing is known, so nothing small is claimed; an end that is no
+    number is missed.
+    """
     held = CONSTRAINTS[name].relative_to(good.constraint.reference)
     far = np.where(np.random.default_rng(0).random((5, 6)) < 0.5, 1e308, -1e308)
     certificate = certifier.certify(far, held)
@@ -532,14 +627,18 @@ def test_velocity_limits_are_the_robots(scene: Scene, good: Question) -> None:
     fastest = good.times * (velocity / scene.robot.velocity).max()
     with Certifier(scene) as certifier:
         assert replace(good, times=fastest).put_to(certifier).valid
-        assert replace(good, times=fastest * (1 - 1e-6)).put_to(certifier).violation.kind == "velocity"
+        assert (
+            replace(good, times=fastest * (1 - 1e-6)).put_to(certifier).violation.kind == "velocity"
+        )
 
 
 def test_acceleration_is_that_of_the_equation(scene: Scene, good: Question) -> None:
     dt = np.diff(good.times)
     velocity = np.diff(good.joints, axis=0) / dt[:, None]
     inner = np.diff(velocity, axis=0) / (0.5 * (dt[1:] + dt[:-1]))[:, None]
-    rows = np.abs(np.concatenate([velocity[:1] / (0.5 * dt[0]), inner, velocity[-1:] / (0.5 * dt[-1])]))
+    rows = np.abs(
+        np.concatenate([velocity[:1] / (0.5 * dt[0]), inner, velocity[-1:] / (0.5 * dt[-1])])
+    )
     largest = rows.max(axis=0)
     with Certifier(scene, Limits(acceleration_rad_s2=tuple(largest))) as certifier:
         assert good.put_to(certifier).valid
@@ -551,7 +650,10 @@ def test_acceleration_is_that_of_the_equation(scene: Scene, good: Question) -> N
 
 
 def test_a_collision_is_found_early_wherever_it_is(certifier, scene, good) -> None:
-    end, middle = into_itself(good, scene).put_to(certifier), through_the_table(good, scene).put_to(certifier)
+    end, middle = (
+        into_itself(good, scene).put_to(certifier),
+        through_the_table(good, scene).put_to(certifier),
+    )
     assert end.collision_checks == 2
     assert middle.collision_checks == 3
     assert through_the_table(good, scene).put_to(certifier, collisions=False).valid
@@ -569,15 +671,21 @@ def test_bare_worlds_differ_from_workcells(scene: Scene, good: Question) -> None
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"end_tolerance_rad": -1.0}, {"max_step_rad": 0.0}, {"collision_spacing_rad": NAN},
-     {"acceleration_rad_s2": (1.0, 0.0)}],
-)  # fmt: skip
+    [
+        {"end_tolerance_rad": -1.0},
+        {"max_step_rad": 0.0},
+        {"collision_spacing_rad": NAN},
+        {"acceleration_rad_s2": (1.0, 0.0)},
+    ],
+)
 def test_limits_that_mean_nothing_are_refused(wrong: dict) -> None:
     with pytest.raises(CertificationError, match=next(iter(wrong))):
         Limits(**wrong)
 
 
-def test_questions_that_mean_nothing_are_refused(scene: Scene, certifier: Certifier, good: Question) -> None:
+def test_questions_that_mean_nothing_are_refused(
+    scene: Scene, certifier: Certifier, good: Question
+) -> None:
     with pytest.raises(CertificationError, match="start"):
         certifier.certify(good.joints, good.constraint, start=good.start[:5])
     pose = Pose(np.zeros(3), np.eye(3))

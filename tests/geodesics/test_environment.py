@@ -3,11 +3,18 @@ import pytest
 from gymnasium.utils.env_checker import check_env as check_gymnasium
 from stable_baselines3.common.env_checker import check_env as check_stable_baselines
 
-from constraint_geodesics.evaluation.analytic_search import analytic_problem, curve_family
 from constraint_geodesics.geodesics.environment import CurveEnv, CurveVecEnv, scalar_environments
-from constraint_geodesics.geodesics.episodes import EpisodeSettings, advance, begin, gompertz, observe, rewards
+from constraint_geodesics.geodesics.episodes import (
+    EpisodeSettings,
+    advance,
+    begin,
+    gompertz,
+    observe,
+    rewards,
+)
 from constraint_geodesics.geodesics.problem import Ends
 from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.studies.analytic_search import analytic_problem, curve_family
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +48,9 @@ def test_the_corrected_reward_pays_for_short_curves_the_printed_one_for_long(par
 
 
 def test_a_longer_curve_earns_no_reduction(params) -> None:
-    only_reduction = params.geodesics.reward.model_copy(update={"length_weight": 0.0, "reduction_weight": 1.0})
+    only_reduction = params.geodesics.reward.model_copy(
+        update={"length_weight": 0.0, "reduction_weight": 1.0}
+    )
     reward = rewards(only_reduction, np.array([1.0, 1.0]), np.array([1.1, 0.9]), np.ones(2))
     assert reward[0] == 0.0
     assert reward[1] > 0.0
@@ -50,13 +59,20 @@ def test_a_longer_curve_earns_no_reduction(params) -> None:
 def test_one_curve_and_many_give_the_same(problem, settings) -> None:
     rng = np.random.default_rng(0)
     ends = problem.sample_ends(7, rng)
-    phi, action = problem.sample_curves(ends, rng), rng.uniform(-1, 1, (7, problem.curve.coefficients))
+    phi, action = (
+        problem.sample_curves(ends, rng),
+        rng.uniform(-1, 1, (7, problem.curve.coefficients)),
+    )
     states, reward = advance(problem, settings, begin(problem, ends, phi), action)
     for i in range(7):
         one = np.array([i])
-        single, single_reward = advance(problem, settings, begin(problem, ends[one], phi[one]), action[one])
+        single, single_reward = advance(
+            problem, settings, begin(problem, ends[one], phi[one]), action[one]
+        )
         np.testing.assert_allclose(single_reward, reward[one], rtol=1e-12)
-        np.testing.assert_allclose(observe(settings, single), observe(settings, states)[one], rtol=1e-6)
+        np.testing.assert_allclose(
+            observe(settings, single), observe(settings, states)[one], rtol=1e-6
+        )
 
 
 def test_the_single_environment_passes_both_checkers(problem, settings) -> None:
@@ -96,7 +112,9 @@ def test_the_best_curve_is_never_worse_than_the_straight_one(problem, settings) 
     for _ in range(4):
         states, _ = advance(problem, settings, states, rng.uniform(-1, 1, states.phi.shape))
         assert (states.best_cost <= states.straight_cost).all()
-        np.testing.assert_allclose(problem.evaluate(states.best_phi, ends).cost, states.best_cost, rtol=1e-12)
+        np.testing.assert_allclose(
+            problem.evaluate(states.best_phi, ends).cost, states.best_cost, rtol=1e-12
+        )
 
 
 def test_a_near_and_a_far_pair_look_alike(settings) -> None:
@@ -104,7 +122,9 @@ def test_a_near_and_a_far_pair_look_alike(settings) -> None:
     start = np.zeros((2, 2))
     ends = Ends(*2 * (start, np.array([[1.0, 0.0], [0.01, 0.0]])))
     phi = np.tile([0.3, -0.2, 0.1, 0.4], (2, 1)) * ends.distance[:, None]
-    states, reward = advance(problem, settings, begin(problem, ends, phi), np.tile([0.5, -1.0, 0.2, 0.1], (2, 1)))
+    states, reward = advance(
+        problem, settings, begin(problem, ends, phi), np.tile([0.5, -1.0, 0.2, 0.1], (2, 1))
+    )
     far, near = observe(settings, states)
     assert reward[0] == pytest.approx(reward[1], rel=1e-9)
     coefficients = problem.curve.coefficients
@@ -122,6 +142,8 @@ def test_scalar_environments_step_like_the_batched_one(problem, settings) -> Non
         assert isinstance(environment, CurveEnv)
         one = np.array([row])
         environment.states = begin(problem, batched.states.ends[one], batched.states.phi[one])
-    actions = np.random.default_rng(0).uniform(-1, 1, (3, problem.curve.coefficients)).astype(np.float32)
+    actions = (
+        np.random.default_rng(0).uniform(-1, 1, (3, problem.curve.coefficients)).astype(np.float32)
+    )
     for ours, theirs in zip(batched.step(actions)[:2], scalar.step(actions)[:2], strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-5)

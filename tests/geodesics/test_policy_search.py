@@ -5,13 +5,18 @@ import numpy as np
 import pytest
 import torch
 
-from constraint_geodesics.evaluation.analytic_search import (
+from constraint_geodesics.geodesics.policy_search import (
+    load_policy,
+    save_policy,
+    search,
+    train_policy,
+)
+from constraint_geodesics.studies.analytic_search import (
     AnalyticTask,
     analytic_problem,
     curve_family,
     run_analytic,
 )
-from constraint_geodesics.geodesics.policy_search import load_policy, save_policy, search, train_policy
 
 
 class Quiet:
@@ -23,7 +28,13 @@ class Quiet:
 def small(params):
     ppo = params.geodesics.ppo.model_copy(update={"batch_size": 80})
     return params.geodesics.model_copy(
-        update={"steps": 2560, "environments": 16, "checkpoint_steps": 800, "ppo": ppo, "rollouts": 8}
+        update={
+            "steps": 2560,
+            "environments": 16,
+            "checkpoint_steps": 800,
+            "ppo": ppo,
+            "rollouts": 8,
+        }
     )
 
 
@@ -33,7 +44,11 @@ def ignore(step, figures) -> None:
 
 def test_policy_search_straightens_curves_in_the_plane(params, tmp_path: Path) -> None:
     settings = params.geodesics.model_copy(update={"steps": 60000})
-    result = run_analytic(AnalyticTask("plane", curve_family(2, settings), settings, 0, tmp_path, nullcontext(Quiet())))
+    result = run_analytic(
+        AnalyticTask(
+            "plane", curve_family(2, settings), settings, 0, tmp_path, nullcontext(Quiet())
+        )
+    )
     figures = result.figures()
     assert (result.ratio >= 1 - 1e-9).all()
     assert figures["first_mean_ratio"] > 1.2
@@ -64,7 +79,9 @@ def test_interrupted_training_ends_as_if_it_had_never_stopped(small, tmp_path: P
     with pytest.raises(KeyboardInterrupt):
         train_policy(problem, small, 0, tmp_path / "cut", interrupt)
     steps = []
-    resumed = train_policy(problem, small, 0, tmp_path / "cut", lambda step, figures: steps.append(step))
+    resumed = train_policy(
+        problem, small, 0, tmp_path / "cut", lambda step, figures: steps.append(step)
+    )
     assert steps[0] > 800, "it went on from a checkpoint"
     assert resumed.curve == whole.curve
     for name, value in whole.actor.state_dict().items():
@@ -86,7 +103,8 @@ def test_a_saved_policy_acts_the_same(small, tmp_path: Path) -> None:
     save_policy(policy, tmp_path, 0)
     ends = problem.sample_ends(1, np.random.default_rng(0))
     found, again = (
-        search(problem, actor, small, ends, 3, lambda phi: True) for actor in (policy.actor, load_policy(tmp_path, 0))
+        search(problem, actor, small, ends, 3, lambda phi: True)
+        for actor in (policy.actor, load_policy(tmp_path, 0))
     )
     np.testing.assert_array_equal(found.phi, again.phi)
     assert found.found
@@ -100,5 +118,7 @@ def test_what_the_exact_check_refuses_is_not_returned(small, tmp_path: Path) -> 
     nothing = search(problem, policy.actor, small, ends, 3, lambda phi: False)
     assert nothing.status == "not_found"
     best = search(problem, policy.actor, small, ends, 3, lambda phi: True)
-    second = search(problem, policy.actor, small, ends, 3, lambda phi: not np.array_equal(phi, best.phi))
+    second = search(
+        problem, policy.actor, small, ends, 3, lambda phi: not np.array_equal(phi, best.phi)
+    )
     assert second.length >= best.length

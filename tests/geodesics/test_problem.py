@@ -65,5 +65,7 @@ def test_random_curves_find_a_way_where_the_straight_line_does_not(problem) -> N
 def test_the_fingerprint_knows_its_inputs(problem, scene, params) -> None:
     relaxed = scene.manifold(params.constraints["level_cup_relaxed"])
     other = LearnedProblem(problem.chart, relaxed, problem.curve, problem.joints, 16, True, 1.0)
-    same = LearnedProblem(problem.chart, problem.manifold, problem.curve, problem.joints.copy(), 16, True, 1.0)
+    same = LearnedProblem(
+        problem.chart, problem.manifold, problem.curve, problem.joints.copy(), 16, True, 1.0
+    )
     assert problem.fingerprint() == same.fingerprint() != other.fingerprint()

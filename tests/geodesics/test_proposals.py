@@ -1,8 +1,18 @@
 import numpy as np
 import pytest
 
-from constraint_geodesics.geodesics.episodes import EpisodeSettings, begin, observation_size, observe
-from constraint_geodesics.geodesics.policy_search import follow, load_policy, save_policy, train_policy
+from constraint_geodesics.geodesics.episodes import (
+    EpisodeSettings,
+    begin,
+    observation_size,
+    observe,
+)
+from constraint_geodesics.geodesics.policy_search import (
+    follow,
+    load_policy,
+    save_policy,
+    train_policy,
+)
 from constraint_geodesics.geodesics.problem import LearnedProblem, ProblemSet
 from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
 from constraint_geodesics.geometry.curves import PinnedPolynomial
@@ -22,7 +32,13 @@ def problems(scene, params, trained):
         frame = draw_shard(ShardTask(scene, manifold, 1000, (1,))).frame
         members.append(
             LearnedProblem(
-                trained.manifold, manifold, PinnedPolynomial(6, 3), joints_of(frame)[free_rows(frame)], 16, True, 1.0
+                trained.manifold,
+                manifold,
+                PinnedPolynomial(6, 3),
+                joints_of(frame)[free_rows(frame)],
+                16,
+                True,
+                1.0,
             )
         )
     return ProblemSet(tuple(members))
@@ -32,7 +48,13 @@ def problems(scene, params, trained):
 def small(params):
     ppo = params.geodesics.ppo.model_copy(update={"batch_size": 80, "hidden": (32, 32)})
     return params.geodesics.model_copy(
-        update={"steps": 1600, "environments": 16, "checkpoint_steps": 600, "episode_steps": 6, "ppo": ppo}
+        update={
+            "steps": 1600,
+            "environments": 16,
+            "checkpoint_steps": 600,
+            "episode_steps": 6,
+            "ppo": ppo,
+        }
     )
 
 
@@ -56,7 +78,8 @@ def test_a_set_measures_each_row_as_its_member_does(problems) -> None:
         assert len(rows) > 5
         assert member.manifold.violation(ends.q_start[rows]).max() < 1e-6
         one = member.look(phi[rows], ends[rows])
-        # batches of another size round differently in single precision, which a retraction may magnify
+        # batches of another size round differently in single precision, which a retraction may
+        # magnify
         close = np.isclose(one.costs.cost, costs.cost[rows], rtol=1e-3)
         assert close.mean() > 0.9
         np.testing.assert_allclose(one.descent[close], whole.descent[rows][close], atol=0.02)
@@ -65,7 +88,9 @@ def test_a_set_measures_each_row_as_its_member_does(problems) -> None:
 
 def test_a_set_of_different_charts_or_families_is_refused(problems) -> None:
     first = problems.members[0]
-    other = LearnedProblem(first.chart, first.manifold, PinnedPolynomial(6, 4), first.joints, 16, True, 1.0)
+    other = LearnedProblem(
+        first.chart, first.manifold, PinnedPolynomial(6, 4), first.joints, 16, True, 1.0
+    )
     with pytest.raises(GeometryError, match="members of a problem set"):
         ProblemSet((first, other))
 
@@ -84,7 +109,9 @@ def test_steps_along_the_descent_shorten_curves(problems) -> None:
     ratio = now.costs.length[both] / first.costs.length[both]
     assert (ratio < 1.002).mean() > 0.9
     assert ratio.mean() < 0.995
-    sizes = [np.linalg.norm(look.descent[both], axis=1) / ends.distance[both] for look in (first, now)]
+    sizes = [
+        np.linalg.norm(look.descent[both], axis=1) / ends.distance[both] for look in (first, now)
+    ]
     assert np.median(sizes[1]) < 0.3 * np.median(sizes[0])
 
 
@@ -93,7 +120,11 @@ def test_observations_have_the_size_announced_and_are_finite(problems, small) ->
     ends = problems.sample_ends(40, rng)
     states = begin(problems, ends, 3 * problems.sample_curves(ends, rng))
     seen = observe(settings_of(small), states)
-    assert seen.shape == (40, observation_size(problems)) == (40, observation_size(problems.members[2]))
+    assert (
+        seen.shape
+        == (40, observation_size(problems))
+        == (40, observation_size(problems.members[2]))
+    )
     assert np.isfinite(seen).all()
     assert np.abs(seen).max() < 40
 
@@ -102,12 +133,16 @@ def test_numpy_acts_as_the_trained_network_does(problems, policy, small, tmp_pat
     save_policy(policy, tmp_path, 0)
     mean = MeanPolicy.load(tmp_path, 0)
     ends = problems.sample_ends(30, np.random.default_rng(3))
-    seen = observe(settings_of(small), begin(problems, ends, np.zeros((30, problems.curve.coefficients))))
+    seen = observe(
+        settings_of(small), begin(problems, ends, np.zeros((30, problems.curve.coefficients)))
+    )
     theirs = load_policy(tmp_path, 0).act(seen, np.zeros((30, problems.curve.coefficients)))
     np.testing.assert_allclose(mean.act(seen), theirs, rtol=1e-4, atol=1e-5)
 
 
-def test_proposals_are_the_best_of_each_policys_own_roll_out(problems, policy, small, tmp_path) -> None:
+def test_proposals_are_the_best_of_each_policys_own_roll_out(
+    problems, policy, small, tmp_path
+) -> None:
     save_policy(policy, tmp_path, 0)
     settings, count = settings_of(small), 25
     ends = problems.sample_ends(count, np.random.default_rng(4))
@@ -126,7 +161,9 @@ def test_proposals_are_the_best_of_each_policys_own_roll_out(problems, policy, s
     np.testing.assert_allclose(costs.cost[costs.feasible], found.cost[0][costs.feasible], rtol=1e-2)
 
 
-def test_interrupted_training_on_a_set_goes_on_as_if_it_had_never_stopped(problems, policy, small, tmp_path) -> None:
+def test_interrupted_training_on_a_set_goes_on_as_if_it_had_never_stopped(
+    problems, policy, small, tmp_path
+) -> None:
     def interrupt(step, figures) -> None:
         if step > 1000:
             raise KeyboardInterrupt

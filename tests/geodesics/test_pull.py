@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from constraint_geodesics.constraints.retraction import retract
-from constraint_geodesics.constraints.vector import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.geodesics.pull_kernels import tangential_pull
 
 TIMES = 0.5 - 0.5 * np.cos(np.pi * np.arange(13) / 12)
@@ -11,9 +11,17 @@ TIMES = 0.5 - 0.5 * np.cos(np.pi * np.arange(13) / 12)
 def pulls_of(manifold, joints: np.ndarray) -> np.ndarray:
     robot, pulls = manifold.robot, np.empty_like(joints)
     tangential_pull(
-        robot.chain.arrays, manifold.held, manifold.tolerance, *manifold.reference_arrays, robot.lower, robot.upper,
-        1e-6, TIMES, joints, pulls,
-    )  # fmt: skip
+        robot.chain.arrays,
+        manifold.held,
+        manifold.tolerance,
+        *manifold.reference_arrays,
+        robot.lower,
+        robot.upper,
+        1e-6,
+        TIMES,
+        joints,
+        pulls,
+    )
     return pulls
 
 
@@ -29,7 +37,9 @@ def curves(manifold, count: int) -> np.ndarray:
     goal = retract(manifold, start + rng.uniform(-0.4, 0.4, start.shape)).joints
     lines = start[:, None] + TIMES[:, None] * (goal - start)[:, None]
     joints = retract(manifold, lines).joints
-    inside = (robot.limit_distance(joints) > 0.01).all(1) & (manifold.violation(joints) < 1e-8).all(1)
+    inside = (robot.limit_distance(joints) > 0.01).all(1) & (manifold.violation(joints) < 1e-8).all(
+        1
+    )
     return np.ascontiguousarray(joints[inside])
 
 
@@ -44,7 +54,9 @@ def test_the_pull_is_minus_the_gradient_on_the_tangent_space(scene, params, name
     assert np.abs(rows @ pulls[:, 1:-1, :, None]).max() < 1e-7 * max(1.0, np.abs(pulls).max())
     step = 1e-5
     tangent = np.random.default_rng(1).normal(size=joints.shape)
-    tangent -= (np.linalg.pinv(manifold.jacobian(joints)) @ manifold.jacobian(joints) @ tangent[..., None])[..., 0]
+    tangent -= (
+        np.linalg.pinv(manifold.jacobian(joints)) @ manifold.jacobian(joints) @ tangent[..., None]
+    )[..., 0]
     tangent[:, [0, -1]] = 0.0
     moved = [retract(manifold, joints + sign * step * tangent).joints for sign in (1, -1)]
     slope = (energy(moved[0]) - energy(moved[1])) / (2 * step)
@@ -58,12 +70,16 @@ def test_a_tolerance_counts_only_on_its_bound_and_only_outward(xarm) -> None:
     joints = np.repeat(q[:, None], len(TIMES), axis=1)
     for offset, sides in ((0.0, (False, False)), (bound, (True, False)), (-bound, (False, True))):
         pose = Pose(position - np.array([0.0, 0.0, offset]), rotation)
-        manifold = ConstraintManifold(xarm, Constraint((0, 0, 1, 0, 0, 0), (0, 0, bound, 0, 0, 0), pose))
+        manifold = ConstraintManifold(
+            xarm, Constraint((0, 0, 1, 0, 0, 0), (0, 0, bound, 0, 0, 0), pose)
+        )
         up = manifold.jacobian(q[0])[2]
         for direction, held in zip((1.0, -1.0), sides, strict=True):
             bent = joints.copy()
             bent[0, 5] += direction * 0.01 * up
-            bent[0, 7] += direction * 0.01 * up  # point 6, still on its bound, is pulled towards its neighbours
+            bent[0, 7] += (
+                direction * 0.01 * up
+            )  # point 6, still on its bound, is pulled towards its neighbours
             pull = pulls_of(manifold, bent)[0, 6]
             assert (abs(pull @ up) < 1e-9) == held
 

@@ -4,7 +4,12 @@ import pytest
 import torch
 
 from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
-from constraint_geodesics.geometry.manifold import GeometryError, MeasuredManifold, NonFiniteError, PeriodicManifold
+from constraint_geodesics.geometry.manifold import (
+    GeometryError,
+    MeasuredManifold,
+    NonFiniteError,
+    PeriodicManifold,
+)
 
 PI = math.pi
 
@@ -40,7 +45,9 @@ def test_plane_distance():
     ],
 )
 def test_sphere_distance(a, b, angle):
-    assert Sphere(3.0).distance(point(*a), point(*b)).item() == pytest.approx(3 * angle, abs=3e-15 * 3, rel=1e-15)
+    assert Sphere(3.0).distance(point(*a), point(*b)).item() == pytest.approx(
+        3 * angle, abs=3e-15 * 3, rel=1e-15
+    )
 
 
 @pytest.mark.parametrize("gap", [1e-3, 1e-6, 1e-9, 1e-12])
@@ -54,7 +61,10 @@ def test_sphere_distance_keeps_its_digits_near_zero_and_near_the_antipode(gap):
 
 
 def test_sphere_distance_holds_beyond_the_poles():
-    elevation, azimuth = torch.linspace(0.0, PI / 2, 201, dtype=torch.float64), torch.tensor(0.3, dtype=torch.float64)
+    elevation, azimuth = (
+        torch.linspace(0.0, PI / 2, 201, dtype=torch.float64),
+        torch.tensor(0.3, dtype=torch.float64),
+    )
     here = torch.stack(torch.broadcast_tensors(elevation, azimuth), dim=-1)
     over_the_pole = torch.stack(torch.broadcast_tensors(PI - elevation, azimuth + PI), dim=-1)
     antipode = torch.stack(torch.broadcast_tensors(elevation - PI, azimuth), dim=-1)
@@ -75,7 +85,8 @@ def test_sphere_distance_broadcasts_and_differentiates():
 
 
 @pytest.mark.parametrize(
-    ("z", "elevation"), [((0.4, 9.0), 0.4), ((PI - 0.4, 0), 0.4), ((-PI / 2, 0), -PI / 2), ((2 * PI - 1, 0), -1)]
+    ("z", "elevation"),
+    [((0.4, 9.0), 0.4), ((PI - 0.4, 0), 0.4), ((-PI / 2, 0), -PI / 2), ((2 * PI - 1, 0), -1)],
 )
 def test_elevation_is_that_of_the_embedded_point(z, elevation):
     sphere = Sphere(2.0)
@@ -83,10 +94,16 @@ def test_elevation_is_that_of_the_embedded_point(z, elevation):
     assert 2 * math.sin(elevation) == pytest.approx(sphere.embed(point(*z))[2].item(), abs=1e-15)
 
 
-@pytest.mark.parametrize(("angle", "wrapped"), [(0.4, 0.4), (PI + 0.5, 0.5 - PI), (-3 * PI / 2, PI / 2), (7 * PI, PI)])
+@pytest.mark.parametrize(
+    ("angle", "wrapped"), [(0.4, 0.4), (PI + 0.5, 0.5 - PI), (-3 * PI / 2, PI / 2), (7 * PI, PI)]
+)
 def test_tube_angle_wraps(angle, wrapped):
-    assert abs(Torus().tube_angle(point(1.0, angle)).item()) == pytest.approx(abs(wrapped), abs=1e-14)
-    assert math.sin(Torus().tube_angle(point(1.0, angle)).item()) == pytest.approx(math.sin(wrapped), abs=1e-14)
+    assert abs(Torus().tube_angle(point(1.0, angle)).item()) == pytest.approx(
+        abs(wrapped), abs=1e-14
+    )
+    assert math.sin(Torus().tube_angle(point(1.0, angle)).item()) == pytest.approx(
+        math.sin(wrapped), abs=1e-14
+    )
 
 
 @pytest.mark.parametrize(
@@ -148,7 +165,9 @@ def test_shapes_that_are_no_manifold_are_refused():
 @pytest.mark.parametrize("manifold", [Plane(2), Sphere(), Torus()])
 def test_points_of_another_dimension_are_refused(manifold):
     for function in (manifold.embed, manifold.metric):
-        with pytest.raises(GeometryError, match=r"z has shape \(4, 3\): its last axis must have 2 entries"):
+        with pytest.raises(
+            GeometryError, match=r"z has shape \(4, 3\): its last axis must have 2 entries"
+        ):
             function(torch.zeros(4, 3))
 
 

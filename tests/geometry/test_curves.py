@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from constraint_geodesics.geometry.curves import CurveError, CurveFamily, PinnedPolynomial, PinnedSpline
+from constraint_geodesics.geometry.curves import (
+    CurveError,
+    CurveFamily,
+    PinnedPolynomial,
+    PinnedSpline,
+)
 from constraint_geodesics.geometry.manifold import NonFiniteError
 
 T = torch.linspace(0, 1, 11, dtype=torch.float64)
@@ -16,7 +21,9 @@ every_family = pytest.mark.parametrize("curve", FAMILIES, ids=str)
 def test_basis_of_low_degrees_is_the_known_one():
     basis = PinnedPolynomial(1, 4).basis(T)
     bump, x = T * (1 - T), 2 * T - 1
-    torch.testing.assert_close(basis, torch.stack([bump, bump * x, bump * (1.5 * x**2 - 0.5)], dim=-1))
+    torch.testing.assert_close(
+        basis, torch.stack([bump, bump * x, bump * (1.5 * x**2 - 0.5)], dim=-1)
+    )
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 6])
@@ -48,14 +55,23 @@ def test_coefficients_are_grouped_by_dimension():
     curve = PinnedPolynomial(2, 3)
     zero = torch.zeros(2, dtype=torch.float64)
     points, _ = curve.evaluate(torch.tensor([1.0, 0.5, 0, 2.0], dtype=torch.float64), zero, zero, T)
-    torch.testing.assert_close(points, curve.basis(T) @ torch.tensor([[1.0, 0.0], [0.5, 2.0]], dtype=torch.float64))
+    torch.testing.assert_close(
+        points, curve.basis(T) @ torch.tensor([[1.0, 0.0], [0.5, 2.0]], dtype=torch.float64)
+    )
 
 
 def test_ends_and_coefficients_broadcast():
     curve = PinnedPolynomial(2, 3)
-    points, velocities = curve.evaluate(torch.zeros(4, 1, 4), torch.zeros(5, 2), torch.ones(2), torch.linspace(0, 1, 3))
+    points, velocities = curve.evaluate(
+        torch.zeros(4, 1, 4), torch.zeros(5, 2), torch.ones(2), torch.linspace(0, 1, 3)
+    )
     assert points.shape == velocities.shape == (4, 5, 3, 2)
-    assert curve.to_monomial(torch.zeros(4, 1, 4), torch.zeros(5, 2), torch.ones(2)).shape == (4, 5, 2, 4)
+    assert curve.to_monomial(torch.zeros(4, 1, 4), torch.zeros(5, 2), torch.ones(2)).shape == (
+        4,
+        5,
+        2,
+        4,
+    )
 
 
 @every_family
@@ -70,7 +86,10 @@ def test_families_keep_the_protocol(curve):
 @every_family
 def test_a_basis_that_is_kept_gives_the_same_curves(curve):
     generator = torch.Generator().manual_seed(0)
-    phi, start, goal = (torch.randn(5, n, generator=generator, dtype=torch.float64) for n in (curve.coefficients, 2, 2))
+    phi, start, goal = (
+        torch.randn(5, n, generator=generator, dtype=torch.float64)
+        for n in (curve.coefficients, 2, 2)
+    )
     kept = curve.from_basis(phi, start, goal, T, curve.basis(T), curve.basis_derivative(T))
     for found, expected in zip(kept, curve.evaluate(phi, start, goal, T), strict=True):
         assert torch.equal(found, expected)
@@ -86,7 +105,9 @@ def test_curves_can_be_transformed_and_differentiated(curve):
     found = torch.func.vmap(jacobian)(torch.ones(4, curve.coefficients, dtype=torch.float64), ends)
     expected = torch.block_diag(*2 * [torch.eye(curve.functions, dtype=torch.float64)])
     blocks = expected.reshape(-1, 2, curve.functions)
-    torch.testing.assert_close(found, torch.einsum("tk,pnk->tnp", curve.basis(T), blocks).expand(4, -1, -1, -1))
+    torch.testing.assert_close(
+        found, torch.einsum("tk,pnk->tnp", curve.basis(T), blocks).expand(4, -1, -1, -1)
+    )
     moving = (T[1:-1] + 0.01).requires_grad_()
     (slope,) = torch.autograd.grad(curve.basis(moving).sum(), moving)
     torch.testing.assert_close(slope, curve.basis_derivative(moving).sum(-1).detach())
@@ -130,7 +151,9 @@ def test_splines_are_twice_continuously_differentiable_and_no_more(segments):
         values = curve.basis(torch.from_numpy((piece + inside) / segments)).numpy()
         cubic = np.polynomial.Polynomial.fit
         pieces = [cubic(inside, column, 3, domain=[0, 1], window=[0, 1]) for column in values.T]
-        at_ends.append([[[p.deriv(order)(end) for p in pieces] for order in range(4)] for end in (0.0, 1.0)])
+        at_ends.append(
+            [[[p.deriv(order)(end) for p in pieces] for order in range(4)] for end in (0.0, 1.0)]
+        )
     at_ends = np.array(at_ends)
     jumps = np.abs(at_ends[1:, 0] - at_ends[:-1, 1])
     assert jumps[:, :3].max() < 1e-12
@@ -142,7 +165,9 @@ def test_derivatives_of_splines_do_not_jump_at_the_knots(segments):
     curve = PinnedSpline(1, segments)
     knots = torch.tensor(curve.breaks[1:-1], dtype=torch.float64)
     for function in (curve.basis, curve.basis_derivative, curve.basis_second_derivative):
-        torch.testing.assert_close(function(knots - 1e-12), function(knots + 1e-12), rtol=0, atol=1e-8)
+        torch.testing.assert_close(
+            function(knots - 1e-12), function(knots + 1e-12), rtol=0, atol=1e-8
+        )
 
 
 # Refusals
@@ -151,9 +176,13 @@ def test_derivatives_of_splines_do_not_jump_at_the_knots(segments):
 def test_wrong_shapes_are_refused():
     curve = PinnedPolynomial(2, 3)
     phi, end, t = torch.zeros(4), torch.zeros(2), torch.zeros(3)
-    with pytest.raises(CurveError, match=r"phi has shape \(5,\): its last axis must have 4 entries"):
+    with pytest.raises(
+        CurveError, match=r"phi has shape \(5,\): its last axis must have 4 entries"
+    ):
         curve.evaluate(torch.zeros(5), end, end, t)
-    with pytest.raises(CurveError, match=r"start has shape \(3, 3\): its last axis must have 2 entries"):
+    with pytest.raises(
+        CurveError, match=r"start has shape \(3, 3\): its last axis must have 2 entries"
+    ):
         curve.evaluate(phi, torch.zeros(3, 3), end, t)
     with pytest.raises(CurveError, match=r"goal has shape \(\)"):
         curve.to_monomial(phi, end, torch.tensor(0.0))
@@ -166,7 +195,9 @@ def test_times_must_fit_the_batch_of_the_curves(curve):
     phi, end = torch.zeros(4, curve.coefficients), torch.zeros(2)
     for t in (torch.zeros(3, 5), torch.zeros(2, 4, 5), torch.tensor(0.5)):
         for function in (curve.evaluate, curve.acceleration):
-            with pytest.raises(CurveError, match=r"must be \(T,\), or \(\*batch, T\) for curves of batch \(4,\)"):
+            with pytest.raises(
+                CurveError, match=r"must be \(T,\), or \(\*batch, T\) for curves of batch \(4,\)"
+            ):
                 function(phi, end, end, t)
     assert curve.evaluate(phi, end, end, torch.zeros(1, 5))[0].shape == (4, 5, 2)
 
@@ -174,7 +205,9 @@ def test_times_must_fit_the_batch_of_the_curves(curve):
 @every_family
 def test_samples_that_no_curve_can_be_fitted_to_are_refused(curve):
     points, few = torch.zeros(11, 2, dtype=torch.float64), curve.functions + 1
-    with pytest.raises(CurveError, match=rf"points has {few} points a curve: must be at least {few + 1}"):
+    with pytest.raises(
+        CurveError, match=rf"points has {few} points a curve: must be at least {few + 1}"
+    ):
         curve.fit(points[:few], torch.linspace(0, 1, few, dtype=torch.float64))
     with pytest.raises(CurveError, match=r"points has shape \(11, 2\) and t \(10,\)"):
         curve.fit(points, T[:-1])

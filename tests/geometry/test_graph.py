@@ -31,7 +31,10 @@ def test_neighbours_on_a_line():
 
 @repeatable
 @given(
-    arrays(np.float64, st.tuples(st.integers(0, 12), st.integers(1, 3)), elements=st.integers(0, 4)), st.integers(1, 5)
+    arrays(
+        np.float64, st.tuples(st.integers(0, 12), st.integers(1, 3)), elements=st.integers(0, 4)
+    ),
+    st.integers(1, 5),
 )
 def test_every_point_is_joined_to_its_nearest(points, neighbours):
     edges = nearest_neighbour_edges(points, neighbours)
@@ -74,7 +77,9 @@ def test_shortest_path_takes_the_shorter_way_round():
 
 
 def test_shortest_path_may_use_edges_of_no_length():
-    nodes, length = shortest_path(3, np.array([[0, 1], [1, 2], [0, 2]]), np.array([0.0, 1.0, 2.0]), 0, 2)
+    nodes, length = shortest_path(
+        3, np.array([[0, 1], [1, 2], [0, 2]]), np.array([0.0, 1.0, 2.0]), 0, 2
+    )
     assert nodes.tolist() == [0, 1, 2]
     assert length == 1.0
 
@@ -135,7 +140,10 @@ def test_bad_graphs_are_refused_by_name():
 
 
 def test_cells_that_meet_at_a_corner_are_apart():
-    assert components_on_grid(np.eye(2, dtype=bool), (False, False)).tolist() == [[0, OUTSIDE], [OUTSIDE, 1]]
+    assert components_on_grid(np.eye(2, dtype=bool), (False, False)).tolist() == [
+        [0, OUTSIDE],
+        [OUTSIDE, 1],
+    ]
 
 
 @pytest.mark.parametrize(
@@ -157,7 +165,10 @@ def test_a_grid_without_cells_inside_has_no_component():
 
 
 @repeatable
-@given(arrays(np.bool_, st.tuples(st.integers(1, 6), st.integers(1, 6))), st.tuples(st.booleans(), st.booleans()))
+@given(
+    arrays(np.bool_, st.tuples(st.integers(1, 6), st.integers(1, 6))),
+    st.tuples(st.booleans(), st.booleans()),
+)
 def test_grid_components_are_those_of_the_graph_of_its_cells(inside, wrap):
     cells = np.arange(inside.size).reshape(inside.shape)
     pairs = []
@@ -183,7 +194,9 @@ def chart(rows: np.ndarray, columns: np.ndarray) -> torch.Tensor:
 
 def test_one_elevation_of_the_sphere_is_one_circle():
     sphere = Sphere()
-    z = chart(np.linspace(-np.pi / 2, np.pi / 2, 91), np.linspace(-np.pi, np.pi, 120, endpoint=False))
+    z = chart(
+        np.linspace(-np.pi / 2, np.pi / 2, 91), np.linspace(-np.pi, np.pi, 120, endpoint=False)
+    )
     inside = ((sphere.elevation(z) - 0.6).abs() < 0.05).numpy()
     assert components_on_grid(inside, (False, True)).max() == 0
     # Cut opposite the seam of the chart: one arc, which only wrapping keeps in one piece.

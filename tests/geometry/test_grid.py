@@ -65,10 +65,14 @@ def test_a_grid_is_a_bounded_manifold_without_embedding():
 
 
 def test_a_constant_grid_is_the_scaled_plane():
-    z = torch.rand(3, 4, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 2 + tensor(LOWER)
+    z = torch.rand(
+        3, 4, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    ) * 2 + tensor(LOWER)
     torch.testing.assert_close(constant().metric(z), 2.25 * Plane(2).metric(z), rtol=1e-15, atol=0)
     line, rule = PinnedPolynomial(2, 3), Quadrature.gauss_legendre(8)
-    length = curve_length(constant(), line, torch.zeros(4).double(), tensor([-1, 2]), tensor([0.5, 4]), rule)
+    length = curve_length(
+        constant(), line, torch.zeros(4).double(), tensor([-1, 2]), tensor([0.5, 4]), rule
+    )
     assert length.item() == pytest.approx(1.5 * 2.5, rel=1e-14)
 
 
@@ -123,11 +127,15 @@ def test_single_precision_stays_single():
 def test_a_point_is_blocked_where_its_nearest_node_is():
     grid = constant(blocked=wall((2, 3)))  # the node at (0, 3.5); the spacing is 0.5
     points = tensor([[0, 3.5], [0.24, 3.5], [0.26, 3.5], [-0.24, 3.26], [-0.24, 3.24], [0, 3.76]])
-    assert grid.contains(points).tolist() == [True ^ blocked for blocked in (True, True, False, True, False, False)]
+    assert grid.contains(points).tolist() == [
+        True ^ blocked for blocked in (True, True, False, True, False, False)
+    ]
 
 
 def test_points_off_the_grid_and_not_finite_are_not_contained():
-    points = tensor([[-1, 2], [1, 5], [1.0001, 3], [0, 1.9999], [math.nan, 3], [0, math.inf], [-math.inf, 3]])
+    points = tensor(
+        [[-1, 2], [1, 5], [1.0001, 3], [0, 1.9999], [math.nan, 3], [0, math.inf], [-math.inf, 3]]
+    )
     assert constant().contains(points).tolist() == [True, True, *[False] * 5]
     with pytest.raises(OutsideError, match=r"z\[1\] = \[9\.0, 3\.0\]"):
         require_inside(constant(), tensor([[0, 3], [9, 3]]), "z")
@@ -138,7 +146,9 @@ def test_walls_rise_away_from_the_free_nodes():
     grid = constant(g=3.0, blocked=wall(*everywhere))
     depths = grid.metric(grid.nodes())[:, 0, 0].reshape(5, 7) / 3.0
     torch.testing.assert_close(depths[:, 0], torch.ones(5).double(), rtol=1e-14, atol=0)
-    torch.testing.assert_close(depths[:, 1:], WALL * torch.arange(1, 7).double().expand(5, 6), rtol=1e-14, atol=0)
+    torch.testing.assert_close(
+        depths[:, 1:], WALL * torch.arange(1, 7).double().expand(5, 6), rtol=1e-14, atol=0
+    )
     z = tensor([[0.1, 2.2], [0.3, 3.4], [-0.9, 4.9]]).requires_grad_()
     (gradient,) = torch.autograd.grad(grid.metric(z)[:, 0, 0].sum(), z)
     assert (gradient[:, 1] > 0).all()
@@ -170,11 +180,16 @@ def half_plane_grid(count):
 
 def test_a_conformal_manifold_is_sampled_as_it_is():
     grid = half_plane_grid(31)
-    torch.testing.assert_close(grid.metric(grid.nodes()), HalfPlane().metric(grid.nodes()), rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        grid.metric(grid.nodes()), HalfPlane().metric(grid.nodes()), rtol=1e-12, atol=0
+    )
 
 
 def test_distances_of_the_hyperbolic_half_plane_are_approached():
-    a, b = tensor([[-0.8, 0.6], [0.2, 0.5], [-0.5, 1.5]]), tensor([[0.8, 0.8], [0.2, 2.0], [0.5, 1.0]])
+    a, b = (
+        tensor([[-0.8, 0.6], [0.2, 0.5], [-0.5, 1.5]]),
+        tensor([[0.8, 0.8], [0.2, 2.0], [0.5, 1.0]]),
+    )
     exact = HalfPlane().distance(a, b)
     curve, errors = PinnedPolynomial(2, 8), []
     for count in (21, 81):
@@ -189,7 +204,9 @@ def test_distances_of_the_hyperbolic_half_plane_are_approached():
             return total
 
         search.step(energy)
-        errors.append((curve_length(grid, curve, phi.detach(), a, b, rule) / exact - 1).abs().max().item())
+        errors.append(
+            (curve_length(grid, curve, phi.detach(), a, b, rule) / exact - 1).abs().max().item()
+        )
     assert errors[0] < 5e-3
     assert errors[1] < errors[0] / 8  # bilinear values are off by the square of the spacing
 
@@ -221,11 +238,26 @@ def test_what_a_bounded_manifold_does_not_contain_is_blocked():
         (torch.ones(4), LOWER, UPPER, r"values has shape \(4,\): must be \(rows, columns\)"),
         (torch.ones(1, 4), LOWER, UPPER, "at least 2 nodes an axis"),
         (torch.ones(2, 2, 2), LOWER, UPPER, r"shape \(2, 2, 2\)"),
-        (torch.ones(3, 3), (0.0, 1.0), (1.0, 1.0), r"lower\[1\] = 1\.0: must be below upper\[1\] = 1\.0"),
+        (
+            torch.ones(3, 3),
+            (0.0, 1.0),
+            (1.0, 1.0),
+            r"lower\[1\] = 1\.0: must be below upper\[1\] = 1\.0",
+        ),
         (torch.ones(3, 3), (0.0, math.nan), (1.0, 1.0), "lower = .*must be two finite numbers"),
         (torch.ones(3, 3), (0.0, 0.0), (1.0, 1.0, 1.0), "upper = .*must be two finite numbers"),
-        (torch.ones(3, 3, dtype=torch.int64), LOWER, UPPER, "dtype torch.int64: must be floating point"),
-        (tensor([[1, 1], [0, 1]]), LOWER, UPPER, r"values\[1, 0\] = 0\.0: must be positive and finite, or blocked"),
+        (
+            torch.ones(3, 3, dtype=torch.int64),
+            LOWER,
+            UPPER,
+            "dtype torch.int64: must be floating point",
+        ),
+        (
+            tensor([[1, 1], [0, 1]]),
+            LOWER,
+            UPPER,
+            r"values\[1, 0\] = 0\.0: must be positive and finite, or blocked",
+        ),
         (tensor([[1, -2], [1, 1]]), LOWER, UPPER, r"values\[0, 1\] = -2\.0"),
         (tensor([[1, 1], [1, math.nan]]), LOWER, UPPER, r"values\[1, 1\] = nan"),
         (tensor([[math.inf, 1], [1, 1]]), LOWER, UPPER, r"values\[0, 0\] = inf"),
@@ -240,7 +272,9 @@ def test_values_of_blocked_nodes_are_never_read():
     values = torch.ones(5, 7, dtype=torch.float64)
     values[1, 2], values[1, 3], values[1, 4] = math.nan, math.inf, -1.0
     grid = GridManifold(values, LOWER, UPPER, wall((1, 2), (1, 3), (1, 4)))
-    torch.testing.assert_close(grid.metric(grid.nodes()), constant(1.0, grid.blocked).metric(grid.nodes()))
+    torch.testing.assert_close(
+        grid.metric(grid.nodes()), constant(1.0, grid.blocked).metric(grid.nodes())
+    )
     with pytest.raises(GridError, match=r"values\[1, 4\] = -1\.0"):
         GridManifold(values, LOWER, UPPER, wall((1, 2), (1, 3)))
 
@@ -269,7 +303,15 @@ def test_points_that_have_no_metric_are_refused():
         "no index out of range, and no made-up value"
     )
     with pytest.raises(NonFiniteError, match=r"goal\[0\] = nan"):
-        curve_length(constant(), PinnedPolynomial(2, 3), torch.zeros(4), tensor([0, 3]), tensor([math.nan, 3]))
+        curve_length(
+            constant(),
+            PinnedPolynomial(2, 3),
+            torch.zeros(4),
+            tensor([0, 3]),
+            tensor([math.nan, 3]),
+        )
     for function in (constant().metric, constant().contains):
-        with pytest.raises(GeometryError, match=r"z has shape \(3,\): its last axis must have 2 entries"):
+        with pytest.raises(
+            GeometryError, match=r"z has shape \(3,\): its last axis must have 2 entries"
+        ):
             function(torch.zeros(3))

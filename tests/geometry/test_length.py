@@ -32,8 +32,12 @@ STRAIGHT = point(0, 0, 0, 0)
 def test_gauss_legendre_is_exact_for_polynomials(count):
     rule = Quadrature.gauss_legendre(count)
     for power in range(2 * count):
-        assert ((rule.nodes**power) @ rule.weights).item() == pytest.approx(1 / (power + 1), rel=1e-13)
-    assert ((rule.nodes ** (2 * count)) @ rule.weights).item() != pytest.approx(1 / (2 * count + 1), rel=1e-13)
+        assert ((rule.nodes**power) @ rule.weights).item() == pytest.approx(
+            1 / (power + 1), rel=1e-13
+        )
+    assert ((rule.nodes ** (2 * count)) @ rule.weights).item() != pytest.approx(
+        1 / (2 * count + 1), rel=1e-13
+    )
 
 
 @pytest.mark.parametrize(
@@ -54,13 +58,20 @@ def test_known_lengths(manifold, start, goal, length):
     energy = curve_energy(manifold, CUBIC, STRAIGHT, point(*start), point(*goal), RULE)
     assert energy.item() == pytest.approx(length**2, rel=1e-13)  # these run at constant speed
     if hasattr(manifold, "distance") and length != 2 * math.cos(1):
-        assert manifold.distance(point(*start), point(*goal)).item() == pytest.approx(length, rel=1e-15)
+        assert manifold.distance(point(*start), point(*goal)).item() == pytest.approx(
+            length, rel=1e-15
+        )
 
 
 def test_length_of_a_parabola():
     # y = 4x(1 − x) for 0 ≤ x ≤ 1: L = √17/2 + asinh(4)/8
     length = curve_length(
-        Plane(2), PinnedPolynomial(2, 2), point(0, 4), point(0, 0), point(1, 0), Quadrature.gauss_legendre(40)
+        Plane(2),
+        PinnedPolynomial(2, 2),
+        point(0, 4),
+        point(0, 0),
+        point(1, 0),
+        Quadrature.gauss_legendre(40),
     )
     assert length.item() == pytest.approx(math.sqrt(17) / 2 + math.asinh(4) / 8, rel=1e-10)
 
@@ -69,7 +80,12 @@ def test_length_of_a_parabola():
 def test_error_where_a_curve_turns_back_falls_like_the_square_of_the_nodes(count):
     # x = 0.6t + 2t(1 − t) rises to 0.845 and comes back to 0.6.
     length = curve_length(
-        Plane(1), PinnedPolynomial(1, 2), point(2), point(0), point(0.6), Quadrature.gauss_legendre(count)
+        Plane(1),
+        PinnedPolynomial(1, 2),
+        point(2),
+        point(0),
+        point(0.6),
+        Quadrature.gauss_legendre(count),
     )
     assert abs(length.item() - (2 * 0.845 - 0.6)) < 2 / count**2
 
@@ -88,7 +104,10 @@ def test_lengths_of_a_batch_are_those_of_its_members():
     phi = torch.randn(3, 4, generator=generator, dtype=torch.float64)
     goals = torch.rand(3, 2, generator=generator, dtype=torch.float64)
     batch = curve_length(Sphere(), CUBIC, phi, point(0, 0), goals, RULE)
-    single = [curve_length(Sphere(), CUBIC, p, point(0, 0), g, RULE) for p, g in zip(phi, goals, strict=True)]
+    single = [
+        curve_length(Sphere(), CUBIC, p, point(0, 0), g, RULE)
+        for p, g in zip(phi, goals, strict=True)
+    ]
     torch.testing.assert_close(batch, torch.stack(single), rtol=1e-14, atol=0)
 
 
@@ -108,7 +127,8 @@ def test_lengths_can_be_measured_without_a_graph():
 
 
 def test_gradient_descent_on_the_length_finds_the_great_circle():
-    # A parallel at 1 rad is 1.7 times as long as it need be; a polynomial of degree 5 reaches the arc within 1e-3.
+    # A parallel at 1 rad is 1.7 times as long as it need be; a polynomial of degree 5 reaches the
+    # arc within 1e-3.
     curve, start, goal = PinnedPolynomial(2, 5), point(1.0, 0.0), point(1.0, 2.0)
     phi = torch.zeros(curve.coefficients, dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.LBFGS([phi], max_iter=60, line_search_fn="strong_wolfe")
@@ -121,13 +141,17 @@ def test_gradient_descent_on_the_length_finds_the_great_circle():
 
     optimiser.step(energy)
     exact = Sphere().distance(start, goal).item()
-    assert curve_length(Sphere(), curve, phi.detach(), start, goal, RULE).item() == pytest.approx(exact, rel=1e-3)
+    assert curve_length(Sphere(), curve, phi.detach(), start, goal, RULE).item() == pytest.approx(
+        exact, rel=1e-3
+    )
 
 
 def test_chord_length():
     square = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
     assert chord_length(square).item() == 4.0
-    torch.testing.assert_close(chord_length(torch.stack([square, 2 * square])), torch.tensor([4.0, 8.0]))
+    torch.testing.assert_close(
+        chord_length(torch.stack([square, 2 * square])), torch.tensor([4.0, 8.0])
+    )
     with pytest.raises(GeometryError, match=r"points has shape \(1, 2\)"):
         chord_length(square[:1])
     with pytest.raises(NonFiniteError, match=r"points\[0, 1\] = inf"):
@@ -143,7 +167,9 @@ def test_bad_input_is_refused_by_name(measure):
     with pytest.raises(NonFiniteError, match=r"goal\[1\] = -inf"):
         measure(Sphere(), CUBIC, STRAIGHT, good, point(0, -math.inf), RULE)
     with pytest.raises(GeometryError, match="the curve has dim 3: must be that of the manifold, 2"):
-        measure(Sphere(), PinnedPolynomial(3, 3), torch.zeros(6), torch.zeros(3), torch.zeros(3), RULE)
+        measure(
+            Sphere(), PinnedPolynomial(3, 3), torch.zeros(6), torch.zeros(3), torch.zeros(3), RULE
+        )
     with pytest.raises(CurveError, match=r"phi has shape \(3,\)"):
         measure(Sphere(), CUBIC, torch.zeros(3), good, good, RULE)
     with pytest.raises(GeometryError, match="count = 0"):
@@ -160,8 +186,12 @@ def test_collocation_differentiates_and_integrates_polynomials_exactly(degree, b
     for power in range(1, degree + 1):
         slopes = rule.slopes((rule.times**power)[:, None])[:, 0]
         assert (slopes @ rule.weights).item() == pytest.approx(1.0, rel=1e-12)
-        assert ((slopes**2) @ rule.weights).item() == pytest.approx(power**2 / (2 * power - 1), rel=1e-11)
-        assert ((rule.times**power) @ rule.own_weights).item() == pytest.approx(1 / (power + 1), rel=1e-12)
+        assert ((slopes**2) @ rule.weights).item() == pytest.approx(
+            power**2 / (2 * power - 1), rel=1e-11
+        )
+        assert ((rule.times**power) @ rule.own_weights).item() == pytest.approx(
+            1 / (power + 1), rel=1e-12
+        )
 
 
 def test_the_rule_of_half_the_degree_stands_on_every_other_point():
@@ -231,7 +261,8 @@ def test_lengths_on_a_grid_agree_with_those_of_the_manifold_it_samples():
     generator = torch.Generator().manual_seed(2)
     phi = 0.3 * torch.randn(20, 4, generator=generator, dtype=torch.float64)
     smooth, sampled = (
-        curve_length(manifold, CUBIC, phi, point(-0.9, -0.8), point(0.7, 0.9)) for manifold in (Mercator(), grid)
+        curve_length(manifold, CUBIC, phi, point(-0.9, -0.8), point(0.7, 0.9))
+        for manifold in (Mercator(), grid)
     )
     torch.testing.assert_close(sampled, smooth, rtol=1e-3, atol=0)
 
@@ -240,7 +271,9 @@ def test_energy_and_length_of_a_grid_have_derivatives():
     grid = GridManifold(torch.ones(5, 5, dtype=torch.float64), (-2.0, -2.0), (2.0, 2.0))
     phi = STRAIGHT.clone().requires_grad_()
     for measure in (curve_length, curve_energy):
-        (gradient,) = torch.autograd.grad(measure(grid, CUBIC, phi, point(0.5, 0.5), point(0.5, 0.5)), phi)
+        (gradient,) = torch.autograd.grad(
+            measure(grid, CUBIC, phi, point(0.5, 0.5), point(0.5, 0.5)), phi
+        )
         assert torch.equal(gradient, torch.zeros_like(phi)), "standing still: no NaN"
 
 
@@ -250,7 +283,10 @@ def test_energy_and_length_of_a_grid_have_derivatives():
         (lambda: Collocation.chebyshev(1), "degree = 1: must be at least 2"),
         (lambda: Collocation.chebyshev(4, (0.0, 0.5)), "must rise from 0 to 1"),
         (lambda: Quadrature.gauss_legendre(4, (0.0, 0.7, 0.3, 1.0)), "must rise from 0 to 1"),
-        (lambda: estimate_length(Plane(2), CUBIC, STRAIGHT, point(0, 0), point(1, 0), 0.0), "tolerance = 0.0"),
+        (
+            lambda: estimate_length(Plane(2), CUBIC, STRAIGHT, point(0, 0), point(1, 0), 0.0),
+            "tolerance = 0.0",
+        ),
     ],
 )
 def test_impossible_rules_are_refused(make, message):

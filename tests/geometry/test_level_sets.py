@@ -43,12 +43,20 @@ def test_a_circle_is_embedded_with_the_metric_it_says(circle):
         assert isinstance(circle, protocol)
     u = torch.linspace(-4, 4, 12, dtype=torch.float64).reshape(3, 4, 1)
     assert circle.embed(u).shape == (3, 4, circle.ambient_dim)
-    torch.testing.assert_close(circle.metric(u), pullback_metric(circle.embed, u), rtol=1e-12, atol=1e-15)
-    torch.testing.assert_close(circle.metric(u), torch.full((3, 4, 1, 1), circle.radius**2).double())
-    torch.testing.assert_close(circle.embed(u + circle.periods[0]), circle.embed(u), rtol=0, atol=1e-14)
+    torch.testing.assert_close(
+        circle.metric(u), pullback_metric(circle.embed, u), rtol=1e-12, atol=1e-15
+    )
+    torch.testing.assert_close(
+        circle.metric(u), torch.full((3, 4, 1, 1), circle.radius**2).double()
+    )
+    torch.testing.assert_close(
+        circle.embed(u + circle.periods[0]), circle.embed(u), rtol=0, atol=1e-14
+    )
     centre = circle.embed(points([0.0], [PI])).mean(0)
     distances = (circle.embed(u) - centre).norm(dim=-1)
-    torch.testing.assert_close(distances, torch.full_like(distances, circle.radius), rtol=1e-13, atol=0)
+    torch.testing.assert_close(
+        distances, torch.full_like(distances, circle.radius), rtol=1e-13, atol=0
+    )
 
 
 @pytest.mark.parametrize(
@@ -66,7 +74,13 @@ def test_radii(circle, radius):
 
 @every_circle
 def test_distance_on_a_circle_is_the_shorter_arc(circle):
-    for a, b, angle in ((0, 1, 1), (-3, 3, 2 * PI - 6), (0.5, 0.5 + 2 * PI, 0), (0, PI, PI), (9, 9, 0)):
+    for a, b, angle in (
+        (0, 1, 1),
+        (-3, 3, 2 * PI - 6),
+        (0.5, 0.5 + 2 * PI, 0),
+        (0, PI, PI),
+        (9, 9, 0),
+    ):
         for ends in ((a, b), (b, a)):
             found = circle.distance(*points(*[[end] for end in ends])).item()
             assert found == pytest.approx(circle.radius * angle, abs=4e-15)
@@ -77,7 +91,10 @@ def test_distance_on_a_circle_is_the_shorter_arc(circle):
 
 @every_circle
 def test_the_way_across_the_manifold_is_never_longer(circle):
-    a, b = torch.zeros(9, 1, dtype=torch.float64), torch.linspace(-PI, PI, 9, dtype=torch.float64)[:, None]
+    a, b = (
+        torch.zeros(9, 1, dtype=torch.float64),
+        torch.linspace(-PI, PI, 9, dtype=torch.float64)[:, None],
+    )
     across = circle.manifold.distance(circle.point(a), circle.point(b))
     assert (across <= circle.distance(a, b) + 1e-14).all()
     tight = isinstance(circle.manifold, Torus) and (circle.coordinate == 0 or circle.level == PI)
@@ -88,7 +105,9 @@ def test_bad_coordinates_on_a_circle_are_refused():
     with pytest.raises(NonFiniteError, match=r"b\[1, 0\] = inf"):
         CIRCLES[0].distance(points([0.0]), points([0.0], [math.inf]))
     for function in (CIRCLES[0].point, CIRCLES[0].embed, CIRCLES[0].metric):
-        with pytest.raises(GeometryError, match=r"u has shape \(5, 2\): its last axis must have 1 entries"):
+        with pytest.raises(
+            GeometryError, match=r"u has shape \(5, 2\): its last axis must have 1 entries"
+        ):
             function(torch.zeros(5, 2))
 
 
@@ -122,14 +141,20 @@ def test_fig_2_the_sphere_has_one_circle_and_the_torus_a_set_of_them():
 def test_levels_of_one_band_are_one_component(levels, tolerance, named):
     found = LevelSet(Torus(), 1, levels, tolerance)
     assert [circle.level for circle in found.components()] == named
-    on = found.component_of(torch.stack([circle.point(torch.ones(1)) for circle in found.components()]))
+    on = found.component_of(
+        torch.stack([circle.point(torch.ones(1)) for circle in found.components()])
+    )
     assert on.tolist() == list(range(len(named)))
 
 
 def test_elevations_do_not_wrap():
     sphere = LevelSet(Sphere(), 0, (1.5, -1.5), 0.2)
     assert len(sphere.components()) == 2
-    assert sphere.component_of(points([-1.6, 0.0], [1.6, 3.0], [0.0, 0.0])).tolist() == [0, 1, OUTSIDE]
+    assert sphere.component_of(points([-1.6, 0.0], [1.6, 3.0], [0.0, 0.0])).tolist() == [
+        0,
+        1,
+        OUTSIDE,
+    ]
     assert sphere.inclusion(points([PI - 1.2, 0.0])).item() == pytest.approx(0.1, abs=1e-15)
 
 
@@ -158,7 +183,8 @@ def test_inclusion_is_zero_to_the_bit_on_every_component(manifold, coordinate, d
 
 
 @pytest.mark.parametrize(
-    ("manifold", "coordinate", "low"), [(Sphere(), 0, -PI / 2), (Torus(), 1, -PI), (Torus(), 0, -PI)]
+    ("manifold", "coordinate", "low"),
+    [(Sphere(), 0, -PI / 2), (Torus(), 1, -PI), (Torus(), 0, -PI)],
 )
 @given(data=st.data())
 @repeatable
@@ -168,18 +194,27 @@ def test_components_are_those_of_the_grid(manifold, coordinate, low, data):
     wraps = math.isfinite(manifold.periods[coordinate])
     nodes = data.draw(st.lists(st.integers(1, steps - 1), min_size=1, max_size=6))
     half_width = data.draw(st.integers(0, 6)) + 0.5
-    found = LevelSet(manifold, coordinate, tuple(low + step * node for node in nodes), half_width * step)
+    found = LevelSet(
+        manifold, coordinate, tuple(low + step * node for node in nodes), half_width * step
+    )
     held = low + step * np.arange(steps + (not wraps))
     free = np.linspace(-PI, PI, others, endpoint=False)
     lines = (held, free) if coordinate == 0 else (free, held)
     z = torch.from_numpy(np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1))
-    # The bands end half a step off the nodes, so that none of them is inside or outside by rounding.
+    # The bands end half a step off the nodes, so that none of them is inside or outside by
+    # rounding.
     inside = (found.inclusion(z) == 0).numpy()
     labels = components_on_grid(inside, (wraps, True) if coordinate == 0 else (True, wraps))
     assert len(found.components()) == labels.max() + 1
     pairs = set(zip(labels.ravel().tolist(), found.component_of(z).ravel().tolist(), strict=True))
-    assert len(pairs) == len({label for label, _ in pairs}) == len({component for _, component in pairs})
-    assert {component for label, component in pairs if label >= 0} == set(range(len(found.components())))
+    assert (
+        len(pairs)
+        == len({label for label, _ in pairs})
+        == len({component for _, component in pairs})
+    )
+    assert {component for label, component in pairs if label >= 0} == set(
+        range(len(found.components()))
+    )
 
 
 @pytest.mark.parametrize(
@@ -206,7 +241,10 @@ def test_what_cuts_out_no_circles_is_refused(manifold, coordinate, levels, toler
 
 
 def test_points_that_are_not_finite_are_refused():
-    for function in (LevelSet(Torus(), 1, (0.0,)).inclusion, LevelSet(Torus(), 1, (0.0,)).component_of):
+    for function in (
+        LevelSet(Torus(), 1, (0.0,)).inclusion,
+        LevelSet(Torus(), 1, (0.0,)).component_of,
+    ):
         with pytest.raises(NonFiniteError, match=r"z\[0, 1\] = nan"):
             function(points([0.0, math.nan]))
         with pytest.raises(GeometryError, match=r"z has shape \(3,\)"):

@@ -16,7 +16,9 @@ from constraint_geodesics.geometry.manifold import (
 def test_pullback_of_a_linear_map_is_its_gram_matrix():
     linear = torch.nn.Linear(3, 5, dtype=torch.float64)
     gram = linear.weight.T @ linear.weight
-    torch.testing.assert_close(pullback_metric(linear, torch.ones(2, 3, dtype=torch.float64)), gram.expand(2, 3, 3))
+    torch.testing.assert_close(
+        pullback_metric(linear, torch.ones(2, 3, dtype=torch.float64)), gram.expand(2, 3, 3)
+    )
 
 
 def test_pullback_is_differentiable():
@@ -43,5 +45,7 @@ def test_non_finite_error_names_the_first_entry_and_survives_a_process_boundary(
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 3), (2, 0)])
 def test_wrong_dimension_is_refused(shape):
-    with pytest.raises(GeometryError, match=rf"z has shape \({', '.join(map(str, shape))}.*must have 2 entries"):
+    with pytest.raises(
+        GeometryError, match=rf"z has shape \({', '.join(map(str, shape))}.*must have 2 entries"
+    ):
         require_dim(torch.zeros(shape), 2, "z")

@@ -13,7 +13,9 @@ ACCELERATION = np.array([4.0, 2.0, 8.0, 5.0, 3.0, 10.0])
 
 def law(test):
     """Cases are drawn, yet the same on every run, so that a red run can be repeated."""
-    return settings(max_examples=60, deadline=None, derandomize=True, database=None)(given(st.data())(test))
+    return settings(max_examples=60, deadline=None, derandomize=True, database=None)(
+        given(st.data())(test)
+    )
 
 
 def differences(joints: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -34,11 +36,14 @@ def draw_limits(data: st.DataObject, dim: int) -> tuple[np.ndarray, np.ndarray]:
 def draw_broken_line(data: st.DataObject) -> np.ndarray:
     """Rows in any order of any distance, with corners, turns back and joints that stand still."""
     rows, dim = data.draw(st.integers(2, 30)), data.draw(st.integers(1, 7))
-    steps = data.draw(arrays(np.float64, (rows - 1, dim), elements=st.floats(-0.125, 0.125, width=32)))
+    steps = data.draw(
+        arrays(np.float64, (rows - 1, dim), elements=st.floats(-0.125, 0.125, width=32))
+    )
     flat = np.abs(steps).max(axis=1) < 1e-3
     steps[flat, 0] += 0.01
     return np.cumsum(
-        np.concatenate([data.draw(arrays(np.float64, (1, dim), elements=st.floats(-3, 3))), steps]), axis=0
+        np.concatenate([data.draw(arrays(np.float64, (1, dim), elements=st.floats(-3, 3))), steps]),
+        axis=0,
     )
 
 
@@ -47,12 +52,19 @@ def smooth_curve(seed: int, rows: int = 300, dim: int = 6) -> np.ndarray:
     rng = np.random.default_rng(seed)
     t = np.linspace(0.0, 1.0, rows)
     t[1:-1] += rng.uniform(-0.15, 0.15, rows - 2) / (rows - 1)
-    waves = [rng.normal(size=dim) * np.sin(np.pi * k * t[:, None] + rng.uniform(0, 6, dim)) / k for k in (1, 2, 3)]
+    waves = [
+        rng.normal(size=dim) * np.sin(np.pi * k * t[:, None] + rng.uniform(0, 6, dim)) / k
+        for k in (1, 2, 3)
+    ]
     return np.sum(waves, axis=0)
 
 
-def fastest_on_a_line(direction: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> float:
-    """Duration of a straight move from rest to rest: speed up, hold the limit if it is reached, slow down."""
+def fastest_on_a_line(
+    direction: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
+) -> float:
+    """Duration of a straight move from rest to rest: speed up, hold the limit if it is reached,
+    slow down.
+    """
     largest = (velocity / np.abs(direction)).min()
     gain = (acceleration / np.abs(direction)).min()
     if largest**2 / gain >= 1.0:
@@ -82,7 +94,9 @@ def test_rows_of_any_spacing_keep_their_limits():
         steps = rng.normal(size=(rows - 1, dim)) * 10 ** rng.uniform(-4, 0, (rows - 1, 1))
         joints = np.cumsum(np.r_[np.zeros((1, dim)), steps], axis=0)
         velocity, acceleration = 10 ** rng.uniform(-2, 2, (2, dim))
-        velocities, accelerations = differences(joints, time_parametrisation(joints, velocity, acceleration))
+        velocities, accelerations = differences(
+            joints, time_parametrisation(joints, velocity, acceleration)
+        )
         assert (np.abs(velocities) <= velocity).all()
         assert (np.abs(accelerations) <= acceleration).all()
 
@@ -91,7 +105,9 @@ def test_rows_of_any_spacing_keep_their_limits():
 def test_a_smooth_curve_keeps_its_limits(rows):
     for seed in range(5):
         joints = smooth_curve(seed, rows)
-        velocities, accelerations = differences(joints, time_parametrisation(joints, VELOCITY, ACCELERATION))
+        velocities, accelerations = differences(
+            joints, time_parametrisation(joints, VELOCITY, ACCELERATION)
+        )
         assert (np.abs(velocities) <= VELOCITY).all()
         assert (np.abs(accelerations) <= ACCELERATION).all()
 
@@ -101,15 +117,21 @@ def test_it_starts_and_ends_at_rest(data):
     joints = draw_broken_line(data)
     velocity, acceleration = draw_limits(data, joints.shape[1])
     times = time_parametrisation(joints, velocity, acceleration)
-    for step, dt in ((joints[1] - joints[0], times[1]), (joints[-1] - joints[-2], times[-1] - times[-2])):
-        # a joint at rest that keeps its acceleration for the whole of the step gets at most this far
+    for step, dt in (
+        (joints[1] - joints[0], times[1]),
+        (joints[-1] - joints[-2], times[-1] - times[-2]),
+    ):
+        # a joint at rest that keeps its acceleration for the whole of the step gets at most this
+        # far
         assert (np.abs(step) <= 0.5 * acceleration * dt**2 * (1 + 1e-9)).all()
 
 
 def test_an_infinite_velocity_limit_is_none():
     joints = smooth_curve(0)
     free = time_parametrisation(joints, np.full(6, np.inf), ACCELERATION)
-    np.testing.assert_allclose(free, time_parametrisation(joints, np.full(6, 1e6), ACCELERATION), rtol=1e-12)
+    np.testing.assert_allclose(
+        free, time_parametrisation(joints, np.full(6, 1e6), ACCELERATION), rtol=1e-12
+    )
 
 
 # Optimality
@@ -147,11 +169,17 @@ def test_turning_back_is_a_stop(rows):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_at_almost_every_row_some_limit_is_reached(seed):
-    """What a time-optimal motion does everywhere: its speed is bounded by something at every place."""
+    """What a time-optimal motion does everywhere: its speed is bounded by something at every
+    place.
+    """
     joints = smooth_curve(seed)
-    velocities, accelerations = differences(joints, time_parametrisation(joints, VELOCITY, ACCELERATION))
+    velocities, accelerations = differences(
+        joints, time_parametrisation(joints, VELOCITY, ACCELERATION)
+    )
     used = (np.abs(velocities) / VELOCITY).max(axis=1)
-    used = np.maximum((np.abs(accelerations) / ACCELERATION).max(axis=1)[1:-1], np.maximum(used[1:], used[:-1]))
+    used = np.maximum(
+        (np.abs(accelerations) / ACCELERATION).max(axis=1)[1:-1], np.maximum(used[1:], used[:-1])
+    )
     assert (used > 0.999).mean() > 0.96
 
 
@@ -164,7 +192,9 @@ def test_no_single_step_can_be_faster_by_a_percent(seed):
         shorter = times.copy()
         shorter[step + 1 :] -= 0.01 * (times[step + 1] - times[step])
         velocities, accelerations = differences(joints, shorter)
-        faster += (np.abs(velocities) <= VELOCITY).all() and (np.abs(accelerations) <= ACCELERATION).all()
+        faster += (np.abs(velocities) <= VELOCITY).all() and (
+            np.abs(accelerations) <= ACCELERATION
+        ).all()
     assert faster <= 1
 
 
@@ -197,7 +227,9 @@ def test_the_unit_of_the_joints_does_not_matter(data):
     velocity, acceleration = draw_limits(data, joints.shape[1])
     k = data.draw(st.sampled_from([2.0**-10, 0.5, 2.0**10]))
     times = time_parametrisation(joints, velocity, acceleration)
-    np.testing.assert_allclose(time_parametrisation(k * joints, k * velocity, k * acceleration), times, rtol=1e-8)
+    np.testing.assert_allclose(
+        time_parametrisation(k * joints, k * velocity, k * acceleration), times, rtol=1e-8
+    )
 
 
 @law
@@ -207,7 +239,9 @@ def test_order_sign_and_idle_joints_do_not_matter(data):
     order = data.draw(st.permutations(range(6)))
     times = time_parametrisation(joints, VELOCITY, ACCELERATION)
     other = time_parametrisation((signs * joints)[:, order], VELOCITY[order], ACCELERATION[order])
-    idle = time_parametrisation(np.c_[joints, np.ones(50)], np.r_[VELOCITY, 0.1], np.r_[ACCELERATION, 0.1])
+    idle = time_parametrisation(
+        np.c_[joints, np.ones(50)], np.r_[VELOCITY, 0.1], np.r_[ACCELERATION, 0.1]
+    )
     np.testing.assert_allclose(other, times, rtol=1e-6)
     np.testing.assert_allclose(idle, times, rtol=1e-6)
 
@@ -241,7 +275,12 @@ ROWS = np.array([[0.0, 0.0], [0.1, 0.2], [0.3, 0.3]])
         (ROWS, [1, 1], [1, np.inf], r"acceleration = \[1.0, inf\]: must be finite"),
         (ROWS[[0, 1, 1, 2]], [1, 1], [1, 1], r"joints\[1\] and joints\[2\] coincide"),
         (ROWS[[0, 0]], [1, 1], [1, 1], r"joints\[0\] and joints\[1\] coincide"),
-        (np.r_[ROWS, ROWS[2:] + 0.1 * COINCIDENT], [1, 1], [1, 1], r"joints\[2\] and joints\[3\] coincide"),
+        (
+            np.r_[ROWS, ROWS[2:] + 0.1 * COINCIDENT],
+            [1, 1],
+            [1, 1],
+            r"joints\[2\] and joints\[3\] coincide",
+        ),
     ],
 )
 def test_misuse_is_named(joints, velocity, acceleration, message):

@@ -27,13 +27,17 @@ def rows(*points):
 
 
 def geodesics(radii, start, directions, length, count):
-    """Points (count, n, 2) along geodesics of unit speed, v̈ = −ρ sin v u̇² / r, ü = 2 r sin v u̇ v̇ / ρ, and the lengths
-    (count, n) up to them.
+    """Points (count, n, 2) along geodesics of unit speed, v̈ = −ρ sin v u̇² / r, ü = 2 r sin v u̇
+    v̇ / ρ, and the lengths (count, n) up to them.
 
-    start: (2,) or (n, 2).  directions: (n,) angles to the parallel.  length: that of the whole, one or (n,).
+    start: (2,) or (n, 2).  directions: (n,) angles to the parallel.  length: that of the whole, one
+    or (n,).
     """
     major, minor = radii
-    start, length = np.broadcast_to(start, (len(directions), 2)), np.broadcast_to(length, len(directions))
+    start, length = (
+        np.broadcast_to(start, (len(directions), 2)),
+        np.broadcast_to(length, len(directions)),
+    )
 
     def slope(_, state):
         _, v, du, dv = state.reshape(4, -1)
@@ -42,10 +46,14 @@ def geodesics(radii, start, directions, length, count):
         return (length * np.stack([du, dv, ddu, ddv])).ravel()
 
     ring = major + minor * np.cos(start[:, 1])
-    state = np.stack([start[:, 0], start[:, 1], np.cos(directions) / ring, np.sin(directions) / minor])
+    state = np.stack(
+        [start[:, 0], start[:, 1], np.cos(directions) / ring, np.sin(directions) / minor]
+    )
     times = np.linspace(0, 1, count + 1)[1:]
     found = solve_ivp(slope, (0, 1), state.ravel(), "DOP853", t_eval=times, rtol=1e-11, atol=1e-12)
-    return found.y.reshape(4, len(directions), count)[:2].transpose(2, 1, 0), times[:, None] * length
+    return found.y.reshape(4, len(directions), count)[:2].transpose(2, 1, 0), times[
+        :, None
+    ] * length
 
 
 # Against geodesics
@@ -58,7 +66,9 @@ def test_a_geodesic_is_shortest_up_to_its_cut_point_and_never_again(radii, tube_
     directions = np.linspace(-PI, PI, 24, endpoint=False)
     longest = PI * (radii[0] - radii[1]) + 2 * PI * radii[1]
     points, lengths = geodesics(radii, start, directions, longest, 40)
-    found = torus_distance(*radii, np.broadcast_to(start, (points[..., 0].size, 2)), points.reshape(-1, 2))
+    found = torus_distance(
+        *radii, np.broadcast_to(start, (points[..., 0].size, 2)), points.reshape(-1, 2)
+    )
     excess = lengths - found.reshape(points.shape[:2])
     assert excess.min() > -1e-9
     shortest = excess < 1e-9
@@ -74,7 +84,8 @@ def test_the_distance_is_the_length_of_a_geodesic_that_arrives(radii):
     metric = np.stack([radii[0] + radii[1] * np.cos(a[:, 1]), np.full(40, radii[1])], axis=-1)
     step = 1e-6 * np.eye(2)
     ahead, behind = (
-        np.stack([torus_distance(*radii, a + sign * s / metric, b) for s in step], axis=-1) for sign in (1, -1)
+        np.stack([torus_distance(*radii, a + sign * s / metric, b) for s in step], axis=-1)
+        for sign in (1, -1)
     )
     away = (ahead - behind) / 2e-6
     np.testing.assert_allclose(np.linalg.norm(away, axis=-1), 1.0, atol=1e-8)
@@ -87,12 +98,16 @@ def test_the_distance_is_the_length_of_a_geodesic_that_arrives(radii):
 def relaxed_length(radii, a, b):
     """Length after the energy of polynomials to every image of b was relaxed."""
     torus, curve, rule = Torus(*radii), PinnedPolynomial(2, 14), Quadrature.gauss_legendre(40)
-    turns = 2 * PI * torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)] * 2)
+    turns = (
+        2 * PI * torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)] * 2)
+    )
     start, goal = torch.from_numpy(a), torch.from_numpy(b) + turns
     sides = torch.zeros(2, 1, curve.coefficients, dtype=torch.float64)
     sides[:, 0, curve.degree - 1] = torch.tensor([1.0, -1.0])
     phi = sides.repeat(1, len(turns), 1).requires_grad_()
-    search = torch.optim.LBFGS([phi], max_iter=500, tolerance_change=1e-14, line_search_fn="strong_wolfe")
+    search = torch.optim.LBFGS(
+        [phi], max_iter=500, tolerance_change=1e-14, line_search_fn="strong_wolfe"
+    )
 
     def energy():
         search.zero_grad()
@@ -126,10 +141,16 @@ def test_meridians_and_the_inner_equator_are_shortest(radii):
     major, minor = radii
     angles = np.linspace(-PI, PI, 33)
     here = np.zeros_like(angles)
-    meridian = torus_distance(major, minor, np.stack([here, here + 0.3], axis=-1), np.stack([here, angles], axis=-1))
+    meridian = torus_distance(
+        major, minor, np.stack([here, here + 0.3], axis=-1), np.stack([here, angles], axis=-1)
+    )
     turn = np.abs(angles - 0.3)
-    np.testing.assert_allclose(meridian, minor * np.minimum(turn, 2 * PI - turn), rtol=0, atol=1e-14 * major)
-    inner = torus_distance(major, minor, np.stack([here, here + PI], axis=-1), np.stack([angles, here - PI], axis=-1))
+    np.testing.assert_allclose(
+        meridian, minor * np.minimum(turn, 2 * PI - turn), rtol=0, atol=1e-14 * major
+    )
+    inner = torus_distance(
+        major, minor, np.stack([here, here + PI], axis=-1), np.stack([angles, here - PI], axis=-1)
+    )
     np.testing.assert_allclose(inner, (major - minor) * np.abs(angles), rtol=0, atol=1e-14 * major)
 
 
@@ -150,10 +171,19 @@ def test_the_outer_equator_is_shortest_up_to_its_conjugate_point(radii):
 @every_torus
 def test_nothing_is_lost_next_to_the_equators(radii, equator):
     major, minor = radii
-    offsets, turns = [1e-4, 1e-7, 1e-8, 1e-9, 1e-12, 1e-16, 1e-40, 1e-200], [1e-9, 0.5, 1.0, 2.5, PI]
+    offsets, turns = (
+        [1e-4, 1e-7, 1e-8, 1e-9, 1e-12, 1e-16, 1e-40, 1e-200],
+        [1e-9, 0.5, 1.0, 2.5, PI],
+    )
     offset, turn, shift = np.array(list(itertools.product(offsets, turns, [0.0, 1.0, -0.5]))).T
-    on_a, on_b = np.stack([0 * turn, 0 * turn + equator], axis=-1), np.stack([turn, 0 * turn + equator], axis=-1)
-    a, b = on_a + np.stack([0 * turn, shift * offset], axis=-1), on_b + np.stack([0 * turn, offset], axis=-1)
+    on_a, on_b = (
+        np.stack([0 * turn, 0 * turn + equator], axis=-1),
+        np.stack([turn, 0 * turn + equator], axis=-1),
+    )
+    a, b = (
+        on_a + np.stack([0 * turn, shift * offset], axis=-1),
+        on_b + np.stack([0 * turn, offset], axis=-1),
+    )
     difference = torus_distance(major, minor, a, b) - torus_distance(major, minor, on_a, on_b)
     assert (np.abs(difference) <= 2 * minor * offset + 1e-14 * major).all()
 
@@ -198,6 +228,8 @@ def test_images_and_mirror_images_are_as_far_apart(radii, a, b):
 @given(any_points, any_points, any_points)
 @repeatable
 def test_no_detour_is_shorter(radii, a, b, c):
-    ab, bc, ac = torus_distance(*radii, np.concatenate([a, b, a]), np.concatenate([b, c, c])).reshape(3, -1)
+    ab, bc, ac = torus_distance(
+        *radii, np.concatenate([a, b, a]), np.concatenate([b, c, c])
+    ).reshape(3, -1)
     assert np.isfinite(ab).all()
     assert (ac <= ab + bc + 1e-13 * radii[0]).all()

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from constraint_geodesics.constraints.retraction import Retraction, retract
-from constraint_geodesics.constraints.vector import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.projection import Retraction, retract
 
 AXES = [
     (0, 0, 0, 0, 0, 0),
@@ -31,7 +31,8 @@ def robot(request: pytest.FixtureRequest):
 def test_the_jacobian_is_the_residuals_derivative(robot, axes) -> None:
     manifold = ConstraintManifold(robot, Constraint(axes, reference=REFERENCE))
     q = robot.sample(40, np.random.default_rng(0))
-    # close to a half turn away the derivative grows without bound, and finite differences say nothing
+    # close to a half turn away the derivative grows without bound, and finite differences say
+    # nothing
     q = q[np.linalg.norm(manifold.residual(q)[:, 3:], axis=-1) < 2.8]
     assert len(q) > 10
     jacobian, step = manifold.jacobian(q), 1e-6
@@ -54,14 +55,18 @@ def test_retraction_ends_on_the_manifold_and_leaves_its_points_alone(robot, axes
 
 
 def test_retraction_is_first_order(xarm) -> None:
-    """Tangent steps stay to second order: halving the step divides the retraction's correction by four."""
+    """Tangent steps stay to second order: halving the step divides the retraction's correction by
+    four.
+    """
     manifold = ConstraintManifold(xarm, Constraint((0, 0, 0, 1, 1, 0), reference=REFERENCE))
     result = retract(manifold, xarm.sample(50, np.random.default_rng(2)))
     q = result.joints[result.converged]
     jacobian = manifold.jacobian(q)[:, 3:5]
     direction = np.random.default_rng(3).normal(size=q.shape)
     direction -= np.einsum(
-        "bji,bj->bi", np.linalg.pinv(jacobian).transpose(0, 2, 1), np.einsum("bij,bj->bi", jacobian, direction)
+        "bji,bj->bi",
+        np.linalg.pinv(jacobian).transpose(0, 2, 1),
+        np.einsum("bij,bj->bi", jacobian, direction),
     )
     sizes = []
     for step in (0.02, 0.01):
@@ -73,14 +78,18 @@ def test_retraction_is_first_order(xarm) -> None:
 @given(st.floats(0.0, np.pi - 0.05), st.floats(-np.pi, np.pi))
 @settings(max_examples=30, deadline=None)
 def test_a_tilt_is_measured_as_its_angle(xarm, tilt: float, heading: float) -> None:
-    """Roll and pitch together give the angle of the tool axis, up to upside down, whatever the yaw."""
+    """Roll and pitch together give the angle of the tool axis, up to upside down, whatever the
+    yaw.
+    """
     q = np.array([0.3, -0.4, -0.6, 0.2, 0.5, 0.1])
     position, rotation = xarm.forward(q)
     axis = np.array([np.cos(heading), np.sin(heading), 0.0])
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     turn = np.eye(3) + np.sin(tilt) * cross + (1 - np.cos(tilt)) * cross @ cross
     reference = Pose(position, turn @ rotation)
-    residual = ConstraintManifold(xarm, Constraint((0, 0, 0, 1, 1, 0), reference=reference)).residual(q)
+    residual = ConstraintManifold(
+        xarm, Constraint((0, 0, 0, 1, 1, 0), reference=reference)
+    ).residual(q)
     # the axis that should be vertical is off by the tilt, wherever that tilt points
     np.testing.assert_allclose(np.linalg.norm(residual[3:5]), tilt, atol=1e-7)
     assert residual[5] == 0.0

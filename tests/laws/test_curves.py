@@ -1,4 +1,6 @@
-"""What every curve family must satisfy, over all members, dimensions and batch shapes, in float64."""
+"""What every curve family must satisfy, over all members, dimensions and batch shapes, in
+float64.
+"""
 
 from collections.abc import Callable
 
@@ -23,7 +25,8 @@ FAMILIES: dict[str, Callable[[int], CurveFamily]] = {
     "spline_8": lambda dim: PinnedSpline(dim, 8),
 }
 EVEN = torch.linspace(0, 1, 25, dtype=torch.float64)
-# Clear of every family's breaks, where a finite difference of the velocity would see the third derivative jump.
+# Clear of every family's breaks, where a finite difference of the velocity would see the third
+# derivative jump.
 INNER = (torch.arange(1, 8, dtype=torch.float64) * (5**0.5 - 1) / 2) % 1
 STEP = 1e-5
 
@@ -34,11 +37,15 @@ every_batch = pytest.mark.parametrize("batch", [(), (3,), (2, 4)], ids=str)
 
 def law(test: Callable[..., None]) -> Callable[..., None]:
     """Cases are drawn, yet the same on every run, so that a red run can be repeated."""
-    return settings(max_examples=4, deadline=None, derandomize=True, database=None)(given(st.data())(test))
+    return settings(max_examples=4, deadline=None, derandomize=True, database=None)(
+        given(st.data())(test)
+    )
 
 
 def tensors(shape: tuple[int, ...], size: float = 1.0) -> st.SearchStrategy[Tensor]:
-    return arrays(np.float64, shape, elements=st.floats(-size, size, width=32)).map(torch.from_numpy)
+    return arrays(np.float64, shape, elements=st.floats(-size, size, width=32)).map(
+        torch.from_numpy
+    )
 
 
 def draw_curves(
@@ -74,7 +81,9 @@ def test_no_coefficients_or_zero_ones_give_the_straight_line(name, dim, batch, d
     line = start[..., None, :] + EVEN[:, None] * (goal - start)[..., None, :]
     torch.testing.assert_close(points, line, rtol=0, atol=1e-14)
     assert torch.equal(velocities, (goal - start)[..., None, :].expand_as(velocities))
-    assert torch.equal(curve.acceleration(torch.zeros_like(phi), start, goal, EVEN), torch.zeros_like(points))
+    assert torch.equal(
+        curve.acceleration(torch.zeros_like(phi), start, goal, EVEN), torch.zeros_like(points)
+    )
 
 
 @every_family
@@ -84,7 +93,9 @@ def test_no_coefficients_or_zero_ones_give_the_straight_line(name, dim, batch, d
 def test_velocity_and_acceleration_agree_with_finite_differences(name, dim, batch, data):
     curve = FAMILIES[name](dim)
     phi, start, goal = draw_curves(data, curve, batch)
-    (ahead, faster), (behind, slower) = (curve.evaluate(phi, start, goal, INNER + sign * STEP) for sign in (1, -1))
+    (ahead, faster), (behind, slower) = (
+        curve.evaluate(phi, start, goal, INNER + sign * STEP) for sign in (1, -1)
+    )
     _, velocities = curve.evaluate(phi, start, goal, INNER)
     torch.testing.assert_close(velocities, (ahead - behind) / (2 * STEP), rtol=1e-6, atol=1e-6)
     acceleration = curve.acceleration(phi, start, goal, INNER)
@@ -137,13 +148,20 @@ def test_what_fit_leaves_over_is_orthogonal_to_the_basis(name, dim, data):
 @pytest.mark.parametrize(
     ("part", "whole"),
     [(f"poly_{degree}", f"spline_{segments}") for degree in (1, 2, 3) for segments in (1, 2, 3, 8)]
-    + [("spline_1", "poly_3"), ("spline_1", "spline_3"), ("spline_2", "spline_4"), ("spline_4", "spline_8")]
+    + [
+        ("spline_1", "poly_3"),
+        ("spline_1", "spline_3"),
+        ("spline_2", "spline_4"),
+        ("spline_4", "spline_8"),
+    ]
     + [("spline_3", "spline_6"), ("spline_2", "spline_6"), ("poly_3", "poly_8")],
 )
 @every_dim
 @law
 def test_one_family_holds_another(part, whole, dim, data):
-    """Splines hold all polynomials up to the cubics, and the splines whose knots are among theirs."""
+    """Splines hold all polynomials up to the cubics, and the splines whose knots are among
+    theirs.
+    """
     smaller, larger = _family(part, dim), _family(whole, dim)
     phi, start, goal = draw_curves(data, smaller, (3,))
     same = larger.fit(smaller.evaluate(phi, start, goal, EVEN)[0], EVEN)
@@ -153,7 +171,10 @@ def test_one_family_holds_another(part, whole, dim, data):
     ):
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
     torch.testing.assert_close(
-        larger.acceleration(same, start, goal, t), smaller.acceleration(phi, start, goal, t), rtol=0, atol=1e-8
+        larger.acceleration(same, start, goal, t),
+        smaller.acceleration(phi, start, goal, t),
+        rtol=0,
+        atol=1e-8,
     )
 
 

@@ -1,4 +1,6 @@
-"""What every manifold, curve family and length must satisfy, over all members and batch shapes, in float64."""
+"""What every manifold, curve family and length must satisfy, over all members and batch shapes, in
+float64.
+"""
 
 import math
 from collections.abc import Callable
@@ -15,9 +17,18 @@ from torch import Tensor
 from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.grid import GridManifold
-from constraint_geodesics.geometry.length import Quadrature, chord_length, curve_energy, curve_length
+from constraint_geodesics.geometry.length import (
+    Quadrature,
+    chord_length,
+    curve_energy,
+    curve_length,
+)
 from constraint_geodesics.geometry.level_sets import LevelSet
-from constraint_geodesics.geometry.manifold import EmbeddedManifold, MeasuredManifold, pullback_metric
+from constraint_geodesics.geometry.manifold import (
+    EmbeddedManifold,
+    MeasuredManifold,
+    pullback_metric,
+)
 
 BATCHES = ((), (3,), (2, 4))
 RULE = Quadrature.gauss_legendre(64)
@@ -25,7 +36,9 @@ RULE = Quadrature.gauss_legendre(64)
 
 @dataclass(frozen=True)
 class Graph:
-    """A user's own manifold: the graph of a function over R³, its metric left to `pullback_metric`."""
+    """A user's own manifold: the graph of a function over R³, its metric left to
+    `pullback_metric`.
+    """
 
     dim: int = 3
     ambient_dim: int = 4
@@ -40,7 +53,9 @@ class Graph:
 
 @dataclass(frozen=True)
 class Member:
-    """A manifold with the box of its chart, clear of the chart's singular points, that cases are drawn from."""
+    """A manifold with the box of its chart, clear of the chart's singular points, that cases are
+    drawn from.
+    """
 
     manifold: EmbeddedManifold
     lower: tuple[float, ...]
@@ -56,7 +71,9 @@ MEMBERS = {
     "torus": Member(Torus(2.0, 1.0), (-math.pi, -math.pi), (math.pi, math.pi)),
     "thin_torus": Member(Torus(3.0, 0.2), (-math.pi, -math.pi), (math.pi, math.pi)),
     "parallel": Member(LevelSet(Sphere(), 0, (0.7,)).components()[0], (-math.pi,), (math.pi,)),
-    "meridian_of_torus": Member(LevelSet(Torus(), 0, (0.4,)).components()[0], (-math.pi,), (math.pi,)),
+    "meridian_of_torus": Member(
+        LevelSet(Torus(), 0, (0.4,)).components()[0], (-math.pi,), (math.pi,)
+    ),
     "user": Member(Graph(), (-2.0, -2.0, -2.0), (2.0, 2.0, 2.0)),
 }
 DISTANCES = [name for name in MEMBERS if isinstance(MEMBERS[name].manifold, MeasuredManifold)]
@@ -68,24 +85,33 @@ every_batch = pytest.mark.parametrize("batch", BATCHES, ids=str)
 
 def law(test: Callable[..., None]) -> Callable[..., None]:
     """Cases are drawn, yet the same on every run, so that a red run can be repeated."""
-    return settings(max_examples=8, deadline=None, derandomize=True, database=None)(given(st.data())(test))
+    return settings(max_examples=8, deadline=None, derandomize=True, database=None)(
+        given(st.data())(test)
+    )
 
 
-def tensors(shape: tuple[int, ...], low: float = -1.0, high: float = 1.0) -> st.SearchStrategy[Tensor]:
+def tensors(
+    shape: tuple[int, ...], low: float = -1.0, high: float = 1.0
+) -> st.SearchStrategy[Tensor]:
     return arrays(np.float64, shape, elements=st.floats(low, high, width=32)).map(torch.from_numpy)
 
 
 def draw_points(data: st.DataObject, member: Member, batch: tuple[int, ...]) -> Tensor:
-    lower, upper = torch.tensor(member.lower, dtype=torch.float64), torch.tensor(member.upper, dtype=torch.float64)
+    lower, upper = (
+        torch.tensor(member.lower, dtype=torch.float64),
+        torch.tensor(member.upper, dtype=torch.float64),
+    )
     return lower + (upper - lower) * data.draw(tensors((*batch, len(lower)), low=0.0))
 
 
 def draw_curve(
     data: st.DataObject, member: Member, batch: tuple[int, ...]
 ) -> tuple[PinnedPolynomial, Tensor, Tensor, Tensor]:
-    """A curve whose first coordinate moves one way from the lower half of the box to the upper half.
+    """A curve whose first coordinate moves one way from the lower half of the box to the upper
+    half.
 
-    Its speed is nowhere zero, so the integrand is smooth and `RULE` exact; |ḃ_k| ≤ 1 keeps the bends below the line.
+    Its speed is nowhere zero, so the integrand is smooth and `RULE` exact; |ḃ_k| ≤ 1 keeps the
+    bends below the line.
     """
     start, goal = draw_points(data, member, batch), draw_points(data, member, batch)
     lower, upper = member.lower[0], member.upper[0]
@@ -116,7 +142,9 @@ def test_embedding_and_metric_have_the_promised_shapes(name, batch, data):
 def test_metric_is_the_pullback_of_the_embedding(name, batch, data):
     manifold = MEMBERS[name].manifold
     z = draw_points(data, MEMBERS[name], batch)
-    torch.testing.assert_close(manifold.metric(z), pullback_metric(manifold.embed, z), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        manifold.metric(z), pullback_metric(manifold.embed, z), rtol=1e-12, atol=1e-12
+    )
 
 
 @every_member
@@ -126,7 +154,9 @@ def test_metric_agrees_with_finite_differences_of_the_embedding(name, batch, dat
     manifold, step = MEMBERS[name].manifold, 1e-5
     z = draw_points(data, MEMBERS[name], batch)
     shifts = step * torch.eye(manifold.dim, dtype=torch.float64)
-    columns = (manifold.embed(z[..., None, :] + shifts) - manifold.embed(z[..., None, :] - shifts)) / (2 * step)
+    columns = (
+        manifold.embed(z[..., None, :] + shifts) - manifold.embed(z[..., None, :] - shifts)
+    ) / (2 * step)
     torch.testing.assert_close(manifold.metric(z), columns @ columns.mT, rtol=1e-7, atol=1e-7)
 
 
@@ -170,7 +200,10 @@ def test_distance_is_a_metric(name, batch, data):
 @law
 def test_distance_of_near_points_is_that_of_the_metric(name, batch, data):
     manifold = MEMBERS[name].manifold
-    z, direction = draw_points(data, MEMBERS[name], batch), data.draw(tensors((*batch, MEMBERS[name].manifold.dim)))
+    z, direction = (
+        draw_points(data, MEMBERS[name], batch),
+        data.draw(tensors((*batch, MEMBERS[name].manifold.dim))),
+    )
     direction[..., 0] += 2.0
     step = (z + 1e-6 * direction) - z
     expected = torch.einsum("...i,...ij,...j->...", step, manifold.metric(z), step).sqrt()
@@ -187,7 +220,9 @@ def test_curve_ends_are_exact_to_the_bit(dim, batch, data):
     curve = PinnedPolynomial(dim, data.draw(st.integers(1, 8)))
     phi = data.draw(tensors((*batch, curve.coefficients), -1e3, 1e3))
     start, goal = (data.draw(tensors((*batch, dim), -10.0, 10.0)) for _ in range(2))
-    points, velocities = curve.evaluate(phi, start, goal, torch.linspace(0, 1, 5, dtype=torch.float64))
+    points, velocities = curve.evaluate(
+        phi, start, goal, torch.linspace(0, 1, 5, dtype=torch.float64)
+    )
     assert points.shape == velocities.shape == (*batch, 5, dim)
     assert torch.equal(points[..., 0, :], start)
     assert torch.equal(points[..., -1, :], goal)
@@ -198,9 +233,13 @@ def test_curve_ends_are_exact_to_the_bit(dim, batch, data):
 @law
 def test_curve_velocity_is_the_derivative_of_its_points(dim, batch, data):
     curve = PinnedPolynomial(dim, data.draw(st.integers(1, 8)))
-    phi, start, goal = (data.draw(tensors((*batch, size))) for size in (curve.coefficients, dim, dim))
+    phi, start, goal = (
+        data.draw(tensors((*batch, size))) for size in (curve.coefficients, dim, dim)
+    )
     t, step = torch.linspace(0.1, 0.9, 7, dtype=torch.float64), 1e-5
-    (ahead, _), (behind, _) = (curve.evaluate(phi, start, goal, t + sign * step) for sign in (1, -1))
+    (ahead, _), (behind, _) = (
+        curve.evaluate(phi, start, goal, t + sign * step) for sign in (1, -1)
+    )
     _, velocities = curve.evaluate(phi, start, goal, t)
     torch.testing.assert_close(velocities, (ahead - behind) / (2 * step), rtol=1e-6, atol=1e-6)
 
@@ -210,7 +249,9 @@ def test_curve_velocity_is_the_derivative_of_its_points(dim, batch, data):
 @law
 def test_curve_is_the_polynomial_of_equation_9(dim, batch, data):
     curve = PinnedPolynomial(dim, data.draw(st.integers(1, 8)))
-    phi, start, goal = (data.draw(tensors((*batch, size))) for size in (curve.coefficients, dim, dim))
+    phi, start, goal = (
+        data.draw(tensors((*batch, size))) for size in (curve.coefficients, dim, dim)
+    )
     monomial = curve.to_monomial(phi, start, goal)
     assert monomial.shape == (*batch, dim, curve.degree + 1)
     assert torch.equal(monomial[..., 0], start)
@@ -218,7 +259,9 @@ def test_curve_is_the_polynomial_of_equation_9(dim, batch, data):
     t = torch.linspace(0, 1, 9, dtype=torch.float64)
     points, velocities = curve.evaluate(phi, start, goal, t)
     powers = torch.arange(curve.degree + 1)
-    torch.testing.assert_close(points, (monomial @ (t[:, None] ** powers).mT).mT, rtol=0, atol=1e-10)
+    torch.testing.assert_close(
+        points, (monomial @ (t[:, None] ** powers).mT).mT, rtol=0, atol=1e-10
+    )
     slopes = powers[1:] * t[:, None] ** (powers[1:] - 1)
     torch.testing.assert_close(velocities, (monomial[..., 1:] @ slopes.mT).mT, rtol=0, atol=1e-9)
 
@@ -240,7 +283,9 @@ class Reparametrised:
     def coefficients(self) -> int:
         return self.curve.coefficients
 
-    def evaluate(self, phi: Tensor, start: Tensor, goal: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    def evaluate(
+        self, phi: Tensor, start: Tensor, goal: Tensor, t: Tensor
+    ) -> tuple[Tensor, Tensor]:
         points, velocities = self.curve.evaluate(phi, start, goal, t * (1 + t) / 2)
         return points, velocities * (0.5 + t)[:, None]
 
@@ -323,7 +368,11 @@ def test_gradients_of_length_and_energy_agree_with_finite_differences(name, batc
     rule = Quadrature.gauss_legendre(8)
     for measure in (curve_length, curve_energy):
         moving = phi.clone().requires_grad_()
-        (gradient,) = torch.autograd.grad(measure(manifold, curve, moving, start, goal, rule).sum(), moving)
-        ahead, behind = (measure(manifold, curve, phi + s * step * direction, start, goal, rule) for s in (1, -1))
+        (gradient,) = torch.autograd.grad(
+            measure(manifold, curve, moving, start, goal, rule).sum(), moving
+        )
+        ahead, behind = (
+            measure(manifold, curve, phi + s * step * direction, start, goal, rule) for s in (1, -1)
+        )
         slope = ((ahead - behind) / (2 * step)).sum()
         torch.testing.assert_close((gradient * direction).sum(), slope, rtol=1e-6, atol=1e-7)

@@ -1,7 +1,8 @@
-"""What every geodesic solver must satisfy on every manifold: exact ends, no curve below the distance, honest statuses.
+"""What every geodesic solver must satisfy on every manifold: exact ends, no curve below the
+distance, honest statuses.
 
-Which curve family can represent a geodesic to 1e-3 is said by `REACHES`: great circles near a pole and geodesics that
-wind around the torus bend too much for one cubic in the chart.
+Which curve family can represent a geodesic to 1e-3 is said by `REACHES`: great circles near a pole
+and geodesics that wind around the torus bend too much for one cubic in the chart.
 """
 
 import math
@@ -15,7 +16,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from constraint_geodesics.evaluation.analytic_search import AnalyticTask, curve_family, run_analytic
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.graph_search import CombinedSolver, GraphSolver
 from constraint_geodesics.geodesics.policy_search import Actor, PolicySolver
@@ -25,7 +25,13 @@ from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
 from constraint_geodesics.geometry.curves import PinnedPolynomial, PinnedSpline
 from constraint_geodesics.geometry.grid import GridManifold
 from constraint_geodesics.geometry.length import curve_length
-from constraint_geodesics.geometry.manifold import GeometryError, NonFiniteError, OutsideError, pullback_metric
+from constraint_geodesics.geometry.manifold import (
+    GeometryError,
+    NonFiniteError,
+    OutsideError,
+    pullback_metric,
+)
+from constraint_geodesics.studies.analytic_search import AnalyticTask, curve_family, run_analytic
 
 SEED = 3
 CUBIC = PinnedPolynomial(2, 3)
@@ -40,13 +46,23 @@ REACHES = {
     "sphere, cubic": ("sphere", CUBIC, Box((-0.7, -1.0), (0.7, 1.0))),
     "sphere, degree 7": ("sphere", PinnedPolynomial(2, 7), Box((-0.9, -math.pi), (0.9, math.pi))),
     "sphere, 8 segments": ("sphere", PinnedSpline(2, 8), Box((-1.0, -math.pi), (1.0, math.pi))),
-    "torus, degree 7": ("torus", PinnedPolynomial(2, 7), Box((-math.pi, -math.pi), (math.pi, math.pi))),
-    "torus, 4 segments": ("torus", PinnedSpline(2, 4), Box((-math.pi, -math.pi), (math.pi, math.pi))),
+    "torus, degree 7": (
+        "torus",
+        PinnedPolynomial(2, 7),
+        Box((-math.pi, -math.pi), (math.pi, math.pi)),
+    ),
+    "torus, 4 segments": (
+        "torus",
+        PinnedSpline(2, 4),
+        Box((-math.pi, -math.pi), (math.pi, math.pi)),
+    ),
 }
 
 
 def distance(manifold, start, goal) -> np.ndarray:
-    return manifold.distance(torch.from_numpy(np.asarray(start)), torch.from_numpy(np.asarray(goal))).numpy()
+    return manifold.distance(
+        torch.from_numpy(np.asarray(start)), torch.from_numpy(np.asarray(goal))
+    ).numpy()
 
 
 def solvers(name: str):
@@ -54,14 +70,21 @@ def solvers(name: str):
     graph = GraphSolver.over_points(manifold, box.sample(1500, np.random.default_rng(SEED)))
     grid = GraphSolver.over_grid(manifold, box.low, box.high, (40, 40))
     gradient = GradientSolver()
-    return {"gradient": gradient, "graph": graph, "grid": grid, "combined": CombinedSolver(graph, gradient)}
+    return {
+        "gradient": gradient,
+        "graph": graph,
+        "grid": grid,
+        "combined": CombinedSolver(graph, gradient),
+    }
 
 
 ALL = {name: solvers(name) for name in WHOLE}
 
 
 def law(test):
-    return settings(max_examples=3, deadline=None, derandomize=True, database=None)(given(st.integers(0, 10_000))(test))
+    return settings(max_examples=3, deadline=None, derandomize=True, database=None)(
+        given(st.integers(0, 10_000))(test)
+    )
 
 
 @pytest.mark.parametrize("solver", ["gradient", "graph", "grid", "combined"])
@@ -72,12 +95,17 @@ def test_ends_are_exact_and_no_curve_is_shorter_than_the_distance(name, solver, 
     problem = ChartProblem(manifold, CUBIC, box)
     ends = problem.sample_ends(2, np.random.default_rng(seed))
     exact = distance(manifold, ends.z_start, ends.z_goal)
-    for row, found in enumerate(geodesics_between(ALL[name][solver], problem, ends.z_start, ends.z_goal)):
+    for row, found in enumerate(
+        geodesics_between(ALL[name][solver], problem, ends.z_start, ends.z_goal)
+    ):
         assert found.found
         points = found.points(np.array([0.0, 0.5, 1.0]))
         np.testing.assert_array_equal(points[0], ends.z_start[row])
         images = (points[-1] - ends.z_goal[row]) / (2 * math.pi)
-        assert np.array_equal(points[-1], ends.z_goal[row]) or np.abs(images - images.round()).max() < 1e-9
+        assert (
+            np.array_equal(points[-1], ends.z_goal[row])
+            or np.abs(images - images.round()).max() < 1e-9
+        )
         assert found.length >= exact[row] * (1 - 1e-6)
         assert found.time_s >= 0
         assert found.iterations >= 1
@@ -91,7 +119,9 @@ def test_solvers_reach_the_exact_distance_where_the_family_can(case, solver) -> 
     problem = ChartProblem(manifold, curve, box)
     ends = problem.sample_ends(20, np.random.default_rng(SEED))
     found = geodesics_between(ALL[name][solver], problem, ends.z_start, ends.z_goal)
-    ratio = np.array([geodesic.length for geodesic in found]) / distance(manifold, ends.z_start, ends.z_goal)
+    ratio = np.array([geodesic.length for geodesic in found]) / distance(
+        manifold, ends.z_start, ends.z_goal
+    )
     assert ratio.max() <= 1 + 1e-3
     assert {geodesic.status for geodesic in found} == {"converged"}
 
@@ -178,7 +208,9 @@ def test_bad_ends_are_refused_with_their_value(name) -> None:
     for solver in ALL[name].values():
         with pytest.raises(NonFiniteError, match=r"goal\[1, 0\] = nan"):
             geodesics_between(solver, problem, good, bad)
-        with pytest.raises(GeometryError, match=r"shapes \(2, 3\) and \(2, 3\)|last axis must have 2"):
+        with pytest.raises(
+            GeometryError, match=r"shapes \(2, 3\) and \(2, 3\)|last axis must have 2"
+        ):
             geodesics_between(solver, problem, np.zeros((2, 3)), np.zeros((2, 3)))
         with pytest.raises(GeometryError, match=r"\(2, 2\) and \(1, 2\)"):
             geodesics_between(solver, problem, good, good[:1])
@@ -203,7 +235,8 @@ def test_a_wall_is_walked_around() -> None:
     assert found.found
     points = found.points(np.linspace(0, 1, 400))
     assert manifold.contains(torch.from_numpy(points)).all()
-    # round the wall's corners at (-0.625, ±0.075) the shortest way is 2.555 long, that of the grid's edges 2.689
+    # round the wall's corners at (-0.625, ±0.075) the shortest way is 2.555 long, that of the
+    # grid's edges 2.689
     assert 2.555 < found.length < 2.689
     (cubic,) = geodesics_between(graph, replace(problem, curve=CUBIC), start, goal)
     assert cubic.status == "not_found", "no cubic bends that far"
@@ -229,7 +262,11 @@ def test_what_a_wall_separates_is_not_connected() -> None:
 def test_ends_in_a_blocked_cell_are_refused_with_their_place() -> None:
     manifold = wall(gap=True)
     problem = ChartProblem(manifold, CUBIC, Box((-1.0, -1.0), (1.0, 1.0)))
-    inside, blocked, beyond = np.array([[0.5, -0.5]]), np.array([[0.5, 0.01]]), np.array([[0.5, 1.2]])
+    inside, blocked, beyond = (
+        np.array([[0.5, -0.5]]),
+        np.array([[0.5, 0.01]]),
+        np.array([[0.5, 1.2]]),
+    )
     with pytest.raises(OutsideError, match=r"goal\[0\] = \[0.5, 0.01\]"):
         geodesics_between(GradientSolver(), problem, inside, blocked)
     with pytest.raises(OutsideError, match=r"start\[0\] = \[0.5, 1.2\]"):
@@ -269,7 +306,9 @@ def test_what_a_graph_found_is_not_lost_to_a_descent_that_sees_no_border() -> No
     points = problem.domain.sample(2000, np.random.default_rng(0))
     graph = GraphSolver.over_points(manifold, points[np.linalg.norm(points, axis=1) > 0.5])
     ends = np.array([[-1.0, 0.05]]), np.array([[1.0, 0.05]])
-    (path,), (combined,) = (geodesics_between(solver, problem, *ends) for solver in (graph, CombinedSolver(graph)))
+    (path,), (combined,) = (
+        geodesics_between(solver, problem, *ends) for solver in (graph, CombinedSolver(graph))
+    )
     assert path.found
     assert combined.found
     assert 2.0 < combined.length <= path.length * (1 + 1e-9)
@@ -281,10 +320,14 @@ def test_a_policy_takes_the_near_image_of_a_goal(params) -> None:
     actor = Actor(CUBIC.coefficients + 7, (4,), CUBIC.coefficients)
     small = params.geodesics.model_copy(update={"rollouts": 2, "episode_steps": 1})
     problem = ChartProblem(Sphere(), CUBIC, WHOLE["sphere"][1])
-    (found,) = geodesics_between(PolicySolver(actor, small), problem, np.array([[0.0, 3.0]]), np.array([[0.0, -3.0]]))
+    (found,) = geodesics_between(
+        PolicySolver(actor, small), problem, np.array([[0.0, 3.0]]), np.array([[0.0, -3.0]])
+    )
     assert found.length == pytest.approx(2 * math.pi - 6, rel=1e-6)
     assert found.straight_length == pytest.approx(2 * math.pi - 6, rel=1e-6)
-    with pytest.raises(GeometryError, match="the policy changes 4 coefficients: must be those of the curve, 8"):
+    with pytest.raises(
+        GeometryError, match="the policy changes 4 coefficients: must be those of the curve, 8"
+    ):
         PolicySolver(actor, small).solve(
             replace(problem, curve=PinnedPolynomial(2, 5)), problem.ends(*np.zeros((2, 1, 2)))
         )
@@ -312,7 +355,10 @@ def test_a_metric_that_is_not_finite_gives_no_short_curves() -> None:
     assert found.found
     with pytest.raises(NonFiniteError, match="length"):
         curve_length(
-            Disc(), CUBIC, torch.zeros(4, dtype=torch.float64), *torch.tensor([[0.1, 0.1], [2.0, 2.0]]).double()
+            Disc(),
+            CUBIC,
+            torch.zeros(4, dtype=torch.float64),
+            *torch.tensor([[0.1, 0.1], [2.0, 2.0]]).double(),
         )
 
 
@@ -339,7 +385,9 @@ def test_a_straight_line_over_a_hill_is_left() -> None:
             return pullback_metric(self.embed, z)
 
     problem = ChartProblem(Hill(), PinnedSpline(2, 4), Box((-1.5, -1.5), (1.5, 1.5)))
-    (found,) = geodesics_between(GradientSolver(starts=1), problem, np.array([[-1.0, 0.0]]), np.array([[1.0, 0.0]]))
+    (found,) = geodesics_between(
+        GradientSolver(starts=1), problem, np.array([[-1.0, 0.0]]), np.array([[1.0, 0.0]])
+    )
     assert found.length < 0.85 * found.straight_length
 
 
@@ -363,7 +411,10 @@ def test_solving_many_pairs_at_once_gives_what_one_at_a_time_does() -> None:
     ends = problem.sample_ends(6, np.random.default_rng(1))
     for solver in (GradientSolver(starts=1), ALL["torus"]["combined"]):
         together = geodesics_between(solver, problem, ends.z_start, ends.z_goal)
-        one = [geodesics_between(solver, problem, ends.z_start[k : k + 1], ends.z_goal[k : k + 1])[0] for k in range(6)]
+        one = [
+            geodesics_between(solver, problem, ends.z_start[k : k + 1], ends.z_goal[k : k + 1])[0]
+            for k in range(6)
+        ]
         np.testing.assert_allclose([a.length for a in together], [b.length for b in one], rtol=1e-6)
 
 

@@ -3,8 +3,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from constraint_geodesics.compute import parallel_map
-from constraint_geodesics.constraints.vector import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.learning.dataset import (
     DatasetError,
     data_card,
@@ -16,6 +15,7 @@ from constraint_geodesics.learning.dataset import (
     write_joints,
     write_queries,
 )
+from constraint_geodesics.pipeline.compute import parallel_map
 
 ABOUT = {"seed": "1", "constraint": "level_cup"}
 
@@ -28,7 +28,9 @@ def labelled(scene, manifold, params, workers, rows=600):
 def test_bytes_do_not_depend_on_the_number_of_workers(scene, params, tmp_path) -> None:
     manifold = scene.manifold(params.constraints["level_cup"])
     for workers in (1, 2):
-        write_joints(labelled(scene, manifold, params, workers), tmp_path / f"{workers}.parquet", ABOUT)
+        write_joints(
+            labelled(scene, manifold, params, workers), tmp_path / f"{workers}.parquet", ABOUT
+        )
     assert (tmp_path / "1.parquet").read_bytes() == (tmp_path / "2.parquet").read_bytes()
 
 
@@ -45,7 +47,9 @@ def test_rows_are_what_pybullet_and_the_constraint_say(scene, params, tmp_path) 
     assert manifold.violation(found.joints).max() <= 1e-9
     assert scene.robot.limit_distance(found.joints).min() >= 0
     tilt = np.linalg.norm(manifold.residual(found.joints)[:, 3:], axis=1)
-    assert 0.3 < np.median(tilt) / np.radians(10.0) < 0.95, "the whole band is used, not its edge alone"
+    assert 0.3 < np.median(tilt) / np.radians(10.0) < 0.95, (
+        "the whole band is used, not its edge alone"
+    )
     with scene.world() as world:
         np.testing.assert_array_equal(world.free(found.joints), found.free)
     card = data_card(shards)

@@ -34,7 +34,9 @@ def test_any_batch_shape_is_answered_in_double_precision(trained, frozen) -> Non
     z = frozen.encode(q)
     assert z.dtype == frozen.decode(z).dtype == np.float64
     np.testing.assert_allclose(frozen.encode(q.reshape(3, 4, -1)), z.reshape(3, 4, -1), atol=1e-5)
-    np.testing.assert_allclose(frozen.decode(z.reshape(2, 6, -1)).reshape(q.shape), frozen.decode(z), atol=1e-5)
+    np.testing.assert_allclose(
+        frozen.decode(z.reshape(2, 6, -1)).reshape(q.shape), frozen.decode(z), atol=1e-5
+    )
     np.testing.assert_allclose(frozen.decode(z[0]), frozen.decode(z)[0], atol=1e-5)
     assert frozen.encode(q[0]).shape == (frozen.dim,)
     assert frozen.decode(z[:0]).shape == (0, q.shape[1])
@@ -51,7 +53,9 @@ def test_samples_lie_around_the_centres(frozen) -> None:
     np.testing.assert_array_equal(first, again)
     assert first.shape == (4000, frozen.dim)
     centres, width = frozen.arrays["precision.centres"], frozen.arrays["precision.bandwidth"]
-    np.testing.assert_allclose(first.mean(axis=0), centres.mean(axis=0), atol=0.2 * centres.std(axis=0).max())
+    np.testing.assert_allclose(
+        first.mean(axis=0), centres.mean(axis=0), atol=0.2 * centres.std(axis=0).max()
+    )
     nearest = np.linalg.norm(first[:, None] - centres, axis=-1) / width
     assert np.median(nearest.min(axis=1)) < SPREAD * np.sqrt(frozen.dim)
 
@@ -62,14 +66,18 @@ def test_samples_of_the_packaged_manifold_are_configurations_of_the_arm(scene) -
     assert (scene.robot.limit_distance(decoded) > -0.2).mean() > 0.75
     with scene.world() as world:
         drawn = scene.robot.sample(1000, np.random.default_rng(3))
-        assert world.free(decoded).mean() > world.free(drawn).mean() + 0.05, "freer than what is drawn blindly"
+        assert world.free(decoded).mean() > world.free(drawn).mean() + 0.05, (
+            "freer than what is drawn blindly"
+        )
     back = chart.decode(chart.encode(decoded))
     assert np.median(np.linalg.norm(back - decoded, axis=1)) < 0.5
 
 
 def test_a_perceptron_of_one_layer_is_its_two_linear_paths() -> None:
     rng = np.random.default_rng(3)
-    hidden, bias, out, last, direct = (rng.normal(size=s) for s in ((5, 3), (5,), (2, 5), (2,), (2, 3)))
+    hidden, bias, out, last, direct = (
+        rng.normal(size=s) for s in ((5, 3), (5,), (2, 5), (2,), (2, 3))
+    )
     arrays = {
         "net.nonlinear.0.weight": hidden,
         "net.nonlinear.0.bias": bias,

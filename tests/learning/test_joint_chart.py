@@ -25,14 +25,18 @@ def test_encoding_is_undone_and_of_the_size_of_latent_coordinates(chart, trained
     np.testing.assert_allclose(z.mean(axis=0), 0.0, atol=1e-12)
     assert z.var(axis=0).mean() == pytest.approx(1.0, abs=1e-12)
     between = np.diff(z[[0, 1, 2]], axis=0)
-    np.testing.assert_allclose(between * float(chart.vae.scale[0]), np.diff(trained.joints[:3], axis=0), atol=1e-12)
+    np.testing.assert_allclose(
+        between * float(chart.vae.scale[0]), np.diff(trained.joints[:3], axis=0), atol=1e-12
+    )
 
 
 def test_its_metric_is_one_everywhere_and_its_deviation_adds_nothing(chart, trained) -> None:
     z = chart.encode(trained.joints[:50])
     square = float(chart.vae.scale[0]) ** 2
     metric = chart.metric(chart.tensor(10 * z))
-    torch.testing.assert_close(metric, (square * torch.eye(6, dtype=torch.float64)).expand(50, 6, 6))
+    torch.testing.assert_close(
+        metric, (square * torch.eye(6, dtype=torch.float64)).expand(50, 6, 6)
+    )
     embedded = chart.embed_points(10 * z)
     assert embedded.shape == (50, 12)
     assert np.ptp(embedded[:, 6:]) == 0.0
@@ -43,7 +47,9 @@ def test_a_straight_line_without_constraint_is_the_joint_line(problem) -> None:
     ends = problem.sample_ends(60, np.random.default_rng(0))
     look = problem.look(np.zeros((60, problem.curve.coefficients)), ends)
     assert look.costs.feasible.all()
-    np.testing.assert_allclose(look.costs.length, np.linalg.norm(ends.q_goal - ends.q_start, axis=1), rtol=1e-5)
+    np.testing.assert_allclose(
+        look.costs.length, np.linalg.norm(ends.q_goal - ends.q_start, axis=1), rtol=1e-5
+    )
     assert (np.linalg.norm(look.descent, axis=1) / ends.distance).max() < 1e-9
 
 
@@ -55,7 +61,9 @@ def test_one_step_of_the_descent_straightens_a_curve_without_constraint(problem)
     inside = look.costs.feasible
     assert inside.sum() > 20
     left = np.linalg.norm(phi + look.descent, axis=1) / np.linalg.norm(phi, axis=1)
-    assert left[inside].max() < 0.05, "the energy is quadratic in the coefficients and the descent is Newton's step"
+    assert left[inside].max() < 0.05, (
+        "the energy is quadratic in the coefficients and the descent is Newton's step"
+    )
 
 
 def test_the_fingerprint_tells_charts_apart(problem, trained) -> None:
@@ -65,7 +73,10 @@ def test_the_fingerprint_tells_charts_apart(problem, trained) -> None:
         ).fingerprint()
 
     assert problem.fingerprint() == on(JointChart.of(trained.joints.copy()))
-    assert problem.fingerprint() not in (on(trained.manifold), on(JointChart.of(trained.joints[:100])))
+    assert problem.fingerprint() not in (
+        on(trained.manifold),
+        on(JointChart.of(trained.joints[:100])),
+    )
 
 
 @pytest.mark.parametrize("joints", [np.zeros((5, 6)), np.ones(6), np.full((3, 6), np.nan)])

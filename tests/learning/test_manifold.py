@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from constraint_geodesics.constraints.submanifold import extract, submanifold_figures
-from constraint_geodesics.constraints.vector import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
 from constraint_geodesics.learning.learned_manifold import LearnedManifold, ManifoldFileError
+from constraint_geodesics.learning.submanifold import extract, submanifold_figures
 from constraint_geodesics.learning.training import train_manifold
 
 
@@ -19,15 +19,25 @@ def free_joints(scene, count):
 
 def train(scene, params, name, folder, rows=6000, **changes):
     settings = params.manifolds[name].model_copy(
-        update={"epochs": 6, "variance_epochs": 3, "variance_centres": 64, "batch_size": 64, **changes}
+        update={
+            "epochs": 6,
+            "variance_epochs": 3,
+            "variance_centres": 64,
+            "batch_size": 64,
+            **changes,
+        }
     )
     joints = free_joints(scene, rows)
-    return joints, train_manifold(joints, scene.robot, settings, folder, lambda step, figures: None, progress=False)
+    return joints, train_manifold(
+        joints, scene.robot, settings, folder, lambda step, figures: None, progress=False
+    )
 
 
 @pytest.fixture(scope="module", params=["paper", "planner"])
 def trained(request, scene, params, tmp_path_factory):
-    return request.param, *train(scene, params, request.param, tmp_path_factory.mktemp(request.param))
+    return request.param, *train(
+        scene, params, request.param, tmp_path_factory.mktemp(request.param)
+    )
 
 
 def test_the_metric_is_sound_on_the_data_and_grows_away_from_it(trained) -> None:
@@ -61,7 +71,9 @@ def test_saved_and_read_again_it_is_the_same(trained, tmp_path) -> None:
     _, joints, result = trained
     result.manifold.save(tmp_path)
     again = LearnedManifold.load(tmp_path)
-    np.testing.assert_array_equal(again.embed_joints(joints[:9]), result.manifold.embed_joints(joints[:9]))
+    np.testing.assert_array_equal(
+        again.embed_joints(joints[:9]), result.manifold.embed_joints(joints[:9])
+    )
     z = result.manifold.encode(joints[:1500].reshape(2, 750, -1))
     plain = result.manifold.embed(result.manifold.tensor(z)).numpy()
     np.testing.assert_allclose(result.manifold.embed_points(z), plain, atol=1e-6)
@@ -82,10 +94,16 @@ def test_altered_weights_are_refused(trained, tmp_path) -> None:
 
 
 def test_the_variance_phase_leaves_the_mean_alone(scene, params, tmp_path) -> None:
-    _, short = train(scene, params, "planner", tmp_path / "a", rows=2000, epochs=2, variance_epochs=1)
-    _, longer = train(scene, params, "planner", tmp_path / "b", rows=2000, epochs=2, variance_epochs=3)
+    _, short = train(
+        scene, params, "planner", tmp_path / "a", rows=2000, epochs=2, variance_epochs=1
+    )
+    _, longer = train(
+        scene, params, "planner", tmp_path / "b", rows=2000, epochs=2, variance_epochs=3
+    )
     z = torch.randn(5, 6)
-    torch.testing.assert_close(short.manifold.vae.mean(z), longer.manifold.vae.mean(z), rtol=0, atol=0)
+    torch.testing.assert_close(
+        short.manifold.vae.mean(z), longer.manifold.vae.mean(z), rtol=0, atol=0
+    )
     assert not torch.equal(short.manifold.vae.deviation(z), longer.manifold.vae.deviation(z))
 
 

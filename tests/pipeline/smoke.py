@@ -1,4 +1,6 @@
-"""The whole pipeline on small parameters, in a copy of this checkout: `python tests/pipeline/smoke.py FOLDER`."""
+"""The whole pipeline on small parameters, in a copy of this checkout: `python
+tests/pipeline/smoke.py FOLDER`.
+"""
 
 import os
 import shutil
@@ -43,7 +45,13 @@ SMALL: dict[str, Any] = {
 }
 QUICK: dict[str, Any] = {
     "many_bands": {"starts": 4},
-    "gradient_geodesic": {"drawn": 32, "starts": 2, "descent_steps": 3, "polish_steps": 2, "rounds": 1},
+    "gradient_geodesic": {
+        "drawn": 32,
+        "starts": 2,
+        "descent_steps": 3,
+        "polish_steps": 2,
+        "rounds": 1,
+    },
     "bayesian_optimisation": {"drawn": 64, "kept": 10, "initial": 4, "evaluations": 6},
 }
 """Settings of the benchmark's planners that take long."""
@@ -72,7 +80,17 @@ def copy_checkout(folder: Path) -> None:
     for command in (
         ["git", "init", "-q"],
         ["git", "add", "-A"],
-        ["git", "-c", "user.name=smoke", "-c", "user.email=smoke@localhost", "commit", "-q", "-m", "smoke"],
+        [
+            "git",
+            "-c",
+            "user.name=smoke",
+            "-c",
+            "user.email=smoke@localhost",
+            "commit",
+            "-q",
+            "-m",
+            "smoke",
+        ],
     ):
         subprocess.run(command, cwd=folder, check=True)
 
@@ -90,17 +108,21 @@ def shrink_params(folder: Path) -> None:
 
 
 def _one_of_each_kind(planners: dict[str, Any]) -> dict[str, Any]:
-    """Those that the benchmark's parameters name, and of the others the first of its kind, on one query each."""
+    """Those that the benchmark's parameters name, and of the others the first of its kind, on one
+    query each.
+    """
     named = ("BiRRT", "BiRRT + band", "band from many starts")
     first = {planner["kind"]: name for name, planner in reversed(planners.items())}
     kept = {name: planners[name] for name in planners if name in named or name in first.values()}
     return {
         name: {
-            **planner, "queries": 1, "seeds": 2 if name == "BiRRT" else 1,
+            **planner,
+            "queries": 1,
+            "seeds": 2 if name == "BiRRT" else 1,
             "settings": planner.get("settings", {}) | QUICK.get(planner["kind"], {}),
         }
         for name, planner in kept.items()
-    }  # fmt: skip
+    }
 
 
 def _overlay(params: dict[str, Any], changes: dict[str, Any]) -> None:
@@ -112,7 +134,9 @@ def _overlay(params: dict[str, Any], changes: dict[str, Any]) -> None:
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """The copy's own source before the installed one, this environment's programs first, no store from outside."""
+    """The copy's own source before the installed one, this environment's programs first, no store
+    from outside.
+    """
     variables = {k: v for k, v in os.environ.items() if k != "MLFLOW_TRACKING_URI"}
     path = os.pathsep.join([str(Path(sys.executable).parent), variables.get("PATH", "")])
     return variables | {"PYTHONPATH": str(folder / "src"), "PATH": path}
@@ -121,7 +145,9 @@ def environment(folder: Path) -> dict[str, str]:
 def dvc(folder: Path, *arguments: str, capture: bool = True) -> subprocess.CompletedProcess[str]:
     """One dvc command in the copy."""
     command = [sys.executable, "-m", "dvc", *arguments]
-    return subprocess.run(command, cwd=folder, env=environment(folder), capture_output=capture, text=True, check=False)
+    return subprocess.run(
+        command, cwd=folder, env=environment(folder), capture_output=capture, text=True, check=False
+    )
 
 
 def main(folder: Path) -> int:
@@ -129,7 +155,10 @@ def main(folder: Path) -> int:
     began = time.monotonic()
     if folder.exists() and any(folder.iterdir()):
         if not (folder / MARK).is_file():
-            print(f"error: {folder}: not empty, and not a folder that an earlier run made", file=sys.stderr)
+            print(
+                f"error: {folder}: not empty, and not a folder that an earlier run made",
+                file=sys.stderr,
+            )
             return 2
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -144,7 +173,10 @@ def main(folder: Path) -> int:
             env=environment(folder),
             check=True,
         )
-        print(f"\nThe whole pipeline on small parameters took {time.monotonic() - began:.0f} s; see {folder}")
+        print(
+            f"\nThe whole pipeline on small parameters took {time.monotonic() - began:.0f} s; "
+            f"see {folder}"
+        )
     return code
 
 

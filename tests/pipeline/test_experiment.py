@@ -1,4 +1,6 @@
-"""The experiments of docs/experiments.md on the cheapest stage and small parameters: the page's commands run."""
+"""The experiments of docs/experiments.md on the cheapest stage and small parameters: the page's
+commands run.
+"""
 
 import json
 import re
@@ -15,7 +17,11 @@ from tests.test_docs import ROOT, words_of
 pytestmark = pytest.mark.timeout(600)
 
 PAGE = (ROOT / "docs" / "experiments.md").read_text()
-COMMANDS = [words for block in re.findall(r"^```bash\n(.*?)^```", PAGE, re.S | re.M) for words in words_of(block)]
+COMMANDS = [
+    words
+    for block in re.findall(r"^```bash\n(.*?)^```", PAGE, re.S | re.M)
+    for words in words_of(block)
+]
 NAME, STAGE = "printed-sphere", "train_analytic@plane"
 REPORT, CURVES = "reports/train_analytic/plane.json", "reports/train_analytic/plane-learning.csv"
 IN_PLACE = {
@@ -29,9 +35,14 @@ IN_PLACE = {
 
 
 def ran(folder: Path, words: list[str]) -> str:
-    environment = smoke.environment(folder) | {"GIT_AUTHOR_NAME": "smoke", "GIT_COMMITTER_NAME": "smoke"}
+    environment = smoke.environment(folder) | {
+        "GIT_AUTHOR_NAME": "smoke",
+        "GIT_COMMITTER_NAME": "smoke",
+    }
     environment |= {"GIT_AUTHOR_EMAIL": "smoke@localhost", "GIT_COMMITTER_EMAIL": "smoke@localhost"}
-    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        words, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, f"{shlex.join(words)}\n{done.stdout}\n{done.stderr}"
     return done.stdout
 
@@ -46,7 +57,9 @@ def committed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     params["geodesics"] |= {"seeds": [0], "analytic_steps": 640}
     (folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
     stages = yaml.safe_load((folder / "dvc.yaml").read_text())["stages"]
-    (folder / "dvc.yaml").write_text(yaml.safe_dump({"stages": {"train_analytic": stages["train_analytic"]}}))
+    (folder / "dvc.yaml").write_text(
+        yaml.safe_dump({"stages": {"train_analytic": stages["train_analytic"]}})
+    )
     for name in ("dvc.yaml", "dvc.lock"):
         (folder / "stages" / name).unlink(missing_ok=True)
     ran(folder, ["dvc", "repro", STAGE])
@@ -57,7 +70,11 @@ def committed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def of_the_page(*beginning: str, holding: str = "") -> list[str]:
     """The page's first command of a kind, on what the small run has."""
-    found = [words for words in COMMANDS if words[: len(beginning)] == list(beginning) and holding in " ".join(words)]
+    found = [
+        words
+        for words in COMMANDS
+        if words[: len(beginning)] == list(beginning) and holding in " ".join(words)
+    ]
     assert found, beginning
     kept = [word for word in found[0] if not re.search(r"^reports/.*(cup|planner)\S*json", word)]
     return [IN_PLACE.get(word, word) for word in kept]
@@ -69,7 +86,9 @@ def test_an_experiment_is_run_compared_brought_back_and_undone(committed: Path) 
     after = json.loads((committed / REPORT).read_text())
     assert after != before
     assert "geodesics.reward.form" in ran(committed, of_the_page("dvc", "params", "diff"))
-    assert "mean_ratio_mean" in ran(committed, of_the_page("dvc", "metrics", "diff", holding="sphere"))
+    assert "mean_ratio_mean" in ran(
+        committed, of_the_page("dvc", "metrics", "diff", holding="sphere")
+    )
     assert NAME in ran(committed, of_the_page("dvc", "exp", "show"))
     assert "geodesics.reward.form" in ran(committed, of_the_page("dvc", "exp", "diff"))
     ran(committed, of_the_page("dvc", "plots", "diff"))

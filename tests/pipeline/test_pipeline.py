@@ -1,4 +1,6 @@
-"""The whole pipeline, from the first configuration to the report, and what it promises about running again."""
+"""The whole pipeline, from the first configuration to the report, and what it promises about
+running again.
+"""
 
 import json
 import re
@@ -14,21 +16,29 @@ import pytest
 import yaml
 from mlflow.tracking import MlflowClient
 
-from constraint_geodesics.evaluation.benchmark import read_table
+from constraint_geodesics.benchmark.runner import read_table
+from constraint_geodesics.recording.recording import read_recording, same_recordings
 from constraint_geodesics.tracking.experiment import fetch_artifacts
-from constraint_geodesics.tracking.recording import read_recording, same_recordings
 from tests.pipeline import smoke
 
 pytestmark = [pytest.mark.xdist_group("pipeline"), pytest.mark.timeout(600)]
 
-SHARED = {"train_policies@planner", "build_planner", "benchmark_plans", "execute_paths", "benchmark_policies"}
+SHARED = {
+    "train_policies@planner",
+    "build_planner",
+    "benchmark_plans",
+    "execute_paths",
+    "benchmark_policies",
+}
 """What is made from all constraints together, and what is measured with it."""
 BENCHMARK = "stages/dvc.yaml:report_benchmark"
 LEARNED = "data/recordings/train_geodesics/planner-level_cup/query0-learned_geodesic-seed0.rrd"
 
 
 def stages_to_run(folder: Path) -> set[str]:
-    """Names of the stages that `dvc repro` would run now; the benchmark of all planners is not among them."""
+    """Names of the stages that `dvc repro` would run now; the benchmark of all planners is not
+    among them.
+    """
     result = smoke.dvc(folder, "status", "--json", "dvc.yaml")
     return set(yaml.safe_load(result.stdout))
 
@@ -56,18 +66,29 @@ def test_every_query_keeps_its_row(finished: Path) -> None:
 
 
 def test_the_report_opens_offline(finished: Path) -> None:
-    page = re.sub(r'src="data:image/png;base64,[^"]*"', "", (finished / "reports/index.html").read_text())
+    page = re.sub(
+        r'src="data:image/png;base64,[^"]*"', "", (finished / "reports/index.html").read_text()
+    )
     assert not re.search(r"src=|<link|@import|url\(", page)
     # nothing but what a person may follow: the runs in the dashboard of this checkout
-    assert not re.search(r"https?:|//", re.sub(r'<a href="http://127\.0\.0\.1:5000/#/[^"]*">', "", page))
-    for name in ("fig2_analytic_submanifolds", "fig3_plane_search", "fig4a_latent_metric", "fig4c_geodesics"):
+    assert not re.search(
+        r"https?:|//", re.sub(r'<a href="http://127\.0\.0\.1:5000/#/[^"]*">', "", page)
+    )
+    for name in (
+        "fig2_analytic_submanifolds",
+        "fig3_plane_search",
+        "fig4a_latent_metric",
+        "fig4c_geodesics",
+    ):
         assert (finished / f"reports/figures/{name}.png").stat().st_size > 5000
     assert "learned geodesic" in (finished / "reports/table.md").read_text()
 
 
 def test_recordings_replay_the_path(finished: Path) -> None:
     table = pd.read_csv(finished / "reports/train_geodesics/planner-level_cup.csv")
-    row = table[(table["planner"] == "learned_geodesic") & (table["query"] == 0) & (table["seed"] == 0)].iloc[0]
+    row = table[
+        (table["planner"] == "learned_geodesic") & (table["query"] == 0) & (table["seed"] == 0)
+    ].iloc[0]
     assert row["recording"] == LEARNED
     summary = read_recording(finished / LEARNED)
     queries = pd.read_csv(finished / "data/joints/level_cup/queries.csv")
@@ -78,9 +99,19 @@ def test_recordings_replay_the_path(finished: Path) -> None:
 
 
 def test_readme_s_replay_opens_valid_paths_of_both_planners(finished: Path) -> None:
-    (command,) = re.findall(r"^(geodesics replay --constraint .*birrt)$", (smoke.ROOT / "README.md").read_text(), re.M)
-    replay, asked = [sys.executable, "-m", "constraint_geodesics.cli", "replay"], command.split()[2:]
-    run = {"cwd": finished, "env": smoke.environment(finished), "capture_output": True, "text": True}
+    (command,) = re.findall(
+        r"^(geodesics replay --constraint .*birrt)$", (smoke.ROOT / "README.md").read_text(), re.M
+    )
+    replay, asked = (
+        [sys.executable, "-m", "constraint_geodesics.cli", "replay"],
+        command.split()[2:],
+    )
+    run = {
+        "cwd": finished,
+        "env": smoke.environment(finished),
+        "capture_output": True,
+        "text": True,
+    }
     done = subprocess.run([*replay, *asked, "--save", ".geodesics/both.rrd"], **run, check=False)
     assert done.returncode == 0, done.stderr
     numbers = re.findall(r"(\d+) \((?:learned_geodesic|birrt)\)", done.stderr)
@@ -89,7 +120,9 @@ def test_readme_s_replay_opens_valid_paths_of_both_planners(finished: Path) -> N
     assert [entries[number]["planner"] for number in numbers] == ["learned_geodesic", "birrt"]
     assert entries[numbers[0]]["manifold"] == "planner"
     for number in numbers:
-        same = [entry for entry in entries.values() if entry["planner"] == entries[number]["planner"]]
+        same = [
+            entry for entry in entries.values() if entry["planner"] == entries[number]["planner"]
+        ]
         assert entries[number]["valid"] or not any(entry["valid"] for entry in same)
 
 
@@ -99,12 +132,21 @@ def test_recordings_share_their_meshes(finished: Path) -> None:
     assert max(sizes.values()) <= 300_000
 
 
-def test_the_built_planner_is_the_registered_champion(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_built_planner_is_the_registered_champion(
+    finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(finished)
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     with fetch_artifacts("models:/constraint_geodesics@champion") as registered:
-        for name in ("planner.json", "manifold.safetensors", "policies.safetensors", "roadmaps.safetensors"):
-            assert (registered / name).read_bytes() == (finished / "data/planner" / name).read_bytes()
+        for name in (
+            "planner.json",
+            "manifold.safetensors",
+            "policies.safetensors",
+            "roadmaps.safetensors",
+        ):
+            assert (registered / name).read_bytes() == (
+                finished / "data/planner" / name
+            ).read_bytes()
 
 
 def test_runs_are_grouped_in_mlflow(finished: Path) -> None:
@@ -114,29 +156,43 @@ def test_runs_are_grouped_in_mlflow(finished: Path) -> None:
     parents = {run.info.run_name: run for run in runs if "mlflow.parentRunId" not in run.data.tags}
     assert len(parents) == len([run for run in runs if "mlflow.parentRunId" not in run.data.tags])
     parent = parents["train_geodesics planner-level_cup"]
-    children = [run for run in runs if run.data.tags.get("mlflow.parentRunId") == parent.info.run_id]
+    children = [
+        run for run in runs if run.data.tags.get("mlflow.parentRunId") == parent.info.run_id
+    ]
     assert len(children) == 2
     assert "seeds/success_mean" in parent.data.metrics
     assert parent.data.tags.items() >= {"constraint": "level_cup", "manifold": "planner"}.items()
-    assert {run.data.tags["recording"] for run in children} == {LEARNED, LEARNED.replace("seed0", "seed1")}
+    assert {run.data.tags["recording"] for run in children} == {
+        LEARNED,
+        LEARNED.replace("seed0", "seed1"),
+    }
     assert len(client.get_metric_history(parent.info.run_id, "seeds/saving_mean")) > 1
     assert parent.data.tags["dvc_stage"] == "train_geodesics@planner-level_cup"
     assert {run.info.status for run in runs} == {"FINISHED"}
 
 
 def test_the_same_seeds_give_the_same_figures_and_recordings(finished: Path) -> None:
-    before = {name: (finished / name).read_bytes() for name in (
-        "reports/train_geodesics/planner-level_cup.csv", "reports/train_geodesics/planner-level_cup.json", LEARNED,
-    )}  # fmt: skip
-    # run by hand, the stage leaves DVC's record of what is up to date alone; equal recordings differ in their bytes
+    before = {
+        name: (finished / name).read_bytes()
+        for name in (
+            "reports/train_geodesics/planner-level_cup.csv",
+            "reports/train_geodesics/planner-level_cup.json",
+            LEARNED,
+        )
+    }
+    # run by hand, the stage leaves DVC's record of what is up to date alone; equal recordings
+    # differ in their bytes
     output = "data/recordings/train_geodesics/planner-level_cup"
     shutil.copytree(finished / output, finished / ".geodesics" / "outputs" / output)
     command = [sys.executable, "stages/train_geodesics.py", "planner", "level_cup"]
-    subprocess.run(command, cwd=finished, env=smoke.environment(finished), check=True, capture_output=True)
+    subprocess.run(
+        command, cwd=finished, env=smoke.environment(finished), check=True, capture_output=True
+    )
     for name in before:
         if name.endswith(".csv"):
             old, new = (
-                pd.read_csv(file).drop(columns="time_s") for file in (_kept(finished, before[name]), finished / name)
+                pd.read_csv(file).drop(columns="time_s")
+                for file in (_kept(finished, before[name]), finished / name)
             )
             pd.testing.assert_frame_equal(old, new, rtol=0, atol=1e-6)
     assert (finished / "reports/train_geodesics/planner-level_cup.json").read_bytes() == before[
@@ -164,25 +220,39 @@ def test_a_tolerance_reruns_its_constraint_only(finished: Path) -> None:
     changed = stages_to_run(finished)
     file.write_text(kept)
     assert changed == {
-        "label_joints@level_cup", "extract_submanifold@paper-level_cup", "extract_submanifold@planner-level_cup",
-        "train_geodesics@planner-level_cup", "train_paper_geodesics@paper-level_cup", "benchmark_planners@level_cup",
-        "benchmark_geometry", "report", *SHARED,
-    }  # fmt: skip
+        "label_joints@level_cup",
+        "extract_submanifold@paper-level_cup",
+        "extract_submanifold@planner-level_cup",
+        "train_geodesics@planner-level_cup",
+        "train_paper_geodesics@paper-level_cup",
+        "benchmark_planners@level_cup",
+        "benchmark_geometry",
+        "report",
+        *SHARED,
+    }
 
 
 def test_a_new_constraint_reruns_what_is_its_own_or_shared(finished: Path) -> None:
     file = finished / "params.yaml"
     kept = file.read_text()
     params = yaml.safe_load(kept)
-    params["constraints"]["upright"] = {**params["constraints"]["level_cup"], "description": "another"}
+    params["constraints"]["upright"] = {
+        **params["constraints"]["level_cup"],
+        "description": "another",
+    }
     file.write_text(yaml.safe_dump(params, sort_keys=False))
     changed = stages_to_run(finished)
     file.write_text(kept)
     assert changed == {
-        "label_joints@upright", "extract_submanifold@paper-upright", "extract_submanifold@planner-upright",
-        "train_geodesics@planner-upright", "benchmark_planners@upright", "report", "train_policies@planner",
+        "label_joints@upright",
+        "extract_submanifold@paper-upright",
+        "extract_submanifold@planner-upright",
+        "train_geodesics@planner-upright",
+        "benchmark_planners@upright",
+        "report",
+        "train_policies@planner",
         "build_planner",
-    }  # fmt: skip
+    }
 
 
 def test_a_comment_in_the_report_retrains_nothing(finished: Path) -> None:
@@ -194,7 +264,9 @@ def test_a_comment_in_the_report_retrains_nothing(finished: Path) -> None:
     assert changed == {"report"}
 
 
-def test_the_benchmark_has_a_row_for_every_planner_and_says_where_it_is_from(finished: Path) -> None:
+def test_the_benchmark_has_a_row_for_every_planner_and_says_where_it_is_from(
+    finished: Path,
+) -> None:
     result = smoke.dvc(finished, "repro", BENCHMARK)
     assert result.returncode == 0, result.stderr
     params = yaml.safe_load((finished / "params.yaml").read_text())["bench"]

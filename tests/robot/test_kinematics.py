@@ -3,9 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from constraint_geodesics.constraints.scene import Scene
-from constraint_geodesics.robot.bullet import data_path
 from constraint_geodesics.robot.kinematics import RobotError, load_robot, rotation_from_rpy
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.world import data_path
 
 ROBOTS = ["scene", "kuka_scene"]
 
@@ -31,7 +31,10 @@ def test_the_jacobian_is_the_poses_derivative(name: str, request: pytest.Fixture
     jacobian, (_, rotation), step = robot.jacobian(q), robot.forward(q), 1e-6
     for joint in range(robot.dof):
         shift = step * np.eye(robot.dof)[joint]
-        (ahead, turned_ahead), (behind, turned_behind) = robot.forward(q + shift), robot.forward(q - shift)
+        (ahead, turned_ahead), (behind, turned_behind) = (
+            robot.forward(q + shift),
+            robot.forward(q - shift),
+        )
         np.testing.assert_allclose(jacobian[:, :3, joint], (ahead - behind) / (2 * step), atol=1e-8)
         spin = (turned_ahead - turned_behind) / (2 * step) @ rotation.transpose(0, 2, 1)
         np.testing.assert_allclose(jacobian[:, 5, joint], spin[:, 1, 0], atol=1e-8)

@@ -23,8 +23,8 @@ import yaml
 from mlflow import MlflowClient
 from mlflow.entities import Run
 
-from constraint_geodesics.compute import parallel_map
 from constraint_geodesics.params import ComputeParams, ConstraintParams, PoseParams, load_params
+from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.tracking import experiment
 from constraint_geodesics.tracking.experiment import (
     ChildRun,
@@ -76,7 +76,9 @@ def runs_of(uri: str, experiment: str) -> dict[str, Run]:
 
 def figures_of(run: Run) -> dict[str, float]:
     """Its metrics without those of the machine, which a run has if it takes long enough."""
-    return {name: value for name, value in run.data.metrics.items() if not name.startswith("system/")}
+    return {
+        name: value for name, value in run.data.metrics.items() if not name.startswith("system/")
+    }
 
 
 def work(task: tuple[ChildRun, int]) -> dict[str, float]:
@@ -89,12 +91,24 @@ def work(task: tuple[ChildRun, int]) -> dict[str, float]:
 
 def test_a_stage_is_a_parent_its_seeds_are_children(root: Path) -> None:
     reference = PoseParams(position_m=(0.4, 0, 0.3), rpy_rad=(0, 0, 0))
-    held = ConstraintParams(description="level", axes=(0, 0, 0, 1, 1, 0), tolerance=(0,) * 6, reference=reference)
-    params = {"seeds": [1, 3], "constraint": held, "long": "x" * 7000, **{f"p{i}": i for i in range(150)}}
+    held = ConstraintParams(
+        description="level", axes=(0, 0, 0, 1, 1, 0), tolerance=(0,) * 6, reference=reference
+    )
+    params = {
+        "seeds": [1, 3],
+        "constraint": held,
+        "long": "x" * 7000,
+        **{f"p{i}": i for i in range(150)},
+    }
     about = Subject({"constraint": "cup"}, {"manifold": {"latent_dim": 6}})
-    with tracked_stage("train", "planner-cup", params, [], experiment="tree", root=root, subject=about) as stage:
+    with tracked_stage(
+        "train", "planner-cup", params, [], experiment="tree", root=root, subject=about
+    ) as stage:
         tasks = [(stage.child(f"seed {seed}", {"seed": seed}), seed) for seed in (1, 3)]
-        curves = [[{"steps": 1.0, "loss": 1.0}, {"steps": 2.0, "loss": 5.0}], [{"steps": 2.0, "loss": 3.0}]]
+        curves = [
+            [{"steps": 1.0, "loss": 1.0}, {"steps": 2.0, "loss": 5.0}],
+            [{"steps": 2.0, "loss": 3.0}],
+        ]
         stage.summarise(parallel_map(work, tasks, TWO), curves)
     runs = runs_of(tracking_uri(root), "tree")
     assert set(runs) == {"train planner-cup", "planner-cup seed 1", "planner-cup seed 3"}
@@ -110,14 +124,23 @@ def test_a_stage_is_a_parent_its_seeds_are_children(root: Path) -> None:
     assert parent.data.tags.items() >= tags.items()
     assert parent.data.params["manifold.latent_dim"] == "6"
     assert figures_of(parent) == {
-        "seeds/length_mean": 2.0, "seeds/length_std": 1.0, "seeds/length_count": 2.0,
-        "seeds/loss_mean": 4.0, "seeds/loss_std": 1.0,
-    }  # fmt: skip
-    (mean,) = MlflowClient(tracking_uri(root)).get_metric_history(parent.info.run_id, "seeds/loss_mean")
+        "seeds/length_mean": 2.0,
+        "seeds/length_std": 1.0,
+        "seeds/length_count": 2.0,
+        "seeds/loss_mean": 4.0,
+        "seeds/loss_std": 1.0,
+    }
+    (mean,) = MlflowClient(tracking_uri(root)).get_metric_history(
+        parent.info.run_id, "seeds/loss_mean"
+    )
     assert mean.step == 2, "the only step that both have"
 
-    assert child.data.tags.items() >= {**tags, "seed": "3", "mlflow.parentRunId": stage.run_id}.items()
-    assert child.data.params == {**parent.data.params, "seed": "3"}, "children of different runs can be compared"
+    assert (
+        child.data.tags.items() >= {**tags, "seed": "3", "mlflow.parentRunId": stage.run_id}.items()
+    )
+    assert child.data.params == {**parent.data.params, "seed": "3"}, (
+        "children of different runs can be compared"
+    )
     history = MlflowClient(tracking_uri(root)).get_metric_history(child.info.run_id, "loss")
     assert [(point.step, point.value) for point in history] == [(0, 4.0), (1, 3.5), (2, 3 + 1 / 3)]
     assert child.data.metrics == {"loss": 3 + 1 / 3, "final/length": 3.0}
@@ -125,23 +148,40 @@ def test_a_stage_is_a_parent_its_seeds_are_children(root: Path) -> None:
 
 def test_a_run_says_where_its_paths_are_recorded(root: Path) -> None:
     def row(planner: str, seed: int, recording: str) -> dict[str, Any]:
-        return {"planner": planner, "query": 0, "seed": seed, "length_rad": 1.5, "recording": recording}
+        return {
+            "planner": planner,
+            "query": 0,
+            "seed": seed,
+            "length_rad": 1.5,
+            "recording": recording,
+        }
 
     with tracked_stage("train", "cup", {}, [], experiment="recorded", root=root) as stage:
         for seed in (0, 1):
             with stage.child(f"seed {seed}", {"seed": seed}):
                 pass
         stage.recordings(
-            [row("line", 0, "line.rrd"), row("ours", 0, "a.rrd"), row("ours", 0, ""), row("ours", 1, "b.rrd")], "ours"
+            [
+                row("line", 0, "line.rrd"),
+                row("ours", 0, "a.rrd"),
+                row("ours", 0, ""),
+                row("ours", 1, "b.rrd"),
+            ],
+            "ours",
         )
     runs = runs_of(tracking_uri(root), "recorded")
-    assert [runs[f"cup seed {seed}"].data.tags["recording"] for seed in (0, 1)] == ["a.rrd", "b.rrd"]
+    assert [runs[f"cup seed {seed}"].data.tags["recording"] for seed in (0, 1)] == [
+        "a.rrd",
+        "b.rrd",
+    ]
     listed = (root / "mlartifacts/recorded" / stage.run_id / "artifacts/recordings.md").read_text()
     for text in (listed, runs["train cup"].data.tags["mlflow.note.content"]):
         assert re.findall(r"`geodesics replay (\S+)`", text) == ["line.rrd", "a.rrd", "b.rrd"]
 
 
-def test_the_machine_is_watched_while_a_stage_runs(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_machine_is_watched_while_a_stage_runs(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(experiment, "SYSTEM_EVERY_S", 0.05)
     with tracked_stage("train", "cup", {}, [], experiment="watched", root=root) as stage:
         time.sleep(0.5)
@@ -150,7 +190,9 @@ def test_the_machine_is_watched_while_a_stage_runs(root: Path, monkeypatch: pyte
     assert "system/cpu_utilization_percentage" in metrics
 
 
-def test_a_run_of_an_experiment_is_named_after_it(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_of_an_experiment_is_named_after_it(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("DVC_EXP_NAME", "tilt-5")
     with (
         tracked_stage("train", "cup", {}, [], experiment="named after", root=root) as stage,
@@ -164,11 +206,18 @@ def test_a_run_of_an_experiment_is_named_after_it(root: Path, monkeypatch: pytes
 
 def test_runs_are_found_by_constraint_manifold_and_reward() -> None:
     params = load_params(Path(__file__).resolve().parents[2] / "params.yaml")
-    found = subject_of(params, constraint="slide", manifold="planner", reward=params.policies.reward)
+    found = subject_of(
+        params, constraint="slide", manifold="planner", reward=params.policies.reward
+    )
     assert set(found.tags) == {"constraint", "manifold", "reward"}
     assert found.tags["reward"].startswith("corrected b=")
-    assert found.params == {"constraint": params.constraints["slide"], "manifold": params.manifolds["planner"]}
-    assert subject_of(params, manifold="sphere") == Subject({"manifold": "sphere"}), "a known manifold is in no file"
+    assert found.params == {
+        "constraint": params.constraints["slide"],
+        "manifold": params.manifolds["planner"],
+    }
+    assert subject_of(params, manifold="sphere") == Subject({"manifold": "sphere"}), (
+        "a known manifold is in no file"
+    )
 
 
 def test_figures_that_some_seeds_lack_are_counted(root: Path) -> None:
@@ -176,9 +225,16 @@ def test_figures_that_some_seeds_lack_are_counted(root: Path) -> None:
         for seed in (1, 2, 3):
             with stage.child(f"seed {seed}", {}):
                 pass
-        stage.summarise([{"a": 1.0, "b": math.nan}, {"a": math.nan, "b": math.nan}, {"a": 3.0, "b": math.inf}])
+        stage.summarise(
+            [{"a": 1.0, "b": math.nan}, {"a": math.nan, "b": math.nan}, {"a": 3.0, "b": math.inf}]
+        )
     figures = figures_of(runs_of(tracking_uri(root), "gaps")["train gaps"])
-    assert figures == {"seeds/a_mean": 2.0, "seeds/a_std": 1.0, "seeds/a_count": 2.0, "seeds/b_count": 0.0}
+    assert figures == {
+        "seeds/a_mean": 2.0,
+        "seeds/a_std": 1.0,
+        "seeds/a_count": 2.0,
+        "seeds/b_count": 0.0,
+    }
 
 
 def test_the_json_report_and_the_store_hold_the_same_numbers(root: Path, tmp_path: Path) -> None:
@@ -196,12 +252,23 @@ def test_the_json_report_and_the_store_hold_the_same_numbers(root: Path, tmp_pat
         stage.metric_logger()(7, {"epoch_loss": 0.5})
     text = (tmp_path / "new" / "cup.json").read_text("utf-8")
     assert json.loads(text) == {
-        "curve": [1.0, None], "length": {"mean": 0.333333333, "std": 0.5, "worst": None}, "name": "größer", "rows": 3,
-        "valid": True, "zero": 0.0,
-    }  # fmt: skip
+        "curve": [1.0, None],
+        "length": {"mean": 0.333333333, "std": 0.5, "worst": None},
+        "name": "größer",
+        "rows": 3,
+        "valid": True,
+        "zero": 0.0,
+    }
     assert "-0" not in text
     assert (tmp_path / "again.json").read_text("utf-8") == text
-    mirrored = {"length/mean": 0.333333333, "length/std": 0.5, "rows": 3, "valid": 1, "zero": 0, "epoch_loss": 0.5}
+    mirrored = {
+        "length/mean": 0.333333333,
+        "length/std": 0.5,
+        "rows": 3,
+        "valid": 1,
+        "zero": 0,
+        "epoch_loss": 0.5,
+    }
     assert figures_of(runs_of(tracking_uri(root), "report")["label cup"]) == mirrored
 
 
@@ -219,8 +286,12 @@ def test_sources_that_differ_make_a_run_dirty_but_reports_do_not(root: Path) -> 
     (root / "stray.py").unlink()
 
 
-@pytest.mark.parametrize(("error", "status"), [(ValueError("no"), "FAILED"), (KeyboardInterrupt(), "KILLED")])
-def test_a_stage_that_fails_says_so_and_ends_its_children(root: Path, error: BaseException, status: str) -> None:
+@pytest.mark.parametrize(
+    ("error", "status"), [(ValueError("no"), "FAILED"), (KeyboardInterrupt(), "KILLED")]
+)
+def test_a_stage_that_fails_says_so_and_ends_its_children(
+    root: Path, error: BaseException, status: str
+) -> None:
     def stage() -> None:
         with tracked_stage("train", "cup", {}, [], experiment=status, root=root) as run:
             run.child("abandoned", {}).__enter__()
@@ -261,7 +332,9 @@ def test_processes_may_make_the_store_at_once(tmp_path: Path) -> None:
     assert {run.info.status for run in runs.values()} == {"FINISHED"}
 
 
-def test_the_named_store_is_used(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_named_store_is_used(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "sqlite:///elsewhere/runs.db")
     assert tracking_uri(root) == f"sqlite:///{tmp_path}/elsewhere/runs.db"
@@ -269,7 +342,16 @@ def test_the_named_store_is_used(root: Path, tmp_path: Path, monkeypatch: pytest
         stage.figure(root / "data" / "joints.csv")
     monkeypatch.delenv("MLFLOW_TRACKING_URI")
     assert set(runs_of(f"sqlite:///{tmp_path}/elsewhere/runs.db", "named")) == {"label cup"}
-    kept = tmp_path / "elsewhere" / "mlartifacts" / "named" / stage.run_id / "artifacts" / "figures" / "joints.csv"
+    kept = (
+        tmp_path
+        / "elsewhere"
+        / "mlartifacts"
+        / "named"
+        / stage.run_id
+        / "artifacts"
+        / "figures"
+        / "joints.csv"
+    )
     assert kept.read_text() == "1,2\n"
     assert MlflowClient(tracking_uri(root)).get_experiment_by_name("named") is None
 
@@ -314,7 +396,8 @@ def test_a_missing_input_stops_the_stage_before_it_has_a_run(root: Path) -> None
 PIPELINE: dict[str, Any] = {
     "stages": {
         "draw": {
-            "cmd": "mkdir -p data/joints/sub && echo 1 > data/joints/a.csv && echo 2 > data/joints/sub/b.csv"
+            "cmd": "mkdir -p data/joints/sub && echo 1 > data/joints/a.csv"
+            " && echo 2 > data/joints/sub/b.csv"
             " && echo 3 > data/card.json",
             "outs": ["data/joints", "data/card.json"],
         },

@@ -1,4 +1,6 @@
-"""The planner in a real registry: registered, loaded by its alias, and served by MLflow's own command."""
+"""The planner in a real registry: registered, loaded by its alias, and served by MLflow's own
+command.
+"""
 
 import json
 import os
@@ -35,7 +37,7 @@ from constraint_geodesics.tracking.experiment import (
 from constraint_geodesics.tracking.registry import register_planner
 
 ROOT = Path(__file__).resolve().parents[2]
-CODE = ROOT / "src/constraint_geodesics/served_model.py"
+CODE = ROOT / "src/constraint_geodesics/tracking/served_model.py"
 QUERY = {
     "start": [1.329923, -0.584036, -3.766650, -2.008429, 0.728803, -2.581396],
     "goal": [1.071549, -0.217480, -1.682647, -2.906655, -0.337949, 1.348704],
@@ -72,7 +74,9 @@ def registered(root: Path, files: Path) -> str:
 
 
 def champion(root: Path) -> str:
-    return str(client_of(tracking_uri(root)).get_model_version_by_alias(PLANNER_MODEL, CHAMPION).version)
+    return str(
+        client_of(tracking_uri(root)).get_model_version_by_alias(PLANNER_MODEL, CHAMPION).version
+    )
 
 
 def other_files(folder: Path) -> Path:
@@ -86,11 +90,15 @@ def test_the_champion_plans_without_a_server(root: Path, monkeypatch: pytest.Mon
     monkeypatch.chdir(root)
     with Planner.load(ADDRESS) as planner, Planner.load(PACKAGED) as packaged:
         assert planner.source == f"MLflow's {ADDRESS}"
-        path, same = (each.plan(QUERY["start"], QUERY["goal"], "level_cup") for each in (planner, packaged))
+        path, same = (
+            each.plan(QUERY["start"], QUERY["goal"], "level_cup") for each in (planner, packaged)
+        )
     np.testing.assert_array_equal(path.joints, same.joints)
 
 
-@pytest.mark.parametrize("address", [f"models:/{PLANNER_MODEL}@nobody", f"models:/{PLANNER_MODEL}/9", "runs:/0/x"])
+@pytest.mark.parametrize(
+    "address", [f"models:/{PLANNER_MODEL}@nobody", f"models:/{PLANNER_MODEL}/9", "runs:/0/x"]
+)
 def test_what_is_not_there_is_said_in_one_line(root: Path, address: str) -> None:
     with pytest.raises(TrackingError, match=address) as caught, fetch_artifacts(address, root):
         pass
@@ -103,7 +111,9 @@ def test_files_that_were_deleted_are_missed_by_name(copy: Path) -> None:
         pass
 
 
-def test_other_files_are_a_new_version_and_equal_ones_are_not(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_files_are_a_new_version_and_equal_ones_are_not(
+    copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert registered(copy, PACKAGED) == "1"
     assert registered(copy, other_files(copy / "other")) == "2"
     assert champion(copy) == "2"
@@ -117,11 +127,18 @@ def test_other_files_are_a_new_version_and_equal_ones_are_not(copy: Path, monkey
 def test_a_model_has_a_signature_an_example_and_nothing_pickled(root: Path) -> None:
     (model,) = (root / "mlartifacts").rglob("MLmodel")
     files = {file.name for file in model.parent.rglob("*") if file.is_file()}
-    assert {"served_model.py", "input_example.json", "planner.json", "manifold.safetensors"} <= files
+    assert {
+        "served_model.py",
+        "input_example.json",
+        "planner.json",
+        "manifold.safetensors",
+    } <= files
     assert not [name for name in files if name.endswith((".pkl", ".pickle"))]
     needed = (model.parent / "requirements.txt").read_text().split()
     assert f"torch=={torch.__version__.split('+')[0]}" in [line.split("+")[0] for line in needed]
-    assert not [line for line in needed if line.startswith("constraint")], "no index has it, or another's"
+    assert not [line for line in needed if line.startswith("constraint")], (
+        "no index has it, or another's"
+    )
     for name in ("start", "goal", "constraint", "status", "joints", "times"):
         assert f'"name": "{name}"' in model.read_text()
 
@@ -130,14 +147,25 @@ def test_the_champion_is_served_as_its_page_says(root: Path) -> None:
     page = (ROOT / "docs" / "mlflow.md").read_text()
     (serve,) = re.findall(r"^(mlflow models serve .*)$", page, re.M)
     (body,) = re.findall(r"^curl \S+ .*? -d '(.*?)'$", page, re.M | re.S)
-    with dashboard(root) as runs, served(serve.split(), runs) as address, ThreadPoolExecutor(4) as pool:
+    with (
+        dashboard(root) as runs,
+        served(serve.split(), runs) as address,
+        ThreadPoolExecutor(4) as pool,
+    ):
         (path,) = ask(address, body)
         at_once = list(pool.map(lambda _: ask(address, body)[0], range(8)))
-        others = [QUERY | {"constraint": "nothing"}, QUERY | {"constraint": '{"axes": [0, 0, 0, 1, 1, 0]}'}]
+        others = [
+            QUERY | {"constraint": "nothing"},
+            QUERY | {"constraint": '{"axes": [0, 0, 0, 1, 1, 0]}'},
+        ]
         unknown, own = ask(address, json.dumps({"dataframe_records": others}))
-    assert all(answer["joints"] == path["joints"] for answer in at_once), "requests do not disturb each other"
+    assert all(answer["joints"] == path["joints"] for answer in at_once), (
+        "requests do not disturb each other"
+    )
     assert path["status"] == own["status"] == "solved"
-    np.testing.assert_allclose([path["joints"][0], path["joints"][-1]], [QUERY["start"], QUERY["goal"]], atol=1e-6)
+    np.testing.assert_allclose(
+        [path["joints"][0], path["joints"][-1]], [QUERY["start"], QUERY["goal"]], atol=1e-6
+    )
     assert len(path["times"]) == len(path["joints"]) == path["rows"]
     assert unknown["status"] == "bad_query"
     assert "level_cup" in unknown["explanation"]
@@ -152,11 +180,15 @@ def served(command: list[str], runs: str) -> Iterator[str]:
     assert command[command.index("--host") + 1] == "127.0.0.1"
     command[command.index("--port") + 1] = str(port)
     environment = {
-        **os.environ, "MLFLOW_TRACKING_URI": runs, "MLFLOW_DISABLE_TELEMETRY": "true",
+        **os.environ,
+        "MLFLOW_TRACKING_URI": runs,
+        "MLFLOW_DISABLE_TELEMETRY": "true",
         "PATH": f"{Path(sys.executable).parent}:/usr/bin",
-    }  # fmt: skip
+    }
     with tempfile.TemporaryFile() as log:
-        server = subprocess.Popen(command, stdout=log, stderr=log, env=environment, start_new_session=True)
+        server = subprocess.Popen(
+            command, stdout=log, stderr=log, env=environment, start_new_session=True
+        )
         try:
             deadline = time.monotonic() + 90
             while time.monotonic() < deadline and server.poll() is None:
@@ -172,6 +204,10 @@ def served(command: list[str], runs: str) -> Iterator[str]:
 
 
 def ask(address: str, body: str) -> list[dict[str, Any]]:
-    request = urllib.request.Request(f"{address}/invocations", body.encode(), {"Content-Type": "application/json"})
-    answer: list[dict[str, Any]] = json.loads(urllib.request.urlopen(request, timeout=120).read())["predictions"]
+    request = urllib.request.Request(
+        f"{address}/invocations", body.encode(), {"Content-Type": "application/json"}
+    )
+    answer: list[dict[str, Any]] = json.loads(urllib.request.urlopen(request, timeout=120).read())[
+        "predictions"
+    ]
     return answer

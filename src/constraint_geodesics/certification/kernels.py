@@ -1,42 +1,51 @@
-"""Compiled kinematics by unit quaternions, and a proven bound of a constraint along straight joint lines.
+"""Compiled kinematics by unit quaternions, and a proven bound of a constraint along straight joint
+lines.
 
-Nothing here is shared with the search.  Shapes: D joints, S stations (configurations along a path), one piece
-between each two; a piece is the straight line q(t) = q₀ + t d, 0 ≤ t ≤ 1, with the increments d.
+Nothing here is shared with the search.  Shapes: D joints, S stations (configurations along a path),
+one piece between each two; a piece is the straight line q(t) = q₀ + t d, 0 ≤ t ≤ 1, with the
+increments d.
 
-The chain: frame j is joint j's, its z axis the joint axis; `turns` (D + 1, 4) quaternions (w, x, y, z) and `offsets`
-(D + 1, 3) [m] lead from frame j − 1 (the base, for j = 0) to frame j at zero, the last ones from the last joint to
-the tool, `lengths` (D + 1,) are theirs; `prismatic` (D,) bool.
+The chain: frame j is joint j's, its z axis the joint axis; `turns` (D + 1, 4) quaternions (w, x, y,
+z) and `offsets` (D + 1, 3) [m] lead from frame j − 1 (the base, for j = 0) to frame j at zero, the
+last ones from the last joint to the tool, `lengths` (D + 1,) are theirs; `prismatic` (D,) bool.
 
-What is held is read off a curve x(t) in at most four dimensions, whose first axis e is where x should point:
+What is held is read off a curve x(t) in at most four dimensions, whose first axis e is where x
+should point:
 
-- swing (two held angles, axis k free): x = u, the unit vector R R_refᵀ e_k, with e = e_k; the size is θ = ∠(x, e);
-- rotation (three held): x = s, the unit quaternion of R R_refᵀ, with e = ±1; the size is 2θ, the angle of rotation;
+- swing (two held angles, axis k free): x = u, the unit vector R R_refᵀ e_k, with e = e_k; the size
+  is θ = ∠(x, e);
+- rotation (three held): x = s, the unit quaternion of R R_refᵀ, with e = ±1; the size is 2θ, the
+  angle of rotation;
 - twist (one held, k): x = (s_w, s_k), the part of s that keeps e_k; the size is 2θ, the twist;
 - position: x_c = p_c − p_ref,c; the size is |x_c|.
 
-Held angles of unequal tolerance have entries instead: the components of 1 or 2 times the vector log_e(x) of length θ.
+Held angles of unequal tolerance have entries instead: the components of 1 or 2 times the vector
+log_e(x) of length θ.
 
-Derivatives.  With W = Σ|d_j| over the revolute joints, u is a product of rotations exp(q_j(t) â_j) and constant
-ones, applied to a constant unit vector.  A derivative of one factor by t multiplies it by d_j â_j, of norm |d_j|, so
-by Leibniz's rule and the multinomial theorem |u⁽ⁿ⁾| ≤ Wⁿ.  The quaternions of the factors turn half as fast:
-|s⁽ⁿ⁾| ≤ (W/2)ⁿ.  The position is a sum of such products, one for each link's offset l_i, which the joints before it
-turn: |p⁗| ≤ Σ_i W_i⁴|l_i|; a prismatic joint adds W_i⁴ max|q_i| + 4 W_i³|d_i|.  Let ω be W or W/2.
+Derivatives.  With W = Σ|d_j| over the revolute joints, u is a product of rotations exp(q_j(t) â_j)
+and constant ones, applied to a constant unit vector.  A derivative of one factor by t multiplies it
+by d_j â_j, of norm |d_j|, so by Leibniz's rule and the multinomial theorem |u⁽ⁿ⁾| ≤ Wⁿ.  The
+quaternions of the factors turn half as fast: |s⁽ⁿ⁾| ≤ (W/2)ⁿ.  The position is a sum of such
+products, one for each link's offset l_i, which the joints before it turn: |p⁗| ≤ Σ_i W_i⁴|l_i|; a
+prismatic joint adds W_i⁴ max|q_i| + 4 W_i³|d_i|.  Let ω be W or W/2.
 
-Bound.  Between two stations let H be the cubic with x's values and derivatives at both; then
-|x − H| ≤ max|x⁗| t²(1 − t)²/24 ≤ max|x⁗|/384 =: ε, along every direction and so in norm.  Over an interval [a, b] of
-length h, H differs from its chord by at most max(|H″(a)|, |H″(b)|) h²/8, for H″ is linear.  Hence x(t) lies within
-δ = max|H″| h²/8 + ε of a point L of the chord.
+Bound.  Between two stations let H be the cubic with x's values and derivatives at both; then |x −
+H| ≤ max|x⁗| t²(1 − t)²/24 ≤ max|x⁗|/384 =: ε, along every direction and so in norm.  Over an
+interval [a, b] of length h, H differs from its chord by at most max(|H″(a)|, |H″(b)|) h²/8, for H″
+is linear.  Hence x(t) lies within δ = max|H″| h²/8 + ε of a point L of the chord.
 
-- Angles: the vectors within α ≤ π/2 of e form a convex cone, so ∠(L, e) is at most its value at the chord's ends, and
-  ∠(x, L) ≤ asin(δ/|x|) for |x| = 1, ≤ asin(δ/|L|) for the twist, whose |L| ≥ max(|H(a)|, |H(b)|) − |H(b) − H(a)|.
-  Beyond π/2 the angle changes by at most ωh/2 from the nearer end.
+- Angles: the vectors within α ≤ π/2 of e form a convex cone, so ∠(L, e) is at most its value at the
+  chord's ends, and ∠(x, L) ≤ asin(δ/|x|) for |x| = 1, ≤ asin(δ/|L|) for the twist, whose |L| ≥
+  max(|H(a)|, |H(b)|) − |H(b) − H(a)|. Beyond π/2 the angle changes by at most ωh/2 from the nearer
+  end.
 - Positions: |x_c| ≤ max(|H_c(a)|, |H_c(b)|) + δ_c.
-- Entries: in polar coordinates about e, with r = θn, |x′| ≤ ω and |x″| ≤ ω²,
-  |r″| ≤ ω²(θ/sin θ + (θ − sin θ cos θ)/sin²θ + (sin θ − θ cos θ)/sin²θ), which grows with θ; and log_e stretches by at
-  most θ/sin θ.  So |r_c| ≤ max(|r_c(a)|, |r_c(b)|) + max|r″| h²/8 + (θ/sin θ) asin ε with θ's largest value.
+- Entries: in polar coordinates about e, with r = θn, |x′| ≤ ω and |x″| ≤ ω², |r″| ≤ ω²(θ/sin θ + (θ
+  − sin θ cos θ)/sin²θ + (sin θ − θ cos θ)/sin²θ), which grows with θ; and log_e stretches by at
+  most θ/sin θ.  So |r_c| ≤ max(|r_c(a)|, |r_c(b)|) + max|r″| h²/8 + (θ/sin θ) asin ε with θ's
+  largest value.
 
-Intervals are halved until their bound is within a hundredth of the excess of a value that is attained.
-Rounding is not proven; `ROUNDING` is a thousand times what it amounts to.
+Intervals are halved until their bound is within a hundredth of the excess of a value that is
+attained. Rounding is not proven; `ROUNDING` is a thousand times what it amounts to.
 """
 
 import numpy as np
@@ -48,15 +57,18 @@ SWING, ROTATION, TWIST, POSITION = 0, 1, 2, 3
 SIZE = 0
 """The entry that stands for the size of the whole vector."""
 ROUNDING = 1e-12
-_SHARPNESS = 2e-7  # [rad or m] and this much of the excess is how far a bound may lie above an attained value
+# how far a bound may lie above an attained value [rad or m], and as a share of the excess
+_SHARPNESS = 2e-7
 _RELATIVE_SHARPNESS = 0.01
 _SHORTEST = 1.0 / 1024.0
 _NEARLY_A_HALF_TURN = 3.0
 
 
 @njit(**_COMPILE)
-def _pose(chain, q, axes, origins):  # type: ignore[no-untyped-def]
-    """Tool quaternion (w, x, y, z) and position in the base frame; every joint's axis and origin (D, 3)."""
+def _pose(chain, q, axes, origins):
+    """Tool quaternion (w, x, y, z) and position in the base frame; every joint's axis and origin
+    (D, 3).
+    """
     turns, offsets, prismatic, _ = chain
     w, x, y, z = 1.0, 0.0, 0.0, 0.0
     p0, p1, p2 = 0.0, 0.0, 0.0
@@ -88,7 +100,7 @@ def _pose(chain, q, axes, origins):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def poses(chain, q, out):  # type: ignore[no-untyped-def]
+def poses(chain, q, out):
     """Tool poses of q (n, D) into out (n, 7): position [m], then quaternion (x, y, z, w)."""
     axes, origins = np.empty((q.shape[1], 3)), np.empty((q.shape[1], 3))
     for n in range(q.shape[0]):
@@ -98,7 +110,7 @@ def poses(chain, q, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def _derivative_bounds(chain, q0, q1):  # type: ignore[no-untyped-def]
+def _derivative_bounds(chain, q0, q1):
     """W [rad] of one piece, and the bound of |p⁗| [m]."""
     _, _, prismatic, lengths = chain
     turned, fourth = 0.0, 0.0
@@ -115,8 +127,10 @@ def _derivative_bounds(chain, q0, q1):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def count_pieces(chain, rows, wanted, most, counts):  # type: ignore[no-untyped-def]
-    """Pieces (T − 1,) each segment is cut into, so that ε stays below `wanted` [rad and m]; `most` at most."""
+def count_pieces(chain, rows, wanted, most, counts):
+    """Pieces (T − 1,) each segment is cut into, so that ε stays below `wanted` [rad and m]; `most`
+    at most.
+    """
     total = 0
     for i in range(counts.shape[0]):
         turned, fourth = _derivative_bounds(chain, rows[i], rows[i + 1])
@@ -130,8 +144,10 @@ def count_pieces(chain, rows, wanted, most, counts):  # type: ignore[no-untyped-
 
 
 @njit(**_COMPILE)
-def cut(chain, rows, counts, stations, segments, turned, fourth):  # type: ignore[no-untyped-def]
-    """The stations (S, D), rows among them; each piece's segment, W [rad] and bound of |p⁗| [m], (S − 1,) each."""
+def cut(chain, rows, counts, stations, segments, turned, fourth):
+    """The stations (S, D), rows among them; each piece's segment, W [rad] and bound of |p⁗| [m], (S
+    − 1,) each.
+    """
     s = 0
     for i in range(counts.shape[0]):
         for k in range(counts[i]):
@@ -146,7 +162,7 @@ def cut(chain, rows, counts, stations, segments, turned, fourth):  # type: ignor
 
 
 @njit(**_COMPILE)
-def _turned(kind, k, s, w, out):  # type: ignore[no-untyped-def]
+def _turned(kind, k, s, w, out):
     """The derivative of x to an angular velocity w, for the x that `_curve_point` writes."""
     if kind == SWING:
         i, j = (k + 1) % 3, (k + 2) % 3
@@ -167,11 +183,11 @@ def _turned(kind, k, s, w, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def _curve_point(kind, k, anchor, w, x, y, z, s, out):  # type: ignore[no-untyped-def]
+def _curve_point(kind, k, anchor, w, x, y, z, s, out):
     """Write x of one tool quaternion; s (4,) gets the vector or quaternion that it is read from.
 
-    anchor (4,): for a swing, e_k turned back into the tool's frame by the reference, and 0; else the conjugate of the
-    reference's quaternion.
+    anchor (4,): for a swing, e_k turned back into the tool's frame by the reference, and 0; else
+    the conjugate of the reference's quaternion.
     """
     if kind == SWING:
         v0, v1, v2 = anchor[0], anchor[1], anchor[2]
@@ -194,11 +210,13 @@ def _curve_point(kind, k, anchor, w, x, y, z, s, out):  # type: ignore[no-untype
 
 
 @njit(**_COMPILE)
-def trace(chain, kind, k, anchor, place, q, turn, turn_out, turn_in, shift, shift_out, shift_in):  # type: ignore[no-untyped-def]
-    """Write x and its derivatives at stations q (S, D): angles into turn, positions into shift, (S, 4) each.
+def trace(chain, kind, k, anchor, place, q, turn, turn_out, turn_in, shift, shift_out, shift_in):
+    """Write x and its derivatives at stations q (S, D): angles into turn, positions into shift, (S,
+    4) each.
 
-    `_out` is the derivative along the piece that leaves a station, `_in` along the one that arrives; t runs from 0 to
-    1 over each.  kind < 0: no angle is held.  shift (0, 4): no position is.  place (3,): the reference position [m].
+    `_out` is the derivative along the piece that leaves a station, `_in` along the one that
+    arrives; t runs from 0 to 1 over each.  kind < 0: no angle is held.  shift (0, 4): no position
+    is.  place (3,): the reference position [m].
     """
     dof = q.shape[1]
     axes, origins = np.empty((dof, 3)), np.empty((dof, 3))
@@ -243,14 +261,16 @@ def trace(chain, kind, k, anchor, place, q, turn, turn_out, turn_in, shift, shif
 
 
 @njit(**_COMPILE)
-def _angle(x, sign):  # type: ignore[no-untyped-def]
-    """Angle [rad] between x (4,) and the first axis times `sign`; either way along it, for sign 0."""
+def _angle(x, sign):
+    """Angle [rad] between x (4,) and the first axis times `sign`; either way along it, for sign
+    0.
+    """
     first = abs(x[0]) if sign == 0.0 else sign * x[0]
     return np.arctan2(np.sqrt(x[1] * x[1] + x[2] * x[2] + x[3] * x[3]), first)
 
 
 @njit(**_COMPILE)
-def _value(kind, entry, x, sign):  # type: ignore[no-untyped-def]
+def _value(kind, entry, x, sign):
     """The size [rad or m] of what is held, or of one of its entries 1 to 3."""
     if kind == POSITION:
         return abs(x[entry])
@@ -262,14 +282,14 @@ def _value(kind, entry, x, sign):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def values(kind, entry, x, out):  # type: ignore[no-untyped-def]
+def values(kind, entry, x, out):
     """What is held at each station, from x (S, 4) into out (S,), as `_value` has it."""
     for n in range(x.shape[0]):
         out[n] = _value(kind, entry, x[n], 1.0 if kind == SWING else 0.0)
 
 
 @njit(**_COMPILE)
-def _interval_bound(kind, entry, xa, xb, sign, curvature, h, omega, error):  # type: ignore[no-untyped-def]
+def _interval_bound(kind, entry, xa, xb, sign, curvature, h, omega, error):
     """The module's bound over one interval, from H at its ends, max|H″|, its length h, ω and ε."""
     if kind == POSITION:
         bound = max(abs(xa[entry]), abs(xb[entry])) + 0.125 * curvature * h * h + error
@@ -308,7 +328,7 @@ def _interval_bound(kind, entry, xa, xb, sign, curvature, h, omega, error):  # t
 
 
 @njit(**_COMPILE)
-def _cubic(x0, x1, m0, m1, t, out):  # type: ignore[no-untyped-def]
+def _cubic(x0, x1, m0, m1, t, out):
     """H(t) (4,) from values and derivatives at both ends."""
     u = 1.0 - t
     a0, a1 = u * u * (1.0 + 2.0 * t), t * t * (1.0 + 2.0 * u)
@@ -318,31 +338,37 @@ def _cubic(x0, x1, m0, m1, t, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def _curvature(kind, entry, x0, x1, m0, m1, t):  # type: ignore[no-untyped-def]
+def _curvature(kind, entry, x0, x1, m0, m1, t):
     """|H″(t)|, or of one coordinate for a position."""
     square = 0.0
     for i in range(4):
         if kind == POSITION and i != entry:
             continue
-        second = (6.0 - 12.0 * t) * (x1[i] - x0[i]) + (6.0 * t - 4.0) * m0[i] + (6.0 * t - 2.0) * m1[i]
+        second = (
+            (6.0 - 12.0 * t) * (x1[i] - x0[i]) + (6.0 * t - 4.0) * m0[i] + (6.0 * t - 2.0) * m1[i]
+        )
         square += second * second
     return np.sqrt(square)
 
 
 @njit(**_COMPILE)
-def _enough(best, tolerance, limit):  # type: ignore[no-untyped-def]
-    """A bound that need not be improved, given a value that is attained; it never decides that `limit` is passed."""
+def _enough(best, tolerance, limit):
+    """A bound that need not be improved, given a value that is attained; it never decides that
+    `limit` is passed.
+    """
     enough = best + _SHARPNESS + _RELATIVE_SHARPNESS * max(best - tolerance, 0.0)
     return limit if best <= limit < enough else enough
 
 
 @njit(**_COMPILE)
-def bound_pieces(kind, entry, tolerance, limit, x, x_out, x_in, turned, fourth, segments):  # type: ignore[no-untyped-def]
+def bound_pieces(kind, entry, tolerance, limit, x, x_out, x_in, turned, fourth, segments):
     """Bound of what is held over all pieces, by the module's equations.
 
-    x, x_out, x_in (S, 4) from `trace`; turned (S − 1,) W of each piece; fourth (S − 1,) its bound of |p⁗|.
-    Returns the bound, the piece and t where the interpolant is largest, and the first segment whose bound passes
-    `limit` (−1: none does) with its bound; all sizes in rad or m, the tolerance not taken off.
+    x, x_out, x_in (S, 4) from `trace`; turned (S − 1,) W of each piece; fourth (S − 1,) its bound
+    of |p⁗|.
+    Returns the bound, the piece and t where the interpolant is largest, and the first segment whose
+    bound passes `limit` (−1: none does) with its bound; all sizes in rad or m, the tolerance not
+    taken off.
     """
     left, right = np.empty(64), np.empty(64)
     xa, xb, middle = np.empty(4), np.empty(4), np.empty(4)
@@ -364,14 +390,19 @@ def bound_pieces(kind, entry, tolerance, limit, x, x_out, x_in, turned, fourth, 
             waiting -= 1
             a, b = left[waiting], right[waiting]
             h = b - a
-            curvature = max(_curvature(kind, entry, x0, x1, m0, m1, a), _curvature(kind, entry, x0, x1, m0, m1, b))
+            curvature = max(
+                _curvature(kind, entry, x0, x1, m0, m1, a),
+                _curvature(kind, entry, x0, x1, m0, m1, b),
+            )
             _cubic(x0, x1, m0, m1, a, xa)
             _cubic(x0, x1, m0, m1, b, xb)
             bound = _interval_bound(kind, entry, xa, xb, sign, curvature, h, omega, error)
             if bound <= max(top, _enough(best, tolerance, limit)):
                 continue
             undecided = best <= limit < bound
-            if h <= _SHORTEST or (not undecided and bound <= _enough(best, tolerance, limit) + 3.0 * error):
+            if h <= _SHORTEST or (
+                not undecided and bound <= _enough(best, tolerance, limit) + 3.0 * error
+            ):
                 top = max(top, bound)
                 continue
             t = 0.5 * (a + b)
@@ -385,4 +416,10 @@ def bound_pieces(kind, entry, tolerance, limit, x, x_out, x_in, turned, fourth, 
         so_far = max(top, _enough(best, tolerance, limit))
         if first < 0 and so_far > limit:
             first, first_bound = segments[i], so_far + ROUNDING
-    return max(top, _enough(best, tolerance, limit)) + ROUNDING, worst_piece, worst_t, first, first_bound
+    return (
+        max(top, _enough(best, tolerance, limit)) + ROUNDING,
+        worst_piece,
+        worst_t,
+        first,
+        first_bound,
+    )

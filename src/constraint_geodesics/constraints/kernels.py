@@ -1,9 +1,11 @@
-"""Compiled constraint residual, its Jacobian and the Gauss-Newton retraction, one configuration at a time.
+"""Compiled constraint residual, its Jacobian and the Gauss-Newton retraction, one configuration at
+a time.
 
-The orientation residual neither wraps nor locks.  With E = R R_refᵀ the rotation away from the reference:
-three held axes: the rotation vector of E; two held axes, axis k free: the swing that turns e_k back, i.e. the
-angle θ between R R_refᵀ e_k and e_k times its direction; one held axis k: the twist of E about e_k.
-The swing keeps its size up to θ = π, where the horizontal part of the axis alone would vanish upside down too.
+The orientation residual neither wraps nor locks.  With E = R R_refᵀ the rotation away from the
+reference: three held axes: the rotation vector of E; two held axes, axis k free: the swing that
+turns e_k back, i.e. the angle θ between R R_refᵀ e_k and e_k times its direction; one held axis k:
+the twist of E about e_k. The swing keeps its size up to θ = π, where the horizontal part of the
+axis alone would vanish upside down too.
 """
 
 import numpy as np
@@ -16,8 +18,10 @@ _SMALL = 1e-9
 
 
 @njit(**_COMPILE)
-def _quaternion(a, b):  # type: ignore[no-untyped-def]
-    """Unit quaternion (w ≥ 0, x, y, z) of the rotation E = A Bᵀ, by Shepperd's branch with the largest component."""
+def _quaternion(a, b):
+    """Unit quaternion (w ≥ 0, x, y, z) of the rotation E = A Bᵀ, by Shepperd's branch with the
+    largest component.
+    """
     e00 = a[0, 0] * b[0, 0] + a[0, 1] * b[0, 1] + a[0, 2] * b[0, 2]
     e01 = a[0, 0] * b[1, 0] + a[0, 1] * b[1, 1] + a[0, 2] * b[1, 2]
     e02 = a[0, 0] * b[2, 0] + a[0, 1] * b[2, 1] + a[0, 2] * b[2, 2]
@@ -46,8 +50,10 @@ def _quaternion(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def _swing(w, k, residual, linear):  # type: ignore[no-untyped-def]
-    """Swing from e_k to the unit vector w into residual[3:], and its derivative (3, 3) to ω, where ẇ = ω × w."""
+def _swing(w, k, residual, linear):
+    """Swing from e_k to the unit vector w into residual[3:], and its derivative (3, 3) to ω, where
+    ẇ = ω × w.
+    """
     i, j = (k + 1) % 3, (k + 2) % 3
     # e_k × w has the components (−w_j, w_i) along (e_i, e_j)
     si, sj, c = -w[j], w[i], w[k]
@@ -77,9 +83,9 @@ def _swing(w, k, residual, linear):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def _rotation_vector(quaternion, residual, linear):  # type: ignore[no-untyped-def]
-    """Rotation vector of a unit quaternion into residual[3:], and the inverse left Jacobian of SO(3), its derivative
-    to ω.
+def _rotation_vector(quaternion, residual, linear):
+    """Rotation vector of a unit quaternion into residual[3:], and the inverse left Jacobian of
+    SO(3), its derivative to ω.
     """
     w, x, y, z = quaternion
     n = np.sqrt(x * x + y * y + z * z)
@@ -93,27 +99,41 @@ def _rotation_vector(quaternion, residual, linear):  # type: ignore[no-untyped-d
     else:
         b = 1.0 / 12.0
     rest = 1.0 - b * (r0 * r0 + r1 * r1 + r2 * r2)
-    linear[0, 0], linear[0, 1], linear[0, 2] = rest + b * r0 * r0, b * r0 * r1 + 0.5 * r2, b * r0 * r2 - 0.5 * r1
-    linear[1, 0], linear[1, 1], linear[1, 2] = b * r1 * r0 - 0.5 * r2, rest + b * r1 * r1, b * r1 * r2 + 0.5 * r0
-    linear[2, 0], linear[2, 1], linear[2, 2] = b * r2 * r0 + 0.5 * r1, b * r2 * r1 - 0.5 * r0, rest + b * r2 * r2
+    linear[0, 0], linear[0, 1], linear[0, 2] = (
+        rest + b * r0 * r0,
+        b * r0 * r1 + 0.5 * r2,
+        b * r0 * r2 - 0.5 * r1,
+    )
+    linear[1, 0], linear[1, 1], linear[1, 2] = (
+        b * r1 * r0 - 0.5 * r2,
+        rest + b * r1 * r1,
+        b * r1 * r2 + 0.5 * r0,
+    )
+    linear[2, 0], linear[2, 1], linear[2, 2] = (
+        b * r2 * r0 + 0.5 * r1,
+        b * r2 * r1 - 0.5 * r0,
+        rest + b * r2 * r2,
+    )
 
 
 @njit(**_COMPILE)
-def _twist(quaternion, k, residual, linear):  # type: ignore[no-untyped-def]
+def _twist(quaternion, k, residual, linear):
     """Twist about e_k into residual[3 + k], and its derivative to ω into row k of `linear`."""
     w, i, j = quaternion[0], (k + 1) % 3, (k + 2) % 3
     vk, vi, vj = quaternion[1 + k], quaternion[1 + i], quaternion[1 + j]
     residual[3 + k] = 2.0 * np.arctan2(vk, w)
     square = max(w * w + vk * vk, _SMALL)
-    # q̇ = ½ ω ⊗ q, so ẇ = −½ ω·v and v̇_k = ½ (w ω_k + (ω × v)_k) with (ω × v)_k = ω_i v_j − ω_j v_i
+    # q̇ = ½ ω ⊗ q, so ẇ = −½ ω·v and v̇_k = ½ (w ω_k + (ω × v)_k) with (ω × v)_k = ω_i v_j − ω_j
+    # v_i
     linear[k, k] = (w * w + vk * vk) / square
     linear[k, i] = (w * vj + vk * vi) / square
     linear[k, j] = (-w * vi + vk * vj) / square
 
 
 @njit(**_COMPILE)
-def residual_of(held, reference_position, reference_rotation, position, rotation, residual, linear):  # type: ignore[no-untyped-def]
-    """Residual (6,) [m, rad] of one tool pose, and the (3, 3) matrix that turns ω into its orientation part.
+def residual_of(held, reference_position, reference_rotation, position, rotation, residual, linear):
+    """Residual (6,) [m, rad] of one tool pose, and the (3, 3) matrix that turns ω into its
+    orientation part.
 
     Entries of axes that are not held are zero.
     """
@@ -131,7 +151,11 @@ def residual_of(held, reference_position, reference_rotation, position, rotation
         for i in range(3):
             if not held[3 + i]:
                 free = i
-        v0, v1, v2 = reference_rotation[free, 0], reference_rotation[free, 1], reference_rotation[free, 2]
+        v0, v1, v2 = (
+            reference_rotation[free, 0],
+            reference_rotation[free, 1],
+            reference_rotation[free, 2],
+        )
         w = (
             rotation[0, 0] * v0 + rotation[0, 1] * v1 + rotation[0, 2] * v2,
             rotation[1, 0] * v0 + rotation[1, 1] * v1 + rotation[1, 2] * v2,
@@ -151,7 +175,7 @@ def residual_of(held, reference_position, reference_rotation, position, rotation
 
 
 @njit(**_COMPILE)
-def shared_tolerance(held, tolerance):  # type: ignore[no-untyped-def]
+def shared_tolerance(held, tolerance):
     """The tolerance [rad] that all held angles have; −1 if they differ, or none is held."""
     common = -1.0
     for i in range(3, 6):
@@ -164,10 +188,12 @@ def shared_tolerance(held, tolerance):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def excess_of(held, tolerance, residual, excess, active):  # type: ignore[no-untyped-def]
-    """What of the residual lies outside the tolerance, signed, eq. 7; marks the rows a step must correct.
+def excess_of(held, tolerance, residual, excess, active):
+    """What of the residual lies outside the tolerance, signed, eq. 7; marks the rows a step must
+    correct.
 
-    Held angles that share one tolerance form a cone (a ball, for three of them): the size of their vector counts.
+    Held angles that share one tolerance form a cone (a ball, for three of them): the size of their
+    vector counts.
     """
     worst = 0.0
     common = shared_tolerance(held, tolerance)
@@ -196,8 +222,10 @@ def excess_of(held, tolerance, residual, excess, active):  # type: ignore[no-unt
 
 
 @njit(**_COMPILE, inline="always")
-def residual_row(i, linear, geometric, rows, k):  # type: ignore[no-untyped-def]
-    """Row i of the residual's Jacobian into row k, from the matrix of `residual_of` and the geometric Jacobian."""
+def residual_row(i, linear, geometric, rows, k):
+    """Row i of the residual's Jacobian into row k, from the matrix of `residual_of` and the
+    geometric Jacobian.
+    """
     for d in range(rows.shape[1]):
         value = 0.0
         if i < 3:
@@ -209,8 +237,10 @@ def residual_row(i, linear, geometric, rows, k):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def residual_batch(chain, held, reference_position, reference_rotation, q, residuals, jacobians):  # type: ignore[no-untyped-def]
-    """Residuals (B, 6) and their Jacobians (B, 6, D) of q (B, D); rows of axes that are not held are zero."""
+def residual_batch(chain, held, reference_position, reference_rotation, q, residuals, jacobians):
+    """Residuals (B, 6) and their Jacobians (B, 6, D) of q (B, D); rows of axes that are not held
+    are zero.
+    """
     origins, axes, prismatic, base, tool = chain
     dof = q.shape[1]
     position = np.empty(3)
@@ -221,8 +251,21 @@ def residual_batch(chain, held, reference_position, reference_rotation, q, resid
     linear = np.empty((3, 3))
     jacobians[:] = 0.0
     for b in range(q.shape[0]):
-        pose_of(origins, axes, prismatic, base, tool, q[b], position, rotation, joint_origins, joint_axes)
-        residual_of(held, reference_position, reference_rotation, position, rotation, residuals[b], linear)
+        pose_of(
+            origins,
+            axes,
+            prismatic,
+            base,
+            tool,
+            q[b],
+            position,
+            rotation,
+            joint_origins,
+            joint_axes,
+        )
+        residual_of(
+            held, reference_position, reference_rotation, position, rotation, residuals[b], linear
+        )
         geometric_jacobian(prismatic, position, joint_origins, joint_axes, geometric)
         for i in range(6):
             if held[i]:
@@ -230,7 +273,7 @@ def residual_batch(chain, held, reference_position, reference_rotation, q, resid
 
 
 @njit(**_COMPILE)
-def excess_batch(held, tolerance, residuals, excesses, worst):  # type: ignore[no-untyped-def]
+def excess_batch(held, tolerance, residuals, excesses, worst):
     """Signed excesses (B, 6) of residuals (B, 6), and the largest of each row (B,)."""
     active = np.empty(6, dtype=np.bool_)
     for b in range(residuals.shape[0]):
@@ -238,8 +281,10 @@ def excess_batch(held, tolerance, residuals, excesses, worst):  # type: ignore[n
 
 
 @njit(**_COMPILE)
-def cholesky(matrix, size, smallest):  # type: ignore[no-untyped-def]
-    """Lower Cholesky factor of the leading `size` rows, in place; False if a pivot is not above `smallest`."""
+def cholesky(matrix, size, smallest):
+    """Lower Cholesky factor of the leading `size` rows, in place; False if a pivot is not above
+    `smallest`.
+    """
     for i in range(size):
         for j in range(i + 1):
             value = matrix[i, j]
@@ -255,7 +300,7 @@ def cholesky(matrix, size, smallest):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def forward(factor, size, right):  # type: ignore[no-untyped-def]
+def forward(factor, size, right):
     """Solve L x = right in place, with the factor L of `cholesky`."""
     for i in range(size):
         for k in range(i):
@@ -264,7 +309,7 @@ def forward(factor, size, right):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def backward(factor, size, right):  # type: ignore[no-untyped-def]
+def backward(factor, size, right):
     """Solve Lᵀ x = right in place, with the factor L of `cholesky`."""
     for i in range(size - 1, -1, -1):
         for k in range(i + 1, size):
@@ -273,13 +318,24 @@ def backward(factor, size, right):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def retract_batch(  # type: ignore[no-untyped-def]
-    chain, held, tolerances, reference_position, reference_rotation, q, accuracy, iterations, largest_step, worst
+def retract_batch(
+    chain,
+    held,
+    tolerances,
+    reference_position,
+    reference_rotation,
+    q,
+    accuracy,
+    iterations,
+    largest_step,
+    worst,
 ):
-    """Gauss-Newton onto the constraint, in place: q ← q − Jᵀ(JJᵀ)⁻¹ ι(q) until |ι| ≤ accuracy, for q (B, D).
+    """Gauss-Newton onto the constraint, in place: q ← q − Jᵀ(JJᵀ)⁻¹ ι(q) until |ι| ≤ accuracy, for
+    q (B, D).
 
-    tolerances: (B, 6), one band a configuration.  A step is never longer than `largest_step` [rad], so that a
-    point far away walks to its own branch instead of jumping to another.  worst (B,) gets the remaining excess.
+    tolerances: (B, 6), one band a configuration.  A step is never longer than `largest_step` [rad],
+    so that a point far away walks to its own branch instead of jumping to another.  worst (B,) gets
+    the remaining excess.
     """
     origins, axes, prismatic, base, tool = chain
     dof = q.shape[1]
@@ -298,8 +354,21 @@ def retract_batch(  # type: ignore[no-untyped-def]
     step = np.empty(dof)
     for b in range(q.shape[0]):
         for iteration in range(iterations + 1):
-            pose_of(origins, axes, prismatic, base, tool, q[b], position, rotation, joint_origins, joint_axes)
-            residual_of(held, reference_position, reference_rotation, position, rotation, residual, linear)
+            pose_of(
+                origins,
+                axes,
+                prismatic,
+                base,
+                tool,
+                q[b],
+                position,
+                rotation,
+                joint_origins,
+                joint_axes,
+            )
+            residual_of(
+                held, reference_position, reference_rotation, position, rotation, residual, linear
+            )
             worst[b] = excess_of(held, tolerances[b], residual, excess, active)
             if not worst[b] > accuracy or iteration == iterations:
                 break

@@ -1,4 +1,6 @@
-"""The same as `geodesics doctor`, where that does not start: `python -m constraint_geodesics.doctor`."""
+"""The same as `geodesics doctor`, where that does not start: `python -m
+constraint_geodesics.doctor`.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from constraint_geodesics.doctor.report import as_json, as_text, examine, exit_code, terminal_colours
+from constraint_geodesics.doctor.report import (
+    as_json,
+    as_text,
+    examine,
+    exit_code,
+    terminal_colours,
+)
 from constraint_geodesics.doctor.surroundings import PACKAGE
 
 if TYPE_CHECKING:

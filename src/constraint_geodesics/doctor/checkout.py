@@ -33,12 +33,18 @@ LEAST_FREE = 2_000_000_000
 
 
 def check_git(root: Path, here: Surroundings) -> Look:
-    """DVC refuses to run outside of a git repository, and a run names the commit it was made from."""
+    """DVC refuses to run outside of a git repository, and a run names the commit it was made
+    from.
+    """
     if not is_checkout(root):
         return ""
     git = shutil.which("git", path=here.environ.get("PATH"))
     if git is None:
-        yield "problem", "git is not installed: no stage can tell the commit it runs from", "install git"
+        yield (
+            "problem",
+            "git is not installed: no stage can tell the commit it runs from",
+            "install git",
+        )
         return ""
     command = [git, "-C", str(root), "rev-parse", "--show-toplevel"]
     answer = answer_of(command, root, {**here.environ, "LC_ALL": "C"}, 10.0)
@@ -49,7 +55,11 @@ def check_git(root: Path, here: Surroundings) -> Look:
         yield "problem", "git refuses this checkout, because another user owns it", mend
     else:
         mend = "clone the project with git, or: dvc config core.no_scm true"
-        yield "problem", "this is no git repository: DVC refuses to run, and runs name no commit", mend
+        yield (
+            "problem",
+            "this is no git repository: DVC refuses to run, and runs name no commit",
+            mend,
+        )
     return ""
 
 
@@ -63,7 +73,10 @@ def check_disk(root: Path, here: Surroundings, least: int = LEAST_FREE) -> Look:
             with tempfile.TemporaryFile(dir=str(folder)):
                 pass
         except OSError as error:
-            mend = f"sudo chown -R $(id -u) {shlex.quote(str(folder))}, or work in a checkout of your own"
+            mend = (
+                f"sudo chown -R $(id -u) {shlex.quote(str(folder))}, or work in a checkout "
+                f"of your own"
+            )
             yield "problem", f"{folder.resolve()} can't be written: {error.strerror}", mend
     free = shutil.disk_usage(root).free
     if free < least:
@@ -73,20 +86,32 @@ def check_disk(root: Path, here: Surroundings, least: int = LEAST_FREE) -> Look:
 
 
 def check_robot(root: Path, here: Surroundings) -> Look:
-    """The URDFs that params.yaml and the planner's files name, found as the planner finds them, and their meshes."""
+    """The URDFs that params.yaml and the planner's files name, found as the planner finds them, and
+    their meshes.
+    """
     data, counted = on_path(here, "pybullet_data"), []
     for name, where in _urdf_names(root, here).items():
         places = [root / name, *([data / name] if data else [])]
         urdf = next((place for place in places if place.is_file()), None)
         if urdf is None:
-            lacking = f"{name}, which {where} names, is neither in this checkout nor in pybullet_data"
-            yield "problem", lacking, f"mend the name in {where}" if data else completing(root, here)
+            lacking = (
+                f"{name}, which {where} names, is neither in this checkout nor in pybullet_data"
+            )
+            yield (
+                "problem",
+                lacking,
+                f"mend the name in {where}" if data else completing(root, here),
+            )
             continue
         packaged = data is not None and data in urdf.parents
         try:
             meshes = [mesh.get("filename", "") for mesh in ElementTree.parse(urdf).iter("mesh")]
         except ElementTree.ParseError as error:
-            yield "problem", f"{urdf}: not XML: {error}", _reinstall_pybullet(root) if packaged else "mend the file"
+            yield (
+                "problem",
+                f"{urdf}: not XML: {error}",
+                _reinstall_pybullet(root) if packaged else "mend the file",
+            )
             continue
         missing = list(dict.fromkeys(mesh for mesh in meshes if not _mesh_found(mesh, urdf)))
         counted.append(f"{name} with {len(meshes)} meshes")
@@ -109,7 +134,10 @@ def _urdf_names(root: Path, here: Surroundings) -> dict[str, str]:
             pass
         else:
             described.append((params.name, yaml.safe_load(params.read_text("utf-8"))))
-    cards = (root / "data" / "planner" / "planner.json", here.package / "pretrained" / "planner.json")
+    cards = (
+        root / "data" / "planner" / "planner.json",
+        here.package / "pretrained" / "planner.json",
+    )
     card = next((file for file in cards if file.is_file()), None)
     if card is not None:
         described.append((str(card), json.loads(card.read_text("utf-8"))))
@@ -128,7 +156,10 @@ def _mesh_found(name: str, urdf: Path) -> bool:
 
 def _reinstall_pybullet(root: Path) -> str:
     wanted = locked(root).get("pybullet")
-    return f"python -m pip install --force-reinstall --no-deps pybullet{f'=={wanted}' if wanted else ''}"
+    return (
+        f"python -m pip install --force-reinstall --no-deps "
+        f"pybullet{f'=={wanted}' if wanted else ''}"
+    )
 
 
 def check_kernels(root: Path, here: Surroundings) -> Look:
@@ -141,7 +172,9 @@ def check_kernels(root: Path, here: Surroundings) -> Look:
     changed = {file: file.stat().st_mtime for file, text in texts.items() if "numba" in text}
     caches, stale, newer = 0, [], set()
     for file, own in changed.items():
-        called = [other for other in _reached(file, package, texts) if other in changed and other != file]
+        called = [
+            other for other in _reached(file, package, texts) if other in changed and other != file
+        ]
         for cache in (file.parent / "__pycache__").glob(f"{file.stem}.*.nb[ic]"):
             caches += 1
             made = cache.stat().st_mtime
@@ -154,7 +187,12 @@ def check_kernels(root: Path, here: Surroundings) -> Look:
     names = few(sorted(file.relative_to(package).as_posix() for file in newer))
     folder = "src" if is_checkout(root) else shlex.quote(str(package))
     mend = f"find {folder} -name '*.nb[ic]' -delete"
-    yield "problem", f"{len(stale)} of {caches} files of compiled kernels are older than {names}, which they call", mend
+    yield (
+        "problem",
+        f"{len(stale)} of {caches} files of compiled kernels are older than {names}, which "
+        f"they call",
+        mend,
+    )
     return ""
 
 

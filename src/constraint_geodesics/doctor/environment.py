@@ -37,10 +37,18 @@ def check_python(root: Path, here: Surroundings) -> Look:
     if here.python[:2] == NEEDED_PYTHON:
         return version
     if own_environment(root, here) is not None:
-        yield "problem", f"this is Python {version}; {needed} is needed, and .venv has its own", ACTIVATE
+        yield (
+            "problem",
+            f"this is Python {version}; {needed} is needed, and .venv has its own",
+            ACTIVATE,
+        )
     else:
         mend = f"install Python {needed}, then: {NEW_ENVIRONMENT} PYTHON=python{needed}"
-        yield "problem", f"this is Python {version}; {needed} is needed (PyBullet has no wheels for others)", mend
+        yield (
+            "problem",
+            f"this is Python {version}; {needed} is needed (PyBullet has no wheels for others)",
+            mend,
+        )
     return ""
 
 
@@ -65,21 +73,31 @@ def check_packages(root: Path, here: Surroundings) -> Look:
 
 
 def check_torch(root: Path, here: Surroundings) -> Look:
-    """Networks are trained on the processor, so that a build for a graphics card only takes gigabytes."""
+    """Networks are trained on the processor, so that a build for a graphics card only takes
+    gigabytes.
+    """
     version = here.installed.get("torch")
     if version is None:
         yield "note", "not installed", ""
         return ""
     release, _, build = version.partition("+")
-    names = [n for n in here.installed if n.startswith("nvidia-") or n in ("triton", "pytorch-triton")]
+    names = [
+        n for n in here.installed if n.startswith("nvidia-") or n in ("triton", "pytorch-triton")
+    ]
     unused = sorted(set(names) - {"nvidia-ml-py"})  # which only reads a card's state, and is small
     if not unused and not re.match(r"cu|rocm|xpu", build):
         return f"{version}, without packages for a graphics card"
     beside = f", and {len(unused)} packages for graphics cards" if unused else ""
-    mend = f"install torch=={locked(root).get('torch', release)} again in its build for the processor"
+    mend = (
+        f"install torch=={locked(root).get('torch', release)} again in its build for the processor"
+    )
     if unused:
         mend += f", then: python -m pip uninstall -y {' '.join(unused)}"
-    yield "note", f"{version}{beside}: gigabytes that nothing here uses, training is on the processor", mend
+    yield (
+        "note",
+        f"{version}{beside}: gigabytes that nothing here uses, training is on the processor",
+        mend,
+    )
     return ""
 
 
@@ -100,7 +118,11 @@ def _of_package(root: Path, here: Surroundings) -> Iterator[Said]:
     if not is_checkout(root):
         found = target is not None and is_checkout(target)
         mend = f"cd {shlex.quote(str(target))}" if found else ""
-        yield "note", f"this folder is no checkout of {PACKAGE}: of its files nothing can be said", mend
+        yield (
+            "note",
+            f"this folder is no checkout of {PACKAGE}: of its files nothing can be said",
+            mend,
+        )
         return
     if own_environment(root, here) is not None:
         yield "note", f"this is the Python of {here.prefix}, not that of .venv", ACTIVATE
@@ -111,12 +133,18 @@ def _of_package(root: Path, here: Surroundings) -> Iterator[Said]:
         yield "problem", f"{gone} (was this checkout moved?)", NEW_ENVIRONMENT
     elif not used:
         in_place = target is not None and target.resolve() == root.resolve()
-        said = f"the package in use is {here.package}, not this checkout's: changes here have no effect"
+        said = (
+            f"the package in use is {here.package}, not this checkout's: changes here have "
+            f"no effect"
+        )
         yield "problem", said, "unset PYTHONPATH" if in_place else mend
     elif target is None:
         yield "note", "the package is not installed, only found by PYTHONPATH or from src", mend
     elif target.resolve() != root.resolve():
-        said = f"the environment has the package from {target}, another checkout; only PYTHONPATH puts this one first"
+        said = (
+            f"the environment has the package from {target}, another checkout; only "
+            f"PYTHONPATH puts this one first"
+        )
         yield "note", said, mend
 
 
@@ -130,7 +158,9 @@ def _installed_from(here: Surroundings) -> Path | None:
 
 
 def _of_scripts(root: Path, here: Surroundings) -> Iterator[Said]:
-    """The programs of an environment name their Python by its full path, which does not move with them."""
+    """The programs of an environment name their Python by its full path, which does not move with
+    them.
+    """
     own = root / ".venv"
     for prefix in dict.fromkeys(folder.resolve() for folder in (own, here.prefix)):
         if not (prefix / "pyvenv.cfg").is_file():
@@ -145,10 +175,18 @@ def _of_scripts(root: Path, here: Surroundings) -> Iterator[Said]:
                 broken.append((script.name, python))
             elif python.name.startswith("python") and python.parent.resolve() != programs:
                 foreign.append((script.name, python))
-        again = NEW_ENVIRONMENT if prefix == own.resolve() else f"make the environment {prefix} again"
-        for scripts, what in ((broken, "which does not exist"), (foreign, "of another environment")):
+        again = (
+            NEW_ENVIRONMENT if prefix == own.resolve() else f"make the environment {prefix} again"
+        )
+        for scripts, what in (
+            (broken, "which does not exist"),
+            (foreign, "of another environment"),
+        ):
             if scripts:
-                message = f"{few([name for name, _ in scripts])} in {programs} start {scripts[0][1]}, {what}"
+                message = (
+                    f"{few([name for name, _ in scripts])} in {programs} start "
+                    f"{scripts[0][1]}, {what}"
+                )
                 yield "problem", message, again
 
 
@@ -159,7 +197,9 @@ def _interpreter(script: Path) -> Path | None:
     if not first.startswith("#!"):
         return None
     words = first[2:].split()
-    if words and Path(words[0]).name == "sh" and second.startswith("'''exec'"):  # pip's way with a long path
+    if (
+        words and Path(words[0]).name == "sh" and second.startswith("'''exec'")
+    ):  # pip's way with a long path
         words = shlex.split(second[len("'''exec'") :].partition('"$0"')[0])
     named = bool(words) and Path(words[0]).is_absolute() and Path(words[0]).name != "env"
     return Path(words[0]) if named else None

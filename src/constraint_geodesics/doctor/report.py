@@ -10,7 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from constraint_geodesics.doctor.checkout import check_disk, check_git, check_kernels, check_robot
-from constraint_geodesics.doctor.environment import check_install, check_packages, check_python, check_torch
+from constraint_geodesics.doctor.environment import (
+    check_install,
+    check_packages,
+    check_python,
+    check_torch,
+)
 from constraint_geodesics.doctor.runs import check_mlflow, check_pipeline
 from constraint_geodesics.doctor.surroundings import Surroundings
 from constraint_geodesics.doctor.viewer import check_display, check_recordings
@@ -25,7 +30,9 @@ COLOURS = {"ok": "\033[32m", "note": "\033[33m", "problem": "\033[31m"}
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check says.  A note is worth knowing and breaks nothing; only a problem makes the exit code 1."""
+    """What one check says.  A note is worth knowing and breaks nothing; only a problem makes the
+    exit code 1.
+    """
 
     check: str
     status: Status
@@ -53,10 +60,15 @@ CHECKS: Mapping[str, Check] = {
 
 def examine(
     root: Path, here: Surroundings | None = None, checks: Mapping[str, Check] | None = None
-) -> list[Finding]:  # fmt: skip
-    """All findings about one checkout, by default of this process; a check that fails is a problem itself."""
+) -> list[Finding]:
+    """All findings about one checkout, by default of this process; a check that fails is a problem
+    itself.
+    """
     here = here or Surroundings.here()
-    looked = [_look(name, check, root, here) for name, check in (CHECKS if checks is None else checks).items()]
+    looked = [
+        _look(name, check, root, here)
+        for name, check in (CHECKS if checks is None else checks).items()
+    ]
     return [finding for findings in looked for finding in findings]
 
 
@@ -70,7 +82,7 @@ def _look(name: str, check: Check, root: Path, here: Surroundings) -> list[Findi
 
     try:
         for one in listen():
-            said.append(one)  # noqa: PERF402  what was said before an error is kept
+            said.append(one)  # noqa: PERF402
     except Exception as error:
         message = f"could not be looked at: {type(error).__name__}: {' '.join(str(error).split())}"
         said.append(("problem", message, "mend what the message names, then look again"))
@@ -84,11 +96,15 @@ def exit_code(findings: Sequence[Finding]) -> int:
 
 def as_json(findings: Sequence[Finding]) -> str:
     """One object: whether all is well, and the findings."""
-    return json.dumps({"ok": not exit_code(findings), "findings": [asdict(finding) for finding in findings]})
+    return json.dumps(
+        {"ok": not exit_code(findings), "findings": [asdict(finding) for finding in findings]}
+    )
 
 
 def as_text(findings: Sequence[Finding], colours: Mapping[str, str] | None = None) -> str:
-    """One line a finding, the mend below it.  colours: how a terminal is told of each status; by default not at all."""
+    """One line a finding, the mend below it.  colours: how a terminal is told of each status; by
+    default not at all.
+    """
     width = 1 + max((len(finding.check) for finding in findings), default=0)
     lines = []
     for finding in findings:

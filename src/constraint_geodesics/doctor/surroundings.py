@@ -52,16 +52,24 @@ class Surroundings:
         """Those of this process."""
         search = tuple(sys.path)
         return cls(
-            tuple(sys.version_info[:3]), sys.platform, Path(sys.prefix), search, dict(os.environ),
-            Path(__file__).resolve().parents[1], versions_in(search),
-        )  # fmt: skip
+            tuple(sys.version_info[:3]),
+            sys.platform,
+            Path(sys.prefix),
+            search,
+            dict(os.environ),
+            Path(__file__).resolve().parents[1],
+            versions_in(search),
+        )
 
 
 def versions_in(search: Sequence[str]) -> dict[str, str]:
-    """Versions of the distributions in some folders, by normalised name; of two, the one that Python finds first."""
+    """Versions of the distributions in some folders, by normalised name; of two, the one that
+    Python finds first.
+    """
     versions: dict[str, str] = {}
     for found in metadata.distributions(path=list(search)):
-        # a broken installation tells nothing of itself, so it counts as missing; Pythons differ in what they raise
+        # a broken installation tells nothing of itself, so it counts as missing; Pythons differ in
+        # what they raise
         with suppress(OSError, TypeError):
             about = found.metadata
             if about["Name"]:
@@ -70,7 +78,9 @@ def versions_in(search: Sequence[str]) -> dict[str, str]:
 
 
 def locked(root: Path) -> dict[str, str]:
-    """Versions of requirements.lock by the names it has for them; none where there is no such file."""
+    """Versions of requirements.lock by the names it has for them; none where there is no such
+    file.
+    """
     file = root / "requirements.lock"
     lines = file.read_text("utf-8").splitlines() if file.is_file() else []
     pinned = [line.partition("#")[0].partition(";")[0].partition("==") for line in lines]
@@ -101,7 +111,9 @@ def is_checkout(folder: Path) -> bool:
 def own_environment(root: Path, here: Surroundings) -> Path | None:
     """The checkout's environment, if this process runs in another."""
     own = root / ".venv"
-    return own if (own / "pyvenv.cfg").is_file() and own.resolve() != here.prefix.resolve() else None
+    return (
+        own if (own / "pyvenv.cfg").is_file() and own.resolve() != here.prefix.resolve() else None
+    )
 
 
 def completing(root: Path, here: Surroundings) -> str:
@@ -119,9 +131,15 @@ def on_path(here: Surroundings, name: str) -> Path | None:
 
 def answer_of(
     command: Sequence[str], folder: Path, environ: Mapping[str, str], longest_s: float
-) -> subprocess.CompletedProcess[str]:  # fmt: skip
+) -> subprocess.CompletedProcess[str]:
     """Run a command that asks nothing.  Raises TimeoutExpired."""
     return subprocess.run(
-        command, cwd=str(folder), env=dict(environ), timeout=longest_s, check=False, stdin=subprocess.DEVNULL,
-        capture_output=True, text=True,
-    )  # fmt: skip
+        command,
+        cwd=str(folder),
+        env=dict(environ),
+        timeout=longest_s,
+        check=False,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+    )

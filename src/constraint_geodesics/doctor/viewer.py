@@ -29,7 +29,8 @@ def check_display(root: Path, here: Surroundings) -> Look:
 
 
 def check_recordings(root: Path, here: Surroundings) -> Look:
-    """Rerun's viewer opens recordings of its own version and the one before; `rerun` must be the one installed here.
+    """Rerun's viewer opens recordings of its own version and the one before; `rerun` must be the
+    one installed here.
 
     A file begins with RRF and a digit, then one byte each of major, minor and patch version.
     """
@@ -38,7 +39,11 @@ def check_recordings(root: Path, here: Surroundings) -> Look:
         yield "note", "rerun-sdk is not installed: recordings can't be written or opened", ""
         return ""
     own = numbers(installed)[:2]
-    files = [file for folder in ("data/recordings", "first_path") for file in (root / folder).rglob("*.rrd")]
+    files = [
+        file
+        for folder in ("data/recordings", "first_path")
+        for file in (root / folder).rglob("*.rrd")
+    ]
     broken: list[str] = []
     versions: Counter[tuple[int, ...]] = Counter()
     for file in files:
@@ -49,16 +54,35 @@ def check_recordings(root: Path, here: Surroundings) -> Look:
         else:
             broken.append(file.relative_to(root).as_posix())
     if broken:
-        mend = f"rm {shlex.quote(broken[0])}, and record it again: dvc repro, or geodesics plan --record"
-        yield "problem", f"{len(broken)} of {len(files)} are no recordings (cut short?): {few(broken)}", mend
+        mend = (
+            f"rm {shlex.quote(broken[0])}, and record it again: dvc repro, or geodesics "
+            f"plan --record"
+        )
+        yield (
+            "problem",
+            f"{len(broken)} of {len(files)} are no recordings (cut short?): {few(broken)}",
+            mend,
+        )
     for version, count in sorted(versions.items()):
         named = f"{count} of {len(files)} are of Rerun {'.'.join(map(str, version))}"
         if version[:2] > own:
-            mend = f"python -m pip install rerun-sdk=={'.'.join(map(str, version))}, or record them again: dvc repro"
-            yield "problem", f"{named}, newer than the installed {installed}, which may not open them", mend
+            mend = (
+                f"python -m pip install rerun-sdk=={'.'.join(map(str, version))}, or record "
+                f"them again: dvc repro"
+            )
+            yield (
+                "problem",
+                f"{named}, newer than the installed {installed}, which may not open them",
+                mend,
+            )
         elif version[:2] < (own[0], own[1] - 1):
             mend = "python -m rerun rrd migrate FILE, or record them again: dvc repro"
-            yield "note", f"{named}; the installed {installed} promises to open only those of the version before", mend
+            yield (
+                "note",
+                f"{named}; the installed {installed} promises to open only those of the "
+                f"version before",
+                mend,
+            )
     yield from _other_viewer(here, installed)
     return f"{len(files)} found, all for the installed Rerun {installed}"
 
@@ -74,7 +98,14 @@ def _other_viewer(here: Surroundings, installed: str) -> Iterator[Said]:
         told = ""
     version = re.search(r"\d+\.\d+\.\d+\S*", told)
     if version is None:
-        yield "note", f"{found} does not tell its version; this environment has {installed}", "geodesics replay FILE"
+        yield (
+            "note",
+            f"{found} does not tell its version; this environment has {installed}",
+            "geodesics replay FILE",
+        )
     elif version[0] != installed:
-        said = f"`rerun` on PATH is {found} of version {version[0]}, but this environment has {installed}"
+        said = (
+            f"`rerun` on PATH is {found} of version {version[0]}, but this environment has "
+            f"{installed}"
+        )
         yield "note", said, "geodesics replay FILE, which starts the right one"

@@ -29,9 +29,13 @@ def _spaces(problem: GeodesicProblem) -> tuple[spaces.Box, spaces.Box]:
 
 
 class CurveVecEnv(VecEnv):
-    """Many curves at once.  Episodes end by time only, so every end is a truncation, and restarts are automatic."""
+    """Many curves at once.  Episodes end by time only, so every end is a truncation, and restarts
+    are automatic.
+    """
 
-    def __init__(self, problem: GeodesicProblem, settings: EpisodeSettings, count: int, seed: int) -> None:
+    def __init__(
+        self, problem: GeodesicProblem, settings: EpisodeSettings, count: int, seed: int
+    ) -> None:
         super().__init__(count, *_spaces(problem))
         self.problem, self.settings = problem, settings
         self.rng = np.random.default_rng(seed)
@@ -60,7 +64,9 @@ class CurveVecEnv(VecEnv):
         self._actions = np.array(actions, np.float64)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Advance all curves; finished episodes restart, their last observation stands in the infos."""
+        """Advance all curves; finished episodes restart, their last observation stands in the
+        infos.
+        """
         self.states, reward = advance(self.problem, self.settings, self.states, self._actions)
         self.returns += reward
         done = self.states.step >= self.settings.steps
@@ -69,16 +75,25 @@ class CurveVecEnv(VecEnv):
         if done.any():
             rows = np.flatnonzero(done)
             for row in rows:
-                infos[row] = {"terminal_observation": observation[row].copy(), "TimeLimit.truncated": True}
-            self.savings += (1.0 - self.states.best_cost[rows] / self.states.straight_cost[rows]).tolist()
+                infos[row] = {
+                    "terminal_observation": observation[row].copy(),
+                    "TimeLimit.truncated": True,
+                }
+            self.savings += (
+                1.0 - self.states.best_cost[rows] / self.states.straight_cost[rows]
+            ).tolist()
             self.episode_returns += self.returns[rows].tolist()
             self.returns[rows] = 0.0
-            self.states = self.states.replaced(rows, draw_episodes(self.problem, len(rows), self.rng))
+            self.states = self.states.replaced(
+                rows, draw_episodes(self.problem, len(rows), self.rng)
+            )
             observation = observe(self.settings, self.states)
         return observation, reward.astype(np.float32), done, infos
 
     def pop_figures(self) -> dict[str, float]:
-        """Means over the episodes finished since the last call: the best curve's saving over the straight, return."""
+        """Means over the episodes finished since the last call: the best curve's saving over the
+        straight, return.
+        """
         figures = {
             "saving": float(np.mean(self.savings)) if self.savings else 0.0,
             "return": float(np.mean(self.episode_returns)) if self.episode_returns else 0.0,
@@ -93,15 +108,22 @@ class CurveVecEnv(VecEnv):
         """The same attribute for every curve."""
         return [getattr(self, attr_name, None) for _ in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:  # noqa: ARG002
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """One attribute for all curves."""
         setattr(self, attr_name, value)
 
-    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
         """Call a method once for each curve named."""
-        return [getattr(self, method_name)(*method_args, **method_kwargs) for _ in self._get_indices(indices)]
+        return [
+            getattr(self, method_name)(*method_args, **method_kwargs)
+            for _ in self._get_indices(indices)
+        ]
 
-    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None) -> list[bool]:  # noqa: ARG002
+    def env_is_wrapped(
+        self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None
+    ) -> list[bool]:
         """No copy is wrapped by itself."""
         return [False for _ in self._get_indices(indices)]
 
@@ -114,7 +136,9 @@ class CurveEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_space, self.action_space = _spaces(problem)
         self.states: CurveStates | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:  # noqa: ARG002
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict]:
         """A fresh episode."""
         super().reset(seed=seed)
         self.states = draw_episodes(self.problem, 1, self.np_random)
@@ -124,11 +148,21 @@ class CurveEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """One change of the curve; episodes are only ever truncated."""
         if self.states is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        self.states, reward = advance(self.problem, self.settings, self.states, np.asarray(action, np.float64)[None])
+        self.states, reward = advance(
+            self.problem, self.settings, self.states, np.asarray(action, np.float64)[None]
+        )
         observation = observe(self.settings, self.states)[0]
-        return observation, float(reward[0]), False, bool(self.states.step[0] >= self.settings.steps), {}
+        return (
+            observation,
+            float(reward[0]),
+            False,
+            bool(self.states.step[0] >= self.settings.steps),
+            {},
+        )
 
 
 def scalar_environments(make: Callable[[], gymnasium.Env], count: int) -> VecEnv:
-    """One scalar environment a copy, stepped one after another: the usual way, and the measure of `CurveVecEnv`."""
+    """One scalar environment a copy, stepped one after another: the usual way, and the measure of
+    `CurveVecEnv`.
+    """
     return DummyVecEnv([make] * count)

@@ -1,7 +1,8 @@
-"""Episodes of the search for a curve, eqs. 9-15, as pure functions of numpy arrays: a state is a curve, an action
-changes its coefficients.
+"""Episodes of the search for a curve, eqs. 9-15, as pure functions of numpy arrays: a state is a
+curve, an action changes its coefficients.
 
-Nothing here learns or needs a library for it: training and planning step through the same functions.
+Nothing here learns or needs a library for it: training and planning step through the same
+functions.
 """
 
 from dataclasses import dataclass, replace
@@ -14,17 +15,21 @@ from constraint_geodesics.geodesics.problem import Ends, GeodesicProblem
 from constraint_geodesics.params import GeodesicParams, RewardParams
 
 DESCENT_SCALE = 0.5
-"""Change of a coefficient by an action of 1, in units of the whole step of the problem's descent."""
+"""Change of a coefficient by an action of 1, in units of the whole step of the problem's descent.
+"""
 LEAST_STRIDE = 1e-3
-"""Least change of a coefficient by an action of 1, in units of the ends' distance: at a minimum the descent is 0."""
+"""Least change of a coefficient by an action of 1, in units of the ends' distance: at a minimum the
+descent is 0.
+"""
 
 
 @dataclass(frozen=True)
 class EpisodeSettings:
     """Length of an episode, size of an action, reward.
 
-    action_scale: what an action of 1 changes a coefficient by, in units of the ends' distance.  descent_scale: the
-    same for a feasible curve whose problem knows a descent, in units of the descent's step.
+    action_scale: what an action of 1 changes a coefficient by, in units of the ends' distance.
+    descent_scale: the same for a feasible curve whose problem knows a descent, in units of the
+    descent's step.
     """
 
     steps: int
@@ -35,13 +40,16 @@ class EpisodeSettings:
 
 def episode_settings(params: GeodesicParams) -> EpisodeSettings:
     """How episodes run."""
-    return EpisodeSettings(params.episode_steps, params.ppo.action_scale, params.reward, params.ppo.descent_scale)
+    return EpisodeSettings(
+        params.episode_steps, params.ppo.action_scale, params.reward, params.ppo.descent_scale
+    )
 
 
 @dataclass(frozen=True)
 class CurveStates:
-    """B curves under way: coefficients (in the chart's unit), ends, length, cost and feasibility now, descent and
-    features of the `Look` at them, cost of the straight line, steps taken, and the cheapest curve met so far.
+    """B curves under way: coefficients (in the chart's unit), ends, length, cost and feasibility
+    now, descent and features of the `Look` at them, cost of the straight line, steps taken, and the
+    cheapest curve met so far.
     """
 
     phi: Float[np.ndarray, "B p"]
@@ -77,25 +85,40 @@ def begin(problem: GeodesicProblem, ends: Ends, phi: Float[np.ndarray, "B p"]) -
         straight_cost[bent] = problem.evaluate(np.zeros_like(phi[bent]), ends[bent]).cost
     better = costs.cost < straight_cost
     return CurveStates(
-        phi, ends, costs.length, costs.cost, costs.feasible, now.descent, now.features, straight_cost,
-        np.zeros(len(phi), dtype=np.int64), np.where(better[:, None], phi, 0.0), np.minimum(costs.cost, straight_cost),
-    )  # fmt: skip
+        phi,
+        ends,
+        costs.length,
+        costs.cost,
+        costs.feasible,
+        now.descent,
+        now.features,
+        straight_cost,
+        np.zeros(len(phi), dtype=np.int64),
+        np.where(better[:, None], phi, 0.0),
+        np.minimum(costs.cost, straight_cost),
+    )
 
 
 def draw_episodes(problem: GeodesicProblem, count: int, rng: np.random.Generator) -> CurveStates:
-    """Episodes on random ends; every other one starts from a random curve, so that bad ones are met as well."""
+    """Episodes on random ends; every other one starts from a random curve, so that bad ones are met
+    as well.
+    """
     ends = problem.sample_ends(count, rng)
     phi = problem.sample_curves(ends, rng) * rng.integers(2, size=(count, 1))
     return begin(problem, ends, phi)
 
 
 def advance(
-    problem: GeodesicProblem, settings: EpisodeSettings, states: CurveStates, actions: Float[np.ndarray, "B p"]
+    problem: GeodesicProblem,
+    settings: EpisodeSettings,
+    states: CurveStates,
+    actions: Float[np.ndarray, "B p"],
 ) -> tuple[CurveStates, Float[np.ndarray, "B"]]:
     """One step of B episodes: new states and rewards (eq. 15).
 
-    An action of 1 changes a coefficient by `strides`: a near pair needs as fine a bend, in proportion, as a far one,
-    and a curve near its minimum as small a step, in proportion, as one far from it.
+    An action of 1 changes a coefficient by `strides`: a near pair needs as fine a bend, in
+    proportion, as a far one, and a curve near its minimum as small a step, in proportion, as one
+    far from it.
     """
     phi = states.phi + strides(settings, states)[:, None] * np.clip(actions, -1.0, 1.0)
     now = problem.look(phi, states.ends)
@@ -103,10 +126,17 @@ def advance(
     reward = rewards(settings.reward, states.cost, costs.cost, states.straight_cost)
     better = costs.cost < states.best_cost
     moved = replace(
-        states, phi=phi, length=costs.length, cost=costs.cost, feasible=costs.feasible, descent=now.descent,
-        features=now.features, step=states.step + 1,
-        best_phi=np.where(better[:, None], phi, states.best_phi), best_cost=np.minimum(states.best_cost, costs.cost),
-    )  # fmt: skip
+        states,
+        phi=phi,
+        length=costs.length,
+        cost=costs.cost,
+        feasible=costs.feasible,
+        descent=now.descent,
+        features=now.features,
+        step=states.step + 1,
+        best_phi=np.where(better[:, None], phi, states.best_phi),
+        best_cost=np.minimum(states.best_cost, costs.cost),
+    )
     return moved, reward
 
 
@@ -115,18 +145,25 @@ def strides(settings: EpisodeSettings, states: CurveStates) -> Float[np.ndarray,
     longest = settings.action_scale * states.ends.distance
     if not states.descent.shape[1]:
         return longest
-    fine = settings.descent_scale * np.linalg.norm(states.descent, axis=1) + LEAST_STRIDE * states.ends.distance
+    fine = (
+        settings.descent_scale * np.linalg.norm(states.descent, axis=1)
+        + LEAST_STRIDE * states.ends.distance
+    )
     return np.where(states.feasible, np.minimum(fine, longest), longest)
 
 
 def rewards(
-    params: RewardParams, before: Float[np.ndarray, "B"], after: Float[np.ndarray, "B"],
+    params: RewardParams,
+    before: Float[np.ndarray, "B"],
+    after: Float[np.ndarray, "B"],
     straight: Float[np.ndarray, "B"],
-) -> Float[np.ndarray, "B"]:  # fmt: skip
-    """Eq. 15, r = K_L R_L + K_Δ R_Δ with R(x) = exp(−b exp(−c x)), and R_Δ only where the curve became shorter.
+) -> Float[np.ndarray, "B"]:
+    """Eq. 15, r = K_L R_L + K_Δ R_Δ with R(x) = exp(−b exp(−c x)), and R_Δ only where the curve
+    became shorter.
 
-    "corrected" does what the paper's text says: R rises with x, so R_L takes the saving against the straight line,
-    1 − L/L_straight, and R_Δ the relative reduction.  "printed" is R_L = R(L), R_Δ = R(Δ), which pays for long curves.
+    "corrected" does what the paper's text says: R rises with x, so R_L takes the saving against the
+    straight line, 1 − L/L_straight, and R_Δ the relative reduction.  "printed" is R_L = R(L), R_Δ =
+    R(Δ), which pays for long curves.
     """
     reduction = before - after
     if params.form == "printed":
@@ -145,9 +182,10 @@ def gompertz(x: Float[np.ndarray, "*batch"], b: float, c: float) -> Float[np.nda
 
 
 def observe(settings: EpisodeSettings, states: CurveStates) -> Float[np.ndarray, "B o"]:
-    """What the policy sees, in this order: coefficients in units of the ends' distance (p), both ends in the chart
-    (2 N), cost and best cost over the straight line's, less 1, time left (3); where the problem knows a descent, its
-    direction (p) and the logarithm of its size in units of the ends' distance, and the problem's features.
+    """What the policy sees, in this order: coefficients in units of the ends' distance (p), both
+    ends in the chart (2 N), cost and best cost over the straight line's, less 1, time left (3);
+    where the problem knows a descent, its direction (p) and the logarithm of its size in units of
+    the ends' distance, and the problem's features.
     """
     scale = np.maximum(states.straight_cost, 1e-9)
     far = states.ends.distance[:, None]
@@ -161,7 +199,11 @@ def observe(settings: EpisodeSettings, states: CurveStates) -> Float[np.ndarray,
     ]
     if states.descent.shape[1]:
         size = np.linalg.norm(states.descent, axis=1, keepdims=True)
-        columns += [states.descent / np.maximum(size, 1e-9), np.log10(size / far + 1e-4) + 2.0, states.features]
+        columns += [
+            states.descent / np.maximum(size, 1e-9),
+            np.log10(size / far + 1e-4) + 2.0,
+            states.features,
+        ]
     return np.concatenate(columns, axis=1).astype(np.float32)
 
 

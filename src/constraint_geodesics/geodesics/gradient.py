@@ -1,4 +1,6 @@
-"""Geodesics as minima of the energy, by a damped Newton method from several starts, all queries in one batch."""
+"""Geodesics as minima of the energy, by a damped Newton method from several starts, all queries in
+one batch.
+"""
 
 import time
 from collections.abc import Callable
@@ -23,22 +25,26 @@ HAIR = 1e-3
 PROMISING = 1.2
 """Energy over the least one of the same query up to which a minimum is followed further."""
 DAMPING = (1e-4, 1e8)
-"""First damping, relative to the largest curvature of the energy, and the one at which a curve is given up."""
+"""First damping, relative to the largest curvature of the energy, and the one at which a curve is
+given up.
+"""
 
 
 @dataclass(frozen=True)
 class GradientSolver:
     """Minima of the energy E = ∫ γ̇ᵀ M(γ) γ̇ dt over a curve family, and from there of the length.
 
-    Over all curves the two are one, since a minimum of the energy runs at constant speed (E = L²).  Over a family they
-    are not: part of a cubic's freedom goes into its speed, so its shortest member is found by the second descent.
+    Over all curves the two are one, since a minimum of the energy runs at constant speed (E = L²).
+    Over a family they are not: part of a cubic's freedom goes into its speed, so its shortest
+    member is found by the second descent.
 
-    starts: curves tried for each image of the goal, the straight line (but for a hair) first, the others bent at random
-    by `spread` times the distance of the ends.  iterations: Newton steps at most, of each descent.  tolerance: a curve
-    has converged when the next step promises to lower the value by less than this share.
-    Raises GeometryError unless starts and iterations are at least 1.
-    Newton's direction is taken with the absolute values of the curvatures, so that saddle points (a path straight
-    over a hill) repel; where the value does not fall the step is damped.
+    starts: curves tried for each image of the goal, the straight line (but for a hair) first, the
+    others bent at random by `spread` times the distance of the ends.  iterations: Newton steps at
+    most, of each descent.  tolerance: a curve has converged when the next step promises to lower
+    the value by less than this share.
+    Raises GeometryError unless starts and iterations are at least 1. Newton's direction is taken
+    with the absolute values of the curvatures, so that saddle points (a path straight over a hill)
+    repel; where the value does not fall the step is damped.
     """
 
     starts: int = 4
@@ -63,42 +69,63 @@ class GradientSolver:
         start = ends.z_start[query]
         distance = np.linalg.norm(goal - start, axis=1)
         rng = np.random.default_rng(self.seed)
-        phi = rng.normal(scale=self.spread, size=(len(query), problem.curve.coefficients)) * distance[:, None]
-        # straight but for a hair: at a saddle the slope of the straight line is exactly zero, and nothing would move
+        phi = (
+            rng.normal(scale=self.spread, size=(len(query), problem.curve.coefficients))
+            * distance[:, None]
+        )
+        # straight but for a hair: at a saddle the slope of the straight line is exactly zero, and
+        # nothing would move
         phi[:: self.starts] *= HAIR
         return Candidates(query, phi, start, goal)
 
     def refine(
-        self, problem: ChartProblem, ends: Ends, candidates: Candidates, given: Candidates | None = None,
+        self,
+        problem: ChartProblem,
+        ends: Ends,
+        candidates: Candidates,
+        given: Candidates | None = None,
         began: float | None = None,
-    ) -> list[Geodesic]:  # fmt: skip
+    ) -> list[Geodesic]:
         """The shortest curve for each query after Newton steps from the candidates.
 
-        given: curves that compete as they are, too: a descent knows nothing of the manifold's border.
+        given: curves that compete as they are, too: a descent knows nothing of the manifold's
+        border.
         began: clock reading [s] from which the time counts; now by default.
         """
         began = time.perf_counter() if began is None else began
         rule = rules(tuple(problem.curve.breaks))[1]
-        energy, length = (make(problem.manifold, problem.curve, rule) for make in (energy_function, length_function))
+        energy, length = (
+            make(problem.manifold, problem.curve, rule)
+            for make in (energy_function, length_function)
+        )
         first = minimise(energy, candidates, self.iterations, self.tolerance)
         inside = problem.stays_inside(first.phi, candidates.ends())
         rows = _promising(candidates.query, np.where(inside, first.value, np.inf))
-        kept = Candidates(candidates.query[rows], first.phi[rows], candidates.start[rows], candidates.goal[rows])
+        kept = Candidates(
+            candidates.query[rows], first.phi[rows], candidates.start[rows], candidates.goal[rows]
+        )
         second = minimise(length, kept, self.iterations, self.tolerance)
         found, converged = replace(kept, phi=second.phi), second.converged
         if given is not None:
             found = Candidates.join([found, given])
             converged = np.concatenate([converged, np.zeros(len(given.query), dtype=bool)])
         return shortest_of(
-            problem, ends, found, converged, first.steps + second.steps, first.evaluations + second.evaluations,
+            problem,
+            ends,
+            found,
+            converged,
+            first.steps + second.steps,
+            first.evaluations + second.evaluations,
             time.perf_counter() - began,
-        )  # fmt: skip
+        )
 
 
 def _promising(query: Int[np.ndarray, "C"], energy: Float[np.ndarray, "C"]) -> Int[np.ndarray, "K"]:
-    """Rows whose energy is near the least of their query: the second descent gains a few per cent, not more.
+    """Rows whose energy is near the least of their query: the second descent gains a few per cent,
+    not more.
 
-    Where no curve of a query can be used (all inf), all of them stay: the second descent may find back.
+    Where no curve of a query can be used (all inf), all of them stay: the second descent may find
+    back.
     """
     least = np.full(query.max() + 1, np.inf)
     np.fmin.at(least, query, energy)
@@ -107,8 +134,8 @@ def _promising(query: Int[np.ndarray, "C"], energy: Float[np.ndarray, "C"]) -> I
 
 @dataclass(frozen=True)
 class Descent:
-    """Coefficients that a descent ended with, the function there, which of them are minima, steps taken, values of the
-    function taken.
+    """Coefficients that a descent ended with, the function there, which of them are minima, steps
+    taken, values of the function taken.
     """
 
     phi: Float[np.ndarray, "C p"]
@@ -118,16 +145,24 @@ class Descent:
     evaluations: int
 
 
-def minimise(function: Objective, candidates: Candidates, iterations: int, tolerance: float) -> Descent:
-    """At most `iterations` damped Newton steps down a function of (phi, start, goal), all curves in one batch."""
-    phi, start, goal = (torch.from_numpy(np.array(x)) for x in (candidates.phi, candidates.start, candidates.goal))
+def minimise(
+    function: Objective, candidates: Candidates, iterations: int, tolerance: float
+) -> Descent:
+    """At most `iterations` damped Newton steps down a function of (phi, start, goal), all curves in
+    one batch.
+    """
+    phi, start, goal = (
+        torch.from_numpy(np.array(x)) for x in (candidates.phi, candidates.start, candidates.goal)
+    )
     damping = torch.full((len(phi),), DAMPING[0], dtype=phi.dtype)
     converged, active = torch.zeros(len(phi), dtype=torch.bool), torch.arange(len(phi))
     reached = torch.full_like(damping, torch.inf)
     evaluations = steps = 0
     while len(active) and steps < iterations:
         steps += 1
-        known, value, gradient, curvature, axes = _expansion(function, phi[active], start[active], goal[active])
+        known, value, gradient, curvature, axes = _expansion(
+            function, phi[active], start[active], goal[active]
+        )
         active = active[known]
         # stiffness no smaller than the damping, in units of the largest curvature of that curve
         largest = curvature.abs().amax(-1, keepdim=True).clamp(min=1e-30)
@@ -136,13 +171,17 @@ def minimise(function: Objective, candidates: Candidates, iterations: int, toler
         promised = 0.5 * (along.square() / stiffness).sum(-1)
         step = -(axes @ (along / stiffness)[..., None])[..., 0]
         with torch.no_grad():  # a step to where the function is not finite is refused
-            lower = torch.nan_to_num(function(phi[active] + step, start[active], goal[active]), nan=torch.inf)
+            lower = torch.nan_to_num(
+                function(phi[active] + step, start[active], goal[active]), nan=torch.inf
+            )
         evaluations += 2 * len(active)
         better = lower < value
         phi[active] += torch.where(better[:, None], step, 0.0)
         reached[active] = torch.where(better, lower, value)
         done = promised <= tolerance * value
-        damping[active] = torch.where(better, damping[active] / 10, damping[active] * 10).clamp(min=1e-12)
+        damping[active] = torch.where(better, damping[active] / 10, damping[active] * 10).clamp(
+            min=1e-12
+        )
         converged[active] = done
         active = active[~done & (damping[active] < DAMPING[1])]
     return Descent(phi.numpy(), reached.numpy(), converged.numpy(), steps, evaluations)
@@ -151,8 +190,8 @@ def minimise(function: Objective, candidates: Candidates, iterations: int, toler
 def _expansion(
     function: Objective, phi: Tensor, start: Tensor, goal: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Which curves (C,) have finite derivatives, and of those K the value (K,), gradient (K, p), curvatures (K, p) and
-    their axes (K, p, p).
+    """Which curves (C,) have finite derivatives, and of those K the value (K,), gradient (K, p),
+    curvatures (K, p) and their axes (K, p, p).
     """
 
     def first(phi: Tensor, start: Tensor, goal: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:

@@ -1,7 +1,9 @@
-"""Geodesics by a shortest path on a graph over points of the manifold: data for any N, a grid for N = 2.
+"""Geodesics by a shortest path on a graph over points of the manifold: data for any N, a grid for N
+= 2.
 
-The second is how the work the paper follows searches its latent plane.  Either way the path is fitted with one curve
-of the problem's family; `CombinedSolver` then lets it slide down to a geodesic.
+The second is how the work the paper follows searches its latent plane.  Either way the path is
+fitted with one curve of the problem's family; `CombinedSolver` then lets it slide down to a
+geodesic.
 """
 
 import time
@@ -16,7 +18,12 @@ from scipy.spatial import KDTree
 
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.problem import ChartProblem, Ends, Geodesic
-from constraint_geodesics.geodesics.solver import Candidates, nearest_image, shortest_of, with_goals_bits
+from constraint_geodesics.geodesics.solver import (
+    Candidates,
+    nearest_image,
+    shortest_of,
+    with_goals_bits,
+)
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.graph import nearest_neighbour_edges, shortest_path
 from constraint_geodesics.geometry.length import estimate_length
@@ -33,14 +40,17 @@ FITTED = 129
 ON_EDGE = 65
 """Points of an edge that are looked up to tell whether it stays inside a bounded manifold."""
 KNIGHT = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
-"""Steps to half of the 16 neighbours of a grid node: with 8 alone a path is up to 8 % too long, with 16 up to 3 %."""
+"""Steps to half of the 16 neighbours of a grid node: with 8 alone a path is up to 8 % too long,
+with 16 up to 3 %.
+"""
 
 
 @dataclass(frozen=True)
 class GraphSolver:
     """Shortest paths along the edges of a graph whose nodes (n, N) lie in the chart.
 
-    edges: (m, 2) pairs i < j.  lengths: (m,) on the manifold, of the straight chart lines the shorter way round.
+    edges: (m, 2) pairs i < j.  lengths: (m,) on the manifold, of the straight chart lines the
+    shorter way round.
     links: nodes that an end of a query is joined to.
     Build it by `over_points` or `over_grid`.
     """
@@ -52,11 +62,14 @@ class GraphSolver:
     links: int
 
     @classmethod
-    def over_points(cls, manifold: Manifold, points: Float[np.ndarray, "n N"], neighbours: int = 12) -> "GraphSolver":
-        """Nearest-neighbour graph: neighbours in the embedding where there is one, in the chart otherwise.
+    def over_points(
+        cls, manifold: Manifold, points: Float[np.ndarray, "n N"], neighbours: int = 12
+    ) -> "GraphSolver":
+        """Nearest-neighbour graph: neighbours in the embedding where there is one, in the chart
+        otherwise.
 
-        Raises GeometryError on a wrong shape or fewer than one neighbour, NonFiniteError or OutsideError with the
-        first point that does not belong to the manifold.
+        Raises GeometryError on a wrong shape or fewer than one neighbour, NonFiniteError or
+        OutsideError with the first point that does not belong to the manifold.
         """
         require_inside(manifold, torch.from_numpy(points), "points")
         edges = nearest_neighbour_edges(_position(manifold, points), neighbours)
@@ -64,14 +77,22 @@ class GraphSolver:
 
     @classmethod
     def over_grid(
-        cls, manifold: Manifold, lower: Sequence[float], upper: Sequence[float], shape: tuple[int, int]
+        cls,
+        manifold: Manifold,
+        lower: Sequence[float],
+        upper: Sequence[float],
+        shape: tuple[int, int],
     ) -> "GraphSolver":
-        """Regular grid of a 2-D chart, every node joined to 16 around it; its borders are joined to nothing, so that a
-        periodic chart is better served by `over_points`.  Raises GeometryError unless N = 2.
+        """Regular grid of a 2-D chart, every node joined to 16 around it; its borders are joined to
+        nothing, so that a periodic chart is better served by `over_points`.  Raises GeometryError
+        unless N = 2.
         """
         if manifold.dim != 2:
             raise GeometryError(f"dim = {manifold.dim}: a grid is for 2; take over_points")
-        axes = [np.linspace(low, high, count) for low, high, count in zip(lower, upper, shape, strict=True)]
+        axes = [
+            np.linspace(low, high, count)
+            for low, high, count in zip(lower, upper, shape, strict=True)
+        ]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
         rows = np.arange(len(points)).reshape(shape)
         pairs = np.concatenate([_shifted_pairs(rows, *step) for step in KNIGHT])
@@ -79,7 +100,11 @@ class GraphSolver:
 
     @classmethod
     def _with_edges(
-        cls, manifold: Manifold, points: Float[np.ndarray, "n N"], edges: Int[np.ndarray, "m 2"], links: int
+        cls,
+        manifold: Manifold,
+        points: Float[np.ndarray, "n N"],
+        edges: Int[np.ndarray, "m 2"],
+        links: int,
     ) -> "GraphSolver":
         offsets = nearest_image(manifold, points[edges[:, 1]] - points[edges[:, 0]])
         lengths = _straight_lengths(manifold, points[edges[:, 0]], offsets)
@@ -87,26 +112,41 @@ class GraphSolver:
         return cls(manifold, points, edges[kept], lengths[kept], links)
 
     def solve(self, problem: ChartProblem, ends: Ends) -> list[Geodesic]:
-        """The shortest path of the graph between each start and goal, as the nearest curve of the problem's family.
+        """The shortest path of the graph between each start and goal, as the nearest curve of the
+        problem's family.
 
-        "not_connected" where there is no path, "not_found" where the family cannot follow it on the manifold.
+        "not_connected" where there is no path, "not_found" where the family cannot follow it on the
+        manifold.
         """
         return _answers(self, problem, ends, None)
 
-    def candidates(self, problem: ChartProblem, ends: Ends) -> tuple[Candidates, Int[np.ndarray, "B"]]:
-        """Fitted curves of the queries that have a path, and how many edges each query's path has (0: none)."""
-        paths = [self.path(start, goal) for start, goal in zip(ends.z_start, ends.z_goal, strict=True)]
+    def candidates(
+        self, problem: ChartProblem, ends: Ends
+    ) -> tuple[Candidates, Int[np.ndarray, "B"]]:
+        """Fitted curves of the queries that have a path, and how many edges each query's path has
+        (0: none).
+        """
+        paths = [
+            self.path(start, goal) for start, goal in zip(ends.z_start, ends.z_goal, strict=True)
+        ]
         found = [query for query, path in enumerate(paths) if path is not None]
         fits = [_fitted(problem, path) for path in paths if path is not None]
         return Candidates(
             np.array(found, dtype=np.int64),
             np.array([fit[0] for fit in fits]).reshape(-1, problem.curve.coefficients),
             ends.z_start[found],
-            with_goals_bits(np.array([fit[1] for fit in fits]).reshape(-1, problem.curve.dim), ends.z_goal[found]),
+            with_goals_bits(
+                np.array([fit[1] for fit in fits]).reshape(-1, problem.curve.dim),
+                ends.z_goal[found],
+            ),
         ), np.array([0 if path is None else len(path) - 1 for path in paths])
 
-    def path(self, start: Float[np.ndarray, "N"], goal: Float[np.ndarray, "N"]) -> Float[np.ndarray, "k N"] | None:
-        """Corners of the shortest path in the chart, from start to an image of goal; None where they are not joined."""
+    def path(
+        self, start: Float[np.ndarray, "N"], goal: Float[np.ndarray, "N"]
+    ) -> Float[np.ndarray, "k N"] | None:
+        """Corners of the shortest path in the chart, from start to an image of goal; None where
+        they are not joined.
+        """
         n = len(self.nodes)
         tails, heads, lengths = self._links(start, goal)
         edges = np.concatenate([self.edges, np.stack([tails, heads], axis=-1)])
@@ -139,7 +179,8 @@ class GraphSolver:
 
 @dataclass(frozen=True)
 class CombinedSolver:
-    """The path of a graph finds the way, the gradient makes it a geodesic; the straight line competes.
+    """The path of a graph finds the way, the gradient makes it a geodesic; the straight line
+    competes.
 
     The graph decides what is connected.
     """
@@ -148,11 +189,15 @@ class CombinedSolver:
     gradient: GradientSolver = field(default_factory=lambda: GradientSolver(starts=1))
 
     def solve(self, problem: ChartProblem, ends: Ends) -> list[Geodesic]:
-        """The shortest minimum of the energy from the graph's path and from the gradient's own starts."""
+        """The shortest minimum of the energy from the graph's path and from the gradient's own
+        starts.
+        """
         return _answers(self.graph, problem, ends, self.gradient)
 
 
-def _answers(graph: GraphSolver, problem: ChartProblem, ends: Ends, gradient: GradientSolver | None) -> list[Geodesic]:
+def _answers(
+    graph: GraphSolver, problem: ChartProblem, ends: Ends, gradient: GradientSolver | None
+) -> list[Geodesic]:
     began = time.perf_counter()
     fitted, edges = graph.candidates(problem, ends)
     results = [
@@ -168,7 +213,9 @@ def _answers(graph: GraphSolver, problem: ChartProblem, ends: Ends, gradient: Gr
     among = ends[joined]
     if gradient is None:
         spent = time.perf_counter() - began
-        found = shortest_of(problem, among, own, np.ones(len(joined), dtype=bool), 1, len(joined), spent)
+        found = shortest_of(
+            problem, among, own, np.ones(len(joined), dtype=bool), 1, len(joined), spent
+        )
     else:
         starts = Candidates.join([own, gradient.candidates(problem, among)])
         found = gradient.refine(problem, among, starts, given=own, began=began)
@@ -177,8 +224,12 @@ def _answers(graph: GraphSolver, problem: ChartProblem, ends: Ends, gradient: Gr
     return results
 
 
-def _fitted(problem: ChartProblem, corners: Float[np.ndarray, "k N"]) -> tuple[Float[np.ndarray, "p"], np.ndarray]:
-    """Coefficients of the curve nearest to a polygon that is run through at constant speed, and the polygon's end."""
+def _fitted(
+    problem: ChartProblem, corners: Float[np.ndarray, "k N"]
+) -> tuple[Float[np.ndarray, "p"], np.ndarray]:
+    """Coefficients of the curve nearest to a polygon that is run through at constant speed, and the
+    polygon's end.
+    """
     lengths = _straight_lengths(problem.manifold, corners[:-1], np.diff(corners, axis=0))
     passed = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(lengths), lengths, 0.0))])
     t = np.linspace(0.0, 1.0, FITTED)
@@ -190,11 +241,15 @@ def _fitted(problem: ChartProblem, corners: Float[np.ndarray, "k N"]) -> tuple[F
 def _straight_lengths(
     manifold: Manifold, start: Float[np.ndarray, "m N"], offset: Float[np.ndarray, "m N"]
 ) -> Float[np.ndarray, "m"]:
-    """Length of straight chart lines; inf where one leaves the manifold or its metric is not finite."""
+    """Length of straight chart lines; inf where one leaves the manifold or its metric is not
+    finite.
+    """
     line, first = PinnedPolynomial(manifold.dim, 1), torch.from_numpy(start)
     last = first + torch.from_numpy(offset)
     with torch.no_grad():
-        lengths = estimate_length(manifold, line, first.new_zeros(len(first), 0), first, last).length.numpy()
+        lengths = estimate_length(
+            manifold, line, first.new_zeros(len(first), 0), first, last
+        ).length.numpy()
     if isinstance(manifold, BoundedManifold):
         t = torch.linspace(0.0, 1.0, ON_EDGE, dtype=first.dtype)[:, None]
         inside = manifold.contains((1 - t) * first[:, None] + t * last[:, None]).all(-1).numpy()

@@ -1,4 +1,5 @@
-"""Policy search of geodesics (eqs. 13-15): PPO over random ends, then a batch of roll-outs for each query.
+"""Policy search of geodesics (eqs. 13-15): PPO over random ends, then a batch of roll-outs for each
+query.
 
 PPO comes from stable-baselines3; what leaves this module is a small actor network in safetensors.
 """
@@ -47,7 +48,8 @@ from constraint_geodesics.params import GeodesicParams, PpoParams
 DRAWN_A_START = 16
 """Random curves drawn for each of those that roll-outs start from."""
 MOST_CHECKED = 40
-"""Candidates given to the exact check at most: those behind them are no shorter and mostly alike."""
+"""Candidates given to the exact check at most: those behind them are no shorter and mostly alike.
+"""
 
 Report = Callable[[int, dict[str, float]], None]
 Accept = Callable[[Float[np.ndarray, "p"]], bool]
@@ -71,7 +73,9 @@ class Actor(nn.Module):
         """Mean actions."""
         return self.mean(self.body(observation))
 
-    def act(self, observation: Float[np.ndarray, "B o"], noise: Float[np.ndarray, "B p"]) -> Float[np.ndarray, "B p"]:
+    def act(
+        self, observation: Float[np.ndarray, "B o"], noise: Float[np.ndarray, "B p"]
+    ) -> Float[np.ndarray, "B p"]:
         """Mean actions plus the given multiples of the standard deviation."""
         with torch.no_grad():
             mean = self(torch.from_numpy(observation)).numpy()
@@ -91,8 +95,9 @@ def train_policy(
 ) -> TrainedPolicy:
     """Train one policy on random ends.
 
-    scratch: folder of the checkpoints; training interrupted at any time goes on from the last one and ends as if it
-    had never stopped.  report: called with (environment steps, figures) after every rollout.
+    scratch: folder of the checkpoints; training interrupted at any time goes on from the last one
+    and ends as if it had never stopped.  report: called with (environment steps, figures) after
+    every rollout.
     """
     torch.manual_seed(seed)
     environment = CurveVecEnv(problem, episode_settings(params), params.environments, seed)
@@ -101,7 +106,8 @@ def train_policy(
     log.restore(model)
     remaining = params.steps - model.num_timesteps
     if remaining > 0:
-        # with reset_num_timesteps=False stable-baselines3 adds the steps already done to this total itself
+        # with reset_num_timesteps=False stable-baselines3 adds the steps already done to this total
+        # itself
         model.learn(remaining, callback=log, reset_num_timesteps=False)
         log.save()
     actor = Actor(observation_size(problem), params.ppo.hidden, problem.curve.coefficients)
@@ -111,32 +117,45 @@ def train_policy(
 
 @dataclass(frozen=True)
 class PolicySolver:
-    """Policy search as a solver: roll-outs of a trained policy for every query, the same seed for each."""
+    """Policy search as a solver: roll-outs of a trained policy for every query, the same seed for
+    each.
+    """
 
     actor: Actor
     params: GeodesicParams
     seed: int = 0
 
     def solve(self, problem: ChartProblem, ends: Ends) -> list[Geodesic]:
-        """The shortest curve that `search` meets between each start and the nearest image of its goal.
+        """The shortest curve that `search` meets between each start and the nearest image of its
+        goal.
 
         Raises GeometryError if the policy was trained for another family or dimension.
         """
         wanted, trained = problem.curve.coefficients, self.actor.mean.out_features
         if wanted != trained:
-            raise GeometryError(f"the policy changes {trained} coefficients: must be those of the curve, {wanted}")
+            raise GeometryError(
+                f"the policy changes {trained} coefficients: must be those of the curve, {wanted}"
+            )
         near = to_nearest_images(problem, ends)
         rows = [near[np.array([row])] for row in range(len(ends))]
-        return [search(problem, self.actor, self.params, row, self.seed, lambda _: True) for row in rows]
+        return [
+            search(problem, self.actor, self.params, row, self.seed, lambda _: True) for row in rows
+        ]
 
 
 def search(
-    problem: GeodesicProblem, actor: Actor, params: GeodesicParams, ends: Ends, seed: int, accept: Accept
+    problem: GeodesicProblem,
+    actor: Actor,
+    params: GeodesicParams,
+    ends: Ends,
+    seed: int,
+    accept: Accept,
 ) -> Geodesic:
     """The shortest acceptable curve that a batch of roll-outs meets between one start and goal.
 
-    The first roll-out follows the policy's mean from the straight line, the others sample its actions, half of them
-    from the cheapest of many random curves.  Every curve met counts, the straight line and the random ones included.
+    The first roll-out follows the policy's mean from the straight line, the others sample its
+    actions, half of them from the cheapest of many random curves.  Every curve met counts, the
+    straight line and the random ones included.
     accept: an exact check (collision, say) applied to the feasible candidates, shortest first.
     """
     began = time.perf_counter()
@@ -147,15 +166,22 @@ def search(
     phi = np.concatenate([np.zeros((count - len(starts), size)), starts])
     noise = rng.normal(size=(params.episode_steps, count, size))
     noise[:, 0] = 0.0
-    visited = follow(problem, actor, episode_settings(params), begin(problem, repeated(ends, count), phi), noise)
-    met = [_Curves(states.phi, Costs(states.length, states.cost, states.feasible)) for states in visited]
+    visited = follow(
+        problem, actor, episode_settings(params), begin(problem, repeated(ends, count), phi), noise
+    )
+    met = [
+        _Curves(states.phi, Costs(states.length, states.cost, states.feasible))
+        for states in visited
+    ]
     return _first_accepted(problem, ends, [drawn, *met], accept, began)
 
 
 def search_at_random(
     problem: GeodesicProblem, params: GeodesicParams, ends: Ends, seed: int, accept: Accept
 ) -> Geodesic:
-    """The control of `search`: as many curves, all drawn at random and none by a policy, chosen by the same rule."""
+    """The control of `search`: as many curves, all drawn at random and none by a policy, chosen by
+    the same rule.
+    """
     began = time.perf_counter()
     number = DRAWN_A_START * (params.rollouts // 2) + (params.episode_steps + 1) * params.rollouts
     drawn = _random_curves(problem, ends, number, np.random.default_rng(seed))
@@ -170,7 +196,9 @@ class _Curves:
     costs: Costs
 
 
-def _random_curves(problem: GeodesicProblem, ends: Ends, count: int, rng: np.random.Generator) -> _Curves:
+def _random_curves(
+    problem: GeodesicProblem, ends: Ends, count: int, rng: np.random.Generator
+) -> _Curves:
     """Many random curves and their costs: in one batch they cost next to nothing."""
     many = repeated(ends, count)
     drawn = problem.sample_curves(many, rng)
@@ -178,10 +206,15 @@ def _random_curves(problem: GeodesicProblem, ends: Ends, count: int, rng: np.ran
 
 
 def follow(
-    problem: GeodesicProblem, actor: Actor, settings: EpisodeSettings, states: CurveStates,
+    problem: GeodesicProblem,
+    actor: Actor,
+    settings: EpisodeSettings,
+    states: CurveStates,
     noise: Float[np.ndarray, "I B p"],
-) -> list[CurveStates]:  # fmt: skip
-    """The I + 1 states of B roll-outs; noise: multiples of the policy's standard deviation, 0 for its mean."""
+) -> list[CurveStates]:
+    """The I + 1 states of B roll-outs; noise: multiples of the policy's standard deviation, 0 for
+    its mean.
+    """
     visited = [states]
     for step_noise in noise:
         action = actor.act(observe(settings, visited[-1]), step_noise)
@@ -214,9 +247,17 @@ def _first_accepted(
         status = "iteration_limit" if late else "converged"
         length = float(problem.evaluate(phi[row][None], ends).length[0])
     return Geodesic(
-        status, problem.curve, phi[row], ends.z_start[0], ends.z_goal[0], length, float(straight.length[0]),
-        len(steps), len(phi), time.perf_counter() - began,
-    )  # fmt: skip
+        status,
+        problem.curve,
+        phi[row],
+        ends.z_start[0],
+        ends.z_goal[0],
+        length,
+        float(straight.length[0]),
+        len(steps),
+        len(phi),
+        time.perf_counter() - began,
+    )
 
 
 def save_policy(policy: TrainedPolicy, folder: Path, seed: int) -> None:
@@ -243,30 +284,54 @@ def load_policy(folder: Path, seed: int) -> Actor:
 def actor_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
     """The actor's part of a stable-baselines3 policy, under this module's names."""
     prefix = "mlp_extractor.policy_net."
-    weights = {f"body.{name.removeprefix(prefix)}": w for name, w in state.items() if name.startswith(prefix)}
+    weights = {
+        f"body.{name.removeprefix(prefix)}": w
+        for name, w in state.items()
+        if name.startswith(prefix)
+    }
     weights |= {f"mean.{part}": state[f"action_net.{part}"] for part in ("weight", "bias")}
-    return {name: w.detach().clone() for name, w in (weights | {"log_std": state["log_std"]}).items()}
+    return {
+        name: w.detach().clone() for name, w in (weights | {"log_std": state["log_std"]}).items()
+    }
 
 
 def ppo_model(environment: VecEnv, params: GeodesicParams, seed: int) -> PPO:
     """PPO as params.yaml describes it, before its first step."""
     ppo: PpoParams = params.ppo
     model = PPO(
-        "MlpPolicy", VecMonitor(environment), seed=seed, device="cpu", verbose=0, n_steps=ppo.rollout_steps,
-        batch_size=ppo.batch_size, n_epochs=ppo.epochs, gamma=ppo.gamma, gae_lambda=ppo.gae_lambda,
-        clip_range=ppo.clip, ent_coef=ppo.entropy,
-        learning_rate=lambda left: ppo.learning_rate_end + left * (ppo.learning_rate - ppo.learning_rate_end),
+        "MlpPolicy",
+        VecMonitor(environment),
+        seed=seed,
+        device="cpu",
+        verbose=0,
+        n_steps=ppo.rollout_steps,
+        batch_size=ppo.batch_size,
+        n_epochs=ppo.epochs,
+        gamma=ppo.gamma,
+        gae_lambda=ppo.gae_lambda,
+        clip_range=ppo.clip,
+        ent_coef=ppo.entropy,
+        learning_rate=lambda left: (
+            ppo.learning_rate_end + left * (ppo.learning_rate - ppo.learning_rate_end)
+        ),
         policy_kwargs={"net_arch": list(ppo.hidden), "log_std_init": -0.5},
-    )  # fmt: skip
+    )
     model.set_logger(Logger(None, []))  # its own would leave a folder in /tmp for every training
     return model
 
 
 class _Progress(BaseCallback):
-    """Reports each rollout and keeps a checkpoint from which training goes on as if it had never stopped."""
+    """Reports each rollout and keeps a checkpoint from which training goes on as if it had never
+    stopped.
+    """
 
     def __init__(
-        self, environment: CurveVecEnv, params: GeodesicParams, seed: int, scratch: Path, report: Report
+        self,
+        environment: CurveVecEnv,
+        params: GeodesicParams,
+        seed: int,
+        scratch: Path,
+        report: Report,
     ) -> None:
         super().__init__()
         self.environment, self.every, self.report = environment, params.checkpoint_steps, report
@@ -289,9 +354,11 @@ class _Progress(BaseCallback):
         self.report(self.num_timesteps, figures)
 
     def save(self) -> None:
-        """Called between an update and the next rollout, where all that is still to come depends on this state."""
+        """Called between an update and the next rollout, where all that is still to come depends on
+        this state.
+        """
         environment, model = self.environment, self.model
-        _, words, place, *_ = np.random.get_state(legacy=True)  # noqa: NPY002 - stable-baselines3 shuffles with it
+        _, words, place, *_ = np.random.get_state(legacy=True)  # noqa: NPY002
         states = environment.states
         arrays = {name: value for name, value in vars(states).items() if name != "ends"}
         content: dict[str, Any] = {
@@ -309,7 +376,9 @@ class _Progress(BaseCallback):
         }
         self.file.parent.mkdir(parents=True, exist_ok=True)
         torch.save(content, self.file.with_suffix(".new"))
-        self.file.with_suffix(".new").replace(self.file)  # an interruption leaves the old or the new, never half
+        self.file.with_suffix(".new").replace(
+            self.file
+        )  # an interruption leaves the old or the new, never half
         self._saved_at = self.num_timesteps
 
     def restore(self, model: PPO) -> None:
@@ -320,7 +389,13 @@ class _Progress(BaseCallback):
         model.policy.load_state_dict(content["policy"])
         model.policy.optimizer.load_state_dict(content["optimiser"])
         torch.set_rng_state(content["torch_rng"])
-        place = ("MT19937", np.array(content["numpy_rng"], np.uint32), content["numpy_rng_place"], 0, 0.0)
+        place = (
+            "MT19937",
+            np.array(content["numpy_rng"], np.uint32),
+            content["numpy_rng_place"],
+            0,
+            0.0,
+        )
         np.random.set_state(place)  # noqa: NPY002
         environment = self.environment
         environment.rng.bit_generator.state = json.loads(content["environment_rng"])

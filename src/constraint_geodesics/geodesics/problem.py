@@ -1,4 +1,6 @@
-"""What a geodesic solver is asked and what it answers: ends, the cost of curves between them, the result."""
+"""What a geodesic solver is asked and what it answers: ends, the cost of curves between them, the
+result.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -10,14 +12,25 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from constraint_geodesics.constraints.lift import Lifted, as_executed, correct_and_retract, densify, jump_excess
-from constraint_geodesics.constraints.retraction import Retraction
-from constraint_geodesics.constraints.vector import ConstraintManifold
+from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.geodesics.pull_kernels import tangential_pull
 from constraint_geodesics.geometry.curves import CurveFamily, PinnedPolynomial
 from constraint_geodesics.geometry.length import Collocation, Quadrature, estimate_length
-from constraint_geodesics.geometry.manifold import BoundedManifold, GeometryError, Manifold, require_inside
+from constraint_geodesics.geometry.manifold import (
+    BoundedManifold,
+    GeometryError,
+    Manifold,
+    require_inside,
+)
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.learning.lift import (
+    Lifted,
+    as_executed,
+    correct_and_retract,
+    densify,
+    jump_excess,
+)
 
 REDRAWN = 10
 """Times that a goal equal to its start is drawn again."""
@@ -32,7 +45,9 @@ SHOWN_NODES = 3
 PRIOR_POINTS = 256
 """Latent points that the decoder's mean Jacobian is taken over."""
 LEAST_SINGULAR = 0.2
-"""Smallest singular value of the decoder's mean Jacobian that is inverted, as a share of the largest."""
+"""Smallest singular value of the decoder's mean Jacobian that is inverted, as a share of the
+largest.
+"""
 LONGEST_DESCENT = 0.5
 """Longest step of the descent, in units of the ends' distance: at a jump the pull has no scale."""
 SEEN_TOLERANCE = 0.2
@@ -41,7 +56,9 @@ SEEN_TOLERANCE = 0.2
 
 @dataclass(frozen=True)
 class Ends:
-    """Starts and goals of B curves, as chart points (B, N) and, on a robot's manifold, as joints (B, D) [rad]."""
+    """Starts and goals of B curves, as chart points (B, N) and, on a robot's manifold, as joints
+    (B, D) [rad].
+    """
 
     z_start: Float[np.ndarray, "B N"]
     z_goal: Float[np.ndarray, "B N"]
@@ -62,7 +79,9 @@ class Ends:
 
     @property
     def distance(self) -> Float[np.ndarray, "B"]:
-        """Distance of start and goal in the chart: the unit of coefficients, so that near and far pairs look alike."""
+        """Distance of start and goal in the chart: the unit of coefficients, so that near and far
+        pairs look alike.
+        """
         return np.maximum(np.linalg.norm(self.z_goal - self.z_start, axis=1), 1e-9)
 
     def replaced(self, rows: np.ndarray, other: "Ends") -> "Ends":
@@ -80,7 +99,9 @@ def repeated(ends: Ends, count: int) -> Ends:
 
 @dataclass(frozen=True)
 class Costs:
-    """Length of B curves, their cost (the length and what is wrong with them), and which are curves one could use."""
+    """Length of B curves, their cost (the length and what is wrong with them), and which are curves
+    one could use.
+    """
 
     length: Float[np.ndarray, "B"]
     cost: Float[np.ndarray, "B"]
@@ -91,8 +112,9 @@ class Costs:
 class Look:
     """What a policy sees of B curves beside their coefficients.
 
-    descent: the step that a preconditioned descent of the energy would take, in the chart's unit; no columns where a
-    problem has none.  features: numbers of order 1, the same in number for every problem of a class.
+    descent: the step that a preconditioned descent of the energy would take, in the chart's unit;
+    no columns where a problem has none.  features: numbers of order 1, the same in number for every
+    problem of a class.
     """
 
     costs: Costs
@@ -136,13 +158,16 @@ Status = Literal["converged", "iteration_limit", "not_found", "not_connected"]
 class Geodesic:
     """What a solver found between one start and goal: the one record of every solver.
 
-    status: "converged" (more of the same work would not shorten the curve: the gradient stands at a local minimum, the
-    graph has given its shortest path, the last step of the policy's roll-outs met nothing shorter), "iteration_limit"
-    (it was still getting shorter), "not_found" (every curve tried jumps, collides, or leaves the limits or the
-    manifold), "not_connected" (start and goal are not joined, as far as the graph that was searched knows).
-    curve, phi, start, goal: γ_φ; on a periodic chart the goal may be another image of the one asked for.
-    length: of γ_φ, in the unit of the manifold; nan where nothing was found.  straight_length: of the straight chart
-    line to the nearest image of the goal.  iterations: steps of the solver.  evaluations: curves measured.
+    status: "converged" (more of the same work would not shorten the curve: the gradient stands at a
+    local minimum, the graph has given its shortest path, the last step of the policy's roll-outs
+    met nothing shorter), "iteration_limit" (it was still getting shorter), "not_found" (every curve
+    tried jumps, collides, or leaves the limits or the manifold), "not_connected" (start and goal
+    are not joined, as far as the graph that was searched knows).
+    curve, phi, start, goal: γ_φ; on a periodic chart the goal may be another image of the one asked
+    for.
+    length: of γ_φ, in the unit of the manifold; nan where nothing was found.  straight_length: of
+    the straight chart line to the nearest image of the goal.  iterations: steps of the solver.
+    evaluations: curves measured.
     """
 
     status: Status
@@ -168,17 +193,25 @@ class Geodesic:
 
     @classmethod
     def nothing(
-        cls, status: Status, curve: CurveFamily, start: Float[np.ndarray, "N"], goal: Float[np.ndarray, "N"]
+        cls,
+        status: Status,
+        curve: CurveFamily,
+        start: Float[np.ndarray, "N"],
+        goal: Float[np.ndarray, "N"],
     ) -> "Geodesic":
         """The answer where there is no curve: φ = 0, and no length."""
-        return cls(status, curve, np.zeros(curve.coefficients), start, goal, np.nan, np.nan, 0, 0, 0.0)
+        return cls(
+            status, curve, np.zeros(curve.coefficients), start, goal, np.nan, np.nan, 0, 0, 0.0
+        )
 
 
 class GeodesicSolver(Protocol):
     """A way to find geodesics.  `geodesics_between` calls it with ends that it has checked."""
 
     def solve(self, problem: "ChartProblem", ends: Ends) -> list[Geodesic]:
-        """The shortest curve of the problem's family found between each start and goal, one record each."""
+        """The shortest curve of the problem's family found between each start and goal, one record
+        each.
+        """
         ...
 
 
@@ -222,7 +255,9 @@ class ChartProblem:
     domain: Domain
 
     def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
-        """The cost is the length, at the default accuracy; a curve that leaves the manifold is not feasible."""
+        """The cost is the length, at the default accuracy; a curve that leaves the manifold is not
+        feasible.
+        """
         free, start, goal = _tensors(phi, ends.z_start, ends.z_goal)
         with torch.no_grad():
             length = estimate_length(self.manifold, self.curve, free, start, goal).length.numpy()
@@ -244,17 +279,22 @@ class ChartProblem:
     def ends(self, start: Float[np.ndarray, "B N"], goal: Float[np.ndarray, "B N"]) -> Ends:
         """Ends from chart points.
 
-        Raises GeometryError on a wrong shape, NonFiniteError or OutsideError with the first bad point.
+        Raises GeometryError on a wrong shape, NonFiniteError or OutsideError with the first bad
+        point.
         """
         start, goal = (np.asarray(values, np.float64) for values in (start, goal))
         if start.ndim != 2 or start.shape != goal.shape:
-            raise GeometryError(f"start and goal have shapes {start.shape} and {goal.shape}: both must be (B, N)")
+            raise GeometryError(
+                f"start and goal have shapes {start.shape} and {goal.shape}: both must be (B, N)"
+            )
         for name, points in (("start", start), ("goal", goal)):
             require_inside(self.manifold, torch.from_numpy(points), name)
         return Ends(start, goal, start, goal)
 
     def sample_ends(self, count: int, rng: np.random.Generator) -> Ends:
-        """Random pairs of points of the domain; a set may hold one twice, so pairs of one point are drawn again."""
+        """Random pairs of points of the domain; a set may hold one twice, so pairs of one point are
+        drawn again.
+        """
         start, goal = self.domain.sample(count, rng), self.domain.sample(count, rng)
         for _ in range(REDRAWN):
             same = np.flatnonzero((start == goal).all(axis=1))
@@ -264,7 +304,9 @@ class ChartProblem:
         return Ends(start, goal, start, goal)
 
     def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
-        """Cubics with normal coefficients, whatever the family; the ends' distance is their standard deviation."""
+        """Cubics with normal coefficients, whatever the family; the ends' distance is their
+        standard deviation.
+        """
         cubic = PinnedPolynomial(self.curve.dim, 3)
         phi = rng.normal(size=(len(ends), cubic.coefficients)) * ends.distance[:, None]
         if self.curve == cubic:
@@ -283,10 +325,10 @@ class ChartProblem:
 class LearnedProblem:
     """Geodesics on a learned manifold under a constraint, between configurations that satisfy it.
 
-    With `retract` the curve is decoded, its ends corrected, every point retracted onto the constraint, and the length
-    is that of the retracted path with the decoder's deviation beside it: ∫ √(‖q̇‖² + ‖σ̇‖²) dt.
-    Without, it is the length of the latent curve as the paper measures it, ∫ ‖ḟ‖ dt, and the cost rises by
-    `inclusion_weight` times the mean of ι_C along the curve.
+    With `retract` the curve is decoded, its ends corrected, every point retracted onto the
+    constraint, and the length is that of the retracted path with the decoder's deviation beside it:
+    ∫ √(‖q̇‖² + ‖σ̇‖²) dt. Without, it is the length of the latent curve as the paper measures it, ∫
+    ‖ḟ‖ dt, and the cost rises by `inclusion_weight` times the mean of ι_C along the curve.
     degree: of the polynomials that lengths are measured with (Collocation), on one point more.
     """
 
@@ -300,9 +342,11 @@ class LearnedProblem:
     retraction: Retraction = field(default_factory=lambda: Retraction(accuracy=1e-3, iterations=6))
 
     def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
-        """Length and cost; a curve is feasible if it has no jump, stays within the limits and, retracted, converged.
+        """Length and cost; a curve is feasible if it has no jump, stays within the limits and,
+        retracted, converged.
 
-        The cost holds the length's error estimate too: a curve must not look short because its length is not known.
+        The cost holds the length's error estimate too: a curve must not look short because its
+        length is not known.
         """
         decoded, deviation = self._decoded(phi, ends)
         return self._costs(self._lifted(decoded, ends), decoded, deviation)
@@ -310,12 +354,14 @@ class LearnedProblem:
     def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:
         """Costs, descent and features; both describe the constraint by what it does to the curve.
 
-        descent: K⁻¹ ∫ (J̄⁺ P q̈) b_k dt in the chart, with P the projector on the tangent space of the constraint
-        (`tangential_pull`), J̄ the decoder's mean Jacobian and K_jk = ∫ ḃ_j ḃ_k dt.
-        features: whether the curve is not feasible; jumps, and what lies outside the limits, as the coefficients that
-        would follow them (2 p); their sizes and what the retraction left (3); configurations at SHOWN_NODES inner
-        times [π rad]; the constraint's axes (6) and tolerances (6) [SEEN_TOLERANCE].
-        Where curves are not retracted there are costs alone: what counts there is the whole embedding.
+        descent: K⁻¹ ∫ (J̄⁺ P q̈) b_k dt in the chart, with P the projector on the tangent space of
+        the constraint (`tangential_pull`), J̄ the decoder's mean Jacobian and K_jk = ∫ ḃ_j ḃ_k dt.
+        features: whether the curve is not feasible; jumps, and what lies outside the limits, as the
+        coefficients that would follow them (2 p); their sizes and what the retraction left (3);
+        configurations at SHOWN_NODES inner times [π rad]; the constraint's axes (6) and tolerances
+        (6) [SEEN_TOLERANCE].
+        Where curves are not retracted there are costs alone: what counts there is the whole
+        embedding.
         """
         if not self.retract:
             return Look(self.evaluate(phi, ends), np.zeros((len(phi), 0)), np.zeros((len(phi), 0)))
@@ -328,8 +374,12 @@ class LearnedProblem:
     def _decoded(
         self, phi: Float[np.ndarray, "B p"], ends: Ends
     ) -> tuple[Float[np.ndarray, "B S D"], Float[np.ndarray, "B S D"]]:
-        """Decoder mean and deviation along the curves, at the times lengths are measured with [rad]."""
-        embedded = self.chart.embed_points(self.latent_points(phi, ends, _rule(self.degree).times.numpy()))
+        """Decoder mean and deviation along the curves, at the times lengths are measured with
+        [rad].
+        """
+        embedded = self.chart.embed_points(
+            self.latent_points(phi, ends, _rule(self.degree).times.numpy())
+        )
         dof = self.manifold.robot.dof
         return embedded[..., :dof].astype(np.float64), embedded[..., dof:]
 
@@ -338,33 +388,56 @@ class LearnedProblem:
         return correct_and_retract(self.manifold, decoded, t, ends.q_start, ends.q_goal, retraction)
 
     def _costs(
-        self, lifted: Lifted, decoded: Float[np.ndarray, "B S D"], deviation: Float[np.ndarray, "B S D"]
+        self,
+        lifted: Lifted,
+        decoded: Float[np.ndarray, "B S D"],
+        deviation: Float[np.ndarray, "B S D"],
     ) -> Costs:
         rule = _rule(self.degree)
-        shape = np.concatenate([lifted.joints if self.retract else decoded, deviation], axis=-1, dtype=np.float32)
+        shape = np.concatenate(
+            [lifted.joints if self.retract else decoded, deviation], axis=-1, dtype=np.float32
+        )
         length, error = _length_and_error(rule, shape)
         outside = -np.minimum(self.manifold.robot.limit_distance(lifted.joints), 0.0).sum(-1)
         if not self.retract:
-            cost = (length + error) * (1.0 + self.inclusion_weight * self.manifold.violation(decoded).mean(-1))
+            cost = (length + error) * (
+                1.0 + self.inclusion_weight * self.manifold.violation(decoded).mean(-1)
+            )
             return Costs(length, cost + outside, outside == 0.0)
         excess = jump_excess(lifted.joints, rule.times.numpy())
         left = lifted.violation.max(axis=-1)
         cost = length + error + JUMP_WEIGHT * excess + outside + left
-        return Costs(length, cost, (excess == 0.0) & (outside == 0.0) & (left <= 10 * self.retraction.accuracy))
+        return Costs(
+            length,
+            cost,
+            (excess == 0.0) & (outside == 0.0) & (left <= 10 * self.retraction.accuracy),
+        )
 
     def _pulls(self, joints: Float[np.ndarray, "B S D"]) -> Float[np.ndarray, "B S D"]:
         manifold, robot = self.manifold, self.manifold.robot
         pulls = np.empty_like(joints)
         tangential_pull(
-            robot.chain.arrays, manifold.held, manifold.tolerance, *manifold.reference_arrays,
-            robot.lower, robot.upper, 2 * self.retraction.accuracy, _rule(self.degree).times.numpy(), joints, pulls,
-        )  # fmt: skip
+            robot.chain.arrays,
+            manifold.held,
+            manifold.tolerance,
+            *manifold.reference_arrays,
+            robot.lower,
+            robot.upper,
+            2 * self.retraction.accuracy,
+            _rule(self.degree).times.numpy(),
+            joints,
+            pulls,
+        )
         return pulls
 
     def _look(
-        self, costs: Costs, lifted: Lifted, pulls: Float[np.ndarray, "B S D"], constraint: Float[np.ndarray, "B 12"],
+        self,
+        costs: Costs,
+        lifted: Lifted,
+        pulls: Float[np.ndarray, "B S D"],
+        constraint: Float[np.ndarray, "B 12"],
         ends: Ends,
-    ) -> Look:  # fmt: skip
+    ) -> Look:
         t, (basis, between) = _rule(self.degree).times.numpy(), self._bases
         robot, joints, far = self.manifold.robot, lifted.joints, ends.distance[:, None]
         descent = self._coefficients(pulls, basis)
@@ -373,15 +446,22 @@ class LearnedProblem:
         steps = np.diff(joints, axis=1)
         lengths = np.linalg.norm(steps, axis=-1)
         excess = np.maximum(lengths - allowed_steps(joints, t), 0.0)
-        jump = self._coefficients(steps * (excess / np.maximum(lengths, 1e-12))[..., None], between) / far
+        jump = (
+            self._coefficients(steps * (excess / np.maximum(lengths, 1e-12))[..., None], between)
+            / far
+        )
         over = np.maximum(joints - robot.upper, 0.0) + np.minimum(joints - robot.lower, 0.0)
         outside = self._coefficients(over, basis) / far
         sizes = np.stack([excess.sum(1), np.abs(over).sum((1, 2)), lifted.violation.max(1)], axis=1)
         shown = joints[:, np.linspace(0, len(t) - 1, SHOWN_NODES + 2).round().astype(int)[1:-1]]
         seen = (
-            ~costs.feasible[:, None], np.clip(jump, -3.0, 3.0), np.clip(outside, -3.0, 3.0), np.log1p(sizes),
-            shown.reshape(len(joints), -1) / np.pi, constraint,
-        )  # fmt: skip
+            ~costs.feasible[:, None],
+            np.clip(jump, -3.0, 3.0),
+            np.clip(outside, -3.0, 3.0),
+            np.log1p(sizes),
+            shown.reshape(len(joints), -1) / np.pi,
+            constraint,
+        )
         return Look(costs, descent, np.concatenate(seen, axis=1))
 
     def _coefficients(
@@ -424,20 +504,29 @@ class LearnedProblem:
         free, start, goal, times = _tensors(phi, ends.z_start, ends.z_goal, t)
         return self.curve.evaluate(free, start, goal, times)[0].numpy()
 
-    def path(self, phi: Float[np.ndarray, "p"], ends: Ends, spacing: float) -> Float[np.ndarray, "T D"]:
-        """The joint path of one curve, rows about `spacing` [rad] apart unless the curve has a jump.
+    def path(
+        self, phi: Float[np.ndarray, "p"], ends: Ends, spacing: float
+    ) -> Float[np.ndarray, "T D"]:
+        """The joint path of one curve, rows about `spacing` [rad] apart unless the curve has a
+        jump.
 
-        The curve itself is evaluated until its points are 0.1 rad apart; the rows between them are drawn as those of
-        any other planner's path.
+        The curve itself is evaluated until its points are 0.1 rad apart; the rows between them are
+        drawn as those of any other planner's path.
         """
         exact = Retraction() if self.retract else None
         points = 65
         while True:
             t = np.linspace(0.0, 1.0, points)
             decoded = self.chart.decode(self.latent_points(phi[None], ends, t))
-            joints = correct_and_retract(self.manifold, decoded, t, ends.q_start, ends.q_goal, exact).joints[0]
+            joints = correct_and_retract(
+                self.manifold, decoded, t, ends.q_start, ends.q_goal, exact
+            ).joints[0]
             if np.linalg.norm(np.diff(joints, axis=0), axis=-1).max() <= 0.1 or points > 1000:
-                return as_executed(self.manifold, joints, spacing) if self.retract else densify(joints, spacing)
+                return (
+                    as_executed(self.manifold, joints, spacing)
+                    if self.retract
+                    else densify(joints, spacing)
+                )
             points = 2 * points - 1
 
     def ends(self, start: Float[np.ndarray, "B D"], goal: Float[np.ndarray, "B D"]) -> Ends:
@@ -450,8 +539,8 @@ class LearnedProblem:
         return self.ends(self.joints[rows[0]], self.joints[rows[1]])
 
     def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
-        """Curves bent towards random configurations of the constraint's data: where a straight line changes its
-        branch, the way round leads past some of them.
+        """Curves bent towards random configurations of the constraint's data: where a straight line
+        changes its branch, the way round leads past some of them.
         """
         past = self.chart.encode(self.joints[rng.integers(len(self.joints), size=len(ends))])
         share = rng.uniform(size=(len(ends), 1))
@@ -464,10 +553,14 @@ class LearnedProblem:
         weights = _content(self.chart)
         settings = (self.curve, self.degree, self.retract, self.inclusion_weight, self.retraction)
         chain = self.manifold.robot.chain.arrays
-        return str(joblib.hash((weights, chain, vars(self.manifold.constraint), self.joints, settings)))
+        return str(
+            joblib.hash((weights, chain, vars(self.manifold.constraint), self.joints, settings))
+        )
 
 
-def allowed_steps(joints: Float[np.ndarray, "B S D"], t: Float[np.ndarray, "S"]) -> Float[np.ndarray, "B S-1"]:
+def allowed_steps(
+    joints: Float[np.ndarray, "B S D"], t: Float[np.ndarray, "S"]
+) -> Float[np.ndarray, "B S-1"]:
     """Longest steps [rad] of curves that do not jump, as `jump_excess` has them."""
     direct = np.linalg.norm(joints[:, -1] - joints[:, 0], axis=-1)
     return 0.05 + 4.0 * direct[:, None] * np.diff(t)
@@ -475,10 +568,12 @@ def allowed_steps(joints: Float[np.ndarray, "B S D"], t: Float[np.ndarray, "S"])
 
 @dataclass(frozen=True)
 class ProblemSet:
-    """Several constraints on one learned manifold as one problem: each pair of ends belongs to one member.
+    """Several constraints on one learned manifold as one problem: each pair of ends belongs to one
+    member.
 
     Rows are decoded and priced together; only the retraction and the pull go by members.
-    Raises GeometryError if the members differ in anything but the constraint and its data, or do not retract.
+    Raises GeometryError if the members differ in anything but the constraint and its data, or do
+    not retract.
     """
 
     members: Sequence[LearnedProblem]
@@ -489,7 +584,8 @@ class ProblemSet:
             same = replace(member, manifold=first.manifold, joints=first.joints) == first
             if not (same and member.retract and member.manifold.robot is first.manifold.robot):
                 raise GeometryError(
-                    "members of a problem set differ in more than constraint and data, or do not retract"
+                    "members of a problem set differ in more than constraint and data, or do "
+                    "not retract"
                 )
 
     @property
@@ -512,7 +608,9 @@ class ProblemSet:
         for member, rows in self._rows(ends):
             pulls[rows] = member._pulls(lifted.joints[rows])
         constraint = np.stack([member._constraint for member in self.members])[ends.member]
-        return first._look(first._costs(lifted, decoded, deviation), lifted, pulls, constraint, ends)
+        return first._look(
+            first._costs(lifted, decoded, deviation), lifted, pulls, constraint, ends
+        )
 
     def _lifted(self, decoded: Float[np.ndarray, "B S D"], ends: Ends) -> Lifted:
         lifted = Lifted(np.empty_like(decoded), np.empty(decoded.shape[:2]))

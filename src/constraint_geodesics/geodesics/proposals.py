@@ -1,4 +1,6 @@
-"""Proposals of trained policies for new queries, with numpy alone: no noise, no random curves, no learning library."""
+"""Proposals of trained policies for new queries, with numpy alone: no noise, no random curves, no
+learning library.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +16,8 @@ from constraint_geodesics.geodesics.problem import Ends, GeodesicProblem
 
 @dataclass(frozen=True)
 class MeanPolicy:
-    """A policy's mean action as a plain network: tanh layers, then a linear one, on `episodes.observe`.
+    """A policy's mean action as a plain network: tanh layers, then a linear one, on
+    `episodes.observe`.
 
     layers: weights (out, in) and biases (out,), in their order.
     """
@@ -44,7 +47,9 @@ class MeanPolicy:
 
 @dataclass(frozen=True)
 class Proposals:
-    """The best curve that each of A policies met for each of B queries: feasible if any was, then the cheapest."""
+    """The best curve that each of A policies met for each of B queries: feasible if any was, then
+    the cheapest.
+    """
 
     phi: Float[np.ndarray, "A B p"]
     cost: Float[np.ndarray, "A B"]
@@ -59,19 +64,29 @@ class Proposals:
 def propose(
     problem: GeodesicProblem, policies: Sequence[MeanPolicy], settings: EpisodeSettings, ends: Ends
 ) -> Proposals:
-    """Follow every policy's mean from the straight line for one episode; the straight line is met too."""
+    """Follow every policy's mean from the straight line for one episode; the straight line is met
+    too.
+    """
     count, queries = len(policies), len(ends)
     states = begin(
-        problem, ends[np.tile(np.arange(queries), count)], np.zeros((count * queries, problem.curve.coefficients))
+        problem,
+        ends[np.tile(np.arange(queries), count)],
+        np.zeros((count * queries, problem.curve.coefficients)),
     )
     phi, cost, feasible = states.phi, states.cost, states.feasible
     for _ in range(settings.steps):
         seen = observe(settings, states).reshape(count, queries, -1)
-        actions = np.concatenate([policy.act(rows) for policy, rows in zip(policies, seen, strict=True)])
+        actions = np.concatenate(
+            [policy.act(rows) for policy, rows in zip(policies, seen, strict=True)]
+        )
         states, _ = advance(problem, settings, states, actions)
-        better = (states.feasible & ~feasible) | ((states.feasible == feasible) & (states.cost < cost))
+        better = (states.feasible & ~feasible) | (
+            (states.feasible == feasible) & (states.cost < cost)
+        )
         phi = np.where(better[:, None], states.phi, phi)
         cost, feasible = np.where(better, states.cost, cost), feasible | states.feasible
     return Proposals(
-        phi.reshape(count, queries, -1), cost.reshape(count, queries), feasible.reshape(count, queries)
-    )  # fmt: skip
+        phi.reshape(count, queries, -1),
+        cost.reshape(count, queries),
+        feasible.reshape(count, queries),
+    )

@@ -1,4 +1,6 @@
-"""Compiled tangential pull: which way every point of a curve on a constraint manifold wants to move to shorten it."""
+"""Compiled tangential pull: which way every point of a curve on a constraint manifold wants to move
+to shorten it.
+"""
 
 import numpy as np
 from numba import njit
@@ -10,8 +12,10 @@ _COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "no
 
 
 @njit(**_COMPILE)
-def _append_normal(row, rows, size):  # type: ignore[no-untyped-def]
-    """Gram-Schmidt: `row` (D,), made orthogonal to the first `size` of `rows`, becomes the next one; the new size."""
+def _append_normal(row, rows, size):
+    """Gram-Schmidt: `row` (D,), made orthogonal to the first `size` of `rows`, becomes the next
+    one; the new size.
+    """
     dof = row.shape[0]
     before = 0.0
     for d in range(dof):
@@ -34,14 +38,26 @@ def _append_normal(row, rows, size):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE)
-def tangential_pull(  # type: ignore[no-untyped-def]
-    chain, held, tolerance, reference_position, reference_rotation, lower, upper, touching, times, joints, pulls
+def tangential_pull(
+    chain,
+    held,
+    tolerance,
+    reference_position,
+    reference_rotation,
+    lower,
+    upper,
+    touching,
+    times,
+    joints,
+    pulls,
 ):
-    """Pull of every inner point of curves into pulls (B, S, D), zero at both ends: minus the gradient of the energy
-    E = ½ Σ_i ‖q_{i+1} − q_i‖² / (t_{i+1} − t_i) with respect to q_i, on the tangent space of the constraint there.
+    """Pull of every inner point of curves into pulls (B, S, D), zero at both ends: minus the
+    gradient of the energy E = ½ Σ_i ‖q_{i+1} − q_i‖² / (t_{i+1} − t_i) with respect to q_i, on the
+    tangent space of the constraint there.
 
-    joints (B, S, D) [rad] on the constraint at times (S,).  Rows held exactly are always projected out; tolerances and
-    joint limits only where the point lies within `touching` [rad or m] of the bound and is pulled across it.
+    joints (B, S, D) [rad] on the constraint at times (S,).  Rows held exactly are always projected
+    out; tolerances and joint limits only where the point lies within `touching` [rad or m] of the
+    bound and is pulled across it.
     """
     origins, axes, prismatic, base, tool = chain
     dof = joints.shape[2]
@@ -71,8 +87,27 @@ def tangential_pull(  # type: ignore[no-untyped-def]
                 pull[d] = ahead - (q[d] - joints[b, s - 1, d]) / (times[s] - times[s - 1])
             size = 0
             if any_held:
-                pose_of(origins, axes, prismatic, base, tool, q, position, rotation, joint_origins, joint_axes)
-                residual_of(held, reference_position, reference_rotation, position, rotation, residual, linear)
+                pose_of(
+                    origins,
+                    axes,
+                    prismatic,
+                    base,
+                    tool,
+                    q,
+                    position,
+                    rotation,
+                    joint_origins,
+                    joint_axes,
+                )
+                residual_of(
+                    held,
+                    reference_position,
+                    reference_rotation,
+                    position,
+                    rotation,
+                    residual,
+                    linear,
+                )
                 geometric_jacobian(prismatic, position, joint_origins, joint_axes, geometric)
                 square = 0.0
                 for i in range(6):
@@ -109,7 +144,9 @@ def tangential_pull(  # type: ignore[no-untyped-def]
                     if across > 0.0:
                         size = _append_normal(row, rows, size)
             for d in range(dof):
-                if (q[d] >= upper[d] - touching and pull[d] > 0.0) or (q[d] <= lower[d] + touching and pull[d] < 0.0):
+                if (q[d] >= upper[d] - touching and pull[d] > 0.0) or (
+                    q[d] <= lower[d] + touching and pull[d] < 0.0
+                ):
                     for k in range(dof):
                         row[k] = 1.0 if k == d else 0.0
                     size = _append_normal(row, rows, size)

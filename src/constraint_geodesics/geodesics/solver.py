@@ -1,4 +1,6 @@
-"""The driver of every geodesic solver: checks the ends, answers what needs no search, hands on the rest."""
+"""The driver of every geodesic solver: checks the ends, answers what needs no search, hands on the
+rest.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +10,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from constraint_geodesics.geodesics.problem import ChartProblem, Ends, Geodesic, GeodesicSolver, Status
+from constraint_geodesics.geodesics.problem import (
+    ChartProblem,
+    Ends,
+    Geodesic,
+    GeodesicSolver,
+    Status,
+)
 from constraint_geodesics.geometry.length import estimate_length
 from constraint_geodesics.geometry.manifold import Manifold, PeriodicManifold
 
@@ -35,23 +43,42 @@ class Candidates:
     @classmethod
     def join(cls, parts: Sequence["Candidates"]) -> "Candidates":
         """All rows of several."""
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+        return cls(
+            *(
+                np.concatenate([getattr(part, name) for part in parts])
+                for name in cls.__dataclass_fields__
+            )
+        )
 
 
 def geodesics_between(
-    solver: GeodesicSolver, problem: ChartProblem, start: Float[np.ndarray, "B N"], goal: Float[np.ndarray, "B N"]
+    solver: GeodesicSolver,
+    problem: ChartProblem,
+    start: Float[np.ndarray, "B N"],
+    goal: Float[np.ndarray, "B N"],
 ) -> list[Geodesic]:
     """Geodesics between B starts and goals in the chart, by any solver, one record each.
 
-    Ends that are one point of the manifold give a curve of length 0.  Raises GeometryError on a wrong shape,
-    NonFiniteError or OutsideError with the first end that is no point of the manifold.
+    Ends that are one point of the manifold give a curve of length 0.  Raises GeometryError on a
+    wrong shape, NonFiniteError or OutsideError with the first end that is no point of the manifold.
     """
     ends = problem.ends(start, goal)
     same = np.logical_not(nearest_image(problem.manifold, ends.z_goal - ends.z_start).any(axis=1))
     found = iter(solver.solve(problem, ends[np.flatnonzero(~same)]) if not same.all() else [])
     zero = np.zeros(problem.curve.coefficients)
     return [
-        Geodesic("converged", problem.curve, zero, ends.z_start[row], ends.z_start[row], 0.0, 0.0, 0, 0, 0.0)
+        Geodesic(
+            "converged",
+            problem.curve,
+            zero,
+            ends.z_start[row],
+            ends.z_start[row],
+            0.0,
+            0.0,
+            0,
+            0,
+            0.0,
+        )
         if same[row]
         else next(found)
         for row in range(len(ends))
@@ -59,7 +86,9 @@ def geodesics_between(
 
 
 def nearest_image(manifold: Manifold, offset: Float[np.ndarray, "m N"]) -> Float[np.ndarray, "m N"]:
-    """Offsets between points of the chart, with every periodic coordinate taken the shorter way round."""
+    """Offsets between points of the chart, with every periodic coordinate taken the shorter way
+    round.
+    """
     period = _periods(manifold)
     finite = np.isfinite(period)
     turned = offset.copy()
@@ -73,13 +102,21 @@ def to_nearest_images(problem: ChartProblem, ends: Ends) -> Ends:
     return replace(ends, z_goal=with_goals_bits(image, ends.z_goal))
 
 
-def with_goals_bits(images: Float[np.ndarray, "*#B N"], goal: Float[np.ndarray, "*#B N"]) -> Float[np.ndarray, "*B N"]:
-    """Images of goals; a coordinate that is no turn away, but for rounding, gets the bits of the goal's own."""
+def with_goals_bits(
+    images: Float[np.ndarray, "*#B N"], goal: Float[np.ndarray, "*#B N"]
+) -> Float[np.ndarray, "*B N"]:
+    """Images of goals; a coordinate that is no turn away, but for rounding, gets the bits of the
+    goal's own.
+    """
     return np.where(np.abs(images - goal) < 1e-9, goal, images)
 
 
-def goal_images(problem: ChartProblem, ends: Ends) -> tuple[Int[np.ndarray, "C"], Float[np.ndarray, "C N"]]:
-    """Images of the goals worth a try, and the query each belongs to: both ways round each periodic coordinate."""
+def goal_images(
+    problem: ChartProblem, ends: Ends
+) -> tuple[Int[np.ndarray, "C"], Float[np.ndarray, "C N"]]:
+    """Images of the goals worth a try, and the query each belongs to: both ways round each periodic
+    coordinate.
+    """
     period = _periods(problem.manifold)
     near = to_nearest_images(problem, ends).z_goal
     other = np.where(near >= ends.z_start, -1.0, 1.0) * np.where(np.isfinite(period), period, 0.0)
@@ -90,16 +127,24 @@ def goal_images(problem: ChartProblem, ends: Ends) -> tuple[Int[np.ndarray, "C"]
 
 
 def shortest_of(
-    problem: ChartProblem, ends: Ends, candidates: Candidates, converged: Bool[np.ndarray, "C"], iterations: int,
-    evaluations: int, time_s: float,
-) -> list[Geodesic]:  # fmt: skip
+    problem: ChartProblem,
+    ends: Ends,
+    candidates: Candidates,
+    converged: Bool[np.ndarray, "C"],
+    iterations: int,
+    evaluations: int,
+    time_s: float,
+) -> list[Geodesic]:
     """The shortest curve of each query that stays on the manifold; "not_found" where there is none.
 
-    iterations and evaluations: of the whole batch; each record carries its query's share of the evaluations and time.
+    iterations and evaluations: of the whole batch; each record carries its query's share of the
+    evaluations and time.
     """
     length = _lengths(problem, candidates.phi, candidates.ends())
     length = np.where(problem.stays_inside(candidates.phi, candidates.ends()), length, np.inf)
-    straight = _lengths(problem, np.zeros((len(ends), problem.curve.coefficients)), to_nearest_images(problem, ends))
+    straight = _lengths(
+        problem, np.zeros((len(ends), problem.curve.coefficients)), to_nearest_images(problem, ends)
+    )
     # of curves that are alike to within their accuracy one that has converged is the answer
     rank = length * np.where(converged, 1.0, 1.0 + LENGTH_TOLERANCE)
     results = []
@@ -111,19 +156,34 @@ def shortest_of(
             status = "not_found"
         results.append(
             Geodesic(
-                status, problem.curve, candidates.phi[best], candidates.start[best], candidates.goal[best],
-                float(length[best]) if status != "not_found" else float("nan"), float(straight[query]), iterations,
-                evaluations * len(rows) // len(length), time_s / len(ends),
+                status,
+                problem.curve,
+                candidates.phi[best],
+                candidates.start[best],
+                candidates.goal[best],
+                float(length[best]) if status != "not_found" else float("nan"),
+                float(straight[query]),
+                iterations,
+                evaluations * len(rows) // len(length),
+                time_s / len(ends),
             )
-        )  # fmt: skip
+        )
     return results
 
 
-def _lengths(problem: ChartProblem, phi: Float[np.ndarray, "C p"], ends: Ends) -> Float[np.ndarray, "C"]:
+def _lengths(
+    problem: ChartProblem, phi: Float[np.ndarray, "C p"], ends: Ends
+) -> Float[np.ndarray, "C"]:
     free, start, goal = (torch.from_numpy(values) for values in (phi, ends.z_start, ends.z_goal))
     with torch.no_grad():
-        return estimate_length(problem.manifold, problem.curve, free, start, goal, LENGTH_TOLERANCE).length.numpy()
+        return estimate_length(
+            problem.manifold, problem.curve, free, start, goal, LENGTH_TOLERANCE
+        ).length.numpy()
 
 
 def _periods(manifold: Manifold) -> Float[np.ndarray, "N"]:
-    return np.array(manifold.periods) if isinstance(manifold, PeriodicManifold) else np.full(manifold.dim, np.inf)
+    return (
+        np.array(manifold.periods)
+        if isinstance(manifold, PeriodicManifold)
+        else np.full(manifold.dim, np.inf)
+    )

@@ -1,7 +1,7 @@
 """Curves in a chart that start and end exactly where they must (eqs. 9-11).
 
-Every family is the straight line between the ends plus a basis that vanishes there,
-γ_φ(t) = (1 − t) start + t goal + Σ_k φ_{n,k} b_k(t), so φ = 0 is the straight line and no φ moves an end.
+Every family is the straight line between the ends plus a basis that vanishes there, γ_φ(t) = (1 −
+t) start + t goal + Σ_k φ_{n,k} b_k(t), so φ = 0 is the straight line and no φ moves an end.
 """
 
 import math
@@ -19,7 +19,9 @@ from constraint_geodesics.geometry.manifold import GeometryError, require_finite
 
 
 class CurveError(GeometryError):
-    """A curve can't be built from the input; the message names it, its shape or value and what is allowed."""
+    """A curve can't be built from the input; the message names it, its shape or value and what is
+    allowed.
+    """
 
 
 @runtime_checkable
@@ -46,7 +48,9 @@ class CurveFamily(Protocol):
 
     @property
     def breaks(self) -> tuple[float, ...]:
-        """Rising times from 0 to 1 between which the curves are polynomials; at the inner ones they are C² only."""
+        """Rising times from 0 to 1 between which the curves are polynomials; at the inner ones they
+        are C² only.
+        """
         ...
 
     def evaluate(
@@ -56,7 +60,8 @@ class CurveFamily(Protocol):
         goal: Float[Tensor, "*#batch N"],
         t: Float[Tensor, "*#batch T"],
     ) -> tuple[Float[Tensor, "*batch T N"], Float[Tensor, "*batch T N"]]:
-        """Points γ(t) and velocities γ̇(t) at times t in [0, 1]; γ(0) = start and γ(1) = goal to the bit.
+        """Points γ(t) and velocities γ̇(t) at times t in [0, 1]; γ(0) = start and γ(1) = goal to
+        the bit.
 
         t: (T,) for all curves, or a row of times for each of them.
         """
@@ -92,8 +97,12 @@ class CurveFamily(Protocol):
         """`evaluate` for callers that keep b_k(t) and ḃ_k(t) of the same times for many curves."""
         ...
 
-    def fit(self, points: Float[Tensor, "*batch T N"], t: Float[Tensor, "T"]) -> Float[Tensor, "*batch p"]:
-        """Coefficients of the curves nearest to sampled ones whose first and last points are the ends."""
+    def fit(
+        self, points: Float[Tensor, "*batch T N"], t: Float[Tensor, "T"]
+    ) -> Float[Tensor, "*batch p"]:
+        """Coefficients of the curves nearest to sampled ones whose first and last points are the
+        ends.
+        """
         ...
 
 
@@ -141,7 +150,8 @@ class PinnedFamily(ABC):
     ) -> tuple[Float[Tensor, "*batch T N"], Float[Tensor, "*batch T N"]]:
         """Points γ(t) and velocities γ̇(t); t is (T,) for all curves, or has a row for each.
 
-        Batches of phi, start and goal broadcast, and t to theirs.  Raises CurveError on a wrong shape.
+        Batches of phi, start and goal broadcast, and t to theirs.  Raises CurveError on a wrong
+        shape.
         """
         return self.from_basis(phi, start, goal, t, self.basis(t), self.basis_derivative(t))
 
@@ -163,9 +173,12 @@ class PinnedFamily(ABC):
             self._batch(t, phi, start, goal)
         for name, values in (("basis", basis), ("derivative", derivative)):
             if values.shape != (*t.shape, self.functions):
-                raise CurveError(f"{name} has shape {tuple(values.shape)}: must be {(*t.shape, self.functions)}")
+                raise CurveError(
+                    f"{name} has shape {tuple(values.shape)}: must be {(*t.shape, self.functions)}"
+                )
         start, goal, time = start[..., None, :], goal[..., None, :], t[..., None]
-        # Weighting both ends, not start + t (goal − start), is what makes the goal exact in floating point.
+        # Weighting both ends, not start + t (goal − start), is what makes the goal exact in
+        # floating point.
         points = (1 - time) * start + time * goal + self._bend(phi, basis)
         velocities = (goal - start) + self._bend(phi, derivative)
         return points, velocities
@@ -177,18 +190,25 @@ class PinnedFamily(ABC):
         goal: Float[Tensor, "*#batch N"],
         t: Float[Tensor, "*#batch T"],
     ) -> Float[Tensor, "*batch T N"]:
-        """Second derivatives γ̈(t) in the chart; the ends only give them their batch.  Raises as `evaluate` does."""
+        """Second derivatives γ̈(t) in the chart; the ends only give them their batch.  Raises as
+        `evaluate` does.
+        """
         self._check(phi, start, goal)
         batch = self._batch(t, phi, start, goal)
         bend = self._bend(phi, self.basis_second_derivative(t))
         return bend.expand(*batch, t.shape[-1], self.dim)
 
-    def fit(self, points: Float[Tensor, "*batch T N"], t: Float[Tensor, "T"]) -> Float[Tensor, "*batch p"]:
-        """Coefficients of the curves nearest to sampled ones, by least squares over the samples, all of equal weight.
+    def fit(
+        self, points: Float[Tensor, "*batch T N"], t: Float[Tensor, "T"]
+    ) -> Float[Tensor, "*batch p"]:
+        """Coefficients of the curves nearest to sampled ones, by least squares over the samples,
+        all of equal weight.
 
-        The first and last points are the ends, t[0] = 0 and t[-1] = 1.  Members of the family come back as they were.
-        Raises CurveError on a wrong shape, other first and last times, or times too few or too close to tell the
-        basis functions apart; NonFiniteError with the place of the first entry that is not finite.
+        The first and last points are the ends, t[0] = 0 and t[-1] = 1.  Members of the family come
+        back as they were.
+        Raises CurveError on a wrong shape, other first and last times, or times too few or too
+        close to tell the basis functions apart; NonFiniteError with the place of the first entry
+        that is not finite.
         """
         self._check_samples(points, t)
         time = t.to(points)
@@ -213,15 +233,21 @@ class PinnedFamily(ABC):
         ):
             if value.ndim == 0 or value.shape[-1] != size:
                 raise CurveError(
-                    f"{name} has shape {tuple(value.shape)}: its last axis must have {size} entries ({self})"
+                    f"{name} has shape {tuple(value.shape)}: its last axis must have {size} "
+                    f"entries ({self})"
                 )
 
     def _batch(self, t: Tensor, phi: Tensor, start: Tensor, goal: Tensor) -> tuple[int, ...]:
-        """The curves' batch, which rows of times must not enlarge: times in a column are a mistake."""
+        """The curves' batch, which rows of times must not enlarge: times in a column are a
+        mistake.
+        """
         batch = tuple(torch.broadcast_shapes(phi.shape[:-1], start.shape[:-1], goal.shape[:-1]))
         sizes = zip(reversed(t.shape[:-1]), reversed(batch), strict=False)
         if not 1 <= t.ndim <= len(batch) + 1 or any(rows not in (1, size) for rows, size in sizes):
-            raise CurveError(f"t has shape {tuple(t.shape)}: must be (T,), or (*batch, T) for curves of batch {batch}")
+            raise CurveError(
+                f"t has shape {tuple(t.shape)}: must be (T,), or (*batch, T) for curves of "
+                f"batch {batch}"
+            )
         return batch
 
     def _check_samples(self, points: Tensor, t: Tensor) -> None:
@@ -230,7 +256,9 @@ class PinnedFamily(ABC):
             raise CurveError(f"{shapes}: must be (*batch, T, {self.dim}) and (T,)")
         needed = self.functions + 2
         if len(t) < needed:
-            raise CurveError(f"points has {len(t)} points a curve: must be at least {needed} ({self})")
+            raise CurveError(
+                f"points has {len(t)} points a curve: must be at least {needed} ({self})"
+            )
         require_finite(points, "points")
         require_finite(t, "t")
         if (float(t[0]), float(t[-1])) != (0.0, 1.0):
@@ -239,18 +267,22 @@ class PinnedFamily(ABC):
     def _require_full_rank(self, basis: Tensor) -> None:
         rank = int(torch.linalg.matrix_rank(basis)) if self.functions else 0
         if rank < self.functions:
-            raise CurveError(f"t tells {rank} basis functions apart: must tell all {self.functions} ({self})")
+            raise CurveError(
+                f"t tells {rank} basis functions apart: must tell all {self.functions} ({self})"
+            )
 
 
 @dataclass(frozen=True)
 class PinnedPolynomial(PinnedFamily):
-    """Polynomials of degree K in N dimensions with both ends given, eqs. 9-11, in a well-conditioned basis:
+    """Polynomials of degree K in N dimensions with both ends given, eqs. 9-11, in a
+    well-conditioned basis:
 
     γ(t) = (1 − t) start + t goal + Σ_k φ_{n,k} b_k(t),  b_k(t) = t (1 − t) P*_k(t),  k = 0 … K − 2,
 
-    with P*_k the Legendre polynomials shifted to [0, 1].  The space is that of eq. 11 with the goal pinned as well
-    (`to_monomial` gives its coefficients), but no two b_k are nearly alike, as powers of t are.
-    φ holds the K − 1 numbers of the first dimension, then those of the next: N (K − 1) in all, 4 for a planar cubic.
+    with P*_k the Legendre polynomials shifted to [0, 1].  The space is that of eq. 11 with the goal
+    pinned as well (`to_monomial` gives its coefficients), but no two b_k are nearly alike, as
+    powers of t are. φ holds the K − 1 numbers of the first dimension, then those of the next: N (K
+    − 1) in all, 4 for a planar cubic.
 
     dim: N, at least 1.  degree: K, at least 1 (the straight line).  Raises CurveError otherwise.
     """
@@ -276,26 +308,39 @@ class PinnedPolynomial(PinnedFamily):
         legendre, _ = shifted_legendre(t, self.functions)
         return (t * (1 - t))[..., None] * legendre
 
-    def basis_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times {self.degree}-1"]:
+    def basis_derivative(
+        self, t: Float[Tensor, "*times"]
+    ) -> Float[Tensor, "*times {self.degree}-1"]:
         """Derivatives ḃ_k(t) = (1 − 2t) P*_k(t) + t (1 − t) Ṗ*_k(t)."""
         legendre, derivative = shifted_legendre(t, self.functions)
         return (1 - 2 * t)[..., None] * legendre + (t * (1 - t))[..., None] * derivative
 
-    def basis_second_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times {self.degree}-1"]:
-        """Second derivatives b̈_k(t) = (1 − 2t) Ṗ*_k(t) − (k² + k + 2) P*_k(t), by Legendre's differential equation."""
+    def basis_second_derivative(
+        self, t: Float[Tensor, "*times"]
+    ) -> Float[Tensor, "*times {self.degree}-1"]:
+        """Second derivatives b̈_k(t) = (1 − 2t) Ṗ*_k(t) − (k² + k + 2) P*_k(t), by Legendre's
+        differential equation.
+        """
         legendre, derivative = shifted_legendre(t, self.functions)
         k = torch.arange(self.functions, dtype=t.dtype, device=t.device)
         return (1 - 2 * t)[..., None] * derivative - (k * k + k + 2) * legendre
 
     def to_monomial(
-        self, phi: Float[Tensor, "*#batch p"], start: Float[Tensor, "*#batch N"], goal: Float[Tensor, "*#batch N"]
+        self,
+        phi: Float[Tensor, "*#batch p"],
+        start: Float[Tensor, "*#batch N"],
+        goal: Float[Tensor, "*#batch N"],
     ) -> Float[Tensor, "*batch N {self.degree}+1"]:
-        """Coefficients φ_{n,k} of t^k in eq. 9: φ_{n,0} = start_n and Σ_{k≥1} φ_{n,k} = goal_n − start_n."""
+        """Coefficients φ_{n,k} of t^k in eq. 9: φ_{n,0} = start_n and Σ_{k≥1} φ_{n,k} = goal_n −
+        start_n.
+        """
         self._check(phi, start, goal)
         powers = _basis_in_powers(self.degree).to(phi)
         bent = self._by_dimension(phi) @ powers
         start, line = start[..., None], (goal - start)[..., None]
-        straight = torch.cat([start.expand_as(line), line, line.new_zeros(*line.shape[:-1], self.degree - 1)], dim=-1)
+        straight = torch.cat(
+            [start.expand_as(line), line, line.new_zeros(*line.shape[:-1], self.degree - 1)], dim=-1
+        )
         return straight + bent
 
 
@@ -303,10 +348,11 @@ class PinnedPolynomial(PinnedFamily):
 class PinnedSpline(PinnedFamily):
     """Cubic C² splines on S equal pieces in N dimensions with both ends given.
 
-    The basis is that of the clamped cubic B-splines (de Boor, A Practical Guide to Splines, ch. IX), S + 3 in number;
-    the first and last, which alone are not zero at the ends, give way to the straight line.  One piece spans the
-    cubics of PinnedPolynomial(N, 3).  A coefficient acts on four pieces at most.
-    φ holds the S + 1 numbers of the first dimension, then those of the next: N (S + 1) in all.
+    The basis is that of the clamped cubic B-splines (de Boor, A Practical Guide to Splines, ch.
+    IX), S + 3 in number; the first and last, which alone are not zero at the ends, give way to the
+    straight line.  One piece spans the cubics of PinnedPolynomial(N, 3).  A coefficient acts on
+    four pieces at most. φ holds the S + 1 numbers of the first dimension, then those of the next: N
+    (S + 1) in all.
 
     dim: N, at least 1.  segments: S, at least 1.  Raises CurveError otherwise.
     """
@@ -331,11 +377,15 @@ class PinnedSpline(PinnedFamily):
         """Inner B-splines b_k(t), zero at t = 0 and t = 1."""
         return self._derivative(t, 0)
 
-    def basis_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times {self.segments}+1"]:
+    def basis_derivative(
+        self, t: Float[Tensor, "*times"]
+    ) -> Float[Tensor, "*times {self.segments}+1"]:
         """Derivatives ḃ_k(t), quadratic on each piece."""
         return self._derivative(t, 1)
 
-    def basis_second_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times {self.segments}+1"]:
+    def basis_second_derivative(
+        self, t: Float[Tensor, "*times"]
+    ) -> Float[Tensor, "*times {self.segments}+1"]:
         """Second derivatives b̈_k(t), linear on each piece."""
         return self._derivative(t, 2)
 
@@ -362,7 +412,9 @@ def shifted_legendre(
 
 
 def _basis_in_powers(degree: int) -> Tensor:
-    """Coefficients of t^0 … t^K in b_k(t), (K − 1, K + 1), each rounded once from the exact integer."""
+    """Coefficients of t^0 … t^K in b_k(t), (K − 1, K + 1), each rounded once from the exact
+    integer.
+    """
     rows = torch.zeros(degree - 1, degree + 1, dtype=torch.float64)
     for k in range(degree - 1):
         legendre = [(-1) ** (k + j) * math.comb(k, j) * math.comb(k + j, j) for j in range(k + 1)]
@@ -379,13 +431,18 @@ def _bernstein(u: Tensor, degree: int) -> Tensor:
 
 @cache
 def _bezier_ordinates(segments: int, order: int) -> Float[np.ndarray, "S d m"]:
-    """Bézier ordinates (S, 4 − order, S + 1) of the inner B-splines' derivatives to t, on each piece.
+    """Bézier ordinates (S, 4 − order, S + 1) of the inner B-splines' derivatives to t, on each
+    piece.
 
-    Ordinate j of the piece [k, k + 1] is the blossom at 3 − j times k and j times k + 1 (Ramshaw, Blossoms are polar
-    forms, 1989), in units of the pieces.  Each derivative of a Bézier curve of degree d is d times its differences.
+    Ordinate j of the piece [k, k + 1] is the blossom at 3 − j times k and j times k + 1 (Ramshaw,
+    Blossoms are polar forms, 1989), in units of the pieces.  Each derivative of a Bézier curve of
+    degree d is d times its differences.
     """
     ordinates = np.array(
-        [[_blossom(segments, k, [k] * (3 - j) + [k + 1] * j) for j in range(4)] for k in range(segments)]
+        [
+            [_blossom(segments, k, [k] * (3 - j) + [k + 1] * j) for j in range(4)]
+            for k in range(segments)
+        ]
     )
     for degree in range(3, 3 - order, -1):
         ordinates = segments * degree * np.diff(ordinates, axis=1)

@@ -12,7 +12,8 @@ class NonFiniteError(GeometryError):
     """
 
     def __init__(self, what: str, index: tuple[int, ...], value: float) -> None:
-        # The bare arguments go to the base class because an exception is copied between processes from them.
+        # The bare arguments go to the base class because an exception is copied between processes
+        # from them.
         super().__init__(what, index, value)
         self.what, self.index, self.value = what, index, value
 
@@ -33,4 +34,7 @@ class OutsideError(GeometryError):
 
     def __str__(self) -> str:
         place = f"[{', '.join(str(i) for i in self.index)}]" if self.index else ""
-        return f"{self.what}{place} = {list(self.point)}: lies outside the manifold or in a blocked cell"
+        return (
+            f"{self.what}{place} = {list(self.point)}: lies outside the manifold or in a "
+            f"blocked cell"
+        )

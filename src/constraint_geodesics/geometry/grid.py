@@ -1,4 +1,6 @@
-"""A plane with a conformal metric known at the nodes of a regular grid, as metrics of latent spaces are exchanged."""
+"""A plane with a conformal metric known at the nodes of a regular grid, as metrics of latent spaces
+are exchanged.
+"""
 
 import math
 from dataclasses import dataclass, field
@@ -22,22 +24,27 @@ WALL = 100.0
 
 
 class GridError(GeometryError):
-    """Arrays or bounds that are no grid of a metric; the message names the input, its value and what is allowed."""
+    """Arrays or bounds that are no grid of a metric; the message names the input, its value and
+    what is allowed.
+    """
 
 
 @dataclass(frozen=True, eq=False)
 class GridManifold:
-    """The metric M(z) = g(z) I on a rectangle of the plane, g given at the nodes of a grid, bilinear between them.
+    """The metric M(z) = g(z) I on a rectangle of the plane, g given at the nodes of a grid,
+    bilinear between them.
 
-    values: g (rows, columns), rows along the first coordinate: positive, in the square of the unit of length over
-    that of the chart.  lower, upper: chart coordinates of the first node of both axes and of the last.
-    blocked: nodes that don't belong to the manifold; what `values` holds there is never read.  None blocks no node.
-    A point is blocked where its nearest node is.  In a blocked region g still leads out: a blocked node carries
-    WALL times the largest free value, times its distance to the nearest free node in steps of the finer axis, so
-    that g falls towards the free nodes from everywhere in it.  By bilinearity the half of a cell that is free
-    next to a blocked node takes part in that slope.
-    Raises GridError on a shape that is no grid, bounds that don't rise, values that aren't positive and finite at
-    the free nodes, or if every node is blocked.
+    values: g (rows, columns), rows along the first coordinate: positive, in the square of the unit
+    of length over that of the chart.  lower, upper: chart coordinates of the first node of both
+    axes and of the last.
+    blocked: nodes that don't belong to the manifold; what `values` holds there is never read.  None
+    blocks no node. A point is blocked where its nearest node is.  In a blocked region g still leads
+    out: a blocked node carries WALL times the largest free value, times its distance to the nearest
+    free node in steps of the finer axis, so that g falls towards the free nodes from everywhere in
+    it.  By bilinearity the half of a cell that is free next to a blocked node takes part in that
+    slope.
+    Raises GridError on a shape that is no grid, bounds that don't rise, values that aren't positive
+    and finite at the free nodes, or if every node is blocked.
     """
 
     values: Float[Tensor, "rows columns"]
@@ -61,12 +68,15 @@ class GridManifold:
         shape: tuple[int, int],
         dtype: torch.dtype = torch.float64,
     ) -> "GridManifold":
-        """The volume √det M of another manifold's metric at the nodes of a grid, taken for the conformal factor g.
+        """The volume √det M of another manifold's metric at the nodes of a grid, taken for the
+        conformal factor g.
 
-        For a conformal metric M = g I the volume is g itself, and distances agree as the grid gets finer; of any
-        other metric only the volume of small regions is kept, not its lengths in single directions.
-        shape: nodes along both axes.  dtype: what the manifold computes in.  Nodes that a BoundedManifold doesn't
-        contain are blocked.  Raises GridError unless the manifold has dim 2, and where the volume isn't positive.
+        For a conformal metric M = g I the volume is g itself, and distances agree as the grid gets
+        finer; of any other metric only the volume of small regions is kept, not its lengths in
+        single directions.
+        shape: nodes along both axes.  dtype: what the manifold computes in.  Nodes that a
+        BoundedManifold doesn't contain are blocked.  Raises GridError unless the manifold has dim
+        2, and where the volume isn't positive.
         """
         if manifold.dim != 2:
             raise GridError(f"manifold has dim {manifold.dim}: must be 2")
@@ -74,7 +84,9 @@ class GridManifold:
         nodes = _nodes(shape, lower, upper, torch.zeros((), dtype=dtype))
         volume = torch.linalg.det(manifold.metric(nodes).detach()).clamp(min=0).sqrt()
         blocked = ~manifold.contains(nodes) if isinstance(manifold, BoundedManifold) else None
-        return cls(volume.reshape(shape), lower, upper, None if blocked is None else blocked.reshape(shape))
+        return cls(
+            volume.reshape(shape), lower, upper, None if blocked is None else blocked.reshape(shape)
+        )
 
     @property
     def dim(self) -> int:
@@ -91,15 +103,18 @@ class GridManifold:
         return first, second
 
     def nodes(self) -> Float[Tensor, "rows*columns 2"]:
-        """Chart points of the nodes, row by row; the first and the last lie on `lower` and `upper` to the bit."""
+        """Chart points of the nodes, row by row; the first and the last lie on `lower` and `upper`
+        to the bit.
+        """
         rows, columns = self.values.shape
         return _nodes((rows, columns), self.lower, self.upper, self.values)
 
     def metric(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch N N"]:
         """The matrix g(z) I, differentiable in z; finite and positive everywhere.
 
-        Outside the grid it is that of the grid's nearest point, its gradient across the border 0.  At a coordinate
-        that is not finite it is not either, as on the other manifolds: values are checked once, by who measures.
+        Outside the grid it is that of the grid's nearest point, its gradient across the border 0.
+        At a coordinate that is not finite it is not either, as on the other manifolds: values are
+        checked once, by who measures.
         """
         require_dim(z, self.dim, "z")
         place = self._place(z)
@@ -114,16 +129,27 @@ class GridManifold:
         return factor[..., None, None] * torch.eye(self.dim, dtype=factor.dtype, device=z.device)
 
     def contains(self, z: Float[Tensor, "*batch N"]) -> Bool[Tensor, "*batch"]:
-        """Whether each point is finite, on the grid (its border included), and nearest to a node that isn't blocked."""
+        """Whether each point is finite, on the grid (its border included), and nearest to a node
+        that isn't blocked.
+        """
         require_dim(z, self.dim, "z")
-        lower, upper = (torch.tensor(bound, dtype=z.dtype, device=z.device) for bound in (self.lower, self.upper))
+        lower, upper = (
+            torch.tensor(bound, dtype=z.dtype, device=z.device)
+            for bound in (self.lower, self.upper)
+        )
         inside = ((z >= lower) & (z <= upper)).all(-1)
-        row, column = self._place(torch.where(inside[..., None], z, lower)).round().long().unbind(-1)
+        row, column = (
+            self._place(torch.where(inside[..., None], z, lower)).round().long().unbind(-1)
+        )
         return inside & ~self._walls.to(z.device)[row, column]
 
     @property
     def _walls(self) -> Bool[Tensor, "rows columns"]:
-        return torch.zeros_like(self.values, dtype=torch.bool) if self.blocked is None else self.blocked
+        return (
+            torch.zeros_like(self.values, dtype=torch.bool)
+            if self.blocked is None
+            else self.blocked
+        )
 
     def _place(self, z: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         """Position in steps of the grid, clamped to it."""
@@ -134,7 +160,9 @@ class GridManifold:
         return ((z - lower) / spacing).clamp(torch.zeros_like(last), last)
 
 
-def _nodes(shape: tuple[int, int], lower: Bounds, upper: Bounds, like: Tensor) -> Float[Tensor, "rows*columns 2"]:
+def _nodes(
+    shape: tuple[int, int], lower: Bounds, upper: Bounds, like: Tensor
+) -> Float[Tensor, "rows*columns 2"]:
     lines = [
         torch.linspace(low, high, count, dtype=like.dtype, device=like.device)
         for low, high, count in zip(lower, upper, shape, strict=True)
@@ -145,7 +173,9 @@ def _nodes(shape: tuple[int, int], lower: Bounds, upper: Bounds, like: Tensor) -
 def _with_walls(
     values: Float[Tensor, "rows columns"], blocked: Bool[Tensor, "rows columns"], spacing: Bounds
 ) -> Float[Tensor, "rows columns"]:
-    """The values with those of blocked nodes replaced by walls that rise with the distance to the free ones."""
+    """The values with those of blocked nodes replaced by walls that rise with the distance to the
+    free ones.
+    """
     depth = ndimage.distance_transform_edt(blocked.cpu().numpy(), sampling=spacing) / min(spacing)
     walls = WALL * values[~blocked].max() * torch.from_numpy(depth).to(values)
     return torch.where(blocked, walls, values)
@@ -153,7 +183,10 @@ def _with_walls(
 
 def _require_grid(shape: tuple[int, ...], lower: Bounds, upper: Bounds) -> None:
     if len(shape) != 2 or min(shape) < 2:
-        raise GridError(f"values has shape {tuple(shape)}: must be (rows, columns) with at least 2 nodes an axis")
+        raise GridError(
+            f"values has shape {tuple(shape)}: must be (rows, columns) with at least 2 nodes "
+            f"an axis"
+        )
     for name, bound in (("lower", lower), ("upper", upper)):
         if len(bound) != 2 or not all(math.isfinite(x) for x in bound):
             raise GridError(f"{name} = {bound}: must be two finite numbers")
@@ -175,4 +208,7 @@ def _require_values(values: Tensor, blocked: Tensor) -> None:
     bad = torch.nonzero(~blocked & ~(torch.isfinite(values) & (values > 0)))
     if len(bad):
         row, column = bad[0].tolist()
-        raise GridError(f"values[{row}, {column}] = {values[row, column]}: must be positive and finite, or blocked")
+        raise GridError(
+            f"values[{row}, {column}] = {values[row, column]}: must be positive and finite, "
+            f"or blocked"
+        )

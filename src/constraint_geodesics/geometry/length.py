@@ -1,9 +1,11 @@
-"""Length and energy of curves on a manifold (eq. 2), batched and differentiable, with an error estimate.
+"""Length and energy of curves on a manifold (eq. 2), batched and differentiable, with an error
+estimate.
 
-The default rule embeds a curve at few Chebyshev points and differentiates the polynomial through them: one pass of the
-embedding a point, where a forward product costs four, at the accuracy of Gauss-Legendre with as many nodes
-(`make bench-geometry` measures both).  The points of the rule of half the degree are among them, so the error
-estimate costs no further point, and only curves whose estimate is too large are measured again with twice as many.
+The default rule embeds a curve at few Chebyshev points and differentiates the polynomial through
+them: one pass of the embedding a point, where a forward product costs four, at the accuracy of
+Gauss-Legendre with as many nodes (`make bench-geometry` measures both).  The points of the rule of
+half the degree are among them, so the error estimate costs no further point, and only curves whose
+estimate is too large are measured again with twice as many.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +19,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from constraint_geodesics.geometry.curves import CurveFamily
-from constraint_geodesics.geometry.manifold import EmbeddedManifold, GeometryError, Manifold, require_finite
+from constraint_geodesics.geometry.manifold import (
+    EmbeddedManifold,
+    GeometryError,
+    Manifold,
+    require_finite,
+)
 
 TOLERANCE = 1e-3
 """Relative error of a length by default."""
@@ -26,8 +33,8 @@ DEGREES = (8, 16, 32, 64)
 SAFETY = 2.0
 """Error estimate over the difference of a length to that by half the degree."""
 ACCIDENT = 32.0
-"""What a piecewise curve's change of length from a quarter of the degree to half counts less than that to the whole:
-with many pieces two rules now and then agree by accident, three hardly ever.
+"""What a piecewise curve's change of length from a quarter of the degree to half counts less than
+that to the whole: with many pieces two rules now and then agree by accident, three hardly ever.
 """
 BLOCK = 4096
 """Points embedded at once: the temporaries of many more leave the processor's cache."""
@@ -37,14 +44,17 @@ Breaks = tuple[float, ...]
 
 @dataclass(frozen=True, eq=False)
 class Quadrature:
-    """A rule ∫₀¹ g dt ≈ Σ_i weights_i g(nodes_i): nodes (Q,) inside [0, 1], weights (Q,) that sum to 1."""
+    """A rule ∫₀¹ g dt ≈ Σ_i weights_i g(nodes_i): nodes (Q,) inside [0, 1], weights (Q,) that sum
+    to 1.
+    """
 
     nodes: Float[Tensor, "Q"]
     weights: Float[Tensor, "Q"]
 
     @classmethod
     def gauss_legendre(cls, count: int, breaks: Breaks = (0.0, 1.0)) -> "Quadrature":
-        """Gauss-Legendre rule with `count` nodes between every two breaks: exact there up to degree 2 count − 1.
+        """Gauss-Legendre rule with `count` nodes between every two breaks: exact there up to degree
+        2 count − 1.
 
         Raises GeometryError if count is below 1 or the breaks do not rise from 0 to 1.
         """
@@ -54,17 +64,21 @@ class Quadrature:
         x, w = np.polynomial.legendre.leggauss(count)
         nodes = [low + (high - low) * (x + 1) / 2 for low, high in _pieces(breaks)]
         weights = [(high - low) * w / 2 for low, high in _pieces(breaks)]
-        return cls(torch.from_numpy(np.concatenate(nodes)), torch.from_numpy(np.concatenate(weights)))
+        return cls(
+            torch.from_numpy(np.concatenate(nodes)), torch.from_numpy(np.concatenate(weights))
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Collocation:
-    """Lengths from values at the Chebyshev-Lobatto points of every piece of a curve, both ends included.
+    """Lengths from values at the Chebyshev-Lobatto points of every piece of a curve, both ends
+    included.
 
-    times: (S,) the points.  derivative: (Q, S) takes values there to the slopes of the polynomials through them, at
-    the nodes of a Gauss-Legendre rule with `weights` (Q,); twice as many nodes as the degree, since the norm of a
-    polynomial is not one.  own_weights: (S,) Clenshaw-Curtis weights of the points themselves, for integrands that
-    need no derivative.  half: the rule of half the degree, on every other point; None for an odd degree.
+    times: (S,) the points.  derivative: (Q, S) takes values there to the slopes of the polynomials
+    through them, at the nodes of a Gauss-Legendre rule with `weights` (Q,); twice as many nodes as
+    the degree, since the norm of a polynomial is not one.  own_weights: (S,) Clenshaw-Curtis
+    weights of the points themselves, for integrands that need no derivative.  half: the rule of
+    half the degree, on every other point; None for an odd degree.
     """
 
     degree: int
@@ -84,7 +98,9 @@ class Collocation:
             raise GeometryError(f"degree = {degree}: must be at least 2")
         _require_breaks(breaks)
         half = cls.chebyshev(degree // 2, breaks) if degree % 2 == 0 and degree >= 4 else None
-        times, derivative, weights, own = (torch.from_numpy(values) for values in _collocation(degree, breaks))
+        times, derivative, weights, own = (
+            torch.from_numpy(values) for values in _collocation(degree, breaks)
+        )
         return cls(degree, times, derivative, weights, own, half)
 
     def slopes(self, values: Float[Tensor, "*batch S A"]) -> Float[Tensor, "*batch Q A"]:
@@ -118,11 +134,12 @@ def curve_length(
 ) -> Float[Tensor, "*batch"]:
     """Length of curves on a manifold, eq. 2: L = ∫₀¹ √(γ̇ᵀ M(γ) γ̇) dt = ∫₀¹ ‖d f(γ)/dt‖ dt.
 
-    In the unit of the embedding.  Without a rule the estimated relative error is brought below `tolerance`, as
-    `estimate_length` does; with one it is whatever the rule gives.  Differentiable in phi, start and goal.
-    Raises NonFiniteError with the place of the first entry of phi, start, goal or of the length that is not finite (a
-    curve that leaves the metric's domain, or overflows), GeometryError if the curves and the manifold differ in
-    dimension, CurveError on a wrong shape.
+    In the unit of the embedding.  Without a rule the estimated relative error is brought below
+    `tolerance`, as `estimate_length` does; with one it is whatever the rule gives.  Differentiable
+    in phi, start and goal.
+    Raises NonFiniteError with the place of the first entry of phi, start, goal or of the length
+    that is not finite (a curve that leaves the metric's domain, or overflows), GeometryError if the
+    curves and the manifold differ in dimension, CurveError on a wrong shape.
     """
     if rule is None:
         length = estimate_length(manifold, curve, phi, start, goal, tolerance).length
@@ -143,12 +160,13 @@ def estimate_length(
 ) -> LengthEstimate:
     """Lengths whose estimated relative error is below `tolerance`, and the estimate.
 
-    The estimate is twice the change from the rule of half the degree, so the length of a smooth curve is better by
-    orders.  It is no bound: where a curve turns back on itself both rules may err alike, and about one such curve in a
-    hundred misses the tolerance; on a grid with walls or rough values, whose metric has kinks, far more do.  Curves
-    that no degree resolves keep the last length, and their estimate says so.  An embedding in single precision adds
-    its rounding: about 1e-7 of its values, which between ends 1e-4 apart is a thousandth of the length.
-    Length and estimate are inf where a curve meets points at which the metric is not finite.
+    The estimate is twice the change from the rule of half the degree, so the length of a smooth
+    curve is better by orders.  It is no bound: where a curve turns back on itself both rules may
+    err alike, and about one such curve in a hundred misses the tolerance; on a grid with walls or
+    rough values, whose metric has kinks, far more do.  Curves that no degree resolves keep the last
+    length, and their estimate says so.  An embedding in single precision adds its rounding: about
+    1e-7 of its values, which between ends 1e-4 apart is a thousandth of the length. Length and
+    estimate are inf where a curve meets points at which the metric is not finite.
     Raises as `curve_length` does, and GeometryError unless tolerance is positive.
     """
     if not tolerance > 0:
@@ -180,8 +198,8 @@ def curve_energy(
 ) -> Float[Tensor, "*batch"]:
     """Energy of curves on a manifold: E = ∫₀¹ γ̇ᵀ M(γ) γ̇ dt ≥ L², equal at constant speed only.
 
-    In the square of the embedding's unit.  Smooth where the length is not; degree 16 for a curve of one piece by
-    default.  Raises as `curve_length` does.
+    In the square of the embedding's unit.  Smooth where the length is not; degree 16 for a curve of
+    one piece by default.  Raises as `curve_length` does.
     """
     _check(manifold, curve, phi, start, goal)
     return energy_function(manifold, curve, rule or rules(tuple(curve.breaks))[1])(phi, start, goal)
@@ -190,7 +208,9 @@ def curve_energy(
 def energy_function(
     manifold: Manifold, curve: CurveFamily, rule: LengthRule
 ) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-    """The function (phi, start, goal) → `curve_energy`, free of checks, so that torch.func can transform it."""
+    """The function (phi, start, goal) → `curve_energy`, free of checks, so that torch.func can
+    transform it.
+    """
 
     def energy(phi: Tensor, start: Tensor, goal: Tensor) -> Tensor:
         squares, weights = _squared_speeds(manifold, curve, phi, start, goal, rule)
@@ -202,7 +222,9 @@ def energy_function(
 def length_function(
     manifold: Manifold, curve: CurveFamily, rule: LengthRule
 ) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-    """The function (phi, start, goal) → `curve_length`, free of checks, so that torch.func can transform it."""
+    """The function (phi, start, goal) → `curve_length`, free of checks, so that torch.func can
+    transform it.
+    """
 
     def length(phi: Tensor, start: Tensor, goal: Tensor) -> Tensor:
         squares, weights = _squared_speeds(manifold, curve, phi, start, goal, rule)
@@ -221,8 +243,8 @@ def curve_speeds(
 ) -> Float[Tensor, "*batch T"]:
     """Speed √(γ̇ᵀ M(γ) γ̇) of curves at times t, shared or one row a curve, in the unit of length.
 
-    One forward product J_f(γ) γ̇ a point where there is an embedding f, never its Jacobian.  Raises as `curve_length`
-    does.
+    One forward product J_f(γ) γ̇ a point where there is an embedding f, never its Jacobian.  Raises
+    as `curve_length` does.
     """
     _check(manifold, curve, phi, start, goal)
     return _root(_squares_at(manifold, curve, phi, start, goal, t)).to(phi)
@@ -231,11 +253,15 @@ def curve_speeds(
 def chord_length(points: Float[Tensor, "*batch T A"]) -> Float[Tensor, "*batch"]:
     """Length of the polygon through embedded points: Σ_i ‖x_{i+1} − x_i‖, in their unit.
 
-    It is never longer than the curve the points lie on, and blind to what that curve does between them.
-    Raises GeometryError for fewer than two points, NonFiniteError with the place of the first entry that is not finite.
+    It is never longer than the curve the points lie on, and blind to what that curve does between
+    them.
+    Raises GeometryError for fewer than two points, NonFiniteError with the place of the first entry
+    that is not finite.
     """
     if points.ndim < 2 or points.shape[-2] < 2:
-        raise GeometryError(f"points has shape {tuple(points.shape)}: must be (*batch, T, A) with T at least 2")
+        raise GeometryError(
+            f"points has shape {tuple(points.shape)}: must be (*batch, T, A) with T at least 2"
+        )
     require_finite(points, "points")
     return torch.linalg.vector_norm(points.diff(dim=-2), dim=-1).sum(-1)
 
@@ -249,13 +275,17 @@ def rules(breaks: Breaks = (0.0, 1.0)) -> tuple[Collocation, ...]:
 def _measured(
     manifold: Manifold, curve: CurveFamily, flat: Sequence[Tensor], rule: Collocation
 ) -> tuple[Tensor, Tensor]:
-    """Length by a rule and its error estimate, from the same points: the difference to the rule of half the degree."""
+    """Length by a rule and its error estimate, from the same points: the difference to the rule of
+    half the degree.
+    """
     (phi, start, goal), half = flat, rule.half
     assert half is not None
     assert half.half is not None
     if isinstance(manifold, EmbeddedManifold):
         values = _embedded(manifold, curve.evaluate(phi, start, goal, rule.times.to(phi))[0])
-        lengths = [part.length(values[:, ::step]) for part, step in ((rule, 1), (half, 2), (half.half, 4))]
+        lengths = [
+            part.length(values[:, ::step]) for part, step in ((rule, 1), (half, 2), (half.half, 4))
+        ]
     else:
         speeds = _root(_squares_at(manifold, curve, phi, start, goal, rule.times))
         nested = ((rule, 1), (half, 2), (half.half, 4))
@@ -268,15 +298,24 @@ def _measured(
     return length, torch.where(error.isfinite(), error, torch.inf)
 
 
-def _check(manifold: Manifold, curve: CurveFamily, phi: Tensor, start: Tensor, goal: Tensor) -> None:
+def _check(
+    manifold: Manifold, curve: CurveFamily, phi: Tensor, start: Tensor, goal: Tensor
+) -> None:
     for name, values in (("phi", phi), ("start", start), ("goal", goal)):
         require_finite(values, name)
     if curve.dim != manifold.dim:
-        raise GeometryError(f"the curve has dim {curve.dim}: must be that of the manifold, {manifold.dim}")
+        raise GeometryError(
+            f"the curve has dim {curve.dim}: must be that of the manifold, {manifold.dim}"
+        )
 
 
 def _squared_speeds(
-    manifold: Manifold, curve: CurveFamily, phi: Tensor, start: Tensor, goal: Tensor, rule: LengthRule
+    manifold: Manifold,
+    curve: CurveFamily,
+    phi: Tensor,
+    start: Tensor,
+    goal: Tensor,
+    rule: LengthRule,
 ) -> tuple[Tensor, Tensor]:
     """γ̇ᵀ M(γ) γ̇ (*batch, Q) at the nodes of a rule, and the nodes' weights."""
     if isinstance(rule, Quadrature):
@@ -287,17 +326,23 @@ def _squared_speeds(
     return rule.slopes(_embedded(manifold, points)).square().sum(-1), rule.weights
 
 
-def _squares_at(manifold: Manifold, curve: CurveFamily, phi: Tensor, start: Tensor, goal: Tensor, t: Tensor) -> Tensor:
+def _squares_at(
+    manifold: Manifold, curve: CurveFamily, phi: Tensor, start: Tensor, goal: Tensor, t: Tensor
+) -> Tensor:
     """γ̇ᵀ M(γ) γ̇ (*batch, T) at times t."""
     points, velocities = curve.evaluate(phi, start, goal, t.to(phi))
     if not isinstance(manifold, EmbeddedManifold):
-        return (velocities * (manifold.metric(points).to(velocities) @ velocities[..., None])[..., 0]).sum(-1)
+        return (
+            velocities * (manifold.metric(points).to(velocities) @ velocities[..., None])[..., 0]
+        ).sum(-1)
     blocks = zip(_blocks(points), _blocks(velocities), strict=True)
     products = torch.cat([torch.func.jvp(manifold.embed, (z,), (v,))[1] for z, v in blocks])
     return products.square().sum(-1).reshape(points.shape[:-1])
 
 
-def _embedded(manifold: EmbeddedManifold, points: Float[Tensor, "*batch S N"]) -> Float[Tensor, "*batch S A"]:
+def _embedded(
+    manifold: EmbeddedManifold, points: Float[Tensor, "*batch S N"]
+) -> Float[Tensor, "*batch S A"]:
     values = torch.cat([manifold.embed(block) for block in _blocks(points)])
     return values.reshape(*points.shape[:-1], values.shape[-1])
 
@@ -309,7 +354,8 @@ def _blocks(points: Float[Tensor, "*batch N"]) -> tuple[Tensor, ...]:
 def _root(squares: Tensor) -> Tensor:
     """Square roots, with slope 0 at 0: a curve that stands still must not give NaN gradients.
 
-    What is no square, NaN or below zero, becomes NaN and is noticed; it must not pass for standing still.
+    What is no square, NaN or below zero, becomes NaN and is noticed; it must not pass for standing
+    still.
     """
     moving = squares != 0
     return torch.where(moving, torch.where(moving, squares, 1.0).sqrt(), 0.0)
@@ -324,13 +370,17 @@ def _pieces(breaks: Breaks) -> list[tuple[float, float]]:
     return list(pairwise(breaks))
 
 
-def _collocation(degree: int, breaks: Breaks) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _collocation(
+    degree: int, breaks: Breaks
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Arrays of a Collocation; neighbouring pieces share the point between them."""
     chebyshev = np.polynomial.chebyshev
     x = -np.cos(np.pi * np.arange(degree + 1) / degree)
     gauss, weights = np.polynomial.legendre.leggauss(2 * degree)
     to_coefficients = np.linalg.inv(chebyshev.chebvander(x, degree))
-    slopes = np.stack([chebyshev.chebval(gauss, chebyshev.chebder(unit)) for unit in np.eye(degree + 1)], axis=1)
+    slopes = np.stack(
+        [chebyshev.chebval(gauss, chebyshev.chebder(unit)) for unit in np.eye(degree + 1)], axis=1
+    )
     derivative = slopes @ to_coefficients
     # ∫ T_k over [−1, 1] is 2 / (1 − k²) for even k and 0 for odd k
     k = np.arange(degree + 1)

@@ -1,4 +1,6 @@
-"""Sub-manifolds that a level of one chart coordinate cuts out of the sphere and the torus, eqs. 7-8 and Fig. 2."""
+"""Sub-manifolds that a level of one chart coordinate cuts out of the sphere and the torus, eqs. 7-8
+and Fig. 2.
+"""
 
 import itertools
 import math
@@ -14,7 +16,8 @@ from constraint_geodesics.geometry.graph import OUTSIDE
 from constraint_geodesics.geometry.manifold import GeometryError, require_dim, require_finite
 
 TOUCH = 1e-12
-"""Bands this close [rad] touch: levels and tolerances written as decimals meet only up to rounding."""
+"""Bands this close [rad] touch: levels and tolerances written as decimals meet only up to rounding.
+"""
 
 
 class LevelSetError(GeometryError):
@@ -23,9 +26,11 @@ class LevelSetError(GeometryError):
 
 @dataclass(frozen=True)
 class LevelCircle:
-    """The circle S¹ on which one chart coordinate of a sphere or torus is held, charted by the other one, u [rad].
+    """The circle S¹ on which one chart coordinate of a sphere or torus is held, charted by the
+    other one, u [rad].
 
-    coordinate: index of the one held.  level: its value [rad].  Raises LevelSetError as LevelSet does.
+    coordinate: index of the one held.  level: its value [rad].  Raises LevelSetError as LevelSet
+    does.
     """
 
     manifold: Sphere | Torus
@@ -72,8 +77,11 @@ class LevelCircle:
         free = 1 - self.coordinate
         return self.manifold.metric(self.point(u))[..., free : free + 1, free : free + 1]
 
-    def distance(self, a: Float[Tensor, "*#batch 1"], b: Float[Tensor, "*#batch 1"]) -> Float[Tensor, "*batch"]:
-        """Length of the shorter arc, 0 to π times the radius: the way on the circle, not across the manifold.
+    def distance(
+        self, a: Float[Tensor, "*#batch 1"], b: Float[Tensor, "*#batch 1"]
+    ) -> Float[Tensor, "*batch"]:
+        """Length of the shorter arc, 0 to π times the radius: the way on the circle, not across the
+        manifold.
 
         Raises NonFiniteError with the place of the first coordinate that is not finite.
         """
@@ -87,12 +95,16 @@ class LevelCircle:
 class LevelSet:
     """The points where one chart coordinate is at one of several levels: a set of circles S¹.
 
-    manifold, coordinate: Sphere with 0, its elevation (Fig. 2a); Torus with 1, its tube angle (Fig. 2b), or with 0,
-    its ring angle.  The sphere's azimuth is refused: its level sets run from pole to pole and don't close.
-    levels: values of that coordinate [rad], at least one.  Levels that differ by whole periods are one.
-    tolerance: deviation of the coordinate that still counts as held [rad], at least 0; the set is then made of bands
-    about the levels.  Bands that overlap or touch (to 1e-12 rad) are one component.
-    Raises LevelSetError on anything else, such as an elevation at a pole, |θ| ≥ π/2, where the circle has no length.
+    manifold, coordinate: Sphere with 0, its elevation (Fig. 2a); Torus with 1, its tube angle (Fig.
+    2b), or with 0, its ring angle.  The sphere's azimuth is refused: its level sets run from pole
+    to pole and don't close.
+    levels: values of that coordinate [rad], at least one.  Levels that differ by whole periods are
+    one.
+    tolerance: deviation of the coordinate that still counts as held [rad], at least 0; the set is
+    then made of bands about the levels.  Bands that overlap or touch (to 1e-12 rad) are one
+    component.
+    Raises LevelSetError on anything else, such as an elevation at a pole, |θ| ≥ π/2, where the
+    circle has no length.
     """
 
     manifold: Sphere | Torus
@@ -110,7 +122,8 @@ class LevelSet:
             raise LevelSetError(f"tolerance = {self.tolerance}: must be finite and at least 0")
 
     def inclusion(self, z: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
-        """The inclusion map ι(z) [rad], eqs. 7-8: how far the coordinate is from the nearest level, beyond `tolerance`.
+        """The inclusion map ι(z) [rad], eqs. 7-8: how far the coordinate is from the nearest level,
+        beyond `tolerance`.
 
         Zero to the bit where the constraint holds.  Elevations beyond a pole are understood.
         Raises NonFiniteError with the place of the first coordinate that is not finite.
@@ -120,12 +133,15 @@ class LevelSet:
     def components(self) -> tuple[LevelCircle, ...]:
         """The connected components, by rising level from −π.
 
-        A band that several levels share is given by the circle of the one that `levels` names first.
+        A band that several levels share is given by the circle of the one that `levels` names
+        first.
         """
         return tuple(self._circle(min(level.number for level in group)) for group in self._groups())
 
     def component_of(self, z: Float[Tensor, "*batch 2"]) -> Int[Tensor, "*batch"]:
-        """Index of each point's component in `components()`, −1 where the constraint doesn't hold."""
+        """Index of each point's component in `components()`, −1 where the constraint doesn't
+        hold.
+        """
         component = [0] * len(self.levels)
         for index, group in enumerate(self._groups()):
             for level in group:
@@ -143,7 +159,8 @@ class LevelSet:
         require_finite(z, "z")
         held = z[..., self.coordinate]
         if isinstance(self.manifold, Sphere):
-            # Elevation by way of the embedded point is inexact by a bit, so only where it has to be.
+            # Elevation by way of the embedded point is inexact by a bit, so only where it has to
+            # be.
             held = torch.where(held.abs() <= math.pi / 2, held, self.manifold.elevation(z))
         offsets = held[..., None] - torch.tensor(self.levels, dtype=z.dtype, device=z.device)
         return (_wrapped(offsets) if self._wraps else offsets).abs()
@@ -163,14 +180,20 @@ class LevelSet:
             if level.value - before.value > width:
                 groups.append([])
             groups[-1].append(level)
-        if self._wraps and len(groups) > 1 and ordered[0].value + 2 * math.pi - ordered[-1].value <= width:
+        if (
+            self._wraps
+            and len(groups) > 1
+            and ordered[0].value + 2 * math.pi - ordered[-1].value <= width
+        ):
             # The last band runs on into the first across the seam of the chart.
             groups = [*groups[1:-1], groups[-1] + groups[0]]
         return groups
 
 
 class _Level(NamedTuple):
-    """A level by its value on the chart's coordinate, wrapped to [−π, π] if that repeats, and its place in `levels`."""
+    """A level by its value on the chart's coordinate, wrapped to [−π, π] if that repeats, and its
+    place in `levels`.
+    """
 
     value: float
     number: int
@@ -185,11 +208,16 @@ def _require_coordinate(manifold: Sphere | Torus, coordinate: int) -> None:
     if coordinate not in (0, 1):
         raise LevelSetError(f"coordinate = {coordinate}: must be 0 or 1")
     if not math.isfinite(manifold.periods[1 - coordinate]):
-        raise LevelSetError(f"coordinate = {coordinate}: the other one doesn't repeat, so its level sets don't close")
+        raise LevelSetError(
+            f"coordinate = {coordinate}: the other one doesn't repeat, so its level sets "
+            f"don't close"
+        )
 
 
 def _require_level(manifold: Sphere | Torus, name: str, level: float) -> None:
     if not math.isfinite(level):
         raise LevelSetError(f"{name} = {level}: must be finite")
     if isinstance(manifold, Sphere) and abs(level) >= math.pi / 2:
-        raise LevelSetError(f"{name} = {level}: an elevation must lie between the poles, −π/2 to π/2")
+        raise LevelSetError(
+            f"{name} = {level}: an elevation must lie between the poles, −π/2 to π/2"
+        )

@@ -1,4 +1,6 @@
-"""What a manifold is to the rest of the project: a chart with a metric, and what some manifolds have beside it."""
+"""What a manifold is to the rest of the project: a chart with a metric, and what some manifolds
+have beside it.
+"""
 
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
@@ -10,19 +12,30 @@ from torch import Tensor
 from constraint_geodesics.geometry.errors import GeometryError, NonFiniteError, OutsideError
 
 __all__ = [
-    "BoundedManifold", "EmbeddedManifold", "GeometryError", "Manifold", "MeasuredManifold", "NonFiniteError",
-    "OutsideError", "PeriodicManifold", "pullback_metric", "require_dim", "require_finite", "require_inside",
-]  # fmt: skip
+    "BoundedManifold",
+    "EmbeddedManifold",
+    "GeometryError",
+    "Manifold",
+    "MeasuredManifold",
+    "NonFiniteError",
+    "OutsideError",
+    "PeriodicManifold",
+    "pullback_metric",
+    "require_dim",
+    "require_finite",
+    "require_inside",
+]
 
 Embedding = Callable[[Tensor], Tensor]
 
 
 @runtime_checkable
 class Manifold(Protocol):
-    """A manifold of dimension N in one chart.  These two members are all that lengths and solvers need.
+    """A manifold of dimension N in one chart.  These two members are all that lengths and solvers
+    need.
 
-    Where the manifold is embedded, add `ambient_dim` and `embed` (EmbeddedManifold): lengths then need no metric at
-    all, and `metric` may return `pullback_metric(self.embed, z)`.
+    Where the manifold is embedded, add `ambient_dim` and `embed` (EmbeddedManifold): lengths then
+    need no metric at all, and `metric` may return `pullback_metric(self.embed, z)`.
     """
 
     @property
@@ -37,7 +50,9 @@ class Manifold(Protocol):
 
 @runtime_checkable
 class EmbeddedManifold(Manifold, Protocol):
-    """A manifold embedded into R^A, with the metric M = JᵀJ that the embedding's Jacobian J induces."""
+    """A manifold embedded into R^A, with the metric M = JᵀJ that the embedding's Jacobian J
+    induces.
+    """
 
     @property
     def ambient_dim(self) -> int:
@@ -45,7 +60,9 @@ class EmbeddedManifold(Manifold, Protocol):
         ...
 
     def embed(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch A"]:
-        """The embedding f(z).  It acts on each point by itself and is differentiable in forward mode."""
+        """The embedding f(z).  It acts on each point by itself and is differentiable in forward
+        mode.
+        """
         ...
 
 
@@ -53,7 +70,9 @@ class EmbeddedManifold(Manifold, Protocol):
 class MeasuredManifold(Manifold, Protocol):
     """A manifold whose geodesic distance is known: the oracle of the solvers."""
 
-    def distance(self, a: Float[Tensor, "*#batch N"], b: Float[Tensor, "*#batch N"]) -> Float[Tensor, "*batch"]:
+    def distance(
+        self, a: Float[Tensor, "*#batch N"], b: Float[Tensor, "*#batch N"]
+    ) -> Float[Tensor, "*batch"]:
         """Length of the shortest curve between two points."""
         ...
 
@@ -87,14 +106,17 @@ def pullback_metric(embed: Embedding, z: Float[Tensor, "*batch N"]) -> Float[Ten
         product: Tensor = torch.func.jvp(embed, (z,), (direction.expand_as(z),))[1]
         return product
 
-    # One forward product a chart direction over the whole batch: N of them, where a map over points would need B.
+    # One forward product a chart direction over the whole batch: N of them, where a map over points
+    # would need B.
     directions = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
     transposed = torch.func.vmap(column, out_dims=-2)(directions)
     return transposed @ transposed.mT
 
 
 def require_finite(values: Float[Tensor, "..."], what: str) -> None:
-    """Raise NonFiniteError with the first entry of `values`, called `what` in the message, that is not finite."""
+    """Raise NonFiniteError with the first entry of `values`, called `what` in the message, that is
+    not finite.
+    """
     finite = torch.isfinite(values)
     if not finite.all():
         index = tuple(int(i) for i in torch.nonzero(~finite)[0])
@@ -102,16 +124,20 @@ def require_finite(values: Float[Tensor, "..."], what: str) -> None:
 
 
 def require_dim(points: Float[Tensor, "..."], dim: int, what: str) -> None:
-    """Raise GeometryError unless the last axis of `points`, called `what` in the message, has `dim` entries."""
+    """Raise GeometryError unless the last axis of `points`, called `what` in the message, has `dim`
+    entries.
+    """
     if points.ndim == 0 or points.shape[-1] != dim:
-        raise GeometryError(f"{what} has shape {tuple(points.shape)}: its last axis must have {dim} entries")
+        raise GeometryError(
+            f"{what} has shape {tuple(points.shape)}: its last axis must have {dim} entries"
+        )
 
 
 def require_inside(manifold: Manifold, points: Float[Tensor, "*batch N"], what: str) -> None:
     """Raise unless `points`, called `what` in the message, are points of the manifold.
 
-    Raises GeometryError on a wrong last axis, NonFiniteError with the first entry that is not finite, OutsideError
-    with the first point a BoundedManifold does not contain.
+    Raises GeometryError on a wrong last axis, NonFiniteError with the first entry that is not
+    finite, OutsideError with the first point a BoundedManifold does not contain.
     """
     require_dim(points, manifold.dim, what)
     require_finite(points, what)

@@ -1,4 +1,6 @@
-"""Curves run through at constant speed: the times at which a curve has covered equal shares of its length."""
+"""Curves run through at constant speed: the times at which a curve has covered equal shares of its
+length.
+"""
 
 from dataclasses import dataclass
 from functools import cache
@@ -21,7 +23,9 @@ FIRST_PANELS = 2
 HALVINGS = 40
 """Times a panel is halved at most: it is then shorter than any spacing."""
 CROWD = 256
-"""Panels of one curve halved at once at most; where more are rough it is the rounding of the embedding."""
+"""Panels of one curve halved at once at most; where more are rough it is the rounding of the
+embedding.
+"""
 NEWTON_STEPS = 40
 
 
@@ -29,7 +33,8 @@ NEWTON_STEPS = 40
 class _Panels:
     """Spans of time of a batch of curves, and the speed there.
 
-    row: which curve.  low, high: when.  speed: Legendre series over [low, high] of the speed times high − low.
+    row: which curve.  low, high: when.  speed: Legendre series over [low, high] of the speed times
+    high − low.
     """
 
     row: Int[Tensor, "K"]
@@ -43,7 +48,9 @@ class _Panels:
     @classmethod
     def in_order(cls, parts: list["_Panels"]) -> "_Panels":
         """All panels of several, by curve and time."""
-        row, low, high, speed = (torch.cat([vars(part)[name] for part in parts]) for name in cls.__dataclass_fields__)
+        row, low, high, speed = (
+            torch.cat([vars(part)[name] for part in parts]) for name in cls.__dataclass_fields__
+        )
         by_time = low.argsort()
         return cls(row, low, high, speed)[by_time[row[by_time].argsort(stable=True)]]
 
@@ -57,14 +64,16 @@ def constant_speed(
     count: int,
     tolerance: float = SPACING_TOLERANCE,
 ) -> Float[Tensor, "*batch {count}"]:
-    """Times, from 0 to 1 exactly, at which points lie equally spaced along curves in the manifold's length.
+    """Times, from 0 to 1 exactly, at which points lie equally spaced along curves in the manifold's
+    length.
 
-    Row by row they are times for `curve.evaluate`.  Each length between neighbours differs from their mean by less
-    than `tolerance` of it, up to the rounding of the embedding: panels of time are halved until the speed is a
-    polynomial on each, which takes more of them next to points where a curve turns back.  A curve of no length gets
-    even times.  No gradient: the times are constants.
-    Raises as `curve_length` does, GeometryError unless count is at least 2 and tolerance positive, and NonFiniteError
-    where a speed overflows.
+    Row by row they are times for `curve.evaluate`.  Each length between neighbours differs from
+    their mean by less than `tolerance` of it, up to the rounding of the embedding: panels of time
+    are halved until the speed is a polynomial on each, which takes more of them next to points
+    where a curve turns back.  A curve of no length gets even times.  No gradient: the times are
+    constants.
+    Raises as `curve_length` does, GeometryError unless count is at least 2 and tolerance positive,
+    and NonFiniteError where a speed overflows.
     """
     if count < 2:
         raise GeometryError(f"count = {count}: must be at least 2")
@@ -72,7 +81,9 @@ def constant_speed(
         raise GeometryError(f"tolerance = {tolerance}: must be positive")
     with torch.no_grad():
         edges = _first_edges(tuple(curve.breaks))
-        speeds = curve_speeds(manifold, curve, phi, start, goal, _nodes(edges[:-1], edges[1:]).flatten())
+        speeds = curve_speeds(
+            manifold, curve, phi, start, goal, _nodes(edges[:-1], edges[1:]).flatten()
+        )
         require_finite(speeds, "speeds")
         batch = speeds.shape[:-1]
         if not speeds.numel():
@@ -80,15 +91,25 @@ def constant_speed(
         row = torch.arange(batch.numel()).repeat_interleave(len(edges) - 1)
         low, high = (ends.repeat(batch.numel()) for ends in (edges[:-1], edges[1:]))
         panels = _panels(row, low, high, speeds.reshape(-1, NODES))
-        flat = [values.expand(*batch, values.shape[-1]).reshape(-1, values.shape[-1]) for values in (phi, start, goal)]
+        flat = [
+            values.expand(*batch, values.shape[-1]).reshape(-1, values.shape[-1])
+            for values in (phi, start, goal)
+        ]
         panels = _refined(manifold, curve, flat, panels, count, tolerance)
         return _inverted(panels, batch.numel(), count).reshape(*batch, count).to(phi)
 
 
 def _refined(
-    manifold: Manifold, curve: CurveFamily, flat: list[Tensor], panels: _Panels, count: int, tolerance: float
+    manifold: Manifold,
+    curve: CurveFamily,
+    flat: list[Tensor],
+    panels: _Panels,
+    count: int,
+    tolerance: float,
 ) -> _Panels:
-    """Panels on which the series of the speed is good enough for so many times, by curve and time."""
+    """Panels on which the series of the speed is good enough for so many times, by curve and
+    time.
+    """
     length = panels.low.new_zeros(len(flat[0])).index_add(0, panels.row, panels.speed[:, 0])
     # Standing still is run through as a straight line would be.
     panels.speed[:, 0] += torch.where(length[panels.row] > 0, 0.0, panels.high - panels.low)
@@ -110,7 +131,9 @@ def _refined(
 
 def _panels(row: Tensor, low: Tensor, high: Tensor, speeds: Float[Tensor, "K n"]) -> _Panels:
     """Panels from speeds at their nodes."""
-    return _Panels(row, low, high, (high - low)[:, None] * (speeds.double() @ torch.from_numpy(_to_series())))
+    return _Panels(
+        row, low, high, (high - low)[:, None] * (speeds.double() @ torch.from_numpy(_to_series()))
+    )
 
 
 def _nodes(low: Float[Tensor, "K"], high: Float[Tensor, "K"]) -> Float[Tensor, "K n"]:
@@ -121,8 +144,9 @@ def _nodes(low: Float[Tensor, "K"], high: Float[Tensor, "K"]) -> Float[Tensor, "
 
 def _rough(panels: _Panels, spacing: Float[Tensor, "B"], tolerance: float) -> Bool[Tensor, "K"]:
     """Which panels must be halved."""
-    # The last two terms are about as large as all that follow.  What they leave out is small enough either against
-    # a spacing, or against the lowest speed of the panel and so against any part of it; half, for a spacing's two ends.
+    # The last two terms are about as large as all that follow.  What they leave out is small enough
+    # either against a spacing, or against the lowest speed of the panel and so against any part of
+    # it; half, for a spacing's two ends.
     sizes = panels.speed.abs()
     lowest = panels.speed[:, 0] - sizes[:, 1:].sum(-1)
     rough = sizes[:, -2:].sum(-1) > tolerance / 2 * torch.maximum(spacing[panels.row], lowest)
@@ -148,8 +172,12 @@ def _inverted(panels: _Panels, curves: int, count: int) -> Float[Tensor, "{curve
     return times.cummax(-1).values
 
 
-def _lengths_passed(panels: _Panels, curves: int) -> tuple[Float[Tensor, "{curves} P+1"], Int[Tensor, "{curves}"]]:
-    """Length passed at the panels' edges, the shorter rows filled with the whole, and each curve's first panel."""
+def _lengths_passed(
+    panels: _Panels, curves: int
+) -> tuple[Float[Tensor, "{curves} P+1"], Int[Tensor, "{curves}"]]:
+    """Length passed at the panels' edges, the shorter rows filled with the whole, and each curve's
+    first panel.
+    """
     many = panels.row.bincount(minlength=curves)
     first = many.cumsum(0) - many
     place = torch.arange(len(panels.row)) - first[panels.row]
@@ -157,8 +185,12 @@ def _lengths_passed(panels: _Panels, curves: int) -> tuple[Float[Tensor, "{curve
     return lengths.index_put((panels.row, place + 1), panels.speed[:, 0]).cumsum(-1), first
 
 
-def _root(series: Float[Tensor, "*batch k"], target: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Where in [0, 1] rising Legendre series reach their targets, by Newton's method kept within a bracket."""
+def _root(
+    series: Float[Tensor, "*batch k"], target: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch"]:
+    """Where in [0, 1] rising Legendre series reach their targets, by Newton's method kept within a
+    bracket.
+    """
     low, high = torch.zeros_like(target), torch.ones_like(target)
     u = (target / series.sum(-1)).nan_to_num(nan=0.5).clamp(0.0, 1.0)
     for _ in range(NEWTON_STEPS):
@@ -182,9 +214,13 @@ def _first_edges(breaks: tuple[float, ...]) -> Float[Tensor, "P+1"]:
 
 @cache
 def _to_series() -> Float[np.ndarray, "n n"]:
-    """Takes values at the Gauss-Legendre nodes to the Legendre series of the polynomial through them."""
+    """Takes values at the Gauss-Legendre nodes to the Legendre series of the polynomial through
+    them.
+    """
     x, weights = np.polynomial.legendre.leggauss(NODES)
-    return np.polynomial.legendre.legvander(x, NODES - 1) * weights[:, None] * (np.arange(NODES) + 0.5)
+    return (
+        np.polynomial.legendre.legvander(x, NODES - 1) * weights[:, None] * (np.arange(NODES) + 0.5)
+    )
 
 
 @cache

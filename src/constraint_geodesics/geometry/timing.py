@@ -1,18 +1,22 @@
-"""Times for the rows of a given path: near time-optimal within velocity and acceleration limits, on the path itself.
+"""Times for the rows of a given path: near time-optimal within velocity and acceleration limits, on
+the path itself.
 
-Only the pace along the path is chosen and no row is moved, so a path that keeps a constraint still keeps it.
-The method is that of TOPP-RA (Pham and Pham 2018, A New Approach to Time-Optimal Path Parameterization Based on
-Reachability Analysis): controllable speeds from the goal backward, then greedily the largest one from the start
-forward.  It is worked out here for the differences of the rows themselves instead of for an interpolating curve, so
-that the result needs no rows between the given ones and keeps the limits exactly in these differences.
+Only the pace along the path is chosen and no row is moved, so a path that keeps a constraint still
+keeps it. The method is that of TOPP-RA (Pham and Pham 2018, A New Approach to Time-Optimal Path
+Parameterization Based on Reachability Analysis): controllable speeds from the goal backward, then
+greedily the largest one from the start forward.  It is worked out here for the differences of the
+rows themselves instead of for an interpolating curve, so that the result needs no rows between the
+given ones and keeps the limits exactly in these differences.
 
-With the step Δq_i between two rows, its length s_i, its direction u_i = Δq_i / s_i and the speed w_i = s_i / Δt_i
-along it, the velocity is v_i = u_i w_i and the acceleration at the row between two steps is
+With the step Δq_i between two rows, its length s_i, its direction u_i = Δq_i / s_i and the speed
+w_i = s_i / Δt_i along it, the velocity is v_i = u_i w_i and the acceleration at the row between two
+steps is
 
-    a_i = (v_i - v_{i-1}) / (½ (Δt_i + Δt_{i-1})) = 2 (u_i w_i - u_{i-1} w_{i-1}) / (s_i/w_i + s_{i-1}/w_{i-1}).
+    a_i = (v_i - v_{i-1}) / (½ (Δt_i + Δt_{i-1})) = 2 (u_i w_i - u_{i-1} w_{i-1}) / (s_i/w_i +
+    s_{i-1}/w_{i-1}).
 
-Two neighbours that keep |a_i| ≤ A keep it at any common slower pace, so the speeds of a step from which the goal can
-be reached are an interval that begins at 0.
+Two neighbours that keep |a_i| ≤ A keep it at any common slower pace, so the speeds of a step from
+which the goal can be reached are an interval that begins at 0.
 """
 
 import numpy as np
@@ -24,9 +28,13 @@ from constraint_geodesics.geometry.errors import GeometryError, NonFiniteError
 COINCIDENT = 1e-9
 """Rows closer than this share of the path's length coincide."""
 MARGIN = 1e-9
-"""Share of the times added at the end, so that a reader's rounding does not carry a value over its limit."""
+"""Share of the times added at the end, so that a reader's rounding does not carry a value over its
+limit.
+"""
 _ROUNDING = 1e-11
-"""Relative excess that counts as rounding while a speed is sought; the stretch at the end takes it off."""
+"""Relative excess that counts as rounding while a speed is sought; the stretch at the end takes it
+off.
+"""
 _NUDGE = 1e-3
 """Relative change of a ratio of speeds by which the side of the better ratios is told."""
 _SECTIONS = 20
@@ -36,23 +44,32 @@ _COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "no
 
 
 def time_parametrisation(
-    joints: Float[np.ndarray, "T D"], velocity: Float[np.ndarray, "D"], acceleration: Float[np.ndarray, "D"]
+    joints: Float[np.ndarray, "T D"],
+    velocity: Float[np.ndarray, "D"],
+    acceleration: Float[np.ndarray, "D"],
 ) -> Float[np.ndarray, "T"]:
-    """Strictly rising times [s] of a path's rows [rad], from 0, at rest at both ends and near time-optimal.
+    """Strictly rising times [s] of a path's rows [rad], from 0, at rest at both ends and near
+    time-optimal.
 
-    velocity, acceleration: limits of each joint [rad/s, rad/s²], positive; a velocity limit may be infinite.
-    With Δt_i = t_{i+1} - t_i and v_i = Δq_i / Δt_i the result keeps |v_i| ≤ velocity and, at every row,
-    |v_i - v_{i-1}| / (½ (Δt_i + Δt_{i-1})) ≤ acceleration, where before the first row and after the last one both
-    the speed and the time step are 0.  Beyond these differences nothing is promised: between two rows the joints are
-    taken to move straight, so the rows must be close enough together for that.
-    Raises GeometryError on a wrong shape, fewer than two rows, a limit that is not positive, or two neighbouring rows
-    that coincide (an arm would have to stop there, for no time at all; drop one), NonFiniteError on a row that is not
-    finite.
+    velocity, acceleration: limits of each joint [rad/s, rad/s²], positive; a velocity limit may be
+    infinite. With Δt_i = t_{i+1} - t_i and v_i = Δq_i / Δt_i the result keeps |v_i| ≤ velocity and,
+    at every row, |v_i - v_{i-1}| / (½ (Δt_i + Δt_{i-1})) ≤ acceleration, where before the first row
+    and after the last one both the speed and the time step are 0.  Beyond these differences nothing
+    is promised: between two rows the joints are taken to move straight, so the rows must be close
+    enough together for that.
+    Raises GeometryError on a wrong shape, fewer than two rows, a limit that is not positive, or two
+    neighbouring rows that coincide (an arm would have to stop there, for no time at all; drop one),
+    NonFiniteError on a row that is not finite.
     """
     q = np.asarray(joints, dtype=np.float64, order="C")
     if q.ndim != 2 or len(q) < 2 or q.shape[1] == 0:
-        raise GeometryError(f"joints has shape {q.shape}: must be (T, D) with at least two rows and one joint")
-    limits = [_limit(velocity, q.shape[1], "velocity"), _limit(acceleration, q.shape[1], "acceleration")]
+        raise GeometryError(
+            f"joints has shape {q.shape}: must be (T, D) with at least two rows and one joint"
+        )
+    limits = [
+        _limit(velocity, q.shape[1], "velocity"),
+        _limit(acceleration, q.shape[1], "acceleration"),
+    ]
     if not np.isfinite(limits[1]).all():
         raise GeometryError(f"acceleration = {limits[1].tolist()}: must be finite")
     if not np.isfinite(q).all():
@@ -61,7 +78,9 @@ def time_parametrisation(
     spacing = np.linalg.norm(np.diff(q, axis=0), axis=1)
     if not spacing.min() > COINCIDENT * spacing.sum():
         row = int(spacing.argmin())
-        raise GeometryError(f"joints[{row}] and joints[{row + 1}] coincide: neighbouring rows must differ")
+        raise GeometryError(
+            f"joints[{row}] and joints[{row + 1}] coincide: neighbouring rows must differ"
+        )
     times = np.empty(len(q))
     _times(q, spacing, *limits, times)
     return times
@@ -70,14 +89,16 @@ def time_parametrisation(
 def _limit(limit: np.ndarray, dim: int, what: str) -> np.ndarray:
     values = np.asarray(limit, dtype=np.float64, order="C")
     if values.shape != (dim,):
-        raise GeometryError(f"{what} has shape {values.shape}: must be ({dim},), one limit for each joint")
+        raise GeometryError(
+            f"{what} has shape {values.shape}: must be ({dim},), one limit for each joint"
+        )
     if not (values > 0).all():
         raise GeometryError(f"{what} = {values.tolist()}: must be positive")
     return values
 
 
 @njit(**_COMPILE)
-def _times(q, spacing, velocity, acceleration, times):  # type: ignore[no-untyped-def]
+def _times(q, spacing, velocity, acceleration, times):
     """Writes the times (T,) of the rows q (T, D) with the given distances (T-1,)."""
     steps = spacing.shape[0]
     directions = np.empty((steps, q.shape[1]))
@@ -89,7 +110,9 @@ def _times(q, spacing, velocity, acceleration, times):  # type: ignore[no-untype
             fastest[i] = min(fastest[i], velocity[j] / abs(directions[i, j]))
     for i in (0, steps - 1):  # from rest and to rest: the acceleration at an end is 2 |u| w² / s
         for j in range(q.shape[1]):
-            fastest[i] = min(fastest[i], np.sqrt(0.5 * acceleration[j] * spacing[i] / abs(directions[i, j])))
+            fastest[i] = min(
+                fastest[i], np.sqrt(0.5 * acceleration[j] * spacing[i] / abs(directions[i, j]))
+            )
     ratios = np.empty(steps)
     _controllable(directions, spacing, acceleration, fastest, ratios)
     speed = fastest[0]
@@ -97,15 +120,25 @@ def _times(q, spacing, velocity, acceleration, times):  # type: ignore[no-untype
     times[1] = spacing[0] / speed
     for i in range(1, steps):
         _, largest = _ratio_window(spacing[i - 1], spacing[i])
-        # the ratio found on the way back is allowed at every pace, so what is allowed is never empty
+        # the ratio found on the way back is allowed at every pace, so what is allowed is never
+        # empty
         allowed = ratios[i - 1] * speed
         most = min(fastest[i], largest * speed)
         speed = max(
             allowed,
-            _fastest_beside(speed, directions[i - 1], spacing[i - 1], directions[i], spacing[i], acceleration, most),
+            _fastest_beside(
+                speed,
+                directions[i - 1],
+                spacing[i - 1],
+                directions[i],
+                spacing[i],
+                acceleration,
+                most,
+            ),
         )
         times[i + 1] = times[i] + spacing[i] / speed
-    # where a step takes a tiny share of the time, rounding makes its acceleration so uncertain that once is not enough
+    # where a step takes a tiny share of the time, rounding makes its acceleration so uncertain that
+    # once is not enough
     margin = MARGIN
     used = _used(q, times, velocity, acceleration)
     while used > 1.0 - 0.5 * MARGIN:
@@ -116,11 +149,12 @@ def _times(q, spacing, velocity, acceleration, times):  # type: ignore[no-untype
 
 
 @njit(**_COMPILE)
-def _controllable(directions, spacing, acceleration, fastest, ratios):  # type: ignore[no-untyped-def]
-    """Lowers `fastest` (T-1,) to the largest speeds from which the goal can be reached, from the last step backward.
+def _controllable(directions, spacing, acceleration, fastest, ratios):
+    """Lowers `fastest` (T-1,) to the largest speeds from which the goal can be reached, from the
+    last step backward.
 
-    ratios[i]: speed of step i + 1 over that of step i with which the largest speed of step i is reached; it is
-    allowed at every slower speed too.
+    ratios[i]: speed of step i + 1 over that of step i with which the largest speed of step i is
+    reached; it is allowed at every slower speed too.
     """
     for i in range(spacing.shape[0] - 2, -1, -1):
         u, s, u_next, s_next = directions[i], spacing[i], directions[i + 1], spacing[i + 1]
@@ -128,12 +162,18 @@ def _controllable(directions, spacing, acceleration, fastest, ratios):  # type: 
         most = min(fastest[i], fastest[i + 1] / smallest)
         speed = _fastest_beside(fastest[i + 1], u_next, s_next, u, s, acceleration, most)
         ratio = fastest[i + 1] / speed
-        if ratio > largest:  # so slow beside the next step's largest speed that this one must be lowered as well
+        if (
+            ratio > largest
+        ):  # so slow beside the next step's largest speed that this one must be lowered as well
             ratio, speed = largest, 0.0
-        # Where a joint turns back or speeds up, going slower after the row can allow to go faster before it.
+        # Where a joint turns back or speeds up, going slower after the row can allow to go faster
+        # before it.
         limit = fastest[i + 1]
         lower = ratio * (1.0 - _NUDGE)
-        if speed < most and _speed_at_ratio(lower, u, s, u_next, s_next, acceleration, most, limit) > speed:
+        if (
+            speed < most
+            and _speed_at_ratio(lower, u, s, u_next, s_next, acceleration, most, limit) > speed
+        ):
             trial = _best_ratio(smallest, ratio, u, s, u_next, s_next, acceleration, most, limit)
             reached = _speed_at_ratio(trial, u, s, u_next, s_next, acceleration, most, limit)
             if reached > speed:
@@ -143,18 +183,22 @@ def _controllable(directions, spacing, acceleration, fastest, ratios):  # type: 
 
 
 @njit(**_COMPILE)
-def _ratio_window(s, s_next):  # type: ignore[no-untyped-def]
-    """Smallest and largest ratio of a step's speed to that of the step before it, at constant acceleration along both.
+def _ratio_window(s, s_next):
+    """Smallest and largest ratio of a step's speed to that of the step before it, at constant
+    acceleration along both.
 
-    The extremes are those of an arm that comes to rest at the end of the second step or starts at rest into the first.
-    Beyond them the differences would allow any change of speed, because a slow step's time makes it look gentle.
+    The extremes are those of an arm that comes to rest at the end of the second step or starts at
+    rest into the first. Beyond them the differences would allow any change of speed, because a slow
+    step's time makes it look gentle.
     """
     return 1.0 / (1.0 + np.sqrt(1.0 + s / s_next)), 1.0 + np.sqrt(1.0 + s_next / s)
 
 
 @njit(**_COMPILE)
-def _speed_at_ratio(ratio, u, s, u_next, s_next, acceleration, most, most_next):  # type: ignore[no-untyped-def]
-    """Largest speed of a step, up to `most`, if the next one's, up to `most_next`, is `ratio` times it."""
+def _speed_at_ratio(ratio, u, s, u_next, s_next, acceleration, most, most_next):
+    """Largest speed of a step, up to `most`, if the next one's, up to `most_next`, is `ratio` times
+    it.
+    """
     square = min(most, most_next / ratio) ** 2
     length = s_next / ratio + s
     for j in range(acceleration.shape[0]):
@@ -165,7 +209,7 @@ def _speed_at_ratio(ratio, u, s, u_next, s_next, acceleration, most, most_next):
 
 
 @njit(**_COMPILE)
-def _best_ratio(low, high, u, s, u_next, s_next, acceleration, most, most_next):  # type: ignore[no-untyped-def]
+def _best_ratio(low, high, u, s, u_next, s_next, acceleration, most, most_next):
     """Ratio between low and high with the largest `_speed_at_ratio`, by golden sections."""
     inner, outer = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     at_inner = _speed_at_ratio(inner, u, s, u_next, s_next, acceleration, most, most_next)
@@ -183,11 +227,12 @@ def _best_ratio(low, high, u, s, u_next, s_next, acceleration, most, most_next):
 
 
 @njit(**_COMPILE)
-def _fastest_beside(x, a, s_x, b, s_y, acceleration, most):  # type: ignore[no-untyped-def]
-    """Largest speed y ≤ most along direction b, beside a step of speed x along a: 2 |b y - a x| ≤ A (s_y/y + s_x/x).
+def _fastest_beside(x, a, s_x, b, s_y, acceleration, most):
+    """Largest speed y ≤ most along direction b, beside a step of speed x along a: 2 |b y - a x| ≤ A
+    (s_y/y + s_x/x).
 
-    The condition is the same for the step before and the one behind.  Of the joint that breaks it the largest root
-    below is taken, until no joint breaks it.
+    The condition is the same for the step before and the one behind.  Of the joint that breaks it
+    the largest root below is taken, until no joint breaks it.
     """
     y = most
     time = s_x / x
@@ -202,15 +247,21 @@ def _fastest_beside(x, a, s_x, b, s_y, acceleration, most):  # type: ignore[no-u
             sign = 1.0 if change > 0.0 else -1.0
             c = acceleration[j] * time + 2.0 * sign * a[j] * x
             root = np.sqrt(max(c * c + 8.0 * sign * b[j] * acceleration[j] * s_y, 0.0))
-            lower = 0.25 * (c + root) / (sign * b[j]) if c > 0.0 else 2.0 * acceleration[j] * s_y / (root - c)
+            lower = (
+                0.25 * (c + root) / (sign * b[j])
+                if c > 0.0
+                else 2.0 * acceleration[j] * s_y / (root - c)
+            )
             y = min(lower, y * (1.0 - _ROUNDING))
             lowered = True
     return y
 
 
 @njit(**_COMPILE)
-def _used(q, times, velocity, acceleration):  # type: ignore[no-untyped-def]
-    """Factor by which times may shrink, or must grow if above 1, for all differences of the rows to keep the limits."""
+def _used(q, times, velocity, acceleration):
+    """Factor by which times may shrink, or must grow if above 1, for all differences of the rows to
+    keep the limits.
+    """
     worst = 0.0
     last = q.shape[0] - 1
     for j in range(q.shape[1]):
@@ -219,6 +270,8 @@ def _used(q, times, velocity, acceleration):  # type: ignore[no-untyped-def]
             dt = times[i + 1] - times[i] if i < last else 0.0
             v = (q[i + 1, j] - q[i, j]) / dt if i < last else 0.0
             worst = max(worst, abs(v) / velocity[j])
-            worst = max(worst, np.sqrt(2.0 * abs(v - v_before) / ((dt + dt_before) * acceleration[j])))
+            worst = max(
+                worst, np.sqrt(2.0 * abs(v - v_before) / ((dt + dt_before) * acceleration[j]))
+            )
             v_before, dt_before = v, dt
     return worst

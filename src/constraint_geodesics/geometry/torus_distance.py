@@ -1,26 +1,30 @@
 """Length of the shortest curve between two points of the torus T², over all its geodesics.
 
-Along a geodesic Clairaut's constant c = ρ² u̇ (at unit speed) stays the same; ρ = R + r cos v is the radius of the ring
-at tube angle v (do Carmo, Differential Geometry of Curves and Surfaces, 4-4).  A stretch of tube angles then gives the
-ring angle it advances, U(c) = ∫ r c / (ρ √(ρ² − c²)) dv, and its action W(c) = ∫ r √(ρ² − c²) / ρ dv.  A geodesic that
-has to advance by u solves U(c) = u and has length c u + W(c).  As dW/dc = −U, an error of c is felt to second order.
+Along a geodesic Clairaut's constant c = ρ² u̇ (at unit speed) stays the same; ρ = R + r cos v is
+the radius of the ring at tube angle v (do Carmo, Differential Geometry of Curves and Surfaces,
+4-4).  A stretch of tube angles then gives the ring angle it advances, U(c) = ∫ r c / (ρ √(ρ² − c²))
+dv, and its action W(c) = ∫ r √(ρ² − c²) / ρ dv.  A geodesic that has to advance by u solves U(c) =
+u and has length c u + W(c).  As dW/dc = −U, an error of c is felt to second order.
 
-Three reflections tell which geodesics can be shortest: each would turn a longer one into a curve of the same length
-with a corner.  A shortest curve advances by at most half a ring (reflect its start in the meridian opposite to it),
-meets the two equators at most once in all between its ends (reflect the piece between two meetings), and swings about
-the outer equator for at most half a period (there the geodesic that left in the mirrored direction arrives as well).
-With the end nearer to the inner equator called the near end, this leaves two families:
+Three reflections tell which geodesics can be shortest: each would turn a longer one into a curve of
+the same length with a corner.  A shortest curve advances by at most half a ring (reflect its start
+in the meridian opposite to it), meets the two equators at most once in all between its ends
+(reflect the piece between two meetings), and swings about the outer equator for at most half a
+period (there the geodesic that left in the mirrored direction arrives as well). With the end nearer
+to the inner equator called the near end, this leaves two families:
 
-- outward: from the near end away from the inner equator to the far end, beyond the outer equator where that lies
-  between them; or first to a turning point ρ = c on the inner side of the near end, and then the same way;
+- outward: from the near end away from the inner equator to the far end, beyond the outer equator
+  where that lies between them; or first to a turning point ρ = c on the inner side of the near end,
+  and then the same way;
 - inward, where the ends lie on opposite sides of the tube: through the inner equator, c < R − r.
 
-Along either family U grows from 0 without bound, so that it holds one geodesic; in the outward one because curvature
-falls from the outer equator to the inner (Gravesen, Markvorsen, Sinclair, Tanaka, The cut locus of a torus of
-revolution, Asian J. Math. 9, 2005).  Only where both ends lie on one equator does U jump or stay at 0 instead; the
-family's member there, c = ρ, is that equator itself.
+Along either family U grows from 0 without bound, so that it holds one geodesic; in the outward one
+because curvature falls from the outer equator to the inner (Gravesen, Markvorsen, Sinclair, Tanaka,
+The cut locus of a torus of revolution, Asian J. Math. 9, 2005).  Only where both ends lie on one
+equator does U jump or stay at 0 instead; the family's member there, c = ρ, is that equator itself.
 
-Within this file lengths are in units of the tube's diameter 2r: ρ = hole + cos²(v/2), hole = (R − r) / 2r.
+Within this file lengths are in units of the tube's diameter 2r: ρ = hole + cos²(v/2), hole = (R −
+r) / 2r.
 """
 
 from collections.abc import Callable
@@ -38,11 +42,14 @@ BISECTIONS = 64
 EPSILON = float(np.finfo(np.float64).eps)
 
 POINT = 1e-60
-"""Difference of cos²(v/2) below which two parallels are one: some 1e-30 rad, and its square is still a float64."""
+"""Difference of cos²(v/2) below which two parallels are one: some 1e-30 rad, and its square is
+still a float64.
+"""
 
 
 class Parallels(NamedTuple):
-    """Circles of constant tube angle v: inner = cos²(v/2), 0 on the inner equator, and outer = sin²(v/2) = 1 − inner.
+    """Circles of constant tube angle v: inner = cos²(v/2), 0 on the inner equator, and outer =
+    sin²(v/2) = 1 − inner.
 
     Both are kept, since either loses its digits next to 1.
     """
@@ -52,9 +59,11 @@ class Parallels(NamedTuple):
 
 
 class Ends(NamedTuple):
-    """Both ends of the curves sought: the one nearer to the inner equator, the other, and what lies between them.
+    """Both ends of the curves sought: the one nearer to the inner equator, the other, and what lies
+    between them.
 
-    gap: cos²(v/2) of the farther less that of the nearer.  opposite: whether they lie on two sides of the tube.
+    gap: cos²(v/2) of the farther less that of the nearer.  opposite: whether they lie on two sides
+    of the tube.
     turn: the ring angle between them, 0 to π.
     """
 
@@ -66,7 +75,9 @@ class Ends(NamedTuple):
 
 
 class Advance(NamedTuple):
-    """What geodesics gain on a stretch of the tube: ring angle `turn` = U [rad] and `action` = W."""
+    """What geodesics gain on a stretch of the tube: ring angle `turn` = U [rad] and `action` =
+    W.
+    """
 
     turn: Numbers
     action: Numbers
@@ -78,11 +89,12 @@ Family = Callable[[Numbers], Advance]
 def torus_distance(
     major: float, minor: float, a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n"]:
-    """Geodesic distance between points (ring angle u, tube angle v) [rad] of the torus with radii R and r.
+    """Geodesic distance between points (ring angle u, tube angle v) [rad] of the torus with radii R
+    and r.
 
-    a, b: finite; any image of a point under the periods 2π will do.  In the unit of the radii, with an error of a few
-    1e-15 R for R ≥ 1.1 r, which grows to 2e-13 R at R = 1.0001 r; near points keep 11 digits of their distance as
-    well.  Symmetric to the bit, and 0 where a equals b.
+    a, b: finite; any image of a point under the periods 2π will do.  In the unit of the radii, with
+    an error of a few 1e-15 R for R ≥ 1.1 r, which grows to 2e-13 R at R = 1.0001 r; near points
+    keep 11 digits of their distance as well.  Symmetric to the bit, and 0 where a equals b.
     """
     hole, ends = (major - minor) / (2 * minor), _ends(a, b)
     # Integrals that diverge at the end of a family are bounds, not mistakes.
@@ -107,8 +119,8 @@ def _ends(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]) -> Ends:
 def _outward_length(hole: float, ends: Ends) -> Numbers:
     """Lengths in the outward family.
 
-    It is run through by one number t: c = ρ + t below the ring ρ of the nearer end, then c = ρ − t, with the
-    turning point on the inner side of that end.
+    It is run through by one number t: c = ρ + t below the ring ρ of the nearer end, then c = ρ − t,
+    with the turning point on the inner side of that end.
     """
     near, far, gap, opposite = ends.near, ends.far, ends.gap, ends.opposite
     equator = Parallels(np.ones_like(gap), np.zeros_like(gap))
@@ -130,13 +142,20 @@ def _outward_length(hole: float, ends: Ends) -> Numbers:
 
 
 def _inward_length(hole: float, ends: Ends) -> Numbers:
-    """Lengths in the inward family, c = hole + t below the ring of the inner equator; no meaning unless opposite."""
+    """Lengths in the inward family, c = hole + t below the ring of the inner equator; no meaning
+    unless opposite.
+    """
     equator = Parallels(np.zeros_like(ends.turn), np.ones_like(ends.turn))
     stops = ends.near, ends.far
     gaps = [np.where(ends.opposite, end.inner, 0.0) for end in stops]
 
     def family(t: Numbers) -> Advance:
-        return _sum(*(_leg(hole, hole + t, equator, end, -t, gap) for end, gap in zip(stops, gaps, strict=True)))
+        return _sum(
+            *(
+                _leg(hole, hole + t, equator, end, -t, gap)
+                for end, gap in zip(stops, gaps, strict=True)
+            )
+        )
 
     t = _shortfall(family, ends.turn, np.full_like(ends.turn, -hole), np.zeros_like(ends.turn))
     return (hole + t) * ends.turn + family(t).action
@@ -153,25 +172,36 @@ def _shortfall(family: Family, turn: Numbers, low: Numbers, high: Numbers) -> Nu
 
 
 def _sum(*legs: Advance) -> Advance:
-    return Advance(np.sum([leg.turn for leg in legs], axis=0), np.sum([leg.action for leg in legs], axis=0))
+    return Advance(
+        np.sum([leg.turn for leg in legs], axis=0), np.sum([leg.action for leg in legs], axis=0)
+    )
 
 
-def _leg(hole: float, c: Numbers, start: Parallels, end: Parallels, margin: Numbers, gap: Numbers) -> Advance:
-    """Gain between two parallels on one side of the tube, from the inner to the outer; 0 where they are one.
+def _leg(
+    hole: float, c: Numbers, start: Parallels, end: Parallels, margin: Numbers, gap: Numbers
+) -> Advance:
+    """Gain between two parallels on one side of the tube, from the inner to the outer; 0 where they
+    are one.
 
-    margin: ρ − c at the start.  gap: what ρ − c grows by.  Given, as differences of nearly equal numbers hold nothing.
+    margin: ρ − c at the start.  gap: what ρ − c grows by.  Given, as differences of nearly equal
+    numbers hold nothing.
     """
     advance = Advance(np.zeros_like(c), np.zeros_like(c))
     some = gap > POINT
     if not some.any():
         return advance
     start, end = (Parallels(at.inner[some], at.outer[some]) for at in (start, end))
-    advance.turn[some], advance.action[some] = _elliptic(hole, c[some], start, end, margin[some], gap[some])
+    advance.turn[some], advance.action[some] = _elliptic(
+        hole, c[some], start, end, margin[some], gap[some]
+    )
     return advance
 
 
-def _elliptic(hole: float, c: Numbers, start: Parallels, end: Parallels, margin: Numbers, gap: Numbers) -> Advance:
-    """U and W as Carlson's integrals (DLMF 19.29.4 and 8): with y = cos²(v/2) and s² = (ρ + c) (ρ − c) y (1 − y),
+def _elliptic(
+    hole: float, c: Numbers, start: Parallels, end: Parallels, margin: Numbers, gap: Numbers
+) -> Advance:
+    """U and W as Carlson's integrals (DLMF 19.29.4 and 8): with y = cos²(v/2) and s² = (ρ + c) (ρ −
+    c) y (1 − y),
 
     2 U = ∫ (ρ + c) / (ρ s) dy − ∫ dy / s,  2 W = ∫ (ρ + c) / s dy − c ∫ (ρ + c) / (ρ s) dy.
     """

@@ -1,7 +1,8 @@
-"""Labelled joint configurations: drawn in shards, projected onto a constraint, judged by PyBullet, kept as parquet.
+"""Labelled joint configurations: drawn in shards, projected onto a constraint, judged by PyBullet,
+kept as parquet.
 
-A shard's rows depend on its seed alone, and every shard opens a physics world of its own (a world remembers
-contacts), so the bytes written are the same whatever the number of workers.
+A shard's rows depend on its seed alone, and every shard opens a physics world of its own (a world
+remembers contacts), so the bytes written are the same whatever the number of workers.
 """
 
 import zlib
@@ -17,23 +18,41 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Bool, Float
 
-from constraint_geodesics.constraints.retraction import Retraction, retract
-from constraint_geodesics.constraints.scene import Scene
-from constraint_geodesics.constraints.vector import ConstraintManifold
+from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.projection import Retraction, retract
+from constraint_geodesics.scene.scene import Scene
 
-POSE_COLUMNS = ("tool_x", "tool_y", "tool_z", "quaternion_x", "quaternion_y", "quaternion_z", "quaternion_w")
+POSE_COLUMNS = (
+    "tool_x",
+    "tool_y",
+    "tool_z",
+    "quaternion_x",
+    "quaternion_y",
+    "quaternion_z",
+    "quaternion_w",
+)
 RPY_COLUMNS = ("roll", "pitch", "yaw")
 UNITS = {
-    "joint": "rad", "tool": "m", "quaternion": "1", "roll": "rad", "pitch": "rad", "yaw": "rad",
-    "self_collision": "bool", "workcell_collision": "bool", "limit_distance": "rad", "residual": "m or rad",
-}  # fmt: skip
+    "joint": "rad",
+    "tool": "m",
+    "quaternion": "1",
+    "roll": "rad",
+    "pitch": "rad",
+    "yaw": "rad",
+    "self_collision": "bool",
+    "workcell_collision": "bool",
+    "limit_distance": "rad",
+    "residual": "m or rad",
+}
 HISTOGRAM_BINS = 24
 
 Map = Callable[[Callable[["ShardTask"], "Shard"], Sequence["ShardTask"]], list["Shard"]]
 
 
 class DatasetError(ValueError):
-    """A table that can't be used, or a constraint that no configuration satisfies; the message says which."""
+    """A table that can't be used, or a constraint that no configuration satisfies; the message says
+    which.
+    """
 
 
 @dataclass(frozen=True)
@@ -72,7 +91,9 @@ class JointSet:
 
 @dataclass(frozen=True)
 class Queries:
-    """Start and goal pairs [rad] on one constraint manifold, free of collision and within the limits."""
+    """Start and goal pairs [rad] on one constraint manifold, free of collision and within the
+    limits.
+    """
 
     starts: Float[np.ndarray, "n D"]
     goals: Float[np.ndarray, "n D"]
@@ -86,11 +107,15 @@ def shard_tasks(
 ) -> list[ShardTask]:
     """The shards of one constraint's set; the constraint's name takes part in the seed."""
     sizes = [min(shard_rows, rows - first) for first in range(0, rows, shard_rows)]
-    return [ShardTask(scene, manifold, n, (seed, zlib.crc32(name.encode()), i)) for i, n in enumerate(sizes)]
+    return [
+        ShardTask(scene, manifold, n, (seed, zlib.crc32(name.encode()), i))
+        for i, n in enumerate(sizes)
+    ]
 
 
 def draw_shard(task: ShardTask) -> Shard:
-    """Draw uniformly within the limits, project onto the constraint, keep what stays within them, and label it.
+    """Draw uniformly within the limits, project onto the constraint, keep what stays within them,
+    and label it.
 
     A tolerance is used evenly: each configuration is projected onto its own share of the band.
     Raises DatasetError if hardly anything satisfies the constraint within the limits.
@@ -111,7 +136,9 @@ def draw_shard(task: ShardTask) -> Shard:
         kept.append(good)
         count += len(good)
         if drawn > 1000 * task.rows and count < task.rows:
-            raise DatasetError(f"only {count} of {drawn} configurations satisfy the constraint within the limits")
+            raise DatasetError(
+                f"only {count} of {drawn} configurations satisfy the constraint within the limits"
+            )
     joints = np.concatenate(kept)[: task.rows]
     return Shard(_label(task, joints), drawn, not_converged, outside)
 
@@ -119,9 +146,13 @@ def draw_shard(task: ShardTask) -> Shard:
 def _label(task: ShardTask, joints: np.ndarray) -> pd.DataFrame:
     with task.scene.world() as world:
         labels = world.label(joints)
-    columns: dict[str, np.ndarray] = {f"joint_{i + 1}": joints[:, i] for i in range(joints.shape[1])}
+    columns: dict[str, np.ndarray] = {
+        f"joint_{i + 1}": joints[:, i] for i in range(joints.shape[1])
+    }
     poses = np.concatenate([labels.position, labels.quaternion], axis=1)
-    columns |= dict(zip(POSE_COLUMNS, poses.T, strict=True)) | dict(zip(RPY_COLUMNS, labels.rpy.T, strict=True))
+    columns |= dict(zip(POSE_COLUMNS, poses.T, strict=True)) | dict(
+        zip(RPY_COLUMNS, labels.rpy.T, strict=True)
+    )
     columns["self_collision"] = labels.self_collision
     columns["workcell_collision"] = labels.workcell_collision
     columns["limit_distance"] = task.scene.robot.limit_distance(joints)
@@ -130,12 +161,18 @@ def _label(task: ShardTask, joints: np.ndarray) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def draw_queries(scene: Scene, manifold: ConstraintManifold, name: str, count: int, seed: int) -> Queries:
-    """Pairs of configurations drawn like the data, from a seed of their own, and free of collision."""
+def draw_queries(
+    scene: Scene, manifold: ConstraintManifold, name: str, count: int, seed: int
+) -> Queries:
+    """Pairs of configurations drawn like the data, from a seed of their own, and free of
+    collision.
+    """
     free: list[np.ndarray] = []
     found = 0
     for attempt in range(100):
-        shard = draw_shard(ShardTask(scene, manifold, 4 * count, (seed, zlib.crc32(name.encode()), attempt, 1)))
+        shard = draw_shard(
+            ShardTask(scene, manifold, 4 * count, (seed, zlib.crc32(name.encode()), attempt, 1))
+        )
         free.append(joints_of(shard.frame)[free_rows(shard.frame)])
         found += len(free[-1])
         if found >= 2 * count:
@@ -152,7 +189,11 @@ def data_card(shards: Sequence[Shard]) -> dict[str, Any]:
     histograms = {}
     for name in numeric:
         counts, edges = np.histogram(numeric[name], bins=HISTOGRAM_BINS)
-        histograms[str(name)] = {"first": float(edges[0]), "last": float(edges[-1]), "counts": counts.tolist()}
+        histograms[str(name)] = {
+            "first": float(edges[0]),
+            "last": float(edges[-1]),
+            "counts": counts.tolist(),
+        }
     return {
         "rows": len(frame),
         "drawn": drawn,
@@ -161,23 +202,31 @@ def data_card(shards: Sequence[Shard]) -> dict[str, Any]:
         "self_collision": float(frame["self_collision"].mean()),
         "workcell_collision": float(frame["workcell_collision"].mean()),
         "free": float(free_rows(frame).mean()),
-        "ranges": {str(name): [float(numeric[name].min()), float(numeric[name].max())] for name in numeric},
+        "ranges": {
+            str(name): [float(numeric[name].min()), float(numeric[name].max())] for name in numeric
+        },
         "histograms": histograms,
     }
 
 
 def write_joints(shards: Sequence[Shard], file: Path, about: dict[str, str]) -> None:
-    """One parquet file, with each column's unit in its field and `about` (seed, robot, constraint) in the schema."""
+    """One parquet file, with each column's unit in its field and `about` (seed, robot, constraint)
+    in the schema.
+    """
     frame = pd.concat([shard.frame for shard in shards], ignore_index=True)
     table = pa.Table.from_pandas(frame, preserve_index=False)
     fields = [field.with_metadata({"unit": _unit(field.name)}) for field in table.schema]
-    table = table.cast(pa.schema(fields, metadata={"constraint_geodesics." + k: v for k, v in about.items()}))
+    table = table.cast(
+        pa.schema(fields, metadata={"constraint_geodesics." + k: v for k, v in about.items()})
+    )
     file.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(table, file, compression="zstd")
 
 
 def read_joints(file: Path) -> JointSet:
-    """Read and check one set.  Raises DatasetError naming the file and the column if a row can't be used."""
+    """Read and check one set.  Raises DatasetError naming the file and the column if a row can't be
+    used.
+    """
     frame = _checked(pd.read_parquet(file), file)
     return JointSet(joints_of(frame), free_rows(frame))
 

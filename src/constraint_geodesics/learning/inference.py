@@ -15,14 +15,15 @@ from constraint_geodesics.learning.files import WEIGHTS
 
 Arrays = Mapping[str, np.ndarray]
 SPREAD = 0.3
-"""Standard deviation of samples around a centre, in its bandwidths: so wide, samples are as often free of collision as
-the training data; wider, they leave it.
+"""Standard deviation of samples around a centre, in its bandwidths: so wide, samples are as often
+free of collision as the training data; wider, they leave it.
 """
 
 
 @dataclass(frozen=True)
 class FrozenManifold:
-    """Encoder and decoder mean of a trained `JointVae`, from the arrays of its state.  Implements Chart.
+    """Encoder and decoder mean of a trained `JointVae`, from the arrays of its state.  Implements
+    Chart.
 
     In the network's own single precision inside; joints are rad outside.
     """
@@ -50,18 +51,27 @@ class FrozenManifold:
         return (self.arrays["centre"] + self.arrays["scale"] * decoded).astype(np.float64)
 
     def sample(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count N"]:
-        """Latent points spread like the training data: normal around the centres of the precision network."""
+        """Latent points spread like the training data: normal around the centres of the precision
+        network.
+        """
         centres, width = self.arrays["precision.centres"], self.arrays["precision.bandwidth"]
         chosen = rng.integers(len(centres), size=count)
         return centres[chosen] + SPREAD * width[chosen, None] * rng.normal(size=(count, self.dim))
 
 
-def perceptron(arrays: Arrays, name: str, x: Float[np.ndarray, "*batch I"]) -> Float[np.ndarray, "*batch O"]:
+def perceptron(
+    arrays: Arrays, name: str, x: Float[np.ndarray, "*batch I"]
+) -> Float[np.ndarray, "*batch O"]:
     """Output of the `vae.Perceptron` called `name`: SiLU layers with a linear path beside them."""
     y, layer = x, 0
     while f"{name}.nonlinear.{layer + 2}.weight" in arrays:
-        y = y @ arrays[f"{name}.nonlinear.{layer}.weight"].T + arrays[f"{name}.nonlinear.{layer}.bias"]
+        y = (
+            y @ arrays[f"{name}.nonlinear.{layer}.weight"].T
+            + arrays[f"{name}.nonlinear.{layer}.bias"]
+        )
         y = y / (1.0 + np.exp(-np.clip(y, -80.0, 80.0)))
         layer += 2
-    last = y @ arrays[f"{name}.nonlinear.{layer}.weight"].T + arrays[f"{name}.nonlinear.{layer}.bias"]
+    last = (
+        y @ arrays[f"{name}.nonlinear.{layer}.weight"].T + arrays[f"{name}.nonlinear.{layer}.bias"]
+    )
     return last + x @ arrays[f"{name}.linear.weight"].T

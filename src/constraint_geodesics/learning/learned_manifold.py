@@ -1,4 +1,6 @@
-"""A trained manifold: the stochastic embedding f(z) = (μ(z), σ(z)), its pullback metric (eq. 5), and its files."""
+"""A trained manifold: the stochastic embedding f(z) = (μ(z), σ(z)), its pullback metric (eq. 5),
+and its files.
+"""
 
 import copy
 import hashlib
@@ -25,7 +27,8 @@ PIECE = 1024
 
 @dataclass(frozen=True)
 class LearnedManifold:
-    """The latent space of a trained VAE as a Riemannian manifold.  Implements the Manifold protocol.
+    """The latent space of a trained VAE as a Riemannian manifold.  Implements the Manifold
+    protocol.
 
     dim N latent dimensions; ambient_dim 2D: every joint's mean and standard deviation [rad].
     """
@@ -65,10 +68,16 @@ class LearnedManifold:
         """f(z) of many points [rad], in pieces that stay in the processor's cache."""
         with torch.no_grad():
             pieces = self.tensor(z).reshape(-1, self.dim).split(PIECE)
-            return torch.cat([self.embed(piece) for piece in pieces]).numpy().reshape(*z.shape[:-1], -1)
+            return (
+                torch.cat([self.embed(piece) for piece in pieces])
+                .numpy()
+                .reshape(*z.shape[:-1], -1)
+            )
 
     def embed_joints(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch A"]:
-        """The embedding of encoded configurations: where a joint path lies on the manifold [rad]."""
+        """The embedding of encoded configurations: where a joint path lies on the manifold
+        [rad].
+        """
         with torch.no_grad():
             return self.embed(self.vae.encode(self.tensor(q))[0]).numpy().astype(np.float64)
 
@@ -87,9 +96,11 @@ class LearnedManifold:
         card = {
             "dof": self.vae.dof,
             "latent_dim": self.dim,
-            "hidden": [layer.out_features for layer in self.vae.encoder.nonlinear if hasattr(layer, "out_features")][
-                :-1
-            ],
+            "hidden": [
+                layer.out_features
+                for layer in self.vae.encoder.nonlinear
+                if hasattr(layer, "out_features")
+            ][:-1],
             "variance_centres": len(self.vae.precision.centres),
             "sha256": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest(),
         }
@@ -99,23 +110,33 @@ class LearnedManifold:
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> "LearnedManifold":
         """From the arrays of a network's state, whose shapes say how large it is."""
         layers = sorted(
-            int(name.split(".")[2]) for name in arrays if re.fullmatch(r"encoder\.nonlinear\.\d+\.bias", name)
+            int(name.split(".")[2])
+            for name in arrays
+            if re.fullmatch(r"encoder\.nonlinear\.\d+\.bias", name)
         )
         hidden = [len(arrays[f"encoder.nonlinear.{layer}.bias"]) for layer in layers[:-1]]
         centres, latent_dim = arrays["precision.centres"].shape
         vae = JointVae(len(arrays["centre"]), latent_dim, hidden, centres)
-        vae.load_state_dict({name: torch.from_numpy(np.array(values)) for name, values in arrays.items()})
+        vae.load_state_dict(
+            {name: torch.from_numpy(np.array(values)) for name, values in arrays.items()}
+        )
         return cls(vae.eval().requires_grad_(False))
 
     @classmethod
     def load(cls, folder: Path) -> "LearnedManifold":
-        """Read what `save` wrote.  Raises ManifoldFileError if a file is missing or its checksum differs."""
+        """Read what `save` wrote.  Raises ManifoldFileError if a file is missing or its checksum
+        differs.
+        """
         try:
             card = json.loads((folder / CARD).read_text())
             found = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
             if found != card["sha256"]:
-                raise ManifoldFileError(f"{folder / WEIGHTS}: altered since it was written (its checksum differs)")
-            vae = JointVae(card["dof"], card["latent_dim"], card["hidden"], card["variance_centres"])
+                raise ManifoldFileError(
+                    f"{folder / WEIGHTS}: altered since it was written (its checksum differs)"
+                )
+            vae = JointVae(
+                card["dof"], card["latent_dim"], card["hidden"], card["variance_centres"]
+            )
             vae.load_state_dict(load_file(folder / WEIGHTS))
         except (OSError, KeyError, json.JSONDecodeError, SafetensorError, RuntimeError) as error:
             raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None

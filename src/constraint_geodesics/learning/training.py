@@ -1,4 +1,6 @@
-"""Training of a learned manifold with Lightning: the mean first, then the variance with the mean frozen (eq. 4)."""
+"""Training of a learned manifold with Lightning: the mean first, then the variance with the mean
+frozen (eq. 4).
+"""
 
 import logging
 import warnings
@@ -14,7 +16,13 @@ from jaxtyping import Float
 from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint, RichProgressBar
 from sklearn.cluster import MiniBatchKMeans
 from torch import Tensor
-from torch.utils.data import BatchSampler, DataLoader, RandomSampler, SequentialSampler, TensorDataset
+from torch.utils.data import (
+    BatchSampler,
+    DataLoader,
+    RandomSampler,
+    SequentialSampler,
+    TensorDataset,
+)
 
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.vae import JointVae, evidence_loss, variance_loss
@@ -51,11 +59,14 @@ class _MeanPhase(lightning.LightningModule):
         (q,) = batch
         noise = torch.zeros(len(q), self.vae.latent_dim)
         loss, reconstruction = evidence_loss(self.vae, q, self.params.beta, noise)
-        self.log_dict({"held_out_loss": loss, "held_out_reconstruction": reconstruction}, prog_bar=True)
+        self.log_dict(
+            {"held_out_loss": loss, "held_out_reconstruction": reconstruction}, prog_bar=True
+        )
 
     def configure_optimizers(self) -> Any:
         optimiser = torch.optim.Adam(
-            [*self.vae.encoder.parameters(), *self.vae.decoder.parameters()], self.params.learning_rate
+            [*self.vae.encoder.parameters(), *self.vae.decoder.parameters()],
+            self.params.learning_rate,
         )
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
             optimiser, self.params.epochs, 0.01 * self.params.learning_rate
@@ -89,19 +100,28 @@ class _History(Callback):
         self.phase, self.first, self.report = phase, first, report
         self.rows: list[dict[str, float]] = []
 
-    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:  # noqa: ARG002
+    def on_validation_epoch_end(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
         if trainer.sanity_checking:
             return
-        figures = {f"{self.phase}_{name}": float(value) for name, value in trainer.callback_metrics.items()}
+        figures = {
+            f"{self.phase}_{name}": float(value) for name, value in trainer.callback_metrics.items()
+        }
         step = self.first + len(self.rows)
         self.rows.append({"epoch": float(step), **figures})
         self.report(step, figures)
 
 
 def train_manifold(
-    joints: Float[np.ndarray, "n D"], robot: SerialRobot, params: ManifoldParams, scratch: Path, report: Report,
-    *, progress: bool = True,
-) -> TrainedManifold:  # fmt: skip
+    joints: Float[np.ndarray, "n D"],
+    robot: SerialRobot,
+    params: ManifoldParams,
+    scratch: Path,
+    report: Report,
+    *,
+    progress: bool = True,
+) -> TrainedManifold:
     """Learn the manifold of the given configurations [rad].
 
     scratch: where checkpoints go.  report: called with (epoch, figures) after every epoch.
@@ -113,22 +133,45 @@ def train_manifold(
     vae.centre.copy_(torch.as_tensor(0.5 * (robot.lower + robot.upper)))
     vae.scale.copy_(torch.as_tensor(0.5 * (robot.upper - robot.lower)))
 
-    history = _fit(_MeanPhase(vae, params), "mean", params.epochs, rows, held_out, params, scratch, 0, report, progress)
+    history = _fit(
+        _MeanPhase(vae, params),
+        "mean",
+        params.epochs,
+        rows,
+        held_out,
+        params,
+        scratch,
+        0,
+        report,
+        progress,
+    )
     _place_variance(vae, rows[held_out:], params)
     vae.encoder.requires_grad_(False)
     vae.decoder.requires_grad_(False)
     history += _fit(
-        _VariancePhase(vae, params), "variance", params.variance_epochs, rows, held_out, params, scratch,
-        len(history), report, progress,
-    )  # fmt: skip
+        _VariancePhase(vae, params),
+        "variance",
+        params.variance_epochs,
+        rows,
+        held_out,
+        params,
+        scratch,
+        len(history),
+        report,
+        progress,
+    )
     manifold = LearnedManifold(vae.eval().requires_grad_(False))
-    return TrainedManifold(manifold, held_out_figures(manifold, robot, rows[:held_out].numpy()), history)
+    return TrainedManifold(
+        manifold, held_out_figures(manifold, robot, rows[:held_out].numpy()), history
+    )
 
 
 def held_out_figures(
     manifold: LearnedManifold, robot: SerialRobot, joints: Float[np.ndarray, "n D"]
 ) -> dict[str, float]:
-    """Reconstruction error in degrees and millimetres, deviation, and condition of the metric (eq. 5)."""
+    """Reconstruction error in degrees and millimetres, deviation, and condition of the metric (eq.
+    5).
+    """
     joints = np.asarray(joints, np.float64)
     z = manifold.encode(joints)
     decoded = manifold.decode(z)
@@ -152,21 +195,39 @@ def held_out_figures(
 
 
 def _fit(
-    module: "_MeanPhase | _VariancePhase", phase: str, epochs: int, rows: Tensor, held_out: int,
-    params: ManifoldParams, scratch: Path, first: int, report: Report, progress: bool,
-) -> list[dict[str, float]]:  # fmt: skip
+    module: "_MeanPhase | _VariancePhase",
+    phase: str,
+    epochs: int,
+    rows: Tensor,
+    held_out: int,
+    params: ManifoldParams,
+    scratch: Path,
+    first: int,
+    report: Report,
+    progress: bool,
+) -> list[dict[str, float]]:
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module="lightning")
     history = _History(phase, first, report)
-    checkpoint = ModelCheckpoint(scratch / phase, "best", monitor="held_out_loss", enable_version_counter=False)
+    checkpoint = ModelCheckpoint(
+        scratch / phase, "best", monitor="held_out_loss", enable_version_counter=False
+    )
     trainer = lightning.Trainer(
-        accelerator="cpu", devices=1, max_epochs=epochs, logger=False, enable_model_summary=False,
-        enable_progress_bar=progress, num_sanity_val_steps=0, default_root_dir=scratch,
+        accelerator="cpu",
+        devices=1,
+        max_epochs=epochs,
+        logger=False,
+        enable_model_summary=False,
+        enable_progress_bar=progress,
+        num_sanity_val_steps=0,
+        default_root_dir=scratch,
         callbacks=[
-            history, checkpoint, EarlyStopping("held_out_loss", patience=params.patience),
+            history,
+            checkpoint,
+            EarlyStopping("held_out_loss", patience=params.patience),
             *([RichProgressBar(leave=True)] if progress else []),
         ],
-    )  # fmt: skip
+    )
     generator = torch.Generator().manual_seed(params.seed)
     trainer.fit(
         module,
@@ -180,7 +241,11 @@ def _fit(
 
 def _batches(rows: Tensor, size: int, generator: torch.Generator | None) -> DataLoader:
     dataset = TensorDataset(rows)
-    order = SequentialSampler(dataset) if generator is None else RandomSampler(dataset, generator=generator)
+    order = (
+        SequentialSampler(dataset)
+        if generator is None
+        else RandomSampler(dataset, generator=generator)
+    )
     # a batch of indices at once: collating row by row costs more than a training step here
     sampler = BatchSampler(order, min(size, len(rows)), drop_last=generator is not None)
     return DataLoader(dataset, sampler=sampler, batch_size=None)
@@ -191,7 +256,9 @@ def _place_variance(vae: JointVae, rows: Tensor, params: ManifoldParams) -> None
     with torch.no_grad():
         z = vae.encode(rows)[0]
     count = min(params.variance_centres, len(z))
-    means = MiniBatchKMeans(count, random_state=params.seed, n_init=1, batch_size=4096).fit(z.numpy())
+    means = MiniBatchKMeans(count, random_state=params.seed, n_init=1, batch_size=4096).fit(
+        z.numpy()
+    )
     centres = torch.as_tensor(means.cluster_centers_).float()
     centres = centres[torch.arange(params.variance_centres) % count]
     neighbours = torch.cdist(centres, centres).topk(min(4, count), largest=False).values[:, 1:]

@@ -1,7 +1,8 @@
 """The variational autoencoder of joint configurations: modules and pure losses, no training loop.
 
-Phase one trains the encoder and the decoder mean (eq. 4 with a fixed variance), phase two the variance network
-with both frozen, as the work the paper follows does.  Joints are scaled to [−1, 1] by the robot's limits inside.
+Phase one trains the encoder and the decoder mean (eq. 4 with a fixed variance), phase two the
+variance network with both frozen, as the work the paper follows does.  Joints are scaled to [−1, 1]
+by the robot's limits inside.
 """
 
 import math
@@ -13,7 +14,9 @@ from torch import Tensor, nn
 
 
 class Perceptron(nn.Module):
-    """Smooth multilayer perceptron with a linear path beside it, so that a linear map needs no hidden unit."""
+    """Smooth multilayer perceptron with a linear path beside it, so that a linear map needs no
+    hidden unit.
+    """
 
     def __init__(self, inputs: int, hidden: Sequence[int], outputs: int) -> None:
         super().__init__()
@@ -31,10 +34,12 @@ class Perceptron(nn.Module):
 
 
 class RbfPrecision(nn.Module):
-    """Precision network β(z) = Σ_k w_k exp(−½‖z − c_k‖²/h²) + ζ(z), one precision a joint; σ = β^(−½).
+    """Precision network β(z) = Σ_k w_k exp(−½‖z − c_k‖²/h²) + ζ(z), one precision a joint; σ =
+    β^(−½).
 
-    A constant floor ζ would make σ flat, and the metric zero, far away from the data.  The floor falls instead,
-    ζ(z) = σ_max⁻² (1 + ‖z‖²/s²)⁻², so that σ grows like ‖z‖² for ever, without the explosion of a tiny floor.
+    A constant floor ζ would make σ flat, and the metric zero, far away from the data.  The floor
+    falls instead, ζ(z) = σ_max⁻² (1 + ‖z‖²/s²)⁻², so that σ grows like ‖z‖² for ever, without the
+    explosion of a tiny floor.
     """
 
     centres: Tensor
@@ -50,8 +55,12 @@ class RbfPrecision(nn.Module):
         self.register_buffer("spread", torch.ones(()))
         self.log_weights = nn.Parameter(torch.zeros(centres, outputs))
 
-    def place(self, centres: Tensor, bandwidth: Tensor, floor: float, spread: float, precision: float) -> None:
-        """Set the centres (K, N), their bandwidths (K,), the floor's height and spread, and the first weights."""
+    def place(
+        self, centres: Tensor, bandwidth: Tensor, floor: float, spread: float, precision: float
+    ) -> None:
+        """Set the centres (K, N), their bandwidths (K,), the floor's height and spread, and the
+        first weights.
+        """
         self.centres.copy_(centres)
         self.bandwidth.copy_(bandwidth)
         self.floor.fill_(floor)
@@ -61,10 +70,15 @@ class RbfPrecision(nn.Module):
     def forward(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch D"]:
         """Precision of each joint [1/rad²]."""
         square = z.square().sum(-1, keepdim=True)
-        # −½‖z − c‖²/h² as one matrix product of (z, ‖z‖², 1): every further pass over (B, K) costs as much again
+        # −½‖z − c‖²/h² as one matrix product of (z, ‖z‖², 1): every further pass over (B, K) costs
+        # as much again
         narrow = -0.5 / self.bandwidth.square()
         weights = torch.cat(
-            [-2.0 * narrow * self.centres.T, narrow[None], (narrow * self.centres.square().sum(-1))[None]]
+            [
+                -2.0 * narrow * self.centres.T,
+                narrow[None],
+                (narrow * self.centres.square().sum(-1))[None],
+            ]
         )
         exponent = torch.cat([z, square, torch.ones_like(square)], dim=-1) @ weights
         # cut where it no longer counts: denormal numbers would make the product ten times slower
@@ -79,7 +93,9 @@ class JointVae(nn.Module):
     centre: Tensor
     scale: Tensor
 
-    def __init__(self, dof: int, latent_dim: int, hidden: Sequence[int], variance_centres: int) -> None:
+    def __init__(
+        self, dof: int, latent_dim: int, hidden: Sequence[int], variance_centres: int
+    ) -> None:
         super().__init__()
         self.dof, self.latent_dim = dof, latent_dim
         self.register_buffer("centre", torch.zeros(dof))
@@ -88,7 +104,9 @@ class JointVae(nn.Module):
         self.decoder = Perceptron(latent_dim, list(reversed(hidden)), dof)
         self.precision = RbfPrecision(latent_dim, variance_centres, dof)
 
-    def encode(self, q: Float[Tensor, "*batch D"]) -> tuple[Float[Tensor, "*batch N"], Float[Tensor, "*batch N"]]:
+    def encode(
+        self, q: Float[Tensor, "*batch D"]
+    ) -> tuple[Float[Tensor, "*batch N"], Float[Tensor, "*batch N"]]:
         """Mean and log variance of the posterior q_ζ(z | ω)."""
         mean, log_variance = self.encoder((q - self.centre) / self.scale).chunk(2, dim=-1)
         return mean, log_variance.clamp(-14.0, 2.0)
@@ -105,7 +123,9 @@ class JointVae(nn.Module):
 def evidence_loss(
     vae: JointVae, q: Float[Tensor, "b D"], beta: float, noise: Float[Tensor, "b N"]
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Negative ELBO of eq. 4 with unit variance in scaled joints: reconstruction + β KL; also the reconstruction."""
+    """Negative ELBO of eq. 4 with unit variance in scaled joints: reconstruction + β KL; also the
+    reconstruction.
+    """
     mean, log_variance = vae.encode(q)
     z = mean + noise * torch.exp(0.5 * log_variance)
     error = (vae.mean(z) - q) / vae.scale

@@ -1,9 +1,10 @@
-"""Compiled kinematics of a serial chain: one implementation for the planner, the constraint and the training.
+"""Compiled kinematics of a serial chain: one implementation for the planner, the constraint and the
+training.
 
-All kernels work in float64 on one configuration and allocate nothing that grows with the batch, so that a
-retraction costs microseconds.  Shapes: D joints, `origins` (D, 4, 4) the transform from the previous joint's
-frame to this joint's frame at zero, `axes` (D, 3) the joint axis in that frame, `prismatic` (D,) bool,
-`tool` (4, 4) from the last joint's frame to the tool.
+All kernels work in float64 on one configuration and allocate nothing that grows with the batch, so
+that a retraction costs microseconds.  Shapes: D joints, `origins` (D, 4, 4) the transform from the
+previous joint's frame to this joint's frame at zero, `axes` (D, 3) the joint axis in that frame,
+`prismatic` (D,) bool, `tool` (4, 4) from the last joint's frame to the tool.
 """
 
 import numpy as np
@@ -12,19 +13,30 @@ from numba import njit
 _COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 
 
-# A frame is a tuple of scalars, its position and its rotation by rows: an allocation costs more than the arithmetic of
-# a joint.  The three functions below are inlined, since passing a frame through a call is slower.
+# A frame is a tuple of scalars, its position and its rotation by rows: an allocation costs more
+# than the arithmetic of a joint.  The three functions below are inlined, since passing a frame
+# through a call is slower.
 @njit(**_COMPILE, inline="always")
-def frame_of(m):  # type: ignore[no-untyped-def]
+def frame_of(m):
     """The frame that a transform (4, 4) leads to from the base."""
     return (
-        m[0, 3], m[1, 3], m[2, 3],
-        m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2], m[2, 0], m[2, 1], m[2, 2],
-    )  # fmt: skip
+        m[0, 3],
+        m[1, 3],
+        m[2, 3],
+        m[0, 0],
+        m[0, 1],
+        m[0, 2],
+        m[1, 0],
+        m[1, 1],
+        m[1, 2],
+        m[2, 0],
+        m[2, 1],
+        m[2, 2],
+    )
 
 
 @njit(**_COMPILE, inline="always")
-def moved_frame(frame, m):  # type: ignore[no-untyped-def]
+def moved_frame(frame, m):
     """The frame that a transform (4, 4) leads to from `frame`."""
     p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = frame
     return (
@@ -44,8 +56,10 @@ def moved_frame(frame, m):  # type: ignore[no-untyped-def]
 
 
 @njit(**_COMPILE, inline="always")
-def joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes):  # type: ignore[no-untyped-def]
-    """The frame that joint j carries, from that of the joint before; writes the joint's origin and axis."""
+def joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes):
+    """The frame that joint j carries, from that of the joint before; writes the joint's origin and
+    axis.
+    """
     p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = moved_frame(frame, origins[j])
     x, y, z = axes[j, 0], axes[j, 1], axes[j, 2]
     a0 = r00 * x + r01 * y + r02 * z
@@ -56,7 +70,8 @@ def joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes
     if prismatic[j]:
         p0, p1, p2 = p0 + a0 * q[j], p1 + a1 * q[j], p2 + a2 * q[j]
     else:
-        # Rodrigues' rotation of each column c about the axis a: c cos + (a × c) sin + a (a·c)(1 − cos)
+        # Rodrigues' rotation of each column c about the axis a: c cos + (a × c) sin + a (a·c)(1 −
+        # cos)
         c, s = np.cos(q[j]), np.sin(q[j])
         x, y, z = x * (1.0 - c), y * (1.0 - c), z * (1.0 - c)
         r00, r10, r20 = (
@@ -78,8 +93,10 @@ def joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes
 
 
 @njit(**_COMPILE)
-def pose_of(origins, axes, prismatic, base, tool, q, position, rotation, joint_origins, joint_axes):  # type: ignore[no-untyped-def]
-    """Tool pose in the base frame, with every joint's origin [m] and axis in the base frame; writes its outputs."""
+def pose_of(origins, axes, prismatic, base, tool, q, position, rotation, joint_origins, joint_axes):
+    """Tool pose in the base frame, with every joint's origin [m] and axis in the base frame; writes
+    its outputs.
+    """
     frame = frame_of(base)
     for j in range(q.shape[0]):
         frame = joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes)
@@ -91,17 +108,30 @@ def pose_of(origins, axes, prismatic, base, tool, q, position, rotation, joint_o
 
 
 @njit(**_COMPILE)
-def forward_batch(origins, axes, prismatic, base, tool, q, positions, rotations):  # type: ignore[no-untyped-def]
+def forward_batch(origins, axes, prismatic, base, tool, q, positions, rotations):
     """Tool poses of q (B, D) into positions (B, 3) and rotations (B, 3, 3)."""
     joint_origins = np.empty((q.shape[1], 3))
     joint_axes = np.empty((q.shape[1], 3))
     for b in range(q.shape[0]):
-        pose_of(origins, axes, prismatic, base, tool, q[b], positions[b], rotations[b], joint_origins, joint_axes)
+        pose_of(
+            origins,
+            axes,
+            prismatic,
+            base,
+            tool,
+            q[b],
+            positions[b],
+            rotations[b],
+            joint_origins,
+            joint_axes,
+        )
 
 
 @njit(**_COMPILE)
-def geometric_jacobian(prismatic, position, joint_origins, joint_axes, jacobian):  # type: ignore[no-untyped-def]
-    """Geometric Jacobian (6, D) of one pose in the base frame: linear rows [m], then angular rows [rad]."""
+def geometric_jacobian(prismatic, position, joint_origins, joint_axes, jacobian):
+    """Geometric Jacobian (6, D) of one pose in the base frame: linear rows [m], then angular rows
+    [rad].
+    """
     for j in range(joint_axes.shape[0]):
         a0, a1, a2 = joint_axes[j, 0], joint_axes[j, 1], joint_axes[j, 2]
         if prismatic[j]:
@@ -118,24 +148,44 @@ def geometric_jacobian(prismatic, position, joint_origins, joint_axes, jacobian)
 
 
 @njit(**_COMPILE)
-def jacobian_batch(origins, axes, prismatic, base, tool, q, jacobians):  # type: ignore[no-untyped-def]
+def jacobian_batch(origins, axes, prismatic, base, tool, q, jacobians):
     """Geometric Jacobians of q (B, D) into jacobians (B, 6, D)."""
     position = np.empty(3)
     rotation = np.empty((3, 3))
     joint_origins = np.empty((q.shape[1], 3))
     joint_axes = np.empty((q.shape[1], 3))
     for b in range(q.shape[0]):
-        pose_of(origins, axes, prismatic, base, tool, q[b], position, rotation, joint_origins, joint_axes)
+        pose_of(
+            origins,
+            axes,
+            prismatic,
+            base,
+            tool,
+            q[b],
+            position,
+            rotation,
+            joint_origins,
+            joint_axes,
+        )
         geometric_jacobian(prismatic, position, joint_origins, joint_axes, jacobians[b])
 
 
 @njit(**_COMPILE)
-def skeleton_batch(origins, axes, prismatic, base, tool, q, points):  # type: ignore[no-untyped-def]
+def skeleton_batch(origins, axes, prismatic, base, tool, q, points):
     """Base, joint origins and tool of q (B, D) into points (B, D + 2, 3)."""
     rotation = np.empty((3, 3))
     joint_axes = np.empty((q.shape[1], 3))
     for b in range(q.shape[0]):
         points[b, 0] = base[:3, 3]
         pose_of(
-            origins, axes, prismatic, base, tool, q[b], points[b, q.shape[1] + 1], rotation, points[b, 1:-1], joint_axes
+            origins,
+            axes,
+            prismatic,
+            base,
+            tool,
+            q[b],
+            points[b, q.shape[1] + 1],
+            rotation,
+            points[b, 1:-1],
+            joint_axes,
         )

@@ -48,7 +48,9 @@ class Robot(Protocol):
 
 @dataclass(frozen=True)
 class Chain:
-    """The serial chain from the root link to the tool link, as the compiled kernels take it (see kernels.py)."""
+    """The serial chain from the root link to the tool link, as the compiled kernels take it (see
+    kernels.py).
+    """
 
     origins: Float[np.ndarray, "D 4 4"]
     axes: Float[np.ndarray, "D 3"]
@@ -97,7 +99,9 @@ class SerialRobot:
         return jacobians.reshape(*q.shape[:-1], 6, self.dof)
 
     def skeleton(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch n 3"]:
-        """Base, joint origins and tool of configurations [m], to draw the arm by: n = D + 2 points."""
+        """Base, joint origins and tool of configurations [m], to draw the arm by: n = D + 2
+        points.
+        """
         flat = self._flat(q)
         points = np.empty((len(flat), self.dof + 2, 3))
         kernels.skeleton_batch(*self.chain.arrays, flat, points)
@@ -113,7 +117,9 @@ class SerialRobot:
 
     def _flat(self, q: np.ndarray) -> np.ndarray:
         if q.shape[-1] != self.dof:
-            raise RobotError(f"{self.name} has {self.dof} joints, but the configurations have {q.shape[-1]}")
+            raise RobotError(
+                f"{self.name} has {self.dof} joints, but the configurations have {q.shape[-1]}"
+            )
         return np.ascontiguousarray(q, dtype=np.float64).reshape(-1, self.dof)
 
 
@@ -123,7 +129,8 @@ def load_robot(
     """Read the chain from the URDF's root to `tool_link`.
 
     tighter_limits: joint name → (lower, upper) [rad]; each must lie within the URDF's own limits.
-    Raises RobotError if the file or the link is missing, a movable joint has no limits, or a limit is not tighter.
+    Raises RobotError if the file or the link is missing, a movable joint has no limits, or a limit
+    is not tighter.
     """
     if not urdf.is_file():
         raise RobotError(f"{urdf}: no such URDF file")
@@ -148,7 +155,9 @@ def load_robot(
         if kind == "fixed":
             continue
         if kind not in ("revolute", "prismatic", "continuous"):
-            raise RobotError(f"{urdf}: joint {name!r} is of type {kind!r}, which a serial arm can't have")
+            raise RobotError(
+                f"{urdf}: joint {name!r} is of type {kind!r}, which a serial arm can't have"
+            )
         low, high, speed = _limits(joint, urdf)
         if name in tighter:
             low, high = _tightened(name, (low, high), tighter.pop(name))
@@ -161,18 +170,29 @@ def load_robot(
         velocity.append(speed)
         pending = np.eye(4)
     if tighter:
-        raise RobotError(f"{urdf}: limits are given for {sorted(tighter)}, which are not joints of the chain {names}")
+        raise RobotError(
+            f"{urdf}: limits are given for {sorted(tighter)}, which are not joints of the "
+            f"chain {names}"
+        )
     if not names:
         raise RobotError(f"{urdf}: no movable joint leads to {tool_link!r}")
     chain = Chain(np.array(origins), np.array(axes), np.array(prismatic), np.eye(4), pending)
     return SerialRobot(
-        root.get("name", urdf.stem), urdf, tool_link, tuple(names),
-        np.array(lower), np.array(upper), np.array(velocity), chain,
-    )  # fmt: skip
+        root.get("name", urdf.stem),
+        urdf,
+        tool_link,
+        tuple(names),
+        np.array(lower),
+        np.array(upper),
+        np.array(velocity),
+        chain,
+    )
 
 
 def rotation_from_rpy(rpy: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation of roll, pitch, yaw [rad] about the fixed x, y and z axes, in this order: Rz Ry Rx."""
+    """Rotation of roll, pitch, yaw [rad] about the fixed x, y and z axes, in this order: Rz Ry
+    Rx.
+    """
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
     return np.array(
         [
@@ -195,14 +215,18 @@ def _origin(joint: ElementTree.Element) -> np.ndarray:
     origin = joint.find("origin")
     transform = np.eye(4)
     if origin is not None:
-        transform[:3, :3] = rotation_from_rpy(np.array([float(x) for x in origin.get("rpy", "0 0 0").split()]))
+        transform[:3, :3] = rotation_from_rpy(
+            np.array([float(x) for x in origin.get("rpy", "0 0 0").split()])
+        )
         transform[:3, 3] = [float(x) for x in origin.get("xyz", "0 0 0").split()]
     return transform
 
 
 def _axis(joint: ElementTree.Element) -> np.ndarray:
     element = joint.find("axis")
-    axis = np.array([float(x) for x in ("1 0 0" if element is None else element.get("xyz", "1 0 0")).split()])
+    axis = np.array(
+        [float(x) for x in ("1 0 0" if element is None else element.get("xyz", "1 0 0")).split()]
+    )
     return axis / np.linalg.norm(axis)
 
 
@@ -212,10 +236,18 @@ def _limits(joint: ElementTree.Element, urdf: Path) -> tuple[float, float, float
         return -np.pi, np.pi, float(limit.get("velocity", "inf")) if limit is not None else np.inf
     if limit is None or limit.get("lower") is None or limit.get("upper") is None:
         raise RobotError(f"{urdf}: joint {joint.get('name')!r} has no limits")
-    return float(limit.get("lower", "")), float(limit.get("upper", "")), float(limit.get("velocity", "inf"))
+    return (
+        float(limit.get("lower", "")),
+        float(limit.get("upper", "")),
+        float(limit.get("velocity", "inf")),
+    )
 
 
-def _tightened(name: str, own: tuple[float, float], wanted: tuple[float, float]) -> tuple[float, float]:
+def _tightened(
+    name: str, own: tuple[float, float], wanted: tuple[float, float]
+) -> tuple[float, float]:
     if not own[0] <= wanted[0] < wanted[1] <= own[1]:
-        raise RobotError(f"limits of {name!r}: {list(wanted)} do not lie within the URDF's {list(own)}")
+        raise RobotError(
+            f"limits of {name!r}: {list(wanted)} do not lie within the URDF's {list(own)}"
+        )
     return wanted

@@ -1,12 +1,15 @@
-"""Runs in MLflow: one parent run a stage and matrix item, one child a seed.  The importer of mlflow, with registry.py.
+"""Runs in MLflow: one parent run a stage and matrix item, one child a seed.  The importer of
+mlflow, with registry.py.
 
-The JSON and CSV files under reports/ are the truth; MLflow mirrors them.  Only MLflow's low-level client is used: it
-has no active run that could be shared by accident, prints nothing, and sends a report in one call.
+The JSON and CSV files under reports/ are the truth; MLflow mirrors them.  Only MLflow's low-level
+client is used: it has no active run that could be shared by accident, prints nothing, and sends a
+report in one call.
 
-Runs are in `mlflow.db` at the root of the checkout and their files in `mlartifacts/` beside it, or in the store that
-MLFLOW_TRACKING_URI names.  In an SQLite store a run knows its files as `mlflow-artifacts:/…`, an address without a
-folder, which the dashboard's server looks up in its own `mlartifacts/`: no server is needed while a stage runs, and a
-checkout that was moved keeps its figures.  MLflow's client can't download such files without the server; they lie in
+Runs are in `mlflow.db` at the root of the checkout and their files in `mlartifacts/` beside it, or
+in the store that MLFLOW_TRACKING_URI names.  In an SQLite store a run knows its files as
+`mlflow-artifacts:/…`, an address without a folder, which the dashboard's server looks up in its own
+`mlartifacts/`: no server is needed while a stage runs, and a checkout that was moved keeps its
+figures.  MLflow's client can't download such files without the server; they lie in
 `mlartifacts/<experiment>/<run id>/artifacts/`.
 """
 
@@ -44,7 +47,8 @@ PARAMS_A_CALL = 100
 METRICS_A_CALL = 1000
 """The most that MLflow takes."""
 DIGITS = 9
-"""Of a reported number: enough to compare runs, too few to show the last bits of another processor."""
+"""Of a reported number: enough to compare runs, too few to show the last bits of another processor.
+"""
 FIRST_ANSWER_S = 5
 SYSTEM_EVERY_S = 5.0
 """How often processor, memory, disk and network are logged while a stage runs."""
@@ -60,21 +64,31 @@ class TrackingError(RuntimeError):
 
 @dataclass(frozen=True)
 class Subject:
-    """What a stage works on: tags by which its runs are found, and parameters by which they are compared."""
+    """What a stage works on: tags by which its runs are found, and parameters by which they are
+    compared.
+    """
 
     tags: Mapping[str, str] = field(default_factory=dict)
     params: Mapping[str, Any] = field(default_factory=dict)
 
 
 def subject_of(
-    params: Params, *, constraint: str | None = None, manifold: str | None = None, reward: RewardParams | None = None
+    params: Params,
+    *,
+    constraint: str | None = None,
+    manifold: str | None = None,
+    reward: RewardParams | None = None,
 ) -> Subject:
-    """The names of constraint, manifold and reward as tags; their entries in params.yaml as `constraint.*` and
-    `manifold.*`.
+    """The names of constraint, manifold and reward as tags; their entries in params.yaml as
+    `constraint.*` and `manifold.*`.
 
     A reward has no name: its tag is what it is made of, eq. 15.
     """
-    names = {"constraint": constraint, "manifold": manifold, "reward": None if reward is None else _in_short(reward)}
+    names = {
+        "constraint": constraint,
+        "manifold": manifold,
+        "reward": None if reward is None else _in_short(reward),
+    }
     values = {
         "constraint": None if constraint is None else params.constraints[constraint],
         "manifold": params.manifolds.get(manifold or ""),  # an analytic one is in no file
@@ -92,7 +106,9 @@ def _in_short(reward: RewardParams) -> str:
 
 @dataclass(frozen=True)
 class MetricLogger:
-    """Sends figures at a step to one run, in one call.  Picklable, so that a worker process can use it."""
+    """Sends figures at a step to one run, in one call.  Picklable, so that a worker process can use
+    it.
+    """
 
     tracking_uri: str
     run_id: str
@@ -104,17 +120,25 @@ class MetricLogger:
         """
         now = round(time.time() * 1000)
         entity = mlflow_module().entities.Metric
-        batch = [entity(name, float(value), now, step) for name, value in metrics.items() if math.isfinite(value)]
+        batch = [
+            entity(name, float(value), now, step)
+            for name, value in metrics.items()
+            if math.isfinite(value)
+        ]
         with explained(self.tracking_uri):
             for first in range(0, len(batch), METRICS_A_CALL):
-                client_of(self.tracking_uri).log_batch(self.run_id, metrics=batch[first : first + METRICS_A_CALL])
+                client_of(self.tracking_uri).log_batch(
+                    self.run_id, metrics=batch[first : first + METRICS_A_CALL]
+                )
 
 
 @dataclass
 class ChildRun:
-    """One seed's run, sent to the process that works on the seed: it starts when entered there and ends when left.
+    """One seed's run, sent to the process that works on the seed: it starts when entered there and
+    ends when left.
 
-    FINISHED, FAILED or KILLED, as the body ends.  A task that is run again on another worker makes another run.
+    FINISHED, FAILED or KILLED, as the body ends.  A task that is run again on another worker makes
+    another run.
     """
 
     tracking_uri: str
@@ -131,7 +155,10 @@ class ChildRun:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         with explained(self.tracking_uri) if error is None else suppress(Exception):
             client_of(self.tracking_uri).set_terminated(self.run_id, _status(error))
@@ -158,19 +185,27 @@ class StageRun:
     """Names, in the order in which `child` was called."""
 
     def report(self, metrics: Mapping[str, Any], file: Path) -> None:
-        """Write figures as JSON, the truth, and mirror the numbers among them under names joined by "/".
+        """Write figures as JSON, the truth, and mirror the numbers among them under names joined by
+        "/".
 
-        metrics: nested records of numbers, texts and lists; lists are not mirrored.  Numbers get 9 digits, one that
-        is not finite becomes null, keys are sorted: equal figures give equal bytes.
+        metrics: nested records of numbers, texts and lists; lists are not mirrored.  Numbers get 9
+        digits, one that is not finite becomes null, keys are sorted: equal figures give equal
+        bytes.
         """
         stable = _stable(metrics)
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(
-            json.dumps(stable, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n", "utf-8"
+            json.dumps(stable, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False)
+            + "\n",
+            "utf-8",
         )
         flat = _flat(stable, "/").items()
         # MLflow takes no other characters in a metric's name
-        numbers = {re.sub(r"[^\w\-. :/]", "_", k): value for k, value in flat if isinstance(value, int | float)}
+        numbers = {
+            re.sub(r"[^\w\-. :/]", "_", k): value
+            for k, value in flat
+            if isinstance(value, int | float)
+        }
         self.metric_logger()(0, numbers)
         _keep_copy(self.tracking_uri, self.run_id, file, "reports")
 
@@ -181,26 +216,32 @@ class StageRun:
     def child(self, name: str, params: Mapping[str, Any]) -> ChildRun:
         """A run below this one, not yet started; its name must be new.
 
-        params: what sets it apart, as tags and as parameters; those of this run are its own as well, so that children
-        of different runs can be compared.
+        params: what sets it apart, as tags and as parameters; those of this run are its own as
+        well, so that children of different runs can be compared.
         """
         if name in self.children:
             raise ValueError(f"there is already a child run {name!r}")
         self.children.append(name)
         tags = {**self.tags, **{key: str(value) for key, value in params.items()}, "child": name}
-        tags |= {"mlflow.runName": _named(f"{self.tags['item']} {name}", self.tags), "mlflow.parentRunId": self.run_id}
+        tags |= {
+            "mlflow.runName": _named(f"{self.tags['item']} {name}", self.tags),
+            "mlflow.parentRunId": self.run_id,
+        }
         return ChildRun(self.tracking_uri, self.experiment_id, tags, {**self.params, **params})
 
     def summarise(
-        self, figures: Sequence[Mapping[str, float]], curves: Sequence[Sequence[Mapping[str, float]]] = ()
+        self,
+        figures: Sequence[Mapping[str, float]],
+        curves: Sequence[Sequence[Mapping[str, float]]] = (),
     ) -> None:
-        """Log the children's final figures, in their order: each on its child, mean and spread on this run.
+        """Log the children's final figures, in their order: each on its child, mean and spread on
+        this run.
 
-        `final/<name>` on the child; `seeds/<name>_mean`, `_std` (over the seeds at hand: divided by their number) and
-        `_count` on this run, of the seeds whose figure is finite.
+        `final/<name>` on the child; `seeds/<name>_mean`, `_std` (over the seeds at hand: divided by
+        their number) and `_count` on this run, of the seeds whose figure is finite.
 
-        curves: each child's figures over its `steps`, which it has logged itself; their mean and spread at each step
-        that all of them have is logged on this run, as a learning curve.
+        curves: each child's figures over its `steps`, which it has logged itself; their mean and
+        spread at each step that all of them have is logged on this run, as a learning curve.
         """
         run_ids = self._child_ids()
         for name, row in zip(self.children, figures, strict=True):
@@ -208,19 +249,23 @@ class StageRun:
             MetricLogger(self.tracking_uri, run_ids[name])(0, final)
         self.metric_logger()(0, _spread(figures))
         for step, rows in _together(curves):
-            self.metric_logger()(step, {n: v for n, v in _spread(rows).items() if not n.endswith("_count")})
+            self.metric_logger()(
+                step, {n: v for n, v in _spread(rows).items() if not n.endswith("_count")}
+            )
 
     def recordings(self, rows: Sequence[Mapping[str, Any]], shown: str = "") -> None:
-        """Tell where paths are recorded: all of them in a file of this run and in its description; on each child, as
-        the tag `recording`, the first one of its seed whose planner is `shown`.
+        """Tell where paths are recorded: all of them in a file of this run and in its description;
+        on each child, as the tag `recording`, the first one of its seed whose planner is `shown`.
 
-        rows: with planner, query, seed, length_rad and recording, which is empty where there is none.
+        rows: with planner, query, seed, length_rad and recording, which is empty where there is
+        none.
         """
         recorded = [row for row in rows if row["recording"]]
         if not recorded:
             return
         lines = [
-            f"- {row['planner']}, query {row['query']}, seed {row['seed']}, {row['length_rad']:.3f} rad: "
+            f"- {row['planner']}, query {row['query']}, seed {row['seed']}, "
+            f"{row['length_rad']:.3f} rad: "
             f"`geodesics replay {row['recording']}`"
             for row in recorded
         ]
@@ -228,7 +273,9 @@ class StageRun:
         with explained(self.tracking_uri):
             client = client_of(self.tracking_uri)
             note = client.get_run(self.run_id).data.tags.get("mlflow.note.content", "")
-            client.set_tag(self.run_id, "mlflow.note.content", "\n".join([note, "", "Recordings:", "", *lines]))
+            client.set_tag(
+                self.run_id, "mlflow.note.content", "\n".join([note, "", "Recordings:", "", *lines])
+            )
             for name, run_id in run_ids.items():
                 own = [r for r in recorded if r["planner"] == shown and name == f"seed {r['seed']}"]
                 if own:
@@ -257,12 +304,14 @@ def tracked_stage(
     root: Path,
     subject: Subject = Subject(),
 ) -> Iterator[StageRun]:
-    """A run for the time of the stage: FINISHED, FAILED or KILLED, as the body ends; its children end with it.
+    """A run for the time of the stage: FINISHED, FAILED or KILLED, as the body ends; its children
+    end with it.
 
-    params: what the stage was asked, flattened to names joined by ".".  inputs: files and folders it reads, linked by
-    DVC's MD5.  subject: what else to find the run and compare it by, as `subject_of` makes it.
-    What the machine does meanwhile is logged as `system/...`, every 5 s.
-    Raises TrackingError, one line, before any work: an input is missing, or the store can't be reached.
+    params: what the stage was asked, flattened to names joined by ".".  inputs: files and folders
+    it reads, linked by DVC's MD5.  subject: what else to find the run and compare it by, as
+    `subject_of` makes it. What the machine does meanwhile is logged as `system/...`, every 5 s.
+    Raises TrackingError, one line, before any work: an input is missing, or the store can't be
+    reached.
     """
     uri = tracking_uri(root)
     own_tags = {"stage": stage, "item": item, **subject.tags, **_source_tags(root)}
@@ -272,7 +321,10 @@ def tracked_stage(
             raise TrackingError(f"{stage} {item}: its input {file} does not exist")
     with explained(uri):
         client, experiment_id = _open_store(uri, experiment)
-        shown = {"mlflow.runName": _named(f"{stage} {item}", own_tags), "mlflow.note.content": _note(stage, own_tags)}
+        shown = {
+            "mlflow.runName": _named(f"{stage} {item}", own_tags),
+            "mlflow.note.content": _note(stage, own_tags),
+        }
         run_id = client.create_run(experiment_id, tags={**own_tags, **shown}).info.run_id
     run = StageRun(uri, experiment_id, run_id, own_tags, own_params, [])
     try:
@@ -294,7 +346,9 @@ def _system_metrics(uri: str, run_id: str) -> Iterator[None]:
     mlflow_module()
     from mlflow.system_metrics.system_metrics_monitor import SystemMetricsMonitor
 
-    logging.getLogger(SystemMetricsMonitor.__module__).setLevel(logging.WARNING)  # it tells of every start and end
+    logging.getLogger(SystemMetricsMonitor.__module__).setLevel(
+        logging.WARNING
+    )  # it tells of every start and end
     monitor = SystemMetricsMonitor(run_id, SYSTEM_EVERY_S, tracking_uri=uri)
     monitor.start()
     try:
@@ -304,12 +358,18 @@ def _system_metrics(uri: str, run_id: str) -> Iterator[None]:
 
 
 def _named(name: str, tags: Mapping[str, str]) -> str:
-    """A run's name; a run of an experiment is told from those of the pipeline by the experiment's name."""
+    """A run's name; a run of an experiment is told from those of the pipeline by the experiment's
+    name.
+    """
     return f"{name} ({tags['dvc_experiment']})" if "dvc_experiment" in tags else name
 
 
 def _note(stage: str, tags: Mapping[str, str]) -> str:
-    again = f"`dvc repro --single-item --force {tags['dvc_stage']}`" if "dvc_stage" in tags else f"`stages/{stage}.py`"
+    again = (
+        f"`dvc repro --single-item --force {tags['dvc_stage']}`"
+        if "dvc_stage" in tags
+        else f"`stages/{stage}.py`"
+    )
     return f"Made by {again}; its figures are under `reports/{stage}/`."
 
 
@@ -328,20 +388,33 @@ def ui_command(root: Path, port: int) -> list[str]:
     uri = tracking_uri(root)
     if uri.startswith("http"):
         raise TrackingError(
-            f"MLFLOW_TRACKING_URI={_without_password(uri)}: this server shows its runs itself, open it in a browser"
+            f"MLFLOW_TRACKING_URI={_without_password(uri)}: this server shows its runs "
+            f"itself, open it in a browser"
         )
     database = _sqlite_file(uri)
     artifacts = _artifact_folder(database) if database else root.resolve() / "mlartifacts"
-    # the job runner serves language models; without it the dashboard starts and stops in half the time
+    # the job runner serves language models; without it the dashboard starts and stops in half the
+    # time
     quiet = ["env", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false"]
-    server = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
+    server = [
+        sys.executable,
+        "-m",
+        "mlflow",
+        "server",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        str(port),
+        "--workers",
+        "1",
+    ]
     return [*quiet, *server, "--backend-store-uri", uri, "--artifacts-destination", str(artifacts)]
 
 
 @contextmanager
 def fetch_artifacts(address: str, root: Path = Path()) -> Iterator[Path]:
-    """A folder with the files behind an MLflow address (models:/… or runs:/…), gone when the context ends; of a model
-    that holds a planner's files, these.
+    """A folder with the files behind an MLflow address (models:/… or runs:/…), gone when the
+    context ends; of a model that holds a planner's files, these.
 
     Raises TrackingError if there is no such model or run, or the store can't be reached.
     """
@@ -361,7 +434,9 @@ def fetch_artifacts(address: str, root: Path = Path()) -> Iterator[Path]:
 
 
 def _beside_store(uri: str, address: str) -> Path | None:
-    """Where files that only the dashboard's server could send lie beside an SQLite store, or None for all others."""
+    """Where files that only the dashboard's server could send lie beside an SQLite store, or None
+    for all others.
+    """
     database = _sqlite_file(uri)
     if database is None:
         return None
@@ -379,13 +454,21 @@ def _stored_at(uri: str, address: str) -> str:
     if address.startswith("models:"):
         from mlflow.store.artifact.utils.models import get_model_name_and_version
 
-        return str(client.get_model_version_download_uri(*get_model_name_and_version(client, address)))
+        return str(
+            client.get_model_version_download_uri(*get_model_name_and_version(client, address))
+        )
     run_id, _, path = address.removeprefix("runs:/").partition("/")
-    return f"{client.get_run(run_id).info.artifact_uri}/{path}" if address.startswith("runs:") else address
+    return (
+        f"{client.get_run(run_id).info.artifact_uri}/{path}"
+        if address.startswith("runs:")
+        else address
+    )
 
 
 def mlflow_module() -> ModuleType:
-    """MLflow, imported with the first run (1.3 s): without usage reports to its makers, notes and links."""
+    """MLflow, imported with the first run (1.3 s): without usage reports to its makers, notes and
+    links.
+    """
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
     os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
@@ -418,7 +501,9 @@ def _without_password(text: str) -> str:
 
 
 def _open_store(uri: str, experiment: str) -> tuple["MlflowClient", str]:
-    """A client whose store exists, and the experiment in it: processes that create one database at once would fail."""
+    """A client whose store exists, and the experiment in it: processes that create one database at
+    once would fail.
+    """
     database = _sqlite_file(uri)
     lock: AbstractContextManager[Any] = nullcontext()
     if database is not None:
@@ -444,7 +529,10 @@ def _check_database(uri: str) -> None:
 @contextmanager
 def _impatient() -> Iterator[None]:
     """For the first call alone: MLflow waits minutes for a server that does not answer."""
-    wanted = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", "MLFLOW_HTTP_REQUEST_TIMEOUT": str(FIRST_ANSWER_S)}
+    wanted = {
+        "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
+        "MLFLOW_HTTP_REQUEST_TIMEOUT": str(FIRST_ANSWER_S),
+    }
     added = {name: value for name, value in wanted.items() if name not in os.environ}
     os.environ.update(added)
     try:
@@ -457,7 +545,9 @@ def _impatient() -> Iterator[None]:
 def _experiment(client: "MlflowClient", name: str, in_sqlite: bool) -> str:
     found = client.get_experiment_by_name(name)
     if found is None:
-        location = f"mlflow-artifacts:/{re.sub(r'[^A-Za-z0-9_-]+', '_', name)}" if in_sqlite else None
+        location = (
+            f"mlflow-artifacts:/{re.sub(r'[^A-Za-z0-9_-]+', '_', name)}" if in_sqlite else None
+        )
         return str(client.create_experiment(name, artifact_location=location))
     return str(found.experiment_id)
 
@@ -493,8 +583,8 @@ def keep_folder(uri: str, run_id: str, folder: Path, name: str) -> str:
 
 
 def _own_folder(uri: str, run_id: str) -> Path | None:
-    """Where the dashboard's server will look for a run's files beside an SQLite store; MLflow itself would need that
-    server now.  None for other stores.
+    """Where the dashboard's server will look for a run's files beside an SQLite store; MLflow
+    itself would need that server now.  None for other stores.
     """
     address, database = client_of(uri).get_run(run_id).info.artifact_uri, _sqlite_file(uri)
     if database is None or not address.startswith("mlflow-artifacts:"):
@@ -512,7 +602,11 @@ def _log_params(client: "MlflowClient", run_id: str, params: BaseModel | Mapping
 def _stored(params: Any) -> Any:
     if isinstance(params, BaseModel):
         return params.model_dump(mode="json")
-    return {str(name): _stored(value) for name, value in params.items()} if isinstance(params, Mapping) else params
+    return (
+        {str(name): _stored(value) for name, value in params.items()}
+        if isinstance(params, Mapping)
+        else params
+    )
 
 
 def _text(value: Any) -> str:
@@ -523,19 +617,28 @@ def _text(value: Any) -> str:
 def _dataset(file: Path, root: Path) -> "DatasetInput":
     """An input under its path in the checkout.
 
-    The digest is computed from what the stage is about to read, by DVC's rule, not looked up in dvc.lock: so it is
-    also right while DVC has not written the lock yet, for a file inside an output folder, and for a stage run by hand.
+    The digest is computed from what the stage is about to read, by DVC's rule, not looked up in
+    dvc.lock: so it is also right while DVC has not written the lock yet, for a file inside an
+    output folder, and for a stage run by hand.
     """
     entities, path = mlflow_module().entities, file.resolve()
-    name = path.relative_to(root.resolve()).as_posix() if path.is_relative_to(root.resolve()) else path.as_posix()
+    name = (
+        path.relative_to(root.resolve()).as_posix()
+        if path.is_relative_to(root.resolve())
+        else path.as_posix()
+    )
     dataset = entities.Dataset(name, dvc_md5(path), "local", json.dumps({"uri": name}))
     return entities.DatasetInput(dataset, [entities.InputTag("mlflow.data.context", "input")])
 
 
 def dvc_md5(path: Path) -> str:
-    """DVC's name of a file's or folder's content: the MD5 of its bytes, or of its list of files with `.dir` behind."""
+    """DVC's name of a file's or folder's content: the MD5 of its bytes, or of its list of files
+    with `.dir` behind.
+    """
     if path.is_dir():
-        files = sorted(entry.relative_to(path).as_posix() for entry in path.rglob("*") if entry.is_file())
+        files = sorted(
+            entry.relative_to(path).as_posix() for entry in path.rglob("*") if entry.is_file()
+        )
         listed = [{"md5": dvc_md5(path / name), "relpath": name} for name in files]
         return hashlib.md5(json.dumps(listed, sort_keys=True).encode()).hexdigest() + ".dir"
     with path.open("rb") as file:
@@ -543,14 +646,20 @@ def dvc_md5(path: Path) -> str:
 
 
 def _source_tags(root: Path) -> dict[str, str]:
-    """The commit the stage runs from, whether its sources differ from it, and DVC's names of stage and experiment."""
+    """The commit the stage runs from, whether its sources differ from it, and DVC's names of stage
+    and experiment.
+    """
     known = {"dvc_stage": "DVC_STAGE", "dvc_experiment": "DVC_EXP_NAME"}
     tags = {tag: os.environ[name] for tag, name in known.items() if os.environ.get(name)}
     commit = _git(root, "rev-parse", "HEAD")
     if commit:
         # what a pipeline itself writes while it runs makes no commit dirty
         changed = _git(root, "status", "--porcelain", "--", ".", ":!dvc.lock", ":!reports")
-        tags |= {"git_commit": commit, "mlflow.source.git.commit": commit, "git_dirty": str(bool(changed)).lower()}
+        tags |= {
+            "git_commit": commit,
+            "mlflow.source.git.commit": commit,
+            "git_dirty": str(bool(changed)).lower(),
+        }
     return tags
 
 
@@ -566,7 +675,9 @@ def _git(root: Path, *arguments: str) -> str:
 def _children(run: StageRun) -> list[Any]:
     """Oldest first, so that the last run of one name is the one that counts."""
     query = f"tags.`mlflow.parentRunId` = '{run.run_id}'"
-    found = client_of(run.tracking_uri).search_runs([run.experiment_id], query, order_by=["attributes.start_time ASC"])
+    found = client_of(run.tracking_uri).search_runs(
+        [run.experiment_id], query, order_by=["attributes.start_time ASC"]
+    )
     return list(found)
 
 
@@ -576,7 +687,9 @@ def _end(run: StageRun, status: str) -> None:
     if run.children:
         for child in _children(run):
             if child.info.status == "RUNNING":
-                client.set_terminated(child.info.run_id, "KILLED" if status == "FINISHED" else status)
+                client.set_terminated(
+                    child.info.run_id, "KILLED" if status == "FINISHED" else status
+                )
     client.set_terminated(run.run_id, status)
 
 
@@ -596,18 +709,25 @@ def _spread(figures: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return spread
 
 
-def _together(curves: Sequence[Sequence[Mapping[str, float]]]) -> list[tuple[int, list[dict[str, float]]]]:
+def _together(
+    curves: Sequence[Sequence[Mapping[str, float]]],
+) -> list[tuple[int, list[dict[str, float]]]]:
     """The rows of all curves at each of their common steps."""
     by_step = [{int(row["steps"]): row for row in curve} for curve in curves]
     common = sorted(set.intersection(*map(set, by_step))) if by_step else []
-    return [(step, [{n: v for n, v in rows[step].items() if n != "steps"} for rows in by_step]) for step in common]
+    return [
+        (step, [{n: v for n, v in rows[step].items() if n != "steps"} for rows in by_step])
+        for step in common
+    ]
 
 
 def _flat(values: Mapping[str, Any], joint: str, prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in values.items():
         nested = isinstance(value, Mapping)
-        flat |= _flat(value, joint, f"{prefix}{name}{joint}") if nested else {f"{prefix}{name}": value}
+        flat |= (
+            _flat(value, joint, f"{prefix}{name}{joint}") if nested else {f"{prefix}{name}": value}
+        )
     return flat
 
 

@@ -1,7 +1,8 @@
-"""The planner in MLflow's model registry: a pyfunc model of its files, a new version for each that differs.
+"""The planner in MLflow's model registry: a pyfunc model of its files, a new version for each that
+differs.
 
-The second part of experiment.py.  Weights stay safetensors with checksums; the model's code is one file of this
-package, so nothing is pickled.
+The second part of experiment.py.  Weights stay safetensors with checksums; the model's code is one
+file of this package, so nothing is pickled.
 """
 
 import hashlib
@@ -28,8 +29,10 @@ from constraint_geodesics.tracking.experiment import (
 FILES = "planner"
 """The folder of the planner's own files within a model."""
 DESCRIPTION = (
-    "Plans paths that keep a task constraint. A row of the input is a query: `start` and `goal`, joint angles in rad, "
-    "and `constraint`, a name or its axes and tolerance as JSON. A row of the output has the path's `status`, "
+    "Plans paths that keep a task constraint. A row of the input is a query: `start` and "
+    "`goal`, joint angles in rad, "
+    "and `constraint`, a name or its axes and tolerance as JSON. A row of the output has the "
+    "path's `status`, "
     "`explanation`, `joints` and `times`."
 )
 
@@ -37,10 +40,11 @@ DESCRIPTION = (
 def register_planner(run: StageRun, folder: Path, code: Path, example: Mapping[str, Any]) -> str:
     """Register a planner's files and let the alias `champion` point to them; returns the version.
 
-    Files that the champion has already make no new version.  A run of a DVC experiment registers its planner, but
-    leaves the champion where it is.
+    Files that the champion has already make no new version.  A run of a DVC experiment registers
+    its planner, but leaves the champion where it is.
 
-    folder: as `Bundle.write` writes it.  code: the file that answers with them.  example: one query.
+    folder: as `Bundle.write` writes it.  code: the file that answers with them.  example: one
+    query.
     Raises TrackingError if the store does not take it.
     """
     digest = folder_digest(folder)
@@ -57,11 +61,20 @@ def register_planner(run: StageRun, folder: Path, code: Path, example: Mapping[s
     return str(version)
 
 
-def _new_version(run: StageRun, folder: Path, code: Path, example: Mapping[str, Any], digest: str) -> str:
+def _new_version(
+    run: StageRun, folder: Path, code: Path, example: Mapping[str, Any], digest: str
+) -> str:
     with saved_model(folder, code, example) as model:
         address = keep_folder(run.tracking_uri, run.run_id, model, FILES)
-    tags = {"sha256": digest, **{name: run.tags[name] for name in ("git_commit", "git_dirty") if name in run.tags}}
-    return str(client_of(run.tracking_uri).create_model_version(PLANNER_MODEL, address, run.run_id, tags).version)
+    tags = {
+        "sha256": digest,
+        **{name: run.tags[name] for name in ("git_commit", "git_dirty") if name in run.tags},
+    }
+    return str(
+        client_of(run.tracking_uri)
+        .create_model_version(PLANNER_MODEL, address, run.run_id, tags)
+        .version
+    )
 
 
 @contextmanager
@@ -88,10 +101,13 @@ def saved_model(folder: Path, code: Path, example: Mapping[str, Any]) -> Iterato
         target, files = Path(scratch) / "model", Path(scratch) / FILES
         shutil.copytree(folder, files)  # a model keeps the folder's name
         pyfunc.save_model(
-            target, python_model=str(code), artifacts={FILES: str(files)},
-            signature=ModelSignature(asked, answered), input_example=pd.DataFrame([dict(example)]),
+            target,
+            python_model=str(code),
+            artifacts={FILES: str(files)},
+            signature=ModelSignature(asked, answered),
+            input_example=pd.DataFrame([dict(example)]),
             pip_requirements=installed_requirements(),
-        )  # fmt: skip
+        )
         yield target
 
 
@@ -105,5 +121,8 @@ def folder_digest(folder: Path) -> str:
     """SHA-256 of a folder's files with their names."""
     digest = hashlib.sha256()
     for file in sorted(path for path in folder.rglob("*") if path.is_file()):
-        digest.update(file.relative_to(folder).as_posix().encode() + hashlib.sha256(file.read_bytes()).digest())
+        digest.update(
+            file.relative_to(folder).as_posix().encode()
+            + hashlib.sha256(file.read_bytes()).digest()
+        )
     return digest.hexdigest()

@@ -1,0 +1,113 @@
+"""Sampling-based planning whose samples come from a learned manifold's decoder, projected onto the
+constraint.
+
+As in learned sampling for RRT-like planners [Ichter and Pavone 2019; Qureshi et al. 2020; Kicki et
+al. 2023]: a sample is drawn in the latent space, decoded to joints, and moved onto the constraint.
+Decoded samples are spread like the training data, so they are mostly free of collision, and near
+the constraint where the data was.  The trees, the steps along the constraint and the simplification
+are those of RRTConnect in `planners/sampling.py`.
+"""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.projection import Retraction, retract
+from constraint_geodesics.learning.lift import Chart
+from constraint_geodesics.params import BenchmarkParams
+from constraint_geodesics.peers.elastic_band import is_clear, nothing, rows_along, settled
+from constraint_geodesics.peers.ompl import birrt_with_sampler
+from constraint_geodesics.problem import PlannedPath, PlanningProblem
+
+BATCH = 64
+"""Samples that are decoded and projected at once."""
+
+
+class LatentChart(Chart, Protocol):
+    """A chart that knows how its training data is spread, as `learning.inference.FrozenManifold`
+    does.
+    """
+
+    def sample(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count N"]:
+        """Latent points spread like the training data."""
+        ...
+
+
+@dataclass(frozen=True)
+class DecoderSampling:
+    """RRTConnect with samples decoded from a chart of the same robot.
+
+    settings: as `SamplingPlanner`'s, but with these: range_rad, the longest extension of a tree;
+    iterations at most.
+    """
+
+    chart: LatentChart
+    settings: BenchmarkParams
+    range_rad: float = 2.0
+    iterations: int = 600
+    name: str = "BiRRT, decoded samples"
+
+    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+        """Grow two trees until they meet or the iterations are used up."""
+        began = time.perf_counter()
+        early = settled(problem, began)
+        if early is not None:
+            return early
+        manifold = problem.manifold
+        misfit = self._misfit(manifold)
+        if misfit:
+            return replace(nothing(problem, began, 0, misfit), status="not_applicable")
+        samples = decoded_samples(self.chart, manifold, np.random.default_rng(seed))
+        settings = self.settings.model_copy(
+            update={
+                "range_rad": self.range_rad,
+                "birrt_iterations": self.iterations,
+                "space": "projected",
+            }
+        )
+        joints, iterations = birrt_with_sampler(
+            problem, settings, partial(next, samples), seed, began + settings.budget_s
+        )
+        if joints is None:
+            return nothing(problem, began, iterations)
+        rows = rows_along(manifold, joints)
+        if not is_clear(problem, rows):
+            return nothing(
+                problem, began, iterations, "its path touches something between its rows"
+            )
+        return PlannedPath("solved", rows, time.perf_counter() - began, iterations)
+
+    def _misfit(self, manifold: ConstraintManifold) -> str:
+        """Why the decoder or OMPL's space cannot serve the constraint; empty where they can."""
+        dof = self.chart.decode(np.zeros(self.chart.dim)).shape[-1]
+        if dof != manifold.robot.dof:
+            return f"the decoder's configurations have {dof} joints, the robot {manifold.robot.dof}"
+        if manifold.codim >= manifold.robot.dof:
+            return (
+                f"{manifold.codim} axes are held by {manifold.robot.dof} joints: isolated "
+                f"points are no space"
+            )
+        return ""
+
+
+def decoded_samples(
+    chart: LatentChart, manifold: ConstraintManifold, rng: np.random.Generator
+) -> Iterator[Float[np.ndarray, "D"]]:
+    """Endless configurations [rad] on the constraint and within the limits, or merely decoded where
+    none is found.
+    """
+    axes = max(sum(manifold.constraint.axes), 1)
+    while True:
+        drawn = chart.decode(chart.sample(BATCH, rng))
+        share = rng.uniform(size=BATCH) ** (
+            1.0 / axes
+        )  # of a tolerance: spread over it, not on its edge
+        projected = retract(manifold, drawn, Retraction(), band=share)
+        kept = projected.converged & (manifold.robot.limit_distance(projected.joints) >= 0.0)
+        yield from projected.joints[kept] if kept.any() else drawn

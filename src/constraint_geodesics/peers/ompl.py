@@ -1,0 +1,542 @@
+"""OMPL's PRM, PRM*, RRT*, Informed RRT* and BiRRT (RRTConnect) on the constraint manifold: the
+planner's peers.
+
+The only importer of ompl.  Held axes are planned in OMPL's constrained state spaces (projected,
+atlas, tangent bundle), no constraint in the plain space of the joints.  OMPL's random numbers
+restart with every problem: where a search ends by counting, a seed gives the same path in any
+process, whatever was planned before and however busy the machine is.  Where `budget_s` ends it, the
+path depends on the machine.
+"""
+
+import itertools
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from ompl import base, geometric, util
+
+from constraint_geodesics.constraints import kernels
+from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
+from constraint_geodesics.constraints.projection import Retraction, retract
+from constraint_geodesics.learning.lift import as_executed
+from constraint_geodesics.params import BenchmarkParams
+from constraint_geodesics.problem import SATISFIED, PlannedPath, PlanningProblem, refusal
+from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.world import Solid, World
+
+PlannerName = Literal["prm", "prm_star", "rrt_star", "informed_rrt_star", "birrt"]
+
+_STALL = 0.2
+"""A step along the constraint that advances by less than this share of itself leads nowhere."""
+_WANDER = 2.0
+"""OMPL's λ: a step along the constraint is at most this many times as long as the straight one."""
+_MILESTONES_BETWEEN_LOOKS = 5
+_SHORTCUTS = 50
+
+Sampler = Callable[[], Float[np.ndarray, "D"]]
+"""Draws one configuration [rad], which is projected onto the constraint afterwards."""
+
+
+@dataclass(frozen=True)
+class SamplingPlanner:
+    """One of OMPL's planners with its settings.
+
+    row_spacing_rad: distance of the path's rows at most, the constraint kept between them; None for
+    OMPL's own rows.
+    """
+
+    name: PlannerName
+    settings: BenchmarkParams
+    simplify: bool = True
+    row_spacing_rad: float | None = None
+
+    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+        """Look for a path until one is found (PRM, BiRRT) or the iterations are used up (RRT*
+        always uses them).
+
+        Rows of the path lie at most 2 `delta_rad` apart, unless the planner's own edge jumps: the
+        jump is kept.
+        time_s holds everything from here on: the projections, the simplification, the rows in
+        between.
+        """
+        began = time.perf_counter()
+        nothing = np.empty((0, problem.manifold.robot.dof))
+        refused = refusal(problem)
+        if refused is not None:
+            return PlannedPath(refused, nothing, time.perf_counter() - began, 0)
+        misfit = self._misfit(problem.manifold)
+        if misfit:
+            return PlannedPath("not_applicable", nothing, time.perf_counter() - began, 0, misfit)
+        _start_random_numbers(seed)
+        space = _Space(problem, self.settings)
+        found, iterations = _SEARCHES[self.name](
+            space, self.settings, began + self.settings.budget_s
+        )
+        joints = nothing if found is None else self._as_executed(space, found)
+        if found is not None and self.row_spacing_rad is not None:
+            joints = as_executed(problem.manifold, joints, self.row_spacing_rad)
+        status: Literal["solved", "not_found"] = "not_found" if found is None else "solved"
+        return PlannedPath(status, joints, time.perf_counter() - began, iterations)
+
+    def _misfit(self, manifold: ConstraintManifold) -> str:
+        """Why OMPL has no space of this kind for the constraint; empty where it has one."""
+        if manifold.codim >= manifold.robot.dof:
+            return (
+                f"{manifold.codim} rows are held by {manifold.robot.dof} joints: isolated "
+                f"points are no space"
+            )
+        if manifold.tolerance.any() and self.settings.space != "projected":
+            return (
+                f"a tolerance has no tangent spaces, which the {self.settings.space} space "
+                f"is made of"
+            )
+        return ""
+
+    def _as_executed(self, space: "_Space", found: Any) -> Float[np.ndarray, "T D"]:
+        return _simplified(space, found)[0] if self.simplify else space.dense(found)[0]
+
+
+def birrt_with_sampler(
+    problem: PlanningProblem,
+    settings: BenchmarkParams,
+    sampler: Sampler,
+    seed: int,
+    deadline: float,
+) -> tuple[Float[np.ndarray, "T D"] | None, int]:
+    """RRTConnect in the projected space with samples from elsewhere, simplified as
+    `SamplingPlanner`'s paths are.
+
+    Both ends must be sound.  deadline: of time.perf_counter().  Returns the rows, None without a
+    sound path, and the iterations.
+    """
+    _start_random_numbers(seed)
+    space = _Space(problem, settings, sampler)
+    found, iterations = _birrt(space, settings, deadline)
+    if found is None:
+        return None, iterations
+    joints, sound = _simplified(space, found)
+    return (joints if sound else None), iterations
+
+
+def plan_all(
+    planner_name: PlannerName,
+    settings: BenchmarkParams,
+    robot: SerialRobot,
+    constraint: Constraint,
+    workcell: Sequence[Solid],
+    starts: Float[np.ndarray, "n D"],
+    goals: Float[np.ndarray, "n D"],
+    seed: int,
+) -> list[PlannedPath]:
+    """Plan n problems of one constraint with one planner and seed, one after another; a task for
+    any process.
+
+    Loading the world and the compiled kernels is not part of the paths' times.
+    """
+    manifold = ConstraintManifold(robot, constraint)
+    planner = SamplingPlanner(planner_name, settings)
+    with World(robot, workcell) as world:
+        problems = [
+            PlanningProblem(a, b, manifold, world.is_free)
+            for a, b in zip(starts, goals, strict=True)
+        ]
+        for problem in problems[:1]:
+            refusal(problem)
+            retract(manifold, problem.start)
+        return [planner.plan(problem, seed) for problem in problems]
+
+
+class _Single:
+    """The constraint of one configuration at a time, without what arrays and checks of a batch
+    cost: OMPL asks for it thousands of times a path.
+    """
+
+    def __init__(self, manifold: ConstraintManifold) -> None:
+        self._about = (manifold.robot.chain.arrays, manifold.held, *manifold.reference_arrays)
+        self._tolerance = manifold.tolerance[None]
+        self._q = np.empty((1, manifold.robot.dof))
+        self._residual, self._jacobian = np.empty((1, 6)), np.empty((1, 6, manifold.robot.dof))
+        self._excess, self._worst = np.empty((1, 6)), np.empty(1)
+        self._settings = Retraction()
+
+    def linearise(self, x: np.ndarray) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6 D"]]:
+        """Residual and Jacobian, until the next call."""
+        self._q[0] = x
+        kernels.residual_batch(*self._about, self._q, self._residual, self._jacobian)
+        return self._residual[0], self._jacobian[0]
+
+    def violation(self, x: np.ndarray) -> float:
+        """Excess over the tolerance [rad or m]."""
+        self.linearise(x)
+        kernels.excess_batch(
+            self._about[1], self._tolerance[0], self._residual, self._excess, self._worst
+        )
+        return float(self._worst[0])
+
+    def retract(self, x: np.ndarray) -> Float[np.ndarray, "D"] | None:
+        """The configuration on the constraint, or None; as `retraction.retract`."""
+        joints = np.array(x, np.float64)[None]
+        chain, held, *reference = self._about
+        own = self._settings
+        kernels.retract_batch(
+            chain,
+            held,
+            self._tolerance,
+            *reference,
+            joints,
+            own.accuracy,
+            own.iterations,
+            own.largest_step,
+            self._worst,
+        )
+        return joints[0] if self._worst[0] <= own.accuracy else None
+
+
+class _HeldAxes(base.Constraint):
+    """The constraint as OMPL asks for it.
+
+    Projection and test are those of the compiled retraction, which also knows tolerances;
+    `function` and `jacobian` (exactly held axes only) serve the tangent spaces of the atlas.
+
+    OMPL's Python bindings let nobody replace the sampler of a projected space.  But a tree's
+    iteration first asks whether to go on, then projects its sample: the first projection after
+    `expect_sample` is given another one.
+    """
+
+    def __init__(self, manifold: ConstraintManifold, step: float, sampler: Sampler | None) -> None:
+        super().__init__(manifold.robot.dof, manifold.codim, SATISFIED)
+        self._single = _Single(manifold)
+        self._sampler = sampler
+        self._samples = False
+        self._exact = np.flatnonzero(manifold.held & (manifold.tolerance == 0.0))
+        self._step = step
+        self._last = np.full(manifold.robot.dof, np.inf)
+
+    def function(self, x: np.ndarray, out: np.ndarray) -> None:
+        out[:] = self._single.linearise(x)[0][self._exact]
+
+    def jacobian(self, x: np.ndarray, out: np.ndarray) -> None:
+        out[:] = self._single.linearise(x)[1][self._exact]
+
+    def expect_sample(self) -> None:
+        """What is projected next is a tree's sample."""
+        self._samples = self._sampler is not None
+
+    def project(self, x: np.ndarray) -> bool:
+        if self._samples and self._sampler is not None:
+            self._samples = False
+            x[:] = self._sampler()
+        joints = self._single.retract(x)
+        if joints is None or self._stalls(x, joints):
+            return False
+        self._last = joints
+        x[:] = joints
+        return True
+
+    def isSatisfied(self, x: np.ndarray) -> bool:
+        return self._single.violation(x) <= SATISFIED
+
+    def _stalls(self, wanted: np.ndarray, reached: np.ndarray) -> bool:
+        # OMPL walks along the manifold as long as the goal comes nearer, by however little:
+        # thousands of steps into a dead end.  It steps from the point projected last, which is how
+        # such a step is told from a sample.
+        if abs(_distance(wanted, self._last) - self._step) > 1e-6 * self._step:
+            return False
+        return _distance(reached, self._last) < _STALL * self._step
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    """`np.linalg.norm` of a difference, at a third of its cost."""
+    return math.dist(a.tolist(), b.tolist())
+
+
+class _Motions(base.MotionValidator):
+    """OMPL's walk along the manifold, and the far end, which that walk leaves unchecked."""
+
+    def __init__(self, information: Any, is_valid: Callable[[Any], bool]) -> None:
+        super().__init__(information)
+        self._walk = base.ConstrainedMotionValidator(information)
+        self._is_valid = is_valid
+
+    def checkMotion(self, first: Any, second: Any) -> bool:
+        return self._is_valid(second) and bool(self._walk.checkMotion(first, second))
+
+
+@dataclass
+class _Space:
+    """OMPL's state space for one problem, its start and goal, and the way from its states to rows
+    of joints.
+    """
+
+    problem: PlanningProblem
+    settings: BenchmarkParams
+    sampler: Sampler | None = None
+    """Where a tree's samples come from; by default from OMPL.  Only the projected space can take
+    one.
+    """
+    information: Any = field(init=False)
+    definition: Any = field(init=False)
+    expect_sample: Callable[[], None] = field(init=False)
+
+    def __post_init__(self) -> None:
+        manifold, kind = self.problem.manifold, self.settings.space
+        if self.sampler is not None:
+            kind = "projected"
+        joints = _joint_space(manifold.robot)
+        axes = _HeldAxes(manifold, self.settings.delta_rad, self.sampler)
+        self.expect_sample = axes.expect_sample
+        if self.is_plain:
+            self.information = base.SpaceInformation(joints)
+            self.information.setStateValidityCheckingResolution(
+                self.settings.delta_rad / joints.getMaximumExtent()
+            )
+        else:
+            self.information = _constrained(joints, kind, axes, self.settings)
+            self.information.getStateSpace().setDelta(self.settings.delta_rad)
+            self.information.getStateSpace().setLambda(_WANDER)
+            self.information.setMotionValidator(_Motions(self.information, _validity(self.problem)))
+        self.information.setStateValidityChecker(_validity(self.problem))
+        self.information.setup()
+        ends = [self._state(q) for q in (self.problem.start, self.problem.goal)]
+        if not self.is_plain and kind != "projected":
+            for end in ends:
+                self.information.getStateSpace().anchorChart(end)
+        self.definition = base.ProblemDefinition(self.information)
+        self.definition.setStartAndGoalStates(*ends)
+
+    def dense(self, path: Any) -> tuple[Float[np.ndarray, "T D"], bool]:
+        """The configurations along a path's edges, its ends exact, and whether all of them are
+        sound.
+        """
+        states = path.getStates()
+        rows, sound = [_read(states[0], self._dof)[None]], True
+        for first, second in itertools.pairwise(states):
+            walk = self._walk(first, second)
+            if not self._is_sound(walk):
+                # a roadmap's edge may have been checked from its other end, and OMPL's walk is not
+                # symmetric; the pieces that a shortcut leaves of an edge are not checked at all
+                backward = self._walk(second, first)[::-1]
+                if self._is_sound(backward):
+                    walk = backward
+                else:
+                    sound = False
+            rows.append(walk[1:])
+        return np.concatenate(rows), sound
+
+    def _walk(self, first: Any, second: Any) -> Float[np.ndarray, "t D"]:
+        path = geometric.PathGeometric(self.information, first, second)
+        path.interpolate()
+        joints = np.array([_read(state, self._dof) for state in path.getStates()])
+        joints[1:-1] = retract(
+            self.problem.manifold, joints[1:-1]
+        ).joints  # the tangent bundle leaves them beside it
+        return joints
+
+    def _is_sound(self, joints: Float[np.ndarray, "t D"]) -> bool:
+        """Whether the rows follow each other without a jump, within the limits and free of
+        collisions.
+        """
+        longest = np.linalg.norm(np.diff(joints, axis=0), axis=1).max(initial=0.0)
+        if longest > _WANDER * self.settings.delta_rad * (1.0 + 1e-6):
+            return False
+        within = self.problem.manifold.robot.limit_distance(joints).min() >= 0.0
+        return bool(within) and all(self.problem.is_free(q) for q in joints[1:-1])
+
+    def _state(self, q: np.ndarray) -> Any:
+        state = self.information.getStateSpace().allocState()
+        if self.is_plain:
+            state[0 : self._dof] = q.tolist()
+        else:
+            state.copy(q.tolist())
+        return state
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether this is the space of the joints itself, which projects nothing."""
+        return self.problem.manifold.constraint.is_free and self.sampler is None
+
+    @property
+    def _dof(self) -> int:
+        return self.problem.manifold.robot.dof
+
+
+def _joint_space(robot: SerialRobot) -> Any:
+    bounds = base.RealVectorBounds(robot.dof)
+    for i in range(robot.dof):
+        bounds.setLow(i, float(robot.lower[i]))
+        bounds.setHigh(i, float(robot.upper[i]))
+    space = base.RealVectorStateSpace(robot.dof)
+    space.setBounds(bounds)
+    return space
+
+
+def _constrained(joints: Any, kind: str, constraint: _HeldAxes, settings: BenchmarkParams) -> Any:
+    if kind == "projected":
+        return base.ConstrainedSpaceInformation(base.ProjectedStateSpace(joints, constraint))
+    if kind == "atlas":
+        space = base.AtlasStateSpace(joints, constraint)
+        information = base.ConstrainedSpaceInformation(space)
+    else:
+        space = base.TangentBundleStateSpace(joints, constraint)
+        information = base.TangentBundleSpaceInformation(space)
+    if settings.chart_radius_rad is not None:
+        space.setRho(settings.chart_radius_rad)
+    if settings.chart_error_rad is not None:
+        space.setEpsilon(settings.chart_error_rad)
+    if settings.exploration is not None:
+        space.setExploration(settings.exploration)
+    return information
+
+
+def _validity(problem: PlanningProblem) -> Callable[[Any], bool]:
+    # it must not hold OMPL's own objects: nothing collects such a cycle
+    robot, is_free = problem.manifold.robot, problem.is_free
+    limits = list(zip(robot.lower.tolist(), robot.upper.tolist(), strict=True))
+    axes = range(robot.dof)
+
+    def is_valid(state: Any) -> bool:
+        q = [state[i] for i in axes]
+        # projection may leave the bounds that were sampled in
+        for value, (low, high) in zip(q, limits, strict=True):
+            if not low <= value <= high:
+                return False
+        return bool(is_free(np.array(q)))
+
+    return is_valid
+
+
+def _read(state: Any, dof: int) -> Float[np.ndarray, "D"]:
+    return np.array([state[i] for i in range(dof)])
+
+
+def _start_random_numbers(seed: int) -> None:
+    util.noOutputHandler()
+    util.RNG.setSeed(seed + 1)  # OMPL refuses the seed 0
+
+
+def _simplified(space: _Space, found: Any) -> tuple[Float[np.ndarray, "T D"], bool]:
+    """The rows of the shortened path, of the path itself where that is not sound, and whether they
+    are.
+    """
+    shorter = geometric.PathGeometric(found)
+    _shorten(space, shorter)
+    joints, sound = space.dense(shorter)
+    return (joints, True) if sound else space.dense(found)
+
+
+def _shorten(space: _Space, path: Any) -> None:
+    # `simplify` leaves out the shortcuts in constrained spaces, and its limit is a time
+    simplifier = geometric.PathSimplifier(space.information)
+    simplifier.reduceVertices(path)
+    simplifier.partialShortcutPath(path, _SHORTCUTS, _SHORTCUTS)
+    simplifier.reduceVertices(path)
+
+
+def _prm(space: _Space, settings: BenchmarkParams, deadline: float) -> tuple[Any, int]:
+    """The first path over a roadmap of at most `prm_iterations` samples."""
+    planner = geometric.PRM(space.information)
+    return _grow_roadmap(
+        planner, space, settings.prm_iterations, _MILESTONES_BETWEEN_LOOKS, deadline
+    )
+
+
+def _prm_star(space: _Space, settings: BenchmarkParams, deadline: float) -> tuple[Any, int]:
+    """The shortest path over a roadmap of `prm_iterations` samples."""
+    planner = geometric.PRMstar(space.information)
+    return _grow_roadmap(planner, space, settings.prm_iterations, settings.prm_iterations, deadline)
+
+
+def _grow_roadmap(
+    planner: Any, space: _Space, most: int, between_looks: int, deadline: float
+) -> tuple[Any, int]:
+    """Grow a roadmap of at most `most` samples around both ends, looking for a path every few
+    samples.
+
+    OMPL's own loop lets a second thread look while the first one samples for 0.2 s at a time, so
+    that a path depends on the machine.  Here `solve` may not run at all: it only enters the ends
+    and answers with the path that comes nearest to the goal, found by A*.
+    """
+    planner.setProblemDefinition(space.definition)
+    planner.setup()
+    tries, wanted = 0, 0
+
+    def enough() -> bool:
+        nonlocal tries
+        tries += 1
+        return (
+            planner.milestoneCount() >= wanted
+            or tries > most_tries
+            or time.perf_counter() > deadline
+        )
+
+    most_tries = 100 * most
+    while True:
+        planner.solve(base.plannerAlwaysTerminatingCondition())
+        looked = wanted > 0 or between_looks < most
+        wanted = planner.milestoneCount() + between_looks
+        if looked and space.definition.getSolutionDifference() == 0.0:
+            return space.definition.getSolutionPath(), planner.milestoneCount()
+        space.definition.clearSolutionPaths()
+        if (looked and wanted > most) or tries > most_tries or time.perf_counter() > deadline:
+            return None, planner.milestoneCount()
+        planner.growRoadmapPtc(base.PlannerTerminationCondition(enough))
+
+
+def _rrt_star(space: _Space, settings: BenchmarkParams, deadline: float) -> tuple[Any, int]:
+    planner = geometric.RRTstar(space.information)
+    planner.setRange(settings.range_rad)
+    return _grow_tree(planner, space, settings.rrt_star_iterations, deadline)
+
+
+def _informed_rrt_star(
+    space: _Space, settings: BenchmarkParams, deadline: float
+) -> tuple[Any, int]:
+    """On a constraint OMPL's sampler of the ellipsoid leaves it, and nearly all of its samples are
+    lost: there the tree rejects what lies outside instead, and is pruned.
+    """
+    if space.is_plain:
+        planner = geometric.InformedRRTstar(space.information)
+    else:
+        planner = geometric.RRTstar(space.information)
+        planner.setSampleRejection(True)
+        planner.setNewStateRejection(True)
+        planner.setTreePruning(True)
+    planner.setRange(settings.range_rad)
+    return _grow_tree(planner, space, settings.rrt_star_iterations, deadline)
+
+
+def _birrt(space: _Space, settings: BenchmarkParams, deadline: float) -> tuple[Any, int]:
+    planner = geometric.RRTConnect(space.information)
+    planner.setRange(settings.range_rad)
+    return _grow_tree(planner, space, settings.birrt_iterations, deadline)
+
+
+def _grow_tree(planner: Any, space: _Space, most: int, deadline: float) -> tuple[Any, int]:
+    iterations = 0
+
+    def enough() -> bool:
+        nonlocal iterations
+        if iterations >= most or time.perf_counter() > deadline:
+            return True
+        iterations += 1
+        space.expect_sample()
+        return False
+
+    planner.setProblemDefinition(space.definition)
+    planner.setup()
+    planner.solve(base.PlannerTerminationCondition(enough))
+    exact = space.definition.hasExactSolution()
+    return (space.definition.getSolutionPath() if exact else None), iterations
+
+
+_SEARCHES: dict[PlannerName, Callable[[_Space, BenchmarkParams, float], tuple[Any, int]]] = {
+    "prm": _prm,
+    "prm_star": _prm_star,
+    "rrt_star": _rrt_star,
+    "informed_rrt_star": _informed_rrt_star,
+    "birrt": _birrt,
+}

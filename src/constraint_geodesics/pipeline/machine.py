@@ -1,0 +1,39 @@
+"""What timings were taken on."""
+
+import hashlib
+import platform
+import subprocess
+from datetime import UTC, datetime
+from pathlib import Path
+
+import torch
+
+
+def machine() -> dict[str, str]:
+    """Processor, Python and torch; one thread, to which every benchmark here keeps."""
+    cpuinfo = Path("/proc/cpuinfo")  # Linux only; elsewhere the platform's own word must do
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
+    named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    processor = named[0] if named else platform.processor() or platform.machine()
+    return {
+        "processor": processor,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "threads": "1",
+    }
+
+
+def run_header(root: Path) -> dict[str, str]:
+    """Where a table is from: commit, digest of dvc.lock, processor and date; blank where there is
+    none.
+    """
+    commit = subprocess.run(
+        ["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=False
+    )
+    lock = root / "dvc.lock"
+    return {
+        "commit": commit.stdout.strip(),
+        "dvc.lock": hashlib.sha256(lock.read_bytes()).hexdigest() if lock.is_file() else "",
+        "processor": machine()["processor"],
+        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+    }

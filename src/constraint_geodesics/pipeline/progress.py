@@ -1,0 +1,123 @@
+"""How far a long piece of work has come, on standard error."""
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
+
+LINE_EVERY_S = 15.0
+
+
+def progress(description: str, total: int) -> AbstractContextManager[Callable[[], None]]:
+    """Show how many of `total` tasks are done; the function it gives is called after each of them.
+
+    On a terminal a bar with the time left.  Elsewhere plain lines: one at every quarter, one where
+    15 s passed since the last, and with CI=true the last line alone.  An empty description shows
+    nothing.
+    """
+    if not description:
+        return nullcontext(lambda: None)
+    return _bar(description, total) if sys.stderr.isatty() else _lines(description, total)
+
+
+@contextmanager
+def waiting(description: str) -> Iterator[None]:
+    """Show that work whose length nobody knows goes on: on a terminal a line with the time it took
+    so far, which goes when the work is done and gives way to a bar of `progress` within it;
+    elsewhere nothing.  An empty description shows nothing.
+    """
+    if not description or not sys.stderr.isatty():
+        yield
+        return
+    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as line:
+        line.add_task(description, total=None)
+        _waiting.append(line)
+        try:
+            yield
+        finally:
+            _waiting.remove(line)
+
+
+_waiting: list[Progress] = []
+"""The lines that are shown now: a terminal has one bottom, which the bar within them needs."""
+
+
+@contextmanager
+def _given_way() -> Iterator[None]:
+    lines = tuple(_waiting)
+    for line in lines:
+        line.stop()
+    try:
+        yield
+    finally:
+        for line in lines:
+            line.start()
+
+
+@contextmanager
+def _bar(description: str, total: int) -> Iterator[Callable[[], None]]:
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"),
+    )
+    start = time.monotonic()
+    with _given_way(), Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(description, total=total, left="")
+        done = 0
+
+        def advance() -> None:
+            nonlocal done
+            done += 1
+            bar.update(task, advance=1, left=_time_left(done, total, start))
+
+        yield advance
+
+
+@contextmanager
+def _lines(description: str, total: int) -> Iterator[Callable[[], None]]:
+    only_last = os.environ.get("CI", "").lower() in ("true", "1")
+    start = shown = time.monotonic()
+    done = 0
+
+    def advance() -> None:
+        nonlocal done, shown
+        done += 1
+        quarter = 4 * done // total > 4 * (done - 1) // total
+        due = (quarter or time.monotonic() - shown >= LINE_EVERY_S) and not only_last
+        if due or done == total:
+            shown = time.monotonic()
+            print(
+                f"{description}: {done}/{total}, {_time_left(done, total, start)}",
+                file=sys.stderr,
+                flush=True,
+            )
+
+    yield advance
+
+
+def _time_left(done: int, total: int, start: float) -> str:
+    """The mean time a task took so far, for those that remain."""
+    elapsed = time.monotonic() - start
+    if done == total:
+        return f"took {_clock(elapsed)}"
+    return f"about {_clock(elapsed / done * (total - done))} left"
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d} min" if minutes else f"{rest} s"

@@ -1,0 +1,107 @@
+"""The seam of the planners: a problem between two configurations, the path as it is executed, and
+who plans it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.scene.clearance import ClearanceModel
+
+SATISFIED = 1e-4
+"""Largest violation [rad or m] at which a configuration still keeps its constraint."""
+
+LIMIT_SLACK = 1e-9
+"""How far beyond a limit an end may lie [rad], by rounding."""
+
+EndStatus = Literal["start_violates", "goal_violates", "out_of_limits"]
+Status = Literal[
+    EndStatus,
+    "solved",
+    "not_found",
+    "not_connected",
+    "start_in_collision",
+    "goal_in_collision",
+    "in_collision",
+    "not_applicable",
+]
+"""not_applicable: the planner cannot work on such a problem at all; `PlannedPath.explanation` says
+why.
+"""
+
+
+@dataclass(frozen=True)
+class PlanningProblem:
+    """Get from `start` to `goal` on the constraint manifold without a collision."""
+
+    start: Float[np.ndarray, "D"]
+    """First configuration [rad]."""
+    goal: Float[np.ndarray, "D"]
+    """Last configuration [rad]."""
+    manifold: ConstraintManifold
+    is_free: Callable[[np.ndarray], bool]
+    """Whether one configuration (D,) touches neither itself nor the workcell."""
+    clearance: ClearanceModel | None = None
+    """Distances to the workcell's boxes, for planners that use them; None if unknown."""
+
+
+@dataclass(frozen=True)
+class PlannedPath:
+    """What a planner answers: a status, and the path if there is one."""
+
+    status: Status
+    """A status other than "solved" comes without a path."""
+    joints: Float[np.ndarray, "T D"]
+    """The configurations [rad] as they are executed, ends included; (0, D) if there is no path."""
+    time_s: float
+    """Wall-clock time from the problem to these configurations."""
+    iterations: int
+    """How often the planner's own loop ran; for a roadmap, its samples."""
+    explanation: str = ""
+    """Why there is no path, where the status does not say it all."""
+
+
+class PathPlanner(Protocol):
+    """Plans one problem at a time; the same problem and seed give the same path."""
+
+    @property
+    def name(self) -> str:
+        """The name results are listed under."""
+        ...
+
+    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+        """Look for a path; that there is none is an answer, not an error."""
+        ...
+
+
+def refusal(problem: PlanningProblem) -> Status | None:
+    """Why no planner needs to look at this problem, or None if both ends can be reached by a
+    robot.
+    """
+    violated = ends_refused(problem.manifold, problem.start, problem.goal)
+    if violated is not None:
+        return violated
+    if not problem.is_free(problem.start):
+        return "start_in_collision"
+    if not problem.is_free(problem.goal):
+        return "goal_in_collision"
+    return None
+
+
+def ends_refused(
+    manifold: ConstraintManifold, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]
+) -> EndStatus | None:
+    """Why these can't be the ends of a path, collisions apart; None where they can."""
+    ends = np.stack([start, goal])
+    violation = manifold.violation(ends)
+    if violation[0] > SATISFIED:
+        return "start_violates"
+    if violation[1] > SATISFIED:
+        return "goal_violates"
+    if manifold.robot.limit_distance(ends).min() < -LIMIT_SLACK:
+        return "out_of_limits"
+    return None

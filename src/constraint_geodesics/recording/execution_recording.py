@@ -1,0 +1,241 @@
+"""Rerun recordings of executed paths: the robot, the cup and its spheres over the time of the
+execution.
+
+The second part of recording.py; recordings of both kinds are read, compared and opened by the same
+functions.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from jaxtyping import Float
+from rerun.chunk import Chunk
+from scipy.spatial.transform import Rotation
+
+from constraint_geodesics.palette import BLUE, SKY, VERMILION, planner_colour
+from constraint_geodesics.recording.recording import (
+    About,
+    Frames,
+    RecordingError,
+    about_chunk,
+    arranged,
+    colours,
+    digest,
+    joint_chunks,
+    joint_panel,
+    moving,
+    rgb,
+    scalars,
+    scene_chunks,
+    scene_panel,
+    static,
+    tool_chunks,
+    write_recording,
+)
+from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.world import Solid
+from constraint_geodesics.studies.cup import CupSettings, Execution
+
+TIME = "time"
+"""The timeline, in seconds from the start of the path."""
+
+_BESIDE_CUP_M = (0.25, -0.25, 0.15)
+"""From where the cup is looked at, seen from its centre."""
+_CUP, _TILT, _KEPT = (*rgb(SKY), 60), rgb(VERMILION), rgb(BLUE)
+
+
+@dataclass(frozen=True)
+class ExecutionRecord:
+    """One execution and where it comes from; `kind` says what was executed, for example "planned
+    path".
+    """
+
+    kind: str
+    constraint: str
+    query: int
+    execution: Execution
+    cup: CupSettings
+    """What it was executed with."""
+
+    @property
+    def name(self) -> str:
+        """Of its file among those of one constraint."""
+        return f"query{self.query}-{self.kind.replace(' ', '-')}"
+
+
+def record_execution(
+    file: Path,
+    record: ExecutionRecord,
+    robot: SerialRobot,
+    workcell: Sequence[Solid],
+    *,
+    meshes: bool = True,
+) -> None:
+    """Write the recording of one execution, its blueprint inside.
+
+    meshes: as for `record_path`.
+    Raises RecordingError if the execution is not one of this robot and cup, or a mesh that is to be
+    written is missing.
+    """
+    execution = _checked(record, robot)
+    frames = Frames(
+        execution.joints,
+        robot.forward(execution.joints)[0],
+        None,
+        rr.TimeColumn(TIME, duration=execution.times),
+    )
+    chunks = [
+        *scene_chunks(robot, workcell, frames, meshes=meshes),
+        *tool_chunks(frames, rgb(planner_colour(record.kind))),
+        *_cup_chunks(execution, record.cup, frames.time),
+        *_sphere_chunks(execution, record.cup, frames.time),
+        *_series_chunks(execution, record.cup, frames.time),
+        *joint_chunks(robot, frames),
+        about_chunk(About(record.kind, record.constraint, query=record.query, executed=True)),
+        static("status", rr.TextDocument(_status(record), media_type=rr.MediaType.MARKDOWN)),
+        static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP),
+    ]
+    name = f"{record.constraint}, query {record.query}: {record.kind}, executed"
+    own = f"{record.constraint}-{record.name}-executed-{digest(frames)}"
+    write_recording(file, own, name, chunks, _blueprint(frames, execution.spheres))
+
+
+def record_executions(
+    folder: Path,
+    records: Sequence[ExecutionRecord | None],
+    robot: SerialRobot,
+    workcell: Sequence[Solid],
+) -> list[str]:
+    """Record executions, one file each without meshes; returns the file of each, or "" where there
+    is None.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for record in records:
+        file = "" if record is None else (folder / f"{record.name}.rrd").as_posix()
+        if record is not None:
+            record_execution(Path(file), record, robot, workcell, meshes=False)
+        files.append(file)
+    return files
+
+
+def in_cup(execution: Execution, cup: CupSettings) -> Float[np.ndarray, "F"]:
+    """How many spheres have their centre in the cup, below its rim, at each frame."""
+    local = np.einsum(
+        "fji,fsj->fsi",
+        _cup_rotations(execution),
+        execution.sphere_positions - execution.cup_pose[:, None, :3],
+    )
+    beside = np.hypot(local[..., 0], local[..., 1]) < cup.inner_radius_m + cup.wall_m
+    return np.asarray(
+        (beside & (np.abs(local[..., 2]) < 0.5 * cup.height_m)).sum(axis=1), dtype=float
+    )
+
+
+def tilt(execution: Execution) -> Float[np.ndarray, "F"]:
+    """Angle of the cup's axis to the vertical [rad] at each frame."""
+    axis = _cup_rotations(execution)[:, :, 2]
+    return np.asarray(np.arctan2(np.hypot(axis[:, 0], axis[:, 1]), axis[:, 2]))
+
+
+def _cup_rotations(execution: Execution) -> Float[np.ndarray, "F 3 3"]:
+    return np.asarray(Rotation.from_quat(execution.cup_pose[:, 3:]).as_matrix())
+
+
+def _checked(record: ExecutionRecord, robot: SerialRobot) -> Execution:
+    execution, name = record.execution, f"{record.constraint}-{record.name}"
+    frames, spheres = len(execution.times), record.cup.spheres
+    for what, values, shape in (
+        ("joints", execution.joints, (frames, robot.dof)),
+        ("sphere_positions", execution.sphere_positions, (frames, spheres, 3)),
+        ("cup_pose", execution.cup_pose, (frames, 7)),
+    ):
+        if values.shape != shape:
+            raise RecordingError(f"{name}: {what} of shape {values.shape}: must be {shape}")
+    return execution
+
+
+def _cup_chunks(execution: Execution, cup: CupSettings, time: rr.TimeColumn) -> Iterator[Chunk]:
+    """A cylinder one can look through.  The entity above it only moves, so that a view from there
+    does not turn.
+    """
+    yield moving("cup", rr.Transform3D.columns(translation=execution.cup_pose[:, :3]), time)
+    yield moving("cup/wall", rr.Transform3D.columns(quaternion=execution.cup_pose[:, 3:]), time)
+    yield static(
+        "cup/wall",
+        rr.Cylinders3D(
+            lengths=[cup.height_m],
+            radii=[cup.inner_radius_m + cup.wall_m],
+            colors=[_CUP],
+            fill_mode="transparentfillmajorwireframe",
+        ),
+    )
+
+
+def _sphere_chunks(execution: Execution, cup: CupSettings, time: rr.TimeColumn) -> Iterator[Chunk]:
+    own = colours(np.arange(execution.spheres))
+    yield static("spheres", rr.Points3D.from_fields(colors=own, radii=[cup.sphere_radius_m]))
+    columns = rr.Points3D.columns(positions=execution.sphere_positions.reshape(-1, 3))
+    yield moving("spheres", columns.partition([execution.spheres] * len(execution.times)), time)
+
+
+def _series_chunks(execution: Execution, cup: CupSettings, time: rr.TimeColumn) -> Iterator[Chunk]:
+    for entity, name, colour, values in (
+        ("cup_tilt", "tilt [deg]", _TILT, np.degrees(tilt(execution))),
+        ("cup_spheres", "spheres", _KEPT, in_cup(execution, cup)),
+    ):
+        yield static(entity, rr.SeriesLines(names=[name], colors=[colour], widths=[2.0]))
+        yield scalars(entity, values, time)
+
+
+def _status(record: ExecutionRecord) -> str:
+    execution = record.execution
+    return "\n".join(
+        (
+            f"**{record.kind}**, constraint `{record.constraint}`, query {record.query}, "
+            f"executed in simulation",
+            "",
+            f"- {execution.kept} of {execution.spheres} spheres stayed in the cup",
+            f"- largest tilt of the cup {np.degrees(execution.largest_tilt_rad):.2f}°",
+            f"- duration {execution.duration_s:.2f} s, "
+            f"largest tracking error {np.degrees(execution.largest_tracking_error_rad):.4f}°",
+        )
+    )
+
+
+def _blueprint(frames: Frames, spheres: int) -> Any:
+    # it follows the cup but does not turn with it; the arm is left out, it would often hide the cup
+    cup = rrb.Spatial3DView(
+        origin="/",
+        name="Cup",
+        contents=[f"+ /{entity}/**" for entity in ("workcell", "cup", "spheres")],
+        spatial_information=rrb.SpatialInformation(target_frame="tf#/cup"),
+        eye_controls=rrb.EyeControls3D(
+            position=_BESIDE_CUP_M, look_target=(0.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
+        ),
+        line_grid=rrb.LineGrid3D(visible=False),
+    )
+    right = rrb.Vertical(cup, *cup_panels(spheres), joint_panel(), row_shares=[2.5, 1.0, 1.0, 1.5])
+    return arranged(scene_panel(frames, "cup", "spheres"), right, execution_time())
+
+
+def cup_panels(spheres: float) -> list[Any]:
+    """The cup's tilt, and how many of its spheres are still in it."""
+    tilted = rrb.ScalarAxis(range=(0.0, 180.0))
+    counted = rrb.ScalarAxis(range=(0.0, 1.1 * spheres))
+    return [
+        rrb.TimeSeriesView(origin="cup_tilt", name="Tilt of the cup [deg]", axis_y=tilted),
+        rrb.TimeSeriesView(origin="cup_spheres", name="Spheres in the cup", axis_y=counted),
+    ]
+
+
+def execution_time() -> Any:
+    """The time panel of executions: they play as fast as they were executed."""
+    return rrb.TimePanel(
+        state="collapsed", timeline=TIME, playback_speed=1.0, play_state="playing", loop_mode="all"
+    )

@@ -1,0 +1,589 @@
+"""Several recordings put together as one, to be seen at once: over each other, or beside each
+other.
+
+Each recording keeps what is its own below an entity of its own, in the colour of its planner; what
+it shares with the others (the workcell, the limits) is there once.  Recordings that name URDFs get
+their meshes here.
+"""
+
+import hashlib
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+import rerun.blueprint as rrb
+from jaxtyping import Float
+from rerun.chunk import Chunk
+
+from constraint_geodesics.palette import planner_colour
+from constraint_geodesics.recording.execution_recording import TIME, cup_panels, execution_time
+from constraint_geodesics.recording.recording import (
+    LIMIT,
+    ROOT_FRAME,
+    TIMELINE,
+    About,
+    RecordingError,
+    about_of,
+    arranged,
+    has,
+    latent_view_of,
+    mesh_chunks,
+    path_time,
+    range_panel,
+    read_chunks,
+    residual_panel,
+    rgb,
+    scalars,
+    scene_view,
+    static,
+    violation_panel,
+)
+from constraint_geodesics.scene.scene import find_urdf
+
+OTHERS_OPACITY = 0.45
+"""Of the robots over the first one."""
+
+_IN_SPACE = ("robot", "transforms", "tool", "cup", "spheres", "workcell")
+_LIMITED = ("constraint/", "violation")
+
+Colour = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A recording as it was read, its meshes added."""
+
+    file: Path
+    recording_id: str
+    about: About
+    chunks: tuple[Chunk, ...]
+    added: tuple[Chunk, ...]
+    """Those of the chunks that the file does not hold: the meshes that it names."""
+
+
+@dataclass(frozen=True)
+class Composed:
+    """What one recording is written from."""
+
+    recording_id: str
+    name: str
+    chunks: list[Chunk]
+    blueprint: Any
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A recording among others: its words, entity and colour."""
+
+    source: Opened
+    label: str
+    entity: str
+    colour: Colour
+    place: float
+    """Where along its trace its words are."""
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """The series of one entity."""
+
+    names: list[str]
+    values: Float[np.ndarray, "frames k"]
+    time: rr.TimeColumn
+
+
+def opened(file: Path) -> Opened:
+    """Read a recording and add the meshes that it names but does not hold.
+
+    Raises RecordingError if it is not a recording or a mesh is missing, and RobotError if a URDF
+    is.
+    """
+    stored, chunks, _ = read_chunks(file)
+    added = _missing_meshes(chunks)
+    about = about_of(stored.recording_id, chunks)
+    return Opened(file, stored.recording_id, about, (*chunks, *added), tuple(added))
+
+
+def _missing_meshes(chunks: Sequence[Chunk]) -> list[Chunk]:
+    drawn = [chunk.entity_path for chunk in chunks if "/visual_geometries/" in chunk.entity_path]
+    added = []
+    for chunk in chunks:
+        if has(chunk, "urdf") and not any(
+            path.startswith(f"{chunk.entity_path}/") for path in drawn
+        ):
+            row = chunk.to_record_batch().to_pylist()[0]
+            added += mesh_chunks(
+                find_urdf(row["urdf"][0]), chunk.entity_path, row.get("frame_prefix", [None])[0]
+            )
+    return added
+
+
+def overlaid(sources: Sequence[Opened]) -> Composed:
+    """Paths over each other: every planner has a robot in its colour, all but the first one half
+    transparent.
+
+    Raises RecordingError for executed paths, for paths of several constraints or in different
+    surroundings, and for what is no recording of one path.
+    """
+    _of_one_kind(sources)
+    if sources[0].about.executed:
+        raise RecordingError("executed paths are not laid over each other: add --side-by-side")
+    if len(constraints := {source.about.constraint for source in sources}) > 1:
+        raise RecordingError(
+            f"paths of several constraints ({', '.join(sorted(constraints))}): add --side-by-side"
+        )
+    _same_surroundings(sources)
+    parts, shared = (
+        _parts(sources),
+        [chunk for chunk in sources[0].chunks if _is_surroundings(chunk)],
+    )
+    own = [
+        chunk
+        for k, part in enumerate(parts)
+        for chunk in _in_space(part, 1.0 if k == 0 else OTHERS_OPACITY)
+        if not _is_surroundings(chunk, part.entity)
+    ]
+    return _composed(parts, shared + _ends_once(own), beside=False)
+
+
+def side_by_side(sources: Sequence[Opened]) -> Composed:
+    """Paths or executed paths, each in a view of its own.  Raises RecordingError for paths among
+    executed ones.
+    """
+    _of_one_kind(sources)
+    parts = _parts(sources)
+    return _composed(
+        parts, [chunk for part in parts for chunk in _in_space(part, 1.0)], beside=True
+    )
+
+
+def _of_one_kind(sources: Sequence[Opened]) -> None:
+    for source in sources:
+        if not any(chunk.entity_path == "/joints" for chunk in source.chunks):
+            raise RecordingError(f"{source.file}: not a recording of one path: open it by itself")
+    executed = [source.file for source in sources if source.about.executed]
+    planned = [source.file for source in sources if not source.about.executed]
+    if executed and planned:
+        raise RecordingError(
+            f"{executed[0]} is an executed path, in seconds, and {planned[0]} is a path, in "
+            f"frames: "
+            "open them one after another"
+        )
+
+
+def _same_surroundings(sources: Sequence[Opened]) -> None:
+    first = _surroundings(sources[0])
+    for source in sources[1:]:
+        if _surroundings(source) != first:
+            raise RecordingError(
+                f"{sources[0].file} and {source.file} have different bodies round the robot: "
+                f"add --side-by-side"
+            )
+
+
+def _surroundings(source: Opened) -> dict[tuple[str, ...], Any]:
+    """The bodies as they stand, meshes and names of URDFs left out."""
+    return {
+        (chunk.entity_path, *_components(chunk)): chunk.to_record_batch()
+        .select(_components(chunk))
+        .to_pylist()
+        for chunk in source.chunks
+        if _is_surroundings(chunk) and not has(chunk, "Asset3D:", "urdf")
+    }
+
+
+def _is_surroundings(chunk: Chunk, below: str = "") -> bool:
+    """Whether a chunk is a body of the workcell or its place, and not the robot's."""
+    parts = chunk.entity_path.removeprefix(f"/{below}").strip("/").split("/")
+    return parts[0] == "workcell" or (parts[0] == "transforms" and len(parts) > 2)
+
+
+def _components(chunk: Chunk) -> list[str]:
+    """Its columns but for the row ids."""
+    return [
+        name
+        for name in chunk.to_record_batch().schema.names
+        if not name.startswith("rerun.controls")
+    ]
+
+
+def _ends_once(chunks: Sequence[Chunk]) -> list[Chunk]:
+    """Starts and goals that several paths share are marked once."""
+    kept, seen = [], []
+    for chunk in chunks:
+        marks = chunk.entity_path.endswith(("/tool/start", "/tool/goal"))
+        row = chunk.to_record_batch().column("Points3D:positions").to_pylist() if marks else None
+        if row is None or row not in seen:
+            kept.append(chunk)
+            seen += [] if row is None else [row]
+    return kept
+
+
+def _parts(sources: Sequence[Opened]) -> list[_Part]:
+    labels = labels_of([source.about for source in sources])
+    colours = shades([planner_colour(source.about.planner) for source in sources])
+    places = np.linspace(0.0, 1.0, len(sources) + 2)[1:-1]
+    return [
+        _Part(
+            source,
+            label,
+            f"path{k}_{re.sub(r'[^a-z0-9]+', '_', label.lower()).strip('_')}",
+            colour,
+            float(place),
+        )
+        for k, (source, label, colour, place) in enumerate(
+            zip(sources, labels, colours, places, strict=True)
+        )
+    ]
+
+
+def labels_of(abouts: Sequence[About]) -> list[str]:
+    """The planner of each, with constraint, scene and query where they differ, and the seed where
+    that alone does.
+    """
+    labels = [about.planner or "path" for about in abouts]
+    for what, words in (("constraint", "{}"), ("scene", "{}"), ("query", "query {}")):
+        values = [getattr(about, what) for about in abouts]
+        if len(set(values)) > 1:
+            labels = [
+                _with_value(label, words, value)
+                for label, value in zip(labels, values, strict=True)
+            ]
+    alike = Counter(labels)
+    labels = [
+        _with_value(label, "seed {}", about.seed) if alike[label] > 1 else label
+        for label, about in zip(labels, abouts, strict=True)
+    ]
+    several, seen = Counter(labels), Counter[str]()
+    for k, label in enumerate(labels):
+        seen[label] += 1
+        labels[k] = f"{label} ({seen[label]})" if several[label] > 1 else label
+    return labels
+
+
+def _with_value(label: str, words: str, value: str | int | None) -> str:
+    return label if value in (None, "") else f"{label}, {words.format(value)}"
+
+
+def shades(colours: Sequence[str]) -> list[Colour]:
+    """Each colour as it is the first time, and lighter each further time."""
+    seen: Counter[str] = Counter()
+    found = []
+    for colour in colours:
+        white = 1.0 - 0.6 ** seen[colour]
+        red, green, blue = (round(value + white * (255 - value)) for value in rgb(colour))
+        found.append((red, green, blue))
+        seen[colour] += 1
+    return found
+
+
+def _in_space(part: _Part, opacity: float) -> Iterator[Chunk]:
+    """What of a recording stands in space, below the part's entity and in its colour."""
+    for chunk in part.source.chunks:
+        path = chunk.entity_path
+        if path.split("/")[1] not in _IN_SPACE:
+            continue
+        moved = _with_frames(chunk, f"{part.entity}/").with_entity_path(f"/{part.entity}{path}")
+        if has(chunk, "Asset3D:blob") and path.startswith("/robot/"):
+            yield from _changed(
+                moved,
+                "Asset3D:albedo_factor",
+                rr.Asset3D.from_fields(albedo_factor=(*part.colour, round(255 * opacity))),
+            )
+        elif path == "/tool/trace":
+            yield from _changed(
+                moved, "LineStrips3D:colors", rr.LineStrips3D.from_fields(colors=[part.colour])
+            )
+            yield static(f"{part.entity}/tool/name", _name(part, chunk))
+        elif path == "/tool/position" and chunk.is_static:
+            yield from _changed(
+                moved, "Points3D:colors", rr.Points3D.from_fields(colors=[part.colour])
+            )
+        else:
+            yield moved
+
+
+def _name(part: _Part, trace: Chunk) -> Any:
+    """The part's words on its trace, a place along it for each part, so that those of equal paths
+    do not meet.
+    """
+    points = trace.to_record_batch().column("LineStrips3D:strips").to_pylist()[0][0]
+    at = points[round(part.place * (len(points) - 1))]
+    return rr.Points3D(
+        [at], colors=[part.colour], radii=[rr.Radius.ui_points(0.0)], labels=[part.label]
+    )
+
+
+def _with_frames(chunk: Chunk, prefix: str) -> Chunk:
+    """The chunk with a prefix before its coordinate frames' names, but for those of entities."""
+    batch = chunk.to_record_batch()
+    for name in ("CoordinateFrame:frame", "Transform3D:child_frame", "Transform3D:parent_frame"):
+        if name in batch.schema.names:
+            rows = [
+                [frame if frame.startswith(ROOT_FRAME) else prefix + frame for frame in row]
+                for row in batch.column(name).to_pylist()
+            ]
+            at = batch.schema.get_field_index(name)
+            batch = batch.set_column(
+                at, batch.schema.field(at), pa.array(rows, batch.schema.field(at).type)
+            )
+    (changed,) = Chunk.from_record_batch(batch)
+    return changed
+
+
+def _changed(chunk: Chunk, component: str, archetype: Any) -> Iterator[Chunk]:
+    """A static chunk without one component, then what replaces it."""
+    batch = chunk.to_record_batch()
+    if component in batch.schema.names:
+        batch = batch.drop_columns([component])
+    yield from Chunk.from_record_batch(batch)
+    yield static(chunk.entity_path, archetype)
+
+
+def _composed(parts: Sequence[_Part], in_space: Sequence[Chunk], *, beside: bool) -> Composed:
+    series = [_series_of(part.source.chunks) for part in parts]
+    latent, latent_view = _latent(parts)
+    panels = [] if latent_view is None else [latent_view]
+    panels += _panels(series)
+    chunks = [
+        *in_space,
+        *_series_chunks(parts, series),
+        *latent,
+        static("status", rr.TextDocument(_texts(parts), media_type=rr.MediaType.MARKDOWN)),
+        static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP),
+    ]
+    ids = " ".join([part.source.recording_id for part in parts] + [str(beside)])
+    name = f"{', '.join(part.label for part in parts)}: {parts[0].source.about.constraint}"
+    return Composed(
+        f"together-{hashlib.sha256(ids.encode()).hexdigest()[:12]}",
+        name,
+        chunks,
+        _beside(parts, panels) if beside else _over(parts, panels),
+    )
+
+
+def _texts(parts: Sequence[_Part]) -> str:
+    texts = []
+    for part in parts:
+        rows = [chunk for chunk in part.source.chunks if chunk.entity_path == "/status"]
+        texts += [
+            chunk.to_record_batch().column("TextDocument:text").to_pylist()[0][0] for chunk in rows
+        ]
+    return "\n\n".join(texts)
+
+
+def _series_of(chunks: Sequence[Chunk]) -> dict[str, _Lines]:
+    names, values = {}, {}
+    for chunk in chunks:
+        entity = re.sub(
+            r"\\(.)", r"\1", chunk.entity_path.strip("/")
+        )  # Rerun escapes spaces and the like
+        if has(chunk, "SeriesLines:names"):
+            names[entity] = chunk.to_record_batch().column("SeriesLines:names").to_pylist()[0]
+        elif has(chunk, "Scalars:scalars"):
+            rows = np.array(
+                chunk.to_record_batch().column("Scalars:scalars").to_pylist(), dtype=float
+            )
+            values[entity] = (rows, _time(chunk))
+    return {
+        entity: _Lines(names[entity], *values[entity]) for entity in names.keys() & values.keys()
+    }
+
+
+def _time(chunk: Chunk) -> rr.TimeColumn:
+    (timeline,) = chunk.timeline_names
+    times = chunk.to_record_batch().column(timeline).to_pylist()
+    return (
+        rr.TimeColumn(TIME, duration=times)
+        if timeline == TIME
+        else rr.TimeColumn(TIMELINE, sequence=times)
+    )
+
+
+def _series_chunks(parts: Sequence[_Part], series: Sequence[dict[str, _Lines]]) -> Iterator[Chunk]:
+    """One line a recording in its colour, then each limit once."""
+    limits: dict[str, tuple[str, float, rr.TimeColumn, int]] = {}
+    alone = Counter(
+        entity.rpartition("/")[0] for entity in {entity for own in series for entity in own}
+    )
+    for part, own in zip(parts, series, strict=True):
+        for entity, lines in own.items():
+            what = (
+                f": {entity.rpartition('/')[2]}"
+                if "/" in entity and alone[entity.rpartition("/")[0]] > 1
+                else ""
+            )
+            for shown, names, values in _own_lines(entity, lines, f"{part.label}{what}"):
+                yield from _lines(
+                    f"{shown}/{part.entity}", names, part.colour, _Lines(names, values, lines.time)
+                )
+            for shown, name, value in _limits(entity, lines, part.source.chunks):
+                name = f"{name}{what}"
+                if len(lines.values) > limits.get(shown, ("", 0.0, None, 0))[3]:
+                    limits[shown] = (name, value, lines.time, len(lines.values))
+    for shown, (name, value, time, count) in limits.items():
+        yield from _lines(
+            shown, [name], LIMIT, _Lines([name], np.full((count, 1), value), time), width=1.0
+        )
+
+
+def _own_lines(
+    entity: str, lines: _Lines, label: str
+) -> Iterator[tuple[str, list[str], np.ndarray]]:
+    """Where the lines of one recording go, what they are called, and their values without the
+    limits.
+    """
+    if entity == "joints":
+        for k, joint in enumerate(lines.names):
+            yield f"joint/{joint}", [label], lines.values[:, k : k + 1]
+    elif entity == "joint_range":
+        joints = [name for name in lines.names if not name.endswith(" limit")]
+        yield entity, [f"{label}: {joint}" for joint in joints], lines.values[:, : len(joints)]
+    else:
+        yield entity, [label], lines.values[:, :1]
+
+
+def _limits(
+    entity: str, lines: _Lines, chunks: Sequence[Chunk]
+) -> Iterator[tuple[str, str, float]]:
+    """The limits that belong to some lines: where each goes, what it is called, and its value."""
+    if entity == "joints":
+        for chunk in chunks:
+            if chunk.entity_path == "/joints" and has(chunk, "lower"):
+                row = chunk.to_record_batch().to_pylist()[0]
+                for side in ("lower", "upper"):
+                    for joint, value in zip(lines.names, row[side], strict=True):
+                        yield f"joint/{joint}/{side}_limit", f"{side} limit", value
+    elif entity == "joint_range":
+        yield "joint_range/upper_limit", "upper limit", 1.0
+        yield "joint_range/lower_limit", "lower limit", -1.0
+    elif entity.startswith(_LIMITED):
+        yield f"{entity}/limit_{lines.values[0, 1]:.6g}", "limit", float(lines.values[0, 1])
+
+
+def _lines(
+    entity: str, names: Sequence[str], colour: Colour, lines: _Lines, width: float = 2.0
+) -> Iterator[Chunk]:
+    count = len(names)
+    entity = str(rr.new_entity_path(entity.split("/")))
+    yield static(
+        entity, rr.SeriesLines(names=list(names), colors=[colour] * count, widths=[width] * count)
+    )
+    yield scalars(entity, lines.values, lines.time)
+
+
+def _panels(series: Sequence[dict[str, _Lines]]) -> list[Any]:
+    """A panel for each quantity that any of the recordings has."""
+    found = {entity for own in series for entity in own}
+    panels = []
+    for unit in ("deg", "mm"):
+        tops = [
+            lines.values.max()
+            for own in series
+            for entity, lines in own.items()
+            if entity.startswith(f"constraint/{unit}/")
+        ]
+        panels += [residual_panel(unit, float(max(tops)))] if tops else []
+    panels += [violation_panel(legend=not panels)] if "violation" in found else []
+    if "cup_spheres" in found:
+        panels += cup_panels(
+            max(own["cup_spheres"].values.max() for own in series if "cup_spheres" in own)
+        )
+    joints = sorted({joint for own in series if "joints" in own for joint in own["joints"].names})
+    single = [
+        rrb.TimeSeriesView(origin=f"joint/{joint}", name=f"{joint} [rad or m]") for joint in joints
+    ]
+    together = [range_panel(legend=False)] if "joint_range" in found else []
+    return [*panels, rrb.Tabs(*together, *single, active_tab=0)]
+
+
+def _over(parts: Sequence[_Part], panels: Sequence[Any]) -> Any:
+    entities = ["workcell", "transforms", *(part.entity for part in parts)]
+    shares = [2.0 if isinstance(panel, rrb.Spatial2DView) else 1.0 for panel in panels[:-1]] + [1.3]
+    return arranged(
+        scene_view("Robots", entities, _reach(parts)),
+        rrb.Vertical(*panels, row_shares=shares),
+        _clock(parts),
+    )
+
+
+def _beside(parts: Sequence[_Part], panels: Sequence[Any]) -> Any:
+    reach = _reach(parts)
+    scenes = rrb.Grid(*(scene_view(part.label, [part.entity], reach) for part in parts))
+    status = rrb.TextDocumentView(origin="status", name="Status")
+    return rrb.Blueprint(
+        rrb.Vertical(scenes, rrb.Horizontal(status, *panels), row_shares=[3.0, 1.5]),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        _clock(parts),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _clock(parts: Sequence[_Part]) -> Any:
+    return execution_time() if parts[0].source.about.executed else path_time()
+
+
+def _reach(parts: Sequence[_Part]) -> float:
+    """The farthest that any of the tools gets from the base [m]."""
+    traces = [
+        chunk.to_record_batch().column("LineStrips3D:strips").to_pylist()[0][0]
+        for part in parts
+        for chunk in part.source.chunks
+        if chunk.entity_path == "/tool/trace"
+    ]
+    return max((float(np.linalg.norm(trace, axis=1).max()) for trace in traces), default=1.0)
+
+
+def _latent(parts: Sequence[_Part]) -> tuple[list[Chunk], Any]:
+    """The first sub-manifold that is shown, the curves of all recordings that show the same one,
+    and the view.
+    """
+    of = {part.entity: _latent_chunks(part.source) for part in parts}
+    shown = [part for part in parts if "submanifold" in of[part.entity]]
+    if not shown:
+        return [], None
+    points, axes = (of[shown[0].entity][name][0] for name in ("submanifold", "axes"))
+    shown = [
+        part for part in shown if _points(of[part.entity]["submanifold"][0]) == _points(points)
+    ]
+    chunks = [points, axes]
+    for k, part in enumerate(shown):
+        for name in ("curve", "position", *(("start", "goal") if k == 0 else ())):
+            for chunk in of[part.entity][name]:
+                chunks += _in_latent(chunk, name, part)
+    strips = axes.to_record_batch().column("LineStrips2D:strips").to_pylist()[0]
+    corners = np.array(strips[0] + strips[1]) * [1.0, -1.0]  # the plane's second axis points down
+    names = axes.to_record_batch().column("LineStrips2D:labels").to_pylist()[0]
+    return chunks, latent_view_of(names, corners.min(axis=0), corners.max(axis=0))
+
+
+def _latent_chunks(source: Opened) -> dict[str, list[Chunk]]:
+    found: dict[str, list[Chunk]] = defaultdict(list)
+    for chunk in source.chunks:
+        if chunk.entity_path.startswith("/latent/"):
+            found[chunk.entity_path.rpartition("/")[2]].append(chunk)
+    return found
+
+
+def _points(chunk: Chunk) -> Any:
+    return chunk.to_record_batch().column("Points2D:positions")
+
+
+def _in_latent(chunk: Chunk, name: str, part: _Part) -> Iterator[Chunk]:
+    own = chunk.with_entity_path(f"/latent/{name}/{part.entity}")
+    if name == "curve":
+        yield from _changed(
+            own, "LineStrips2D:colors", rr.LineStrips2D.from_fields(colors=[part.colour])
+        )
+    elif name == "position" and chunk.is_static:
+        yield from _changed(own, "Points2D:colors", rr.Points2D.from_fields(colors=[part.colour]))
+    else:
+        yield own

@@ -1,0 +1,282 @@
+"""The benchmark's page (reports/benchmark.html), from the tables and figures of its stages."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+
+from constraint_geodesics.benchmark.runner import TABLE, read_table
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.layout import Layout, in_checkout
+from constraint_geodesics.report.benchmark_tables import (
+    PYTHON_NOTE,
+    TABLE_I_NOTE,
+    Cells,
+    ahead_cells,
+    ahead_told,
+    asks_in_python,
+    break_even_cells,
+    case_cells,
+    counted,
+    overview_cells,
+    repeated_cells,
+    table_i_cells,
+    verdict_cells,
+)
+from constraint_geodesics.report.blocks import Block, Look, Recorded
+from constraint_geodesics.report.page import Picture, Section, write_page
+from constraint_geodesics.report.results import ReportError, fixed
+
+Case = tuple[str, str, str]
+"""Constraint, scene and planner."""
+GROWTH = ("what grows with what", "exponent", "± standard error", "points")
+
+
+def write_benchmark_page(params: Params, layout: Layout) -> None:
+    """Write reports/benchmark.html from reports/benchmark.csv, benchmark/, growth/ and
+    benchmark_repeat/.
+
+    Raises ReportError naming the first file that is missing.
+    """
+    try:
+        rows, about = read_table(layout.benchmark_table)
+        sections = benchmark_sections(params, layout, rows)
+    except FileNotFoundError as error:
+        raise ReportError(f"{error.filename or error}: missing; `make bench` makes it") from None
+    write_page(
+        layout,
+        "benchmark",
+        about=about,
+        planners=len(params.bench.planners),
+        rows=len(rows),
+        sections=sections,
+    )
+
+
+def benchmark_sections(params: Params, layout: Layout, rows: pd.DataFrame) -> list[Section]:
+    """The page's parts in their order.  rows: of reports/benchmark.csv."""
+    folder = layout.root / "reports" / "benchmark"
+    summary, overview, budgets, costs = (
+        pd.read_csv(folder / f"{name}.csv")
+        for name in ("summary", "overview", "budgets", "break_even")
+    )
+    return [
+        *_overview_sections(params, layout, overview),
+        _budget_section(layout, budgets),
+        _published_section(params, rows),
+        Section(
+            "lengths",
+            "How lengths spread",
+            "The higher a curve is at the left, the more of the planner's paths are as short "
+            "as any that is known.",
+            [_picture(layout, "ratio_distributions")],
+        ),
+        _break_even_section(layout, costs),
+        _growth_section(layout),
+        _repeat_section(layout),
+        _case_section(summary, benchmark_recordings(rows)),
+    ]
+
+
+def _overview_sections(params: Params, layout: Layout, overview: pd.DataFrame) -> list[Section]:
+    in_python = asks_in_python(params.bench.planners)
+    parts = [name for name, peer in params.bench.planners.items() if peer.kind == "planner"]
+    drawn, own = (
+        overview[overview["planner"].isin(names)] for names in (params.bench.drawn, parts)
+    )
+    return [
+        Section(
+            "overview",
+            "Overview",
+            f"All constraints together, a table for each scene. {PYTHON_NOTE}",
+            [_picture(layout, "overview")],
+            _overview_blocks(drawn, in_python, "planners that are drawn"),
+            _overview_blocks(overview, in_python, "all planners"),
+        ),
+        Section(
+            "parts",
+            "The planner without its parts",
+            "The same queries with a part left out, with a longer budget, or with nothing learned.",
+            blocks=_overview_blocks(own, (), "the planner and its parts"),
+        ),
+    ]
+
+
+def _budget_section(layout: Layout, budgets: pd.DataFrame) -> Section:
+    pictures = [_picture(layout, name) for name in ("success_over_budget", "length_over_budget")]
+    note = "a case is a constraint in a scene; from reports/benchmark/budgets.csv"
+    cases = Block("Cases by budget", note, *_parted(verdict_cells(budgets)))
+    header, rows = _parted(ahead_cells(budgets))
+    behind = Block("Peers that are ahead", note, header, rows)
+    return Section(
+        "budgets", "Within a time budget", ahead_told(budgets), pictures, [cases], [behind]
+    )
+
+
+def _published_section(params: Params, rows: pd.DataFrame) -> Section:
+    constraint = params.geodesics.illustrated_constraints[0]
+    cells = table_i_cells(rows[(rows["constraint"] == constraint) & (rows["scene"] == TABLE)])
+    block = _of_planners(
+        f"Table I and {constraint}, scene {TABLE}", "from reports/benchmark.csv", cells
+    )
+    return Section(
+        "published", "Beside the paper: Table I", TABLE_I_NOTE.replace("`", ""), blocks=[block]
+    )
+
+
+def _break_even_section(layout: Layout, costs: pd.DataFrame) -> Section:
+    note = "never: the other is no slower; from reports/benchmark/break_even.csv"
+    block = _of_planners("From how many queries on", note, break_even_cells(costs))
+    told = "What training takes once, from data to files, against what it saves in each query."
+    return Section(
+        "break_even", "When training pays", told, [_picture(layout, "break_even")], [block]
+    )
+
+
+def _growth_section(layout: Layout) -> Section:
+    slopes = pd.read_csv(layout.root / "reports" / "growth" / "slopes.csv", comment="#")
+    told = (
+        "Seconds against joints, held task axes, obstacles, queries, latent dimensions and "
+        "rows, on one thread."
+    )
+    note = "of seconds over size, in log-log; from reports/growth/slopes.csv"
+    block = Block(
+        "Exponents",
+        note,
+        GROWTH,
+        growth_cells(slopes),
+        planners=slopes["what"].astype(str).tolist(),
+    )
+    return Section("growth", "How cost grows", told, [_picture(layout, "growth")], [block])
+
+
+def _repeat_section(layout: Layout) -> Section:
+    table = pd.read_csv(layout.root / "reports" / "benchmark_repeat" / "repeat.csv")
+    block = _of_planners(
+        "Two runs", "from reports/benchmark_repeat/repeat.csv", repeated_cells(table)
+    )
+    told = "Part of the queries answered a second time, by the planners whose search no clock ends."
+    return Section("repeat", "The same again", told, blocks=[block])
+
+
+def _case_section(summary: pd.DataFrame, recorded: Mapping[Case, Sequence[Recorded]]) -> Section:
+    blocks = []
+    for (constraint, scene), case in summary.groupby(["constraint", "scene"], sort=False):
+        looks = [
+            Look("", recorded.get((str(constraint), str(scene), str(name)), ()))
+            for name in case["planner"]
+        ]
+        note = f"{counted(case)}; from reports/benchmark/summary.csv"
+        blocks.append(_of_planners(f"{constraint}, scene {scene}", note, case_cells(case), looks))
+    told = (
+        "Recorded paths stand below the table that they belong to. The benchmark makes no "
+        "MLflow runs: its rows are in "
+        "reports/benchmark.csv, and in data/benchmark.db for Planner Arena."
+    )
+    return Section("cases", "Every constraint and scene", told, folded=blocks)
+
+
+def benchmark_recordings(rows: pd.DataFrame) -> dict[Case, list[Recorded]]:
+    """The recorded paths of each constraint, scene and planner."""
+    found: dict[Case, list[Recorded]] = {}
+    for row in rows[rows["recording"] != ""].to_dict("records"):
+        key = (str(row["constraint"]), str(row["scene"]), str(row["planner"]))
+        verdict = "valid" if row["valid"] else "not valid"
+        told = (
+            f"query {row['query']}, seed {row['seed']}: {verdict}, {fixed(row['length_rad'])} rad"
+        )
+        found.setdefault(key, []).append(Recorded(in_checkout(row["recording"]), told))
+    return found
+
+
+def growth_cells(slopes: pd.DataFrame) -> list[Sequence[str]]:
+    """Exponents of time over size, one row an axis and what grows."""
+    return [
+        (
+            f"{row['what']}: {row['axis']}",
+            _two(row["slope"]),
+            _two(row["standard_error"]),
+            str(row["points"]),
+        )
+        for row in slopes.to_dict("records")
+    ]
+
+
+def _two(value: float) -> str:
+    return f"{value:.2f}" if np.isfinite(value) else "–"
+
+
+def _overview_blocks(summary: pd.DataFrame, in_python: Sequence[str], which: str) -> list[Block]:
+    source = "from reports/benchmark/overview.csv"
+    return [
+        _of_planners(
+            f"Scene {scene}, {which}", f"{counted(case)}; {source}", overview_cells(case, in_python)
+        )
+        for scene, case in summary.groupby("scene", sort=False)
+    ]
+
+
+def _of_planners(title: str, note: str, cells: Cells, looks: Sequence[Look] = ()) -> Block:
+    """A block whose rows begin with their planner's name."""
+    header, rows = _parted(cells)
+    return Block(
+        title,
+        note,
+        header,
+        rows,
+        planners=[row[0].removeprefix("learned geodesic; here ") for row in rows],
+        looks=looks,
+    )
+
+
+def _parted(cells: Cells) -> tuple[Sequence[str], Cells]:
+    """A table's header, and its rows; the page needs no marks around names."""
+    header, *rows = ([cell.replace("`", "") for cell in row] for row in cells)
+    return header, list(rows)
+
+
+CAPTIONS: Mapping[str, tuple[str, str, str]] = {
+    "overview": (
+        "benchmark",
+        "Success, length and spread, all constraints together",
+        "Left: share of the queries that any planner solved. Middle: 95th percentile of "
+        "length over best known, "
+        "failures infinite. Right: share of rows within some excess over the best known length.",
+    ),
+    "success_over_budget": (
+        "benchmark",
+        "Success within a time budget",
+        "Share of the queries that any planner solved with a valid path within the budget, by "
+        "constraint and scene.",
+    ),
+    "length_over_budget": (
+        "benchmark",
+        "Length within a time budget",
+        "95th percentile of length over best known; a line begins where 95 % of the rows have "
+        "a path.",
+    ),
+    "ratio_distributions": (
+        "benchmark",
+        "Excess over the best known length",
+        "Share of the rows of solvable queries whose path is within some excess; failures "
+        "never are.",
+    ),
+    "break_even": (
+        "benchmark",
+        "Training and planning, in all",
+        "Seconds spent from the first query on, of planners with a valid path in half of "
+        "their rows or more.",
+    ),
+    "growth": (
+        "growth",
+        "Seconds over size",
+        "A panel for each axis, in log-log; slopes with their standard errors stand in the "
+        "legends.",
+    ),
+}
+"""Folder, title and caption of each figure."""
+
+
+def _picture(layout: Layout, name: str) -> Picture:
+    folder, title, caption = CAPTIONS[name]
+    return Picture(name, title, caption, title, layout.root / "reports" / folder / f"{name}.png")

@@ -1,0 +1,125 @@
+"""The figure of how cost grows: a panel an axis, in log-log, with the exponents in its legends."""
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter, NullLocator
+
+from constraint_geodesics.report.figures import BLACK, BLUE, GREEN, LIGHT, ORANGE, PURPLE, VERMILION
+
+COLUMNS = 3
+FAMILIES = (("planner", ORANGE), ("band and trees", ORANGE), ("straight", GREEN), ("BiRRT", BLUE))
+"""How the names of a family begin, and its colour, as in the benchmark's figures; others take the
+next of OTHERS.
+"""
+OTHERS = (VERMILION, PURPLE, BLACK)
+DASHES = ("-", "--", ":", "-.")
+"""Tell members of one family apart."""
+LABELS = {
+    "joints": "joints (one query)",
+    "codimension": "held task axes (one query)",
+    "obstacles": "spheres in the workcell (one query)",
+    "queries": "queries (all of them)",
+    "latent dimension": "latent dimensions",
+    "dataset rows": "dataset rows, or nodes of the roadmap",
+}
+"""What is below each axis' panel."""
+NOTE = (
+    "shaded: quartiles;  dotted: fit to sizes above 0;  hollow: fewer than half of the "
+    "queries solved"
+)
+LEGEND_ROOM = 0.27
+"""Of a panel's height, above what is drawn."""
+
+
+def growth_figure(table: pd.DataFrame, fits: pd.DataFrame) -> Figure:
+    """Seconds over size: medians joined, quartiles shaded, the fitted line thin, its slope ±
+    standard error beside it.
+
+    table: as `growth.measure_growth` has it.  fits: its `growth.slopes`.
+    """
+    axes_names = list(dict.fromkeys(table["axis"]))
+    lines = -(-len(axes_names) // COLUMNS)
+    figure = Figure(figsize=(10.5, 0.6 + 3.1 * lines), layout="constrained")
+    for k, name in enumerate(axes_names):
+        panel = figure.add_subplot(lines, COLUMNS, k + 1)
+        _draw_panel(panel, table[table["axis"] == name], fits[fits["axis"] == name])
+        panel.set_xlabel(LABELS.get(name, name), fontsize=9)
+    figure.supxlabel(NOTE, fontsize=8)
+    figure.supylabel("seconds", fontsize=9)
+    return figure
+
+
+def _draw_panel(panel: Axes, table: pd.DataFrame, fits: pd.DataFrame) -> None:
+    styles = _styles(list(dict.fromkeys(table["what"])))
+    for what, rows in table.groupby("what", sort=False):
+        own, style = rows.sort_values("value"), styles[str(what)]
+        value, colour = own["value"].to_numpy(float), style["color"]
+        fit = fits[fits["what"] == what].iloc[0]
+        panel.plot(value, own["seconds"], label=f"{what}: {_slope(fit)}", linewidth=1.3, **style)
+        panel.fill_between(value, own["low"], own["high"], color=colour, alpha=0.12, linewidth=0)
+        inside = [
+            "white" if share < 0.5 else colour for share in own["solved"]
+        ]  # nan, no query, is filled
+        panel.scatter(
+            value, own["seconds"], s=14, c=inside, edgecolors=colour, linewidths=0.9, zorder=3
+        )
+        above = value[value > 0]
+        if np.isfinite(fit["slope"]):
+            ends = np.array([above.min(), above.max()])
+            panel.plot(
+                ends,
+                fit["seconds_at_1"] * ends ** fit["slope"],
+                color=colour,
+                linewidth=0.8,
+                linestyle=":",
+            )
+    _scale(
+        panel, np.unique(table["value"].to_numpy(float)), table["low"].min(), table["high"].max()
+    )
+    panel.grid(color=LIGHT, linewidth=0.6)
+    panel.tick_params(labelsize=7, which="both")
+    panel.legend(fontsize=7, frameon=False, loc="upper left")
+
+
+def _scale(panel: Axes, values: Float[np.ndarray, "n"], low: float, high: float) -> None:
+    """Logarithmic, what was measured as its ticks, a decade of seconds at least; nothing, 0, stands
+    to the left of 1.
+
+    low, high: of the seconds drawn.
+    """
+    if values.min() > 0:
+        panel.set_xscale("log")
+    else:
+        panel.set_xscale("symlog", linthresh=1.0, linscale=0.4)
+    middle, decades = np.log10(low * high) / 2, max(np.log10(high / low), 1.0) + 0.2
+    bottom = middle - decades / 2
+    panel.set_yscale("log")
+    panel.set_ylim(10**bottom, 10 ** (bottom + decades / (1.0 - LEGEND_ROOM)))
+    panel.set_xticks(values, [f"{value:g}" for value in values])
+    panel.xaxis.set_minor_locator(NullLocator())
+    panel.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _slope(fit: pd.Series) -> str:
+    if not np.isfinite(fit["slope"]):
+        return "no slope"
+    error = fit["standard_error"]
+    return f"slope {fit['slope']:.2f}" + (f" ± {error:.2f}" if np.isfinite(error) else "")
+
+
+def _styles(names: list[str]) -> dict[str, dict[str, Any]]:
+    """Colour and dashes of each name of a panel."""
+    met: dict[str, int] = {}
+    styles, others = {}, iter(OTHERS * len(names))
+    for name in names:
+        colour = next(
+            (colour for begin, colour in FAMILIES if name.startswith(begin)), None
+        ) or next(others)
+        met[colour] = met.get(colour, -1) + 1
+        styles[name] = {"color": colour, "linestyle": DASHES[met[colour] % len(DASHES)]}
+    return styles

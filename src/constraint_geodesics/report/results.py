@@ -1,0 +1,363 @@
+"""The result table of a run: the paths of all planners read, checked, compared, and printed.
+
+Everything comes from the tables of the other stages; names come from params.yaml, never from what
+lies in a folder.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pandera.pandas as pandera
+
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.report.figures import PLANNERS
+from constraint_geodesics.report.statistics import BESIDE, RANDOM, STRAIGHT, Counted, summarise
+
+LEARNED = "learned_geodesic"
+TEXTS = ("reason", "recording")
+
+COUNTED = {"valid": "valid paths", "found": "all paths found, valid or not"}
+COLUMNS = (
+    "constraint",
+    "planner",
+    "valid",
+    "queries",
+    "shortest",
+    "average ± std",
+    "joint length [rad]",
+    "time [s]",
+    "violation, median [°]",
+    "worst [°]",
+)
+
+
+class ReportError(ValueError):
+    """A file that the report needs is missing or can't be used; the message is one line with its
+    name.
+    """
+
+
+def searched_items(params: Params) -> list[tuple[str, str]]:
+    """The pairs (manifold, constraint) whose geodesics were searched."""
+    geodesics = params.geodesics
+    pairs = [(m, c) for m in geodesics.searched for c in params.constraints]
+    pairs += [(m, c) for m in geodesics.illustrated for c in geodesics.illustrated_constraints]
+    return list(dict.fromkeys(pairs))
+
+
+def compare_planners(params: Params, layout: Layout) -> pd.DataFrame:
+    """One row a manifold, constraint and planner: the figures of `summarise`, sampled and learned
+    paths side by side.
+
+    Where curves are retracted the lengths are those of valid paths; where they are only decoded, as
+    in the paper, of all paths found (column `counted`), since hardly any of those keeps the
+    constraint.
+    """
+    items = searched_items(params)
+    if not items:
+        raise ReportError(
+            "geodesics.searched and geodesics.illustrated name no manifold: there is nothing "
+            "to compare"
+        )
+    tables = []
+    for manifold, constraint in items:
+        settings = params.manifolds[manifold]
+        counted: Counted = "valid" if settings.retract else "found"
+        summary = summarise(
+            read_comparison(params, layout, manifold, constraint), manifold, counted
+        )
+        about = {
+            "manifold": manifold,
+            "latent_dim": settings.latent_dim,
+            "constraint": constraint,
+            "counted": counted,
+        }
+        tables.append(pd.DataFrame([about] * len(summary)).join(summary))
+    return pd.concat(tables, ignore_index=True)
+
+
+def read_comparison(params: Params, layout: Layout, manifold: str, constraint: str) -> pd.DataFrame:
+    """The rows of all planners under one constraint, sampled first, in the order they are shown."""
+    sampled = read_paths(layout.report("benchmark_planners", constraint, "csv"), manifold)
+    sampled = sampled[sampled["planner"].isin(params.benchmark.planners)]
+    searched = read_paths(
+        layout.report("train_geodesics", f"{manifold}-{constraint}", "csv"), manifold
+    )
+    rows = pd.concat([sampled, searched], ignore_index=True)
+    return rows.sort_values(
+        "planner", key=lambda names: names.map(list(PLANNERS).index), kind="stable"
+    )
+
+
+def read_paths(file: Path, manifold: str) -> pd.DataFrame:
+    """Read and check a table of measured paths that has the latent length on `manifold`.
+
+    Raises ReportError naming the file and the column if a row can't be used.
+    """
+    columns = (
+        "length_rad",
+        f"latent_length_{manifold}",
+        "max_violation_rad",
+        "max_violation_m",
+        "time_s",
+    )
+    schema = pandera.DataFrameSchema(
+        {
+            "planner": pandera.Column(str, pandera.Check.isin(list(PLANNERS))),
+            **{name: pandera.Column(int) for name in ("query", "seed")},
+            **{name: pandera.Column(str) for name in ("status", *TEXTS)},
+            "valid": pandera.Column(bool),
+            **{name: pandera.Column(float, nullable=True) for name in columns},
+        }
+    )
+    frame = pd.read_csv(file, float_precision="round_trip", dtype=dict.fromkeys(TEXTS, str))
+    frame = frame.fillna(
+        dict.fromkeys(TEXTS, "")
+    )  # CSV does not tell an empty text from a missing one
+    try:
+        return schema.validate(frame)
+    except pandera.errors.SchemaError as error:
+        raise ReportError(f"{file}: {' '.join(str(error).split())[:300]}") from None
+
+
+def read_metrics(file: Path) -> dict[str, Any]:
+    """A stage's metrics.  Raises ReportError naming the file if it is not JSON."""
+    try:
+        content: dict[str, Any] = json.loads(file.read_text())
+    except json.JSONDecodeError as error:
+        raise ReportError(f"{file}: not JSON: {error}") from None
+    return content
+
+
+def result_table(layout: Layout) -> str:
+    """The result table as Markdown, from reports/table.csv; columns are aligned, so that it reads
+    in a terminal too.
+    """
+    table = pd.read_csv(layout.root / "reports" / "table.csv")
+    parts = []
+    for (manifold, latent_dim, counted), rows in table.groupby(
+        ["manifold", "latent_dim", "counted"], sort=False
+    ):
+        cells: list[Sequence[str]] = [COLUMNS]
+        for constraint, group in rows.groupby("constraint", sort=False):
+            for k, row in enumerate(records(group)):
+                cells.append((str(constraint) if k == 0 else "", *table_cells(row)))
+        heading = (
+            f"`{manifold}`, {latent_dim} latent dimensions; lengths are those of "
+            f"{COUNTED[str(counted)]}"
+        )
+        parts.append(f"{heading}:\n\n{markdown_table(cells)}")
+    return "\n\n".join(parts) + "\n"
+
+
+def geometry_table(layout: Layout) -> str:
+    """What the geometry core reaches, as Markdown, from reports/geometry.json."""
+    geometry = read_metrics(layout.root / "reports" / "geometry.json")
+    constraint = geometry["constraint"]
+    rates: list[Sequence[str]] = [
+        (f"on `{geometry['manifold']}`, a second", "here", "the usual way", "ratio")
+    ]
+    for suffix, told in (("", ""), ("_retracted", f", retracted onto {constraint}")):
+        lengths, steps = geometry[f"curve_length{suffix}"], geometry[f"environment{suffix}"]
+        rates += [
+            (
+                f"curve lengths, batches of {lengths['batch']}{told}",
+                f"{lengths['per_second']:,.0f}",
+                f"{lengths['naive_per_second']:,.0f}",
+                f"{lengths['ratio_to_naive']:.0f}",
+            ),
+            (
+                f"environment steps, PPO included{told}",
+                f"{steps['steps_per_second']:,.0f}",
+                f"{steps['dummy_vec_env_steps_per_second']:,.0f}",
+                f"{steps['ratio_to_dummy_vec_env']:.0f}",
+            ),
+        ]
+    found: list[Sequence[str]] = [
+        (
+            "length over exact distance, mean",
+            "random curve",
+            "policy (worst seed)",
+            "gradient",
+            "domain of the pairs",
+        )
+    ]
+    for name, searched in geometry["policy_search"].items():
+        found.append(
+            (
+                name,
+                f"{np.mean(searched['first_mean_ratio']):.3f}",
+                f"{max(searched['mean_ratio']):.4f}",
+                f"{geometry['solvers'][name]['gradient']['mean_ratio']:.5f}",
+                searched["domain"].replace("|", "\\|"),
+            )
+        )
+    return f"{markdown_table(rates)}\n\n{markdown_table(found)}\n"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What the table says of one thing, good and bad, in sentences."""
+
+    about: str
+    sentences: Sequence[str]
+
+
+def findings(
+    params: Params, table: pd.DataFrame, manifolds: Mapping[str, Mapping[str, float]]
+) -> list[Finding]:
+    """What was found on each manifold, and what to keep in mind.
+
+    table: what `compare_planners` returns.  manifolds: each learned manifold's held-out metrics.
+    """
+    told = [
+        _told_of(params, str(name), rows, manifolds[str(name)])
+        for name, rows in table.groupby("manifold", sort=False)
+    ]
+    sampled = table[~table["planner"].isin([LEARNED, *BESIDE])].drop_duplicates(
+        ["constraint", "planner"]
+    )
+    refused = ", ".join(
+        f"{PLANNERS[str(name)].label} {_share(rows, 'refused')}"
+        for name, rows in sampled.groupby("planner", sort=False)
+    )
+    seeds, queries = len(params.geodesics.seeds), params.queries.count
+    cautions = [
+        f"This is {queries} queries a constraint and {seeds} policies each: enough to see "
+        f"large differences, not small "
+        "ones.",
+        "Training the manifolds and policies is not in the planning times.",
+        "No planner's own word counts: of all rows, the share in which a sampling planner "
+        "returned a path that the "
+        f"judge refused is {refused}.",
+    ]
+    return [*told, Finding("To keep in mind", cautions)]
+
+
+def _told_of(
+    params: Params, manifold: str, rows: pd.DataFrame, held_out: Mapping[str, float]
+) -> Finding:
+    settings = params.manifolds[manifold]
+    learned, straight, random = (
+        rows[rows["planner"] == name].set_index("constraint")
+        for name in (LEARNED, STRAIGHT, RANDOM)
+    )
+    sampled = rows[~rows["planner"].isin([LEARNED, *BESIDE])]
+    how = (
+        "curves retracted onto the constraint"
+        if settings.retract
+        else "curves decoded and their ends corrected, nothing retracted"
+    )
+    shares = ", ".join(f"{name} {share:.0%}" for name, share in learned["success"].items())
+    others = ", ".join(
+        f"{PLANNERS[str(name)].label} {_share(group, 'success')}"
+        for name, group in sampled.groupby("planner", sort=False)
+    )
+    return Finding(
+        f"{manifold}: {settings.latent_dim} latent dimensions, {how}",
+        [
+            f"The judge accepts {_share(learned, 'success')} of the learned geodesics ({shares}).",
+            f"Under the same constraints it accepts {_share(straight, 'success')} of the "
+            f"straight latent lines, and of "
+            f"the sampling planners' answers: {others}.",
+            f"The learned geodesics returned violate the constraint by "
+            f"{short(learned['violation_max_deg'].max())}° at "
+            f"worst; the median path of the worst constraint by "
+            f"{short(learned['violation_median_deg'].max())}°.",
+            _shortest_under(rows),
+            f"The decoder reproduces unseen poses to "
+            f"{short(held_out['joint_error_mean_deg'])}° a joint (mean) "
+            f"and {short(held_out['tool_error_median_mm'])} mm at the tool (median).",
+            f"Without a policy, as many random curves as the search meets, chosen by the same "
+            f"rule, give "
+            f"{_share(random, 'success')}.",
+            f"No connection in the sampled graph, and so no search: "
+            f"{_share(learned, 'not_connected')} of the queries.",
+        ],
+    )
+
+
+def _shortest_under(rows: pd.DataFrame) -> str:
+    """Under which constraints the learned geodesic is the shortest, in the mean over the common
+    queries.
+    """
+    comparable = rows[~rows["planner"].isin(BESIDE)].dropna(subset=["latent_mean"])
+    shortest = comparable.loc[comparable.groupby("constraint", sort=False)["latent_mean"].idxmin()]
+    won = shortest.loc[shortest["planner"] == LEARNED, "constraint"].tolist()
+    lost = [
+        f"{row['constraint']} ({PLANNERS[row['planner']].label})"
+        for row in records(shortest[shortest["planner"] != LEARNED])
+    ]
+    told = (
+        f"On the queries that all planners solved, their mean latent length is the shortest "
+        f"under {_listed(won)}"
+    )
+    return f"{told}; another planner's is under {_listed(lost)}." if lost else f"{told}."
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names) or "no constraint"
+
+
+def _share(rows: pd.DataFrame, column: str) -> str:
+    return f"{float(np.average(rows[column], weights=rows['rows'])):.0%}" if len(rows) else "–"
+
+
+def table_cells(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """One row of the result table after its constraint."""
+    return (
+        PLANNERS[row["planner"]].label,
+        f"{row['success']:.0%}",
+        f"{row['compared']}/{row['queries']}",
+        fixed(row["latent_shortest"]),
+        plus_minus(row["latent_mean"], row["latent_std"], fixed),
+        fixed(row["length_mean_rad"]),
+        plus_minus(row["time_mean_s"], row["time_std_s"], short),
+        short(row["violation_median_deg"]),
+        short(row["violation_max_deg"]),
+    )
+
+
+def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows as dictionaries by column."""
+    return [{str(name): value for name, value in row.items()} for row in frame.to_dict("records")]
+
+
+def fixed(value: float) -> str:
+    """Two decimals, or a dash where there is no value."""
+    return "–" if np.isnan(value) else f"{value:.2f}"
+
+
+def short(value: float) -> str:
+    """Three digits, or a dash where there is no value."""
+    if np.isnan(value):
+        return "–"
+    return f"{value:.1e}" if 0 < abs(value) < 1e-3 else f"{value:.3g}"
+
+
+def plus_minus(mean: float, deviation: float, number: Callable[[float], str]) -> str:
+    """A mean and its deviation, if it has one."""
+    return number(mean) if np.isnan(deviation) else f"{number(mean)} ± {number(deviation)}"
+
+
+def markdown_table(rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table, its header first; columns are aligned, so that it reads in a terminal
+    too.
+    """
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    # names to the left, figures to the right
+    padded = [
+        [
+            cell.ljust(width) if k < 2 else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        for row in rows
+    ]
+    rule = ["-" * width if k < 2 else "-" * (width - 1) + ":" for k, width in enumerate(widths)]
+    return "\n".join("| " + " | ".join(row) + " |" for row in [padded[0], rule, *padded[1:]])

@@ -1,0 +1,439 @@
+"""PyBullet as the judge: tool poses, self-collision and collision with the workcell of given
+configurations.
+
+The only importer of pybullet.  Every world is a physics client of its own in DIRECT mode; nothing
+is simulated here.
+"""
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from constraint_geodesics.robot.kinematics import SerialRobot
+
+
+@dataclass(frozen=True)
+class Box:
+    """A fixed box: its centre and edge lengths [m], and the robot's links that may touch it."""
+
+    name: str
+    centre: tuple[float, float, float]
+    size: tuple[float, float, float]
+    exempt_links: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A fixed sphere: its centre and radius [m], and the robot's links that may touch it."""
+
+    name: str
+    centre: tuple[float, float, float]
+    radius: float
+    exempt_links: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Body:
+    """A fixed body read from a URDF at a pose [m, rad], and the robot's links that may touch it."""
+
+    name: str
+    urdf: Path
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    exempt_links: tuple[str, ...] = ()
+
+
+Solid = Box | Sphere | Body
+"""What can stand in a workcell."""
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What PyBullet says of n configurations."""
+
+    position: Float[np.ndarray, "n 3"]
+    """Tool position in the base frame [m]."""
+    quaternion: Float[np.ndarray, "n 4"]
+    """Tool orientation x, y, z, w."""
+    rpy: Float[np.ndarray, "n 3"]
+    """Roll, pitch, yaw [rad], for people: they wrap and lock."""
+    self_collision: Bool[np.ndarray, "n"]
+    workcell_collision: Bool[np.ndarray, "n"]
+
+
+@dataclass(frozen=True)
+class LoadedLink:
+    """One link of the chain to the tool as PyBullet holds it, with the joint that carries it.
+
+    A link's pose is that of its inertial frame.  At joint value 0 the joint lies at
+    `joint_position` [m] in the parent's inertial frame, and `quaternion` (x, y, z, w) turns this
+    link's inertial frame into the parent's.
+    """
+
+    name: str
+    kind: str
+    """revolute, prismatic, fixed, or another of PyBullet's joint types."""
+    column: int | None
+    """Which entry of a configuration moves the joint; None for none."""
+    axis: tuple[float, float, float]
+    """Of the joint, in this link's inertial frame."""
+    joint_position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+    inertial_position: tuple[float, float, float]
+    """Of the inertial frame in the link's own frame, whose origin is the joint [m]."""
+    inertial_quaternion: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class LoadedChain:
+    """PyBullet's model from the base to the tool: the pose of the base's inertial frame [m], then
+    each link.
+    """
+
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+    links: tuple[LoadedLink, ...]
+
+
+@dataclass(frozen=True)
+class LinkHull:
+    """Corners of one link's collision shapes (n, 3) [m] in the frame that joint `joint` carries;
+    -1: the base's.
+    """
+
+    link: str
+    joint: int
+    points: Float[np.ndarray, "n 3"]
+
+
+def data_path() -> Path:
+    """Folder of the robots and meshes that ship with PyBullet."""
+    with _quiet():
+        import pybullet_data
+    return Path(pybullet_data.getDataPath())
+
+
+class World:
+    """One robot among fixed bodies.  Adjacent links and exempt links may touch; nothing else may.
+
+    Raises FileNotFoundError if a URDF is missing and ValueError if an exempt link is not the
+    robot's.
+    """
+
+    def __init__(self, robot: SerialRobot, fixed: Sequence[Solid] = ()) -> None:
+        with _quiet():
+            import pybullet
+        self._bullet = pybullet
+        self.robot = robot
+        self._client = pybullet.connect(pybullet.DIRECT)
+        flags = pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
+        with _quiet():
+            self._body = pybullet.loadURDF(
+                str(robot.urdf), useFixedBase=True, flags=flags, physicsClientId=self._client
+            )
+        info = [
+            pybullet.getJointInfo(self._body, i, physicsClientId=self._client)
+            for i in range(pybullet.getNumJoints(self._body, physicsClientId=self._client))
+        ]
+        joint_index = {row[1].decode(): row[0] for row in info}
+        self._link_index = {row[12].decode(): row[0] for row in info}
+        self._link_index[
+            pybullet.getBodyInfo(self._body, physicsClientId=self._client)[0].decode()
+        ] = -1
+        self._joints = [joint_index[name] for name in robot.joint_names]
+        self._tool = self._link_index[robot.tool_link]
+        self._exempt = {self._add(body): self._links(body) for body in fixed}
+        for body, links in self._exempt.items():
+            for link in links:  # a pair that may touch need not be examined again and again
+                pybullet.setCollisionFilterPair(
+                    self._body, body, link, -1, 0, physicsClientId=self._client
+                )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the physics client."""
+        if self._bullet.isConnected(self._client):
+            self._bullet.disconnect(self._client)
+
+    def label(self, q: Float[np.ndarray, "n D"]) -> Labels:
+        """Tool pose and collisions of each configuration [rad]."""
+        poses, collisions = [], []
+        for row in q:
+            self._place(row)
+            state = self._bullet.getLinkState(
+                self._body, self._tool, computeForwardKinematics=1, physicsClientId=self._client
+            )
+            poses.append((*state[4], *state[5]))
+            collisions.append(self._collisions())
+        table = np.array(poses).reshape(-1, 7)
+        hits = np.array(collisions, dtype=bool).reshape(-1, 2)
+        rpy = [self._bullet.getEulerFromQuaternion(quaternion) for quaternion in table[:, 3:]]
+        return Labels(
+            table[:, :3], table[:, 3:], np.array(rpy).reshape(-1, 3), hits[:, 0], hits[:, 1]
+        )
+
+    def is_free(self, q: Float[np.ndarray, "D"]) -> bool:
+        """Whether one configuration touches neither itself nor the workcell."""
+        self._place(q)
+        return not any(self._collisions())
+
+    def free(self, q: Float[np.ndarray, "n D"]) -> Bool[np.ndarray, "n"]:
+        """Which configurations touch neither themselves nor the workcell."""
+        return np.array([self.is_free(row) for row in q], dtype=bool)
+
+    def first_collision(self, q: Float[np.ndarray, "n D"]) -> int | None:
+        """Index of the first configuration that is not free; None where all are."""
+        for index, values in enumerate(np.asarray(q, float)[:, :, None].tolist()):
+            self._bullet.resetJointStatesMultiDof(
+                self._body, self._joints, values, physicsClientId=self._client
+            )
+            if any(self._collisions()):
+                return index
+        return None
+
+    def loaded_chain(self) -> LoadedChain:
+        """The chain from the base to the tool, as PyBullet understood the URDF."""
+        bullet, body, client = self._bullet, self._body, self._client
+        kinds = {
+            bullet.JOINT_REVOLUTE: "revolute",
+            bullet.JOINT_PRISMATIC: "prismatic",
+            bullet.JOINT_FIXED: "fixed",
+        }
+        links: list[LoadedLink] = []
+        link = self._tool
+        while link >= 0:
+            info = bullet.getJointInfo(body, link, physicsClientId=client)
+            dynamics = bullet.getDynamicsInfo(body, link, physicsClientId=client)
+            x, y, z, w = info[
+                15
+            ]  # it turns the parent's coordinates into this link's: the inverse is recorded
+            links.append(
+                LoadedLink(
+                    info[12].decode(),
+                    kinds.get(info[2], f"PyBullet's type {info[2]}"),
+                    self._joints.index(link) if link in self._joints else None,
+                    info[13],
+                    info[14],
+                    (-x, -y, -z, w),
+                    dynamics[3],
+                    dynamics[4],
+                )
+            )
+            link = info[16]
+        position, quaternion = bullet.getBasePositionAndOrientation(body, physicsClientId=client)
+        return LoadedChain(position, quaternion, tuple(reversed(links)))
+
+    def hulls(self) -> list[LinkHull]:
+        """The collision shapes of all links that have one."""
+        bullet, body, client = self._bullet, self._body, self._client
+        self._place(np.zeros(self.robot.dof))
+        frames = _joint_frames(self.robot)
+        found = []
+        for link, index in sorted(self._link_index.items(), key=lambda item: item[1]):
+            shapes = bullet.getCollisionShapeData(body, index, physicsClientId=client)
+            points = np.concatenate(
+                [np.empty((0, 3)), *(self._corners(index, shape) for shape in shapes)]
+            )
+            if not len(points) or index < 0:
+                continue
+            state = bullet.getLinkState(
+                body, index, computeForwardKinematics=1, physicsClientId=client
+            )
+            rotation = np.array(bullet.getMatrixFromQuaternion(state[1])).reshape(3, 3)
+            joint = self._carrier(index)
+            pose = np.linalg.inv(frames[joint]) if joint >= 0 else np.eye(4)
+            in_base = points @ rotation.T + state[0]
+            found.append(LinkHull(link, joint, in_base @ pose[:3, :3].T + pose[:3, 3]))
+        return found
+
+    def _corners(self, link: int, shape: tuple) -> Float[np.ndarray, "n 3"]:
+        """Outermost points of one collision shape in the link's inertial frame; those of a round
+        one are many.
+        """
+        bullet = self._bullet
+        kind, size = shape[2], np.array(shape[3])
+        if kind == bullet.GEOM_MESH:
+            with _quiet():
+                mesh = bullet.getMeshData(self._body, link, physicsClientId=self._client)[1]
+            if mesh:  # of a link with one shape; it is in the inertial frame already
+                return np.array(mesh).reshape(-1, 3)
+            points = _mesh_vertices(Path(shape[4].decode())) * size
+        elif kind == bullet.GEOM_BOX:
+            points = (
+                0.5
+                * size
+                * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+            )
+        elif kind == bullet.GEOM_SPHERE:
+            points = size[0] * directions(96)
+        elif kind == bullet.GEOM_CYLINDER:
+            turn = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
+            rim = size[1] * np.stack([np.cos(turn), np.sin(turn), np.zeros(32)], axis=1)
+            points = np.concatenate(
+                [rim + np.array([0.0, 0.0, z]) for z in (-0.5 * size[0], 0.5 * size[0])]
+            )
+        elif kind == bullet.GEOM_CAPSULE:
+            ball = size[1] * directions(96)
+            points = np.concatenate(
+                [ball + np.array([0.0, 0.0, z]) for z in (-0.5 * size[0], 0.5 * size[0])]
+            )
+        else:
+            return np.empty((0, 3))
+        rotation = np.array(bullet.getMatrixFromQuaternion(shape[6])).reshape(3, 3)
+        return points @ rotation.T + shape[5]
+
+    def _carrier(self, link: int) -> int:
+        """Which joint of the chain moves a link last; -1 for none."""
+        while link >= 0:
+            if link in self._joints:
+                return self._joints.index(link)
+            link = self._bullet.getJointInfo(self._body, link, physicsClientId=self._client)[16]
+        return -1
+
+    def _place(self, q: np.ndarray) -> None:
+        self._bullet.resetJointStatesMultiDof(
+            self._body, self._joints, [[float(x)] for x in q], physicsClientId=self._client
+        )
+
+    def _collisions(self) -> tuple[bool, bool]:
+        self._bullet.performCollisionDetection(physicsClientId=self._client)
+        own = workcell = False
+        for contact in self._bullet.getContactPoints(
+            bodyA=self._body, physicsClientId=self._client
+        ):
+            if contact[8] >= 0.0:  # a contact is listed from a small positive distance on
+                continue
+            if contact[2] == self._body:
+                own = True
+            elif contact[3] not in self._exempt[contact[2]]:
+                workcell = True
+        return own, workcell
+
+    def _add(self, body: Solid) -> int:
+        bullet, client = self._bullet, self._client
+        if isinstance(body, Box):
+            half = [0.5 * edge for edge in body.size]
+            shape = bullet.createCollisionShape(
+                bullet.GEOM_BOX, halfExtents=half, physicsClientId=client
+            )
+            return int(
+                bullet.createMultiBody(0, shape, basePosition=body.centre, physicsClientId=client)
+            )
+        if isinstance(body, Sphere):
+            shape = bullet.createCollisionShape(
+                bullet.GEOM_SPHERE, radius=body.radius, physicsClientId=client
+            )
+            return int(
+                bullet.createMultiBody(0, shape, basePosition=body.centre, physicsClientId=client)
+            )
+        if not body.urdf.is_file():
+            raise FileNotFoundError(f"workcell {body.name!r}: no such URDF file: {body.urdf}")
+        with _quiet():
+            return int(
+                bullet.loadURDF(
+                    str(body.urdf),
+                    basePosition=body.position,
+                    baseOrientation=bullet.getQuaternionFromEuler(body.rpy),
+                    useFixedBase=True,
+                    physicsClientId=client,
+                )
+            )
+
+    def _links(self, body: Solid) -> frozenset[int]:
+        unknown = [name for name in body.exempt_links if name not in self._link_index]
+        if unknown:
+            raise ValueError(
+                f"workcell {body.name!r}: {unknown} are not links of {self.robot.name}"
+            )
+        return frozenset(self._link_index[name] for name in body.exempt_links)
+
+
+def _mesh_vertices(file: Path) -> Float[np.ndarray, "n 3"]:
+    """Vertices of an OBJ file; none of another kind of file."""
+    if file.suffix.lower() != ".obj" or not file.is_file():
+        return np.empty((0, 3))
+    rows = [
+        line.split()[1:4]
+        for line in file.read_text(errors="replace").splitlines()
+        if line.startswith("v ")
+    ]
+    return np.array(rows, float).reshape(-1, 3)
+
+
+def directions(count: int) -> Float[np.ndarray, "count 3"]:
+    """Evenly spread unit vectors (Fibonacci's lattice)."""
+    k = np.arange(count) + 0.5
+    height, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + np.sqrt(5.0)) * k
+    width = np.sqrt(1.0 - height**2)
+    return np.stack([width * np.cos(turn), width * np.sin(turn), height], axis=1)
+
+
+def _joint_frames(robot: SerialRobot) -> list[Float[np.ndarray, "4 4"]]:
+    """The frame of each joint in the base frame, all joints at 0."""
+    frames = [robot.chain.base]
+    for origin in robot.chain.origins:
+        frames.append(frames[-1] @ origin)
+    return frames[1:]
+
+
+@dataclass(frozen=True)
+class Physics:
+    """A world's PyBullet module and client, with the indices of its robot, for what simulates
+    instead of judging.
+    """
+
+    bullet: Any
+    client: int
+    body: int
+    joints: tuple[int, ...]
+    tool: int
+    fixed: tuple[int, ...]
+
+
+def physics(world: World) -> Physics:
+    """What simulating in a world takes; the world is no judge afterwards, and closing it ends the
+    simulation.
+    """
+    return Physics(
+        world._bullet,
+        world._client,
+        world._body,
+        tuple(world._joints),
+        world._tool,
+        tuple(world._exempt),
+    )
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence the lines that the library writes past Python straight to the process's output."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    saved = [(stream, os.dup(stream)) for stream in (1, 2)]
+    try:
+        with open(os.devnull, "w") as nothing:
+            for stream, _ in saved:
+                os.dup2(nothing.fileno(), stream)
+        yield
+    finally:
+        for stream, copy in saved:
+            os.dup2(copy, stream)
+            os.close(copy)

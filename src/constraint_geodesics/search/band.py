@@ -1,0 +1,168 @@
+"""The elastic band: a chain of points on the constraint, shortened by Newton's method, and the
+curve through it.
+
+The short second-order refinement of a proposed curve.  It works in joint space on the exact
+constraint, within the joint limits and clear of the workcell's boxes; the arithmetic is in
+band_kernels.py.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.constraints import kernels
+from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.scene.clearance import ClearanceModel, clearance_batch, no_clearance
+from constraint_geodesics.search import band_kernels
+
+ACCURACY = 1e-9
+"""Violation [rad or m] that is left on a point of a curve, at most."""
+_PROJECTIONS = 12
+_LONGEST_STEP = 0.6
+_COINCIDENT = 1e-12
+_ZERO = np.zeros(1)
+
+
+@dataclass(frozen=True)
+class BandSettings:
+    """segments: of the band.  iterations: of Newton's method, at most.  accuracy: relative decrease
+    of the energy below which it stops.  largest_step_rad: of one node in one iteration.
+    clearance_m: kept to the workcell's boxes, no less than what PyBullet's own margin of its
+    collision shapes asks for.
+    """
+
+    segments: int = 16
+    iterations: int = 30
+    accuracy: float = 1e-5
+    largest_step_rad: float = 0.5
+    clearance_m: float = 0.006
+
+
+@dataclass(frozen=True)
+class BandSpace:
+    """The configurations a band may use: on the constraint, within the joint limits, clear of
+    boxes.
+    """
+
+    manifold: ConstraintManifold
+    clearance: ClearanceModel
+    clearance_m: float
+
+    @property
+    def arrays(self) -> tuple:
+        """The kernels' arguments, in their order."""
+        robot = self.manifold.robot
+        return (
+            robot.chain.arrays,
+            self.manifold.held,
+            self.manifold.tolerance,
+            *self.manifold.reference_arrays,
+            np.stack([robot.lower, robot.upper]),
+            self.clearance.arrays,
+            self.clearance_m,
+        )
+
+    def without_boxes(self) -> "BandSpace":
+        """The same with an empty workcell."""
+        return BandSpace(self.manifold, no_clearance(self.manifold.robot.dof), 0.0)
+
+
+@dataclass(frozen=True)
+class Band:
+    """A relaxed band: nodes (n + 1, D) [rad], what is left of the violation, iterations, and
+    whether it converged.
+    """
+
+    nodes: Float[np.ndarray, "n D"]
+    violation: float
+    iterations: int
+    converged: bool
+
+
+def relax(space: tuple, nodes: Float[np.ndarray, "n D"], settings: BandSettings) -> Band:
+    """The shortest band near the given one, its ends fixed.  space: `BandSpace.arrays`, taken once
+    for many bands.
+    """
+    moved = np.array(nodes, np.float64)
+    left, iterations, converged = band_kernels.relax_band(
+        space, moved, settings.iterations, settings.accuracy, settings.largest_step_rad
+    )
+    return Band(moved, left, iterations, converged)
+
+
+@dataclass(frozen=True)
+class BandCurve:
+    """The continuous curve through a band: a cubic spline over arc length, every point projected
+    onto the space.
+
+    Both ends are the band's, to the bit.
+    """
+
+    space: tuple
+    nodes: Float[np.ndarray, "n D"]
+    knots: Float[np.ndarray, "n"]
+    moments: Float[np.ndarray, "n D"]
+
+    @classmethod
+    def through(cls, space: tuple, nodes: Float[np.ndarray, "n D"]) -> "BandCurve | None":
+        """None where nodes coincide or are not finite, so that there is no curve."""
+        steps = step_lengths(nodes)
+        if not (np.isfinite(steps).all() and steps.min(initial=np.inf) > _COINCIDENT):
+            return None
+        knots = np.concatenate([_ZERO, np.cumsum(steps)])
+        return cls(space, nodes, knots, band_kernels.spline_moments(knots, nodes))
+
+    @property
+    def length(self) -> float:
+        """Of the band [rad]: the range of the spline's parameter."""
+        return float(self.knots[-1])
+
+    def at(self, s: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n D"], float]:
+        """Points at shares of the way from 0 to 1, rising [rad], and what is left of the violation,
+        limits included.
+        """
+        points = np.empty((len(s), self.nodes.shape[1]))
+        band_kernels.spline_points(self.knots, self.nodes, self.moments, s * self.length, points)
+        left = project(self.space, points)
+        points[s == 0.0], points[s == 1.0] = self.nodes[0], self.nodes[-1]
+        return points, left
+
+
+def step_lengths(points: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T-1"]:
+    """Distances between neighbouring points [rad]; `norm` and `diff` would cost as much again in
+    calls.
+    """
+    return np.sqrt(np.square(points[1:] - points[:-1]).sum(axis=1))
+
+
+def project(space: tuple, points: Float[np.ndarray, "n D"]) -> float:
+    """Move points onto the space, in place; returns what is left of the violation [rad or m].
+
+    The constraint alone is cheap; limits and boxes are taken together with it only where one of
+    them is broken.
+    """
+    chain, held, tolerance, position, rotation, limits, model, margin = space
+    worst = np.empty(len(points))
+    kernels.retract_batch(
+        chain,
+        held,
+        np.broadcast_to(tolerance, (len(points), 6)),
+        position,
+        rotation,
+        points,
+        ACCURACY,
+        _PROJECTIONS,
+        _LONGEST_STEP,
+        worst,
+    )
+    beyond = ((points < limits[0]) | (points > limits[1])).any(axis=1)
+    if len(model[0]):
+        smallest = np.empty(len(points))
+        clearance_batch(chain, model, 2.0 * margin, points, smallest)
+        beyond |= smallest < margin
+    if beyond.any():
+        rows = points[beyond]
+        worst[beyond] = band_kernels.project_rows(space, rows, _PROJECTIONS)
+        points[beyond] = rows
+    return float(worst.max(initial=0.0))

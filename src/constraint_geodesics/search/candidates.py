@@ -1,0 +1,372 @@
+"""The project's own planner: proposals of a curve, the shortest of which is refined by an elastic
+band.
+
+Proposals are tried in the order of what they cost: the straight joint line, curves of the policies
+on the learned manifold, the sub-manifold's graph, two trees grown towards each other.  Each is
+relaxed by Newton's method on the exact constraint; the shortest curve that is continuous, within
+the limits and clear of the workcell's boxes and spheres is drawn as rows so close together that the
+straight lines between them keep the constraint, and goes to the caller, who has it certified.
+"""
+
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Literal, Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.scene.clearance import ClearanceModel, clearance_batch
+from constraint_geodesics.search.band import BandCurve, BandSettings, BandSpace, relax, step_lengths
+from constraint_geodesics.search.roadmap import Joined, Roadmap, join, resample, shortest_way
+from constraint_geodesics.search.tree import tree_way
+
+Status = Literal["not_connected", "not_found"]
+Source = Literal["straight", "policy", "graph", "tree", "bend"]
+
+CHECK_STEP = 0.1
+"""Distance of the points at which a relaxed curve is first looked at [rad]."""
+JUMP = 3.0
+"""A step between two of these points longer than so many times CHECK_STEP is a jump to another
+branch.
+"""
+ROW_SAFETY = 0.8
+"""Share of the allowed violation between two rows that their distance is chosen for."""
+PARTLY_RELAXED = (3, 1, 0)
+"""Iterations of a band that must stay near the graph."""
+HALVINGS = 8
+"""Times that rows are drawn closer where the lines between them still leave the constraint."""
+LONGEST_ROW_STEP = 0.08
+"""Distance of two rows at most [rad], however flat the path."""
+TREES = 4
+"""Pairs of trees that are grown where all else failed."""
+BENDS = 4
+"""Bent lines that are tried for each pair of trees, where a path is to be improved: they cost less.
+"""
+
+
+class Proposals(Protocol):
+    """Curves proposed for a query, as points (K, n + 1, D) [rad] from start to goal, the most
+    promising first.
+    """
+
+    def __call__(
+        self,
+        manifold: ConstraintManifold,
+        start: Float[np.ndarray, "D"],
+        goal: Float[np.ndarray, "D"],
+        points: int,
+    ) -> Float[np.ndarray, "K n D"]:
+        """Some curves, each of which need not be continuous."""
+        ...
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Which parts of the planner are switched on; all of them but for an ablation."""
+
+    straight: bool = True
+    policy: bool = True
+    graph: bool = True
+    refinement: bool = True
+    tree: bool = True
+
+
+ALL_PARTS = Parts()
+
+
+@dataclass(frozen=True)
+class Task:
+    """One constraint, prepared: the space of its configurations with and without the workcell's
+    boxes, its graph.
+
+    roadmap: the graph, made when it is first asked for; None where there is none.  has_graph:
+    whether it came with the planner.
+    """
+
+    manifold: ConstraintManifold
+    clearance: ClearanceModel
+    roadmap: Callable[[], Roadmap | None]
+    has_graph: bool
+    settings: BandSettings = field(default_factory=BandSettings)
+
+    def __post_init__(self) -> None:
+        space = BandSpace(self.manifold, self.clearance, self.settings.clearance_m)
+        object.__setattr__(self, "clear", space.arrays)
+        object.__setattr__(self, "open", space.without_boxes().arrays)
+
+    clear: tuple = field(init=False, repr=False)
+    open: tuple = field(init=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A curve that looks sound: where it came from, its length [rad], and points about CHECK_STEP
+    apart.
+    """
+
+    source: Source
+    curve: BandCurve
+    length: float
+    shares: Float[np.ndarray, "n"]
+    points: Float[np.ndarray, "n D"]
+    iterations: int
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What `candidates` ended with where nothing was found, and how the ends are joined to the
+    graph.
+    """
+
+    status: Status
+    at_start: Joined | None = None
+    at_goal: Joined | None = None
+
+
+def candidates(
+    task: Task,
+    start: Float[np.ndarray, "D"],
+    goal: Float[np.ndarray, "D"],
+    proposals: Callable[[], Proposals | None],
+    parts: Parts = ALL_PARTS,
+) -> Iterator[Candidate | Answer]:
+    """Sound curves from the cheapest proposals to the dearest, of one kind the shortest first; an
+    Answer ends them.
+
+    A straight start that leads through a box is pushed out of it only after the graph was asked:
+    that takes longer.
+
+    A graph that came with the planner goes before the policies, which take longer to ask; one that
+    has to be made, which takes longer still, after them.  Trees come last, and not where the graph
+    holds the ends to be unconnected.
+    """
+    segments = task.settings.segments
+    blocked = None
+    if parts.straight:
+        share = np.linspace(0.0, 1.0, segments + 1)[:, None]
+        found = _relaxed(
+            task,
+            "straight",
+            (1.0 - share) * start + share * goal,
+            _settings(task, parts.refinement),
+        )
+        if found is not None and _is_clear(task, found.points):
+            yield found
+        else:
+            blocked = found
+    asked = parts.policy and not (parts.graph and task.has_graph)
+    if asked:
+        yield from _proposed(task, proposals(), start, goal, parts.refinement)
+    answer = Answer("not_found")
+    if parts.graph:
+        answer = yield from _over_graph(task, start, goal, parts.refinement, blocked is not None)
+    if blocked is not None and parts.refinement:
+        pushed = _relaxed(task, "straight", blocked.curve.nodes, task.settings, boxes=True)
+        if pushed is not None and _is_clear(task, pushed.points):
+            yield pushed
+    if parts.policy and not asked and answer.status != "not_connected":
+        yield from _proposed(task, proposals(), start, goal, parts.refinement)
+    if parts.tree and answer.status != "not_connected":
+        for seed in range(TREES):
+            yield from _over_tree(task, start, goal, parts.refinement, seed)
+    yield answer
+
+
+def improvements(
+    task: Task,
+    start: Float[np.ndarray, "D"],
+    goal: Float[np.ndarray, "D"],
+    parts: Parts = ALL_PARTS,
+) -> Iterator[Candidate | None]:
+    """Further curves, for as long as the caller has time: the straight line pushed out of what it
+    leads through, lines bent past configurations of the graph, and now and then the way of new
+    trees, all relaxed; None for one that is not sound.
+
+    Which is tried when depends on nothing but the query.
+    """
+    rng, segments = np.random.default_rng(0), task.settings.segments
+    t = np.linspace(0.0, 1.0, segments + 1)[:, None]
+    line = (1.0 - t) * start + t * goal
+    roadmap = task.roadmap() if parts.graph else None
+    nodes = np.empty((0, len(start))) if roadmap is None else roadmap.joints
+    seed = TREES
+    if parts.straight:
+        yield refined(task, "straight", line, boxes=True)
+    while parts.tree or len(nodes):
+        for _ in range(BENDS if len(nodes) else 0):
+            bend = rng.uniform() * (nodes[rng.integers(len(nodes))] - 0.5 * (start + goal))
+            bent = line + 4.0 * t * (1.0 - t) * bend
+            bent[0], bent[-1] = start, goal
+            yield refined(task, "bend", bent)
+        if parts.tree:
+            yield next(_over_tree(task, start, goal, refine=True, seed=seed), None)
+        seed += 1
+
+
+def _proposed(
+    task: Task,
+    proposals: Proposals | None,
+    start: Float[np.ndarray, "D"],
+    goal: Float[np.ndarray, "D"],
+    refine: bool,
+) -> Iterator[Candidate]:
+    if proposals is None:
+        return
+    curves = proposals(task.manifold, start, goal, task.settings.segments + 1)
+    relaxed = [refined(task, "policy", nodes, refine) for nodes in curves]
+    yield from sorted((c for c in relaxed if c is not None), key=lambda c: c.length)
+
+
+def _over_graph(
+    task: Task,
+    start: Float[np.ndarray, "D"],
+    goal: Float[np.ndarray, "D"],
+    refine: bool,
+    boxes: bool,
+) -> Generator[Candidate, None, Answer]:
+    """The relaxed way over the graph; returns how the ends are joined to it.  boxes: whether some
+    are in the way.
+    """
+    roadmap = task.roadmap()
+    if roadmap is None:
+        return Answer("not_found")
+    at_start, at_goal = join(roadmap, task.clear, start), join(roadmap, task.clear, goal)
+    if not (at_start.components(roadmap) & at_goal.components(roadmap)):
+        apart = len(at_start.nodes) > 0 and len(at_goal.nodes) > 0
+        return Answer("not_connected" if apart else "not_found", at_start, at_goal)
+    corners = shortest_way(roadmap, start, goal, at_start, at_goal, task.clear)
+    if corners is not None:
+        yield from _along(task, "graph", corners, refine, boxes)
+    return Answer("not_found", at_start, at_goal)
+
+
+def _over_tree(
+    task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], refine: bool, seed: int
+) -> Iterator[Candidate]:
+    corners = tree_way(task.clear, start, goal, seed)
+    if corners is not None:
+        yield from _along(task, "tree", corners, refine, boxes=True)
+
+
+def _along(
+    task: Task, source: Source, corners: Float[np.ndarray, "k D"], refine: bool, boxes: bool
+) -> Iterator[Candidate]:
+    """The relaxed way over a graph or tree, with more nodes where fewer jump; then less and less
+    relaxed, since the graph's own edges are free of collisions that a band knows nothing of, those
+    of the arm with itself.
+    """
+    segments = task.settings.segments
+    if refine:
+        for pieces in (segments, 2 * segments, 4 * segments):
+            found = refined(task, source, resample(corners, pieces + 1), boxes=boxes)
+            if found is not None:
+                yield found
+                break
+    for iterations in PARTLY_RELAXED if refine else (0,):
+        partly = replace(task, settings=replace(task.settings, iterations=iterations))
+        found = refined(partly, source, resample(corners, 4 * segments + 1), boxes=boxes)
+        if found is not None:
+            yield found
+
+
+def refined(
+    task: Task,
+    source: Source,
+    nodes: Float[np.ndarray, "n D"],
+    refine: bool = True,
+    boxes: bool = False,
+) -> Candidate | None:
+    """The curve through the relaxed nodes; None if it jumps, leaves the limits or runs into a box.
+
+    Most curves never meet a box: they are relaxed without, and again with them only where they do.
+    boxes: take them into account at once.
+    """
+    settings = _settings(task, refine)
+    if not boxes:
+        found = _relaxed(task, source, nodes, settings)
+        if found is not None and _is_clear(task, found.points):
+            return found
+        if found is None and source not in ("graph", "tree"):
+            return None
+    found = _relaxed(task, source, nodes, settings, boxes=True)
+    return found if found is not None and _is_clear(task, found.points) else None
+
+
+def _settings(task: Task, refine: bool) -> BandSettings:
+    return task.settings if refine else replace(task.settings, iterations=0)
+
+
+def _relaxed(
+    task: Task,
+    source: Source,
+    nodes: Float[np.ndarray, "n D"],
+    settings: BandSettings,
+    boxes: bool = False,
+) -> Candidate | None:
+    """The curve through relaxed nodes, whether or not it runs into a box."""
+    space = task.clear if boxes else task.open
+    band = relax(space, nodes, settings)
+    return _sound(space, source, band.nodes, band.iterations)
+
+
+def _sound(
+    space: tuple, source: Source, nodes: Float[np.ndarray, "n D"], iterations: int
+) -> Candidate | None:
+    """The curve through nodes if its points keep the constraint and the limits, without a jump."""
+    curve = BandCurve.through(space, nodes)
+    if curve is None:
+        return None
+    shares = np.linspace(0.0, 1.0, max(int(np.ceil(curve.length / CHECK_STEP)), 2) + 1)
+    points, left = curve.at(shares)
+    steps = step_lengths(points)
+    longest = JUMP * curve.length / (len(shares) - 1)
+    if left > 1e-6 or steps.max() > longest:
+        return None
+    return Candidate(source, curve, float(steps.sum()), shares, points, iterations)
+
+
+def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
+    if not len(task.clearance.points):
+        return True
+    smallest = np.empty(len(points))
+    robot, margin = task.manifold.robot, task.settings.clearance_m
+    clearance_batch(robot.chain.arrays, task.clear[6], 2.0 * margin, points, smallest)
+    # the ends are what they are; PyBullet has the last word on them
+    return bool(smallest[1:-1].min(initial=np.inf) >= 0.5 * margin)
+
+
+def rows_of(
+    task: Task, candidate: Candidate, violation: float
+) -> tuple[Float[np.ndarray, "T"], Float[np.ndarray, "T D"]]:
+    """Rows so close that straight joint lines between them leave the constraint by less than
+    `violation` [rad or m].
+
+    Between two points h apart a straight line is off by r''h²/8; halfway it is measured, and h
+    chosen from it.  Near a singular configuration r'' changes faster than that: lines that are
+    still off are halved.
+    Returns the shares of the way and the rows (T, D).
+    """
+    allowed = ROW_SAFETY * violation
+    points = candidate.points
+    steps = step_lengths(points)
+    pieces = np.maximum(np.sqrt(_halfway(task, points) / allowed), steps / LONGEST_ROW_STEP)
+    pieces = np.maximum(np.ceil(pieces), 1.0).astype(int)
+    shares = np.concatenate(
+        [[0.0], np.cumsum(np.repeat(np.diff(candidate.shares) / pieces, pieces))]
+    )
+    shares[-1] = 1.0
+    rows, _ = candidate.curve.at(shares)
+    for _ in range(HALVINGS):
+        steps = step_lengths(rows)
+        off = np.flatnonzero((_halfway(task, rows) > allowed) | (steps > 1.1 * LONGEST_ROW_STEP))
+        if not len(off):
+            break
+        between = 0.5 * (shares[off] + shares[off + 1])
+        new, _ = candidate.curve.at(between)
+        shares, rows = np.insert(shares, off + 1, between), np.insert(rows, off + 1, new, axis=0)
+    return shares, rows
+
+
+def _halfway(task: Task, points: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T-1"]:
+    return task.manifold.violation(0.5 * (points[1:] + points[:-1]))

@@ -1,0 +1,292 @@
+"""Paths over a sub-manifold's graph: where a straight start jumps, or goes through the table, the
+graph leads round.
+
+The graph of `constraints/submanifold.py` (eq. 8) with a query's two ends joined to it, searched by
+A* [Hart et al. 1968] with the straight joint distance as the bound from below.  Compiled; PyBullet
+checked the graph's own edges when it was made; the edges to a query's ends, and those of the way
+that is found, are checked here for jumps, limits and the workcell's boxes and spheres.
+"""
+
+import heapq
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import njit
+
+from constraint_geodesics.geometry.graph import components, nearest_neighbour_edges
+from constraint_geodesics.learning.submanifold import GraphSubmanifold
+from constraint_geodesics.search.band_kernels import project_node, workspace
+
+_COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
+NEAREST = 32
+"""Nodes that an end is tried to be joined to, the nearest first."""
+JOINED = 4
+"""Nodes that are enough for an end."""
+EDGE_STEP = 0.15
+"""Distance of the points that an edge is checked at [rad]."""
+_NO_EDGES = np.empty((0, 2), dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class Roadmap:
+    """A graph in joint space: nodes (n, D) [rad], undirected edges (m, 2) with lengths (m,) [rad],
+    components (n,).
+    """
+
+    joints: Float[np.ndarray, "n D"]
+    edges: Int[np.ndarray, "m 2"]
+    lengths: Float[np.ndarray, "m"]
+    labels: Int[np.ndarray, "n"]
+
+    @classmethod
+    def from_submanifold(cls, graph: GraphSubmanifold) -> "Roadmap":
+        """The same graph without its latent coordinates."""
+        return cls(graph.joints, graph.edges, graph.lengths, graph.labels)
+
+    @cached_property
+    def neighbours(
+        self,
+    ) -> tuple[Int[np.ndarray, "n1"], Int[np.ndarray, "m2"], Float[np.ndarray, "m2"]]:
+        """Each node's edges one after another: where they begin, where they lead, their lengths
+        [rad].
+        """
+        both = np.concatenate([self.edges, self.edges[:, ::-1]]).astype(np.int64)
+        order = np.argsort(both[:, 0], kind="stable")
+        begins = np.searchsorted(both[order, 0], np.arange(len(self.joints) + 1))
+        return (
+            begins.astype(np.int64),
+            both[order, 1],
+            np.concatenate([self.lengths, self.lengths])[order],
+        )
+
+
+@dataclass(frozen=True)
+class Joined:
+    """The nodes that a configuration can be joined to, and the lengths of these edges [rad]."""
+
+    nodes: Int[np.ndarray, "k"]
+    lengths: Float[np.ndarray, "k"]
+
+    def components(self, roadmap: Roadmap) -> set[int]:
+        """Components of the graph that the configuration belongs to; empty where it could not be
+        joined to any.
+        """
+        return {int(roadmap.labels[node]) for node in self.nodes}
+
+
+def join(roadmap: Roadmap, space: tuple, q: Float[np.ndarray, "D"], tried: int = NEAREST) -> Joined:
+    """The edges from a configuration to the graph.  space: as `BandSpace.arrays`."""
+    distances = np.linalg.norm(roadmap.joints - q, axis=1)
+    count = min(tried, len(distances))
+    nearest = np.argpartition(distances, count - 1)[:count]
+    nearest = nearest[np.argsort(distances[nearest], kind="stable")]
+    lengths = np.empty(count)
+    _edges(space, q, roadmap.joints, nearest, lengths, JOINED)
+    holds = np.isfinite(lengths)
+    return Joined(nearest[holds], lengths[holds])
+
+
+def shortest_way(
+    roadmap: Roadmap,
+    start: Float[np.ndarray, "D"],
+    goal: Float[np.ndarray, "D"],
+    at_start: Joined,
+    at_goal: Joined,
+    space: tuple | None = None,
+) -> Float[np.ndarray, "k D"] | None:
+    """Corners of the shortest way over the graph, both ends included; None where the graph does not
+    join them.
+
+    space: as `BandSpace.arrays`; the edges of a way that was found are looked at in it, since the
+    graph may be of a workcell with less in it.  Those that fail are left out, and the search is
+    begun again [lazy shortest paths, Dellin and Srinivasa 2016].
+    """
+    if not len(at_start.nodes) or not len(at_goal.nodes):
+        return None
+    begins, leads, lengths = roadmap.neighbours
+    own, looked_at = lengths.copy(), np.zeros(len(lengths), bool)
+    while True:
+        nodes = _a_star(
+            roadmap.joints,
+            begins,
+            leads,
+            own,
+            goal,
+            at_start.nodes,
+            at_start.lengths,
+            at_goal.nodes,
+            at_goal.lengths,
+        )
+        if not len(nodes):
+            return None
+        if space is None or _holds(space, roadmap.joints, begins, leads, own, looked_at, nodes):
+            return np.concatenate([start[None], roadmap.joints[nodes], goal[None]])
+
+
+def build_roadmap(space: tuple, joints: Float[np.ndarray, "n D"], neighbours: int) -> Roadmap:
+    """A graph over configurations of the space, each joined to its nearest neighbours where the
+    edge holds.
+    """
+    edges = (
+        nearest_neighbour_edges(joints, min(neighbours, len(joints) - 1))
+        if len(joints) > 1
+        else _NO_EDGES
+    )
+    lengths = np.empty(len(edges))
+    edge_lengths(space, joints, edges, lengths)
+    holds = np.isfinite(lengths)
+    return Roadmap(joints, edges[holds], lengths[holds], components(len(joints), edges[holds]))
+
+
+def resample(corners: Float[np.ndarray, "k D"], count: int) -> Float[np.ndarray, "count D"]:
+    """Points spaced evenly along the straight lines between corners."""
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    at = np.linspace(0.0, way[-1], count)
+    points = np.stack([np.interp(at, way, column) for column in corners.T], axis=1)
+    points[0], points[-1] = corners[0], corners[-1]
+    return points
+
+
+@njit(**_COMPILE)
+def edge_length(space, first, second, work):
+    """Length [rad] of the straight joint line between two configurations, projected; inf where it
+    jumps.
+    """
+    dof = first.shape[0]
+    direct = 0.0
+    for d in range(dof):
+        direct += (second[d] - first[d]) ** 2
+    direct = np.sqrt(direct)
+    pieces = int(np.ceil(direct / EDGE_STEP)) + 1
+    allowed = 0.05 + 3.0 * direct / pieces
+    before, point = first.copy(), first.copy()
+    total = 0.0
+    for k in range(1, pieces + 1):
+        for d in range(dof):
+            point[d] = first[d] + k / pieces * (second[d] - first[d])
+        if k < pieces and project_node(space, point, 12, work) > 1e-6:
+            return np.inf
+        step = 0.0
+        for d in range(dof):
+            step += (point[d] - before[d]) ** 2
+        step = np.sqrt(step)
+        if not step <= allowed:
+            return np.inf
+        total += step
+        before[:] = point
+    return total
+
+
+@njit(**_COMPILE)
+def _edges(space, q, nodes, tried, lengths, enough):
+    """Lengths of the edges from q to the nodes named by `tried`, until `enough` of them hold; inf
+    for the others.
+    """
+    work = workspace(q.shape[0])
+    lengths[:] = np.inf
+    found = 0
+    for k in range(tried.shape[0]):
+        lengths[k] = edge_length(space, q, nodes[tried[k]], work)
+        if lengths[k] < np.inf:
+            found += 1
+            if found >= enough:
+                return
+
+
+@njit(**_COMPILE)
+def edge_lengths(space, nodes, edges, lengths):
+    """Lengths of many edges (m, 2) between nodes (n, D) into lengths (m,); inf where one does not
+    hold.
+    """
+    work = workspace(nodes.shape[1])
+    for k in range(edges.shape[0]):
+        lengths[k] = edge_length(space, nodes[edges[k, 0]], nodes[edges[k, 1]], work)
+
+
+@njit(**_COMPILE)
+def _holds(space, joints, begins, leads, lengths, looked_at, way):
+    """Whether all edges of a way hold in the space; those that do not become infinitely long, in
+    either direction.
+    """
+    work = workspace(joints.shape[1])
+    sound = True
+    for k in range(way.shape[0] - 1):
+        here, there = way[k], way[k + 1]
+        for e in range(begins[here], begins[here + 1]):
+            if leads[e] != there or looked_at[e]:
+                continue
+            point = joints[there].copy()  # a node may lie in what the graph does not know
+            holds = (
+                project_node(space, point, 12, work) <= 1e-6
+                and np.sum((point - joints[there]) ** 2) < EDGE_STEP**2
+                and edge_length(space, joints[here], joints[there], work) < np.inf
+            )
+            looked_at[e] = True
+            if not holds:
+                sound = False
+                lengths[e] = np.inf
+            for back in range(begins[there], begins[there + 1]):
+                if leads[back] == here:
+                    looked_at[back] = True
+                    if not holds:
+                        lengths[back] = np.inf
+    return sound
+
+
+@njit(**_COMPILE)
+def _a_star(nodes, begins, leads, lengths, goal, sources, source_lengths, targets, target_lengths):
+    """Nodes of the shortest way from the sources to the targets, with the lengths at either end;
+    empty for none.
+    """
+    n = nodes.shape[0]
+    cost = np.full(n + 1, np.inf)  # entry n stands for the goal itself
+    before = np.full(n + 1, -1, dtype=np.int64)
+    closed = np.zeros(n + 1, dtype=np.bool_)
+    last = np.full(n, np.inf)
+    for k in range(targets.shape[0]):
+        last[targets[k]] = target_lengths[k]
+    heap = [(0.0, np.int64(0))]
+    heap.pop()
+    for k in range(sources.shape[0]):
+        node = sources[k]
+        if source_lengths[k] < cost[node]:
+            cost[node] = source_lengths[k]
+            heapq.heappush(
+                heap, (cost[node] + np.sqrt(np.sum((nodes[node] - goal) ** 2)), np.int64(node))
+            )
+    while len(heap) > 0:
+        node = heapq.heappop(heap)[1]
+        if closed[node]:
+            continue
+        closed[node] = True
+        if node == n:
+            break
+        if cost[node] + last[node] < cost[n]:
+            cost[n] = cost[node] + last[node]
+            before[n] = node
+            heapq.heappush(heap, (cost[n], np.int64(n)))
+        for e in range(begins[node], begins[node + 1]):
+            other = leads[e]
+            through = cost[node] + lengths[e]
+            if through < cost[other]:
+                cost[other] = through
+                before[other] = node
+                heapq.heappush(
+                    heap, (through + np.sqrt(np.sum((nodes[other] - goal) ** 2)), np.int64(other))
+                )
+    if not np.isfinite(cost[n]):
+        return np.empty(0, dtype=np.int64)
+    count = 0
+    node = before[n]
+    while node >= 0:
+        count += 1
+        node = before[node]
+    way = np.empty(count, dtype=np.int64)
+    node = before[n]
+    while node >= 0:
+        count -= 1
+        way[count] = node
+        node = before[node]
+    return way

@@ -1,0 +1,238 @@
+"""What each choice is worth: the reward as printed, other curve families, the metric without its
+variance term.
+"""
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from constraint_geodesics.benchmark.judge import Free
+from constraint_geodesics.geodesics.gradient import GradientSolver
+from constraint_geodesics.geodesics.problem import ChartProblem, Ends, Geodesic, Samples
+from constraint_geodesics.geodesics.solver import geodesics_between
+from constraint_geodesics.geometry.manifold import pullback_metric
+from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.params import GeodesicParams
+from constraint_geodesics.studies.analytic_search import (
+    AnalyticTask,
+    analytic_problem,
+    curve_family,
+    unseen_pairs,
+)
+from constraint_geodesics.studies.geodesic_search import SeedLog
+
+PAIRS_SEED = 21
+POINTS = 101
+"""Points of a geodesic that are decoded and checked for collision."""
+COARSE, DRAWN_AT_ONCE, MOST_DRAWN = 17, 500, 10_000
+"""Search for pairs whose straight line collides: points of a line, pairs drawn at once and at most.
+"""
+
+
+def policy_variants(params: GeodesicParams) -> dict[str, tuple[GeodesicParams, int]]:
+    """Name of each ablated policy search, its parameters and the segments of its splines (0: the
+    polynomial).
+    """
+    printed = params.model_copy(
+        update={"reward": params.reward.model_copy(update={"form": "printed"})}
+    )
+    return {"printed_reward": (printed, 0)} | {
+        name: (params, n) for name, n in _segments(params).items() if n
+    }
+
+
+def _segments(params: GeodesicParams) -> dict[str, int]:
+    """Name of each curve family compared, and its segments (0: the polynomial)."""
+    return {"polynomial": 0} | {f"spline_{n}": n for n in params.ablated_segments}
+
+
+def variant_task(
+    name: str,
+    variant: str,
+    params: GeodesicParams,
+    seed: int,
+    scratch: Path,
+    run: AbstractContextManager[SeedLog],
+) -> AnalyticTask:
+    """One seed of one ablated policy search on an analytic manifold."""
+    settings, segments = policy_variants(params)[variant]
+    dim = 2  # of every analytic manifold searched
+    return AnalyticTask(name, curve_family(dim, settings, segments), settings, seed, scratch, run)
+
+
+def family_ratios(name: str, params: GeodesicParams) -> dict[str, float]:
+    """Mean ratio to the exact distance of the best curve of each family, as the gradient finds it:
+    what a search with that family could reach at most.
+    """
+    ratios = {}
+    for label, segments in _segments(params).items():
+        problem = analytic_problem(name, curve_family(2, params, segments))
+        ends, exact = unseen_pairs(name, problem)
+        found = geodesics_between(GradientSolver(), problem, ends.z_start, ends.z_goal)
+        ratios[label] = float(np.mean([geodesic.length for geodesic in found] / exact))
+    return ratios
+
+
+@dataclass(frozen=True)
+class MeanManifold:
+    """A learned manifold without the variance term of eq. 5: M = JμᵀJμ.  Implements
+    EmbeddedManifold.
+    """
+
+    chart: LearnedManifold
+
+    @property
+    def dim(self) -> int:
+        """Latent dimension N."""
+        return self.chart.dim
+
+    @property
+    def ambient_dim(self) -> int:
+        """D joints."""
+        return self.chart.vae.dof
+
+    def embed(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch D"]:
+        """Decoder mean μ(z) [rad]."""
+        return self.chart.vae.mean(z.to(self.chart.vae.centre.dtype))
+
+    def metric(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch N N"]:
+        """JμᵀJμ."""
+        return pullback_metric(self.embed, z)
+
+
+@dataclass(frozen=True)
+class LearnedAblation:
+    """Geodesics between pairs of training configurations, with one choice changed at a time."""
+
+    chart: LearnedManifold
+    joints: Float[np.ndarray, "n D"]
+    params: GeodesicParams
+    pairs: int
+    free: Free
+
+    def figures(self) -> dict[str, dict[str, float]]:
+        """Curve families between random pairs, and the variance term between pairs whose straight
+        line collides.
+        """
+        domain, rng = Samples(self.chart.encode(self.joints)), np.random.default_rng(PAIRS_SEED)
+        return self._families(domain, rng) | self._variance(domain, rng)
+
+    def _families(self, domain: Samples, rng: np.random.Generator) -> dict[str, dict[str, float]]:
+        """Length of the best curve of each family over the shortest of all."""
+        problems = {
+            name: self._problem(segments, domain)
+            for name, segments in _segments(self.params).items()
+        }
+        ends = problems["polynomial"].sample_ends(self.pairs, rng)
+        lengths = np.array(
+            [
+                [found.length for found in self._solved(problem, ends)]
+                for problem in problems.values()
+            ]
+        )
+        ratios = (lengths / lengths.min(axis=0)).mean(axis=1)
+        return {
+            name: {"mean_ratio_to_best": float(ratio)}
+            for name, ratio in zip(problems, ratios, strict=True)
+        }
+
+    def _variance(self, domain: Samples, rng: np.random.Generator) -> dict[str, dict[str, float]]:
+        """`path_figures` of geodesics with and without the variance term, and of the straight line.
+
+        Between pairs whose straight latent line touches something; between most others there is
+        nothing to avoid.
+        """
+        whole = self._problem(0, domain)
+        mean = ChartProblem(MeanManifold(self.chart), whole.curve, domain)
+        ends, drawn = self._colliding(whole, rng)
+        straight = [
+            Geodesic.nothing("not_found", whole.curve, *pair) for pair in zip(*ends, strict=True)
+        ]
+        solved = {"with_variance": whole, "without_variance": mean}
+        found = {
+            name: self._solved(problem, Ends(*ends, *ends)) for name, problem in solved.items()
+        }
+        found["straight_latent_line"] = straight
+        counts = {
+            "pairs": float(len(straight)),
+            "straight_lines_that_collide": len(straight) / drawn,
+        }
+        return {
+            name: path_figures(self.chart, self._points(curves), self.free) | counts
+            for name, curves in found.items()
+        }
+
+    def _colliding(
+        self, problem: ChartProblem, rng: np.random.Generator
+    ) -> tuple[tuple[Float[np.ndarray, "P N"], Float[np.ndarray, "P N"]], int]:
+        """Starts and goals of pairs whose straight latent line touches something, and how many
+        pairs were drawn.
+        """
+        starts, goals, drawn, found = [], [], 0, 0
+        t = np.linspace(0.0, 1.0, COARSE)[:, None]
+        while found < self.pairs and drawn < MOST_DRAWN:
+            ends = problem.sample_ends(DRAWN_AT_ONCE, rng)
+            line = (1 - t) * ends.z_start[:, None] + t * ends.z_goal[:, None]
+            joints = self.chart.decode(line)
+            rows = ~self.free(joints.reshape(-1, joints.shape[-1])).reshape(joints.shape[:2]).all(
+                axis=1
+            )
+            starts.append(ends.z_start[rows])
+            goals.append(ends.z_goal[rows])
+            drawn, found = drawn + len(ends), found + int(rows.sum())
+        return (np.concatenate(starts)[: self.pairs], np.concatenate(goals)[: self.pairs]), drawn
+
+    def _problem(self, segments: int, domain: Samples) -> ChartProblem:
+        return ChartProblem(self.chart, curve_family(self.chart.dim, self.params, segments), domain)
+
+    def _solved(self, problem: ChartProblem, ends: Ends) -> list[Geodesic]:
+        return (
+            geodesics_between(GradientSolver(starts=1), problem, ends.z_start, ends.z_goal)
+            if len(ends)
+            else []
+        )
+
+    def _points(self, curves: list[Geodesic]) -> Float[np.ndarray, "P T N"]:
+        t = np.linspace(0.0, 1.0, POINTS)
+        return np.array([curve.points(t) for curve in curves]).reshape(-1, POINTS, self.chart.dim)
+
+
+def path_figures(
+    chart: LearnedManifold, z: Float[np.ndarray, "P T N"], free: Free
+) -> dict[str, float]:
+    """What decoded latent curves are like.
+
+    length_rad: of the decoded joints, mean.  deviation_rad: largest norm of σ along a curve, mean
+    over the curves; it rises where no data is.  collision_free: share of the curves of which no
+    configuration touches anything.
+    collision_free_points: share of the configurations.  All nan where there is no curve.
+    """
+    if not len(z):
+        return dict.fromkeys(
+            ("length_rad", "deviation_rad", "collision_free", "collision_free_points"), np.nan
+        )
+    embedded = chart.embed_points(z).astype(np.float64)
+    dof = chart.vae.dof
+    joints, deviation = embedded[..., :dof], embedded[..., dof:]
+    untouched = free(joints.reshape(-1, dof)).reshape(joints.shape[:2])
+    return {
+        "length_rad": float(np.linalg.norm(np.diff(joints, axis=1), axis=-1).sum(axis=1).mean()),
+        "deviation_rad": float(np.linalg.norm(deviation, axis=-1).max(axis=1).mean()),
+        "collision_free": float(untouched.all(axis=1).mean()),
+        "collision_free_points": float(untouched.mean()),
+    }
+
+
+def by_variant(ratios: Mapping[str, list[float]], families: Mapping[str, float]) -> dict[str, Any]:
+    """The metrics file of one analytic manifold's ablation."""
+    policy = {name: {"mean_ratio": values} for name, values in ratios.items()}
+    return {
+        "policy_search": policy,
+        "gradient": {name: {"mean_ratio": ratio} for name, ratio in families.items()},
+    }

@@ -1,0 +1,431 @@
+"""A timed path executed in simulation: position control under gravity, with an open cup of spheres
+at the tool.
+
+What the path promises in joint space is seen here as a person would see it: the cup stays level or
+spills.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
+
+from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.world import Physics, Solid, World, physics
+
+GRAVITY = 9.81
+"""[m/s²], along the negative z axis of the base frame."""
+FRAME_RATE = 30.0
+"""Frames that are kept of a second of execution."""
+POSITION_GAIN = 0.2
+"""Share of the position's error that the motors take off in a step."""
+UNLIMITED = 1e4
+"""[N or N m]"""
+
+_Pose = tuple[Sequence[float], Sequence[float]]
+
+
+class ExecutionError(ValueError):
+    """A path, an axis or a setting that can't be executed; the message names it, its value and what
+    is allowed.
+    """
+
+
+@dataclass(frozen=True)
+class CupSettings:
+    """The cup, the spheres in it and the simulation; by default a cup 10 cm high and 7 cm wide,
+    three quarters full.
+
+    The cup is a bottom and a ring of `walls` upright boxes, `wall_m` thick.  It sits where a
+    gripper would be, its nearest point `gap_m` in front of the tool link's origin along the tool's
+    z axis, and it touches the spheres only: the path was planned without it.  Spheres that have
+    left it touch everything.  More of them than fit fall beside.
+    seed: of the places the spheres are dropped from.  settle_s: the rest before the path, in which
+    they settle, and behind it, before they are counted.
+    """
+
+    spheres: int = 12
+    sphere_radius_m: float = 0.012
+    sphere_mass_kg: float = 0.01
+    inner_radius_m: float = 0.03
+    height_m: float = 0.1
+    wall_m: float = 0.005
+    walls: int = 12
+    mass_kg: float = 0.1
+    gap_m: float = 0.04
+    friction: float = 0.3
+    restitution: float = 0.2
+    step_s: float = 1.0 / 480.0
+    settle_s: float = 0.5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, least in _LEAST.items():
+            if not getattr(self, name) >= least:
+                raise ExecutionError(f"{name} = {getattr(self, name)}: must be at least {least}")
+        for name in (
+            "sphere_radius_m",
+            "sphere_mass_kg",
+            "height_m",
+            "wall_m",
+            "mass_kg",
+            "step_s",
+        ):
+            if not getattr(self, name) > 0:
+                raise ExecutionError(f"{name} = {getattr(self, name)}: must be positive")
+        if not self.inner_radius_m >= 2.2 * self.sphere_radius_m:
+            raise ExecutionError(
+                f"inner_radius_m = {self.inner_radius_m}: must be at least "
+                f"{2.2 * self.sphere_radius_m:.4g}, "
+                "so that two spheres fit beside each other"
+            )
+
+
+_LEAST = {
+    "spheres": 1,
+    "walls": 6,
+    "gap_m": 0,
+    "friction": 0,
+    "restitution": 0,
+    "settle_s": 0,
+    "seed": 0,
+}
+
+
+@dataclass(frozen=True)
+class Execution:
+    """What became of an executed path.
+
+    kept: spheres in the cup at the end, of `spheres` put in.  largest_tracking_error_rad: of any
+    joint, between where it was and where the path has it.  largest_tilt_rad: angle of the cup's
+    axis to the vertical.  Both are taken at every step of the path; `duration_s` is the path's.
+    The frames go on through the rest behind it.
+    """
+
+    spheres: int
+    kept: int
+    largest_tracking_error_rad: float
+    largest_tilt_rad: float
+    duration_s: float
+    times: Float[np.ndarray, "F"]
+    """Of the frames [s], from 0 at the start of the path."""
+    joints: Float[np.ndarray, "F D"]
+    sphere_positions: Float[np.ndarray, "F S 3"]
+    """In the base frame [m]."""
+    cup_pose: Float[np.ndarray, "F 7"]
+    """Centre of the cup [m] and quaternion x, y, z, w in the base frame; its z axis points to the
+    opening.
+    """
+
+    @property
+    def kept_share(self) -> float:
+        """Share of the spheres that stayed in the cup."""
+        return self.kept / self.spheres
+
+
+def execute(
+    robot: SerialRobot,
+    workcell: Sequence[Solid],
+    joints: Float[np.ndarray, "T D"],
+    times: Float[np.ndarray, "T"],
+    cup_axis_in_tool: Float[np.ndarray, "3"],
+    settings: CupSettings | None = None,
+) -> Execution:
+    """Follow a timed path [rad, s] with a cup of spheres at the tool, and count the spheres that
+    stay in it.
+
+    Between the rows the arm follows the cubics through them.  The motors hold it by position and
+    velocity with no more than the URDF's effort; where that is 0 they are not limited.
+    cup_axis_in_tool: direction of the cup's opening in the tool frame, of any length.
+    The same arguments give the same result, in any process on one machine.
+    Raises ExecutionError on a wrong shape, fewer than two rows, a number that is not finite, times
+    that do not rise or an axis of no length.
+    """
+    settings = settings or CupSettings()
+    q, t, axis = _checked(robot, joints, times, cup_axis_in_tool)
+    with World(robot, workcell) as world:
+        simulation = _Simulation(physics(world), q[0], _cup_in_tool(axis, settings), settings)
+        return _follow(simulation, q, t - t[0], settings)
+
+
+def _follow(
+    simulation: "_Simulation", q: np.ndarray, t: np.ndarray, settings: CupSettings
+) -> Execution:
+    path = CubicHermiteSpline(t, q, _row_velocities(q, t))
+    rest, moving = (
+        int(np.ceil(seconds / settings.step_s)) for seconds in (settings.settle_s, t[-1])
+    )
+    for _ in range(rest):
+        simulation.step(q[0], np.zeros_like(q[0]))
+    clock = np.minimum(settings.step_s * np.arange(moving + rest + 1), t[-1])
+    wanted = path(clock)
+    # the velocity that leads from one wanted position to the next one: 0 from the goal on
+    velocities = np.diff(wanted, axis=0) / settings.step_s
+    every = max(1, round(1.0 / (FRAME_RATE * settings.step_s)))
+    frames, frame_times = [simulation.frame()], [0.0]
+    error = 0.0
+    tilt = simulation.tilt()
+    for k in range(moving + rest):
+        simulation.step(wanted[k], velocities[k])
+        if k < moving:
+            error = max(error, float(np.abs(simulation.joints() - wanted[k + 1]).max()))
+            tilt = max(tilt, simulation.tilt())
+        if (k + 1) % every == 0 or k + 1 == moving + rest:
+            frames.append(simulation.frame())
+            simulation.free_outside(_inside(frames[-1][1], frames[-1][2], settings))
+            frame_times.append((k + 1) * settings.step_s)
+    kept = int(_inside(frames[-1][1], frames[-1][2], settings).sum())
+    recorded = [np.array(column) for column in zip(*frames, strict=True)]
+    return Execution(
+        settings.spheres, kept, error, tilt, float(t[-1]), np.array(frame_times), *recorded
+    )
+
+
+class _Simulation:
+    """A robot at rest at a configuration, with the cup fixed to its tool and the spheres above the
+    cup's bottom.
+    """
+
+    def __init__(
+        self, world: Physics, start: np.ndarray, cup_in_tool: _Pose, settings: CupSettings
+    ) -> None:
+        self._world = world
+        self._bullet, self._client = world.bullet, world.client
+        bullet, client = self._bullet, self._client
+        bullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=client)
+        bullet.setPhysicsEngineParameter(
+            fixedTimeStep=settings.step_s,
+            numSolverIterations=100,
+            deterministicOverlappingPairs=1,
+            physicsClientId=client,
+        )
+        bullet.resetJointStatesMultiDof(
+            world.body,
+            world.joints,
+            start[:, None].tolist(),
+            targetVelocities=[[0.0]] * len(start),
+            physicsClientId=client,
+        )
+        efforts = [
+            bullet.getJointInfo(world.body, joint, physicsClientId=client)[10]
+            for joint in world.joints
+        ]
+        self._efforts = [effort if effort > 0 else UNLIMITED for effort in efforts]
+        state = bullet.getLinkState(
+            world.body, world.tool, computeForwardKinematics=1, physicsClientId=client
+        )
+        self._cup = self._add_cup(
+            cup_in_tool, bullet.multiplyTransforms(*state[4:6], *cup_in_tool), settings
+        )
+        centres = _places(settings, np.random.default_rng(settings.seed))
+        self._spheres = [self._add_sphere(centre, settings) for centre in centres]
+        self._held = set(self._spheres)
+
+    def step(self, position: np.ndarray, velocity: np.ndarray) -> None:
+        """Pull the joints towards a position [rad] and velocity [rad/s] for one step."""
+        self._bullet.setJointMotorControlArray(
+            self._world.body,
+            self._world.joints,
+            self._bullet.POSITION_CONTROL,
+            targetPositions=position.tolist(),
+            targetVelocities=velocity.tolist(),
+            forces=self._efforts,
+            positionGains=[POSITION_GAIN] * len(self._efforts),
+            velocityGains=[1.0] * len(self._efforts),
+            physicsClientId=self._client,
+        )
+        self._bullet.stepSimulation(physicsClientId=self._client)
+
+    def joints(self) -> Float[np.ndarray, "D"]:
+        """Where the joints are [rad]."""
+        states = self._bullet.getJointStates(
+            self._world.body, self._world.joints, physicsClientId=self._client
+        )
+        return np.array([state[0] for state in states])
+
+    def tilt(self) -> float:
+        """Angle of the cup's axis to the vertical [rad]."""
+        _, (x, y, z, w) = self._pose(self._cup)
+        return float(
+            np.arctan2(2.0 * np.hypot(x * z + w * y, y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
+        )
+
+    def frame(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Joints (D,) [rad], centres of the spheres (S, 3) [m] and pose of the cup (7,)."""
+        centres = np.array([self._pose(sphere)[0] for sphere in self._spheres])
+        return self.joints(), centres, np.concatenate(self._pose(self._cup))
+
+    def free_outside(self, inside: Bool[np.ndarray, "S"]) -> None:
+        """Let the spheres that have left the cup touch the robot and the workcell from now on."""
+        for sphere in sorted(
+            self._held - {s for s, held in zip(self._spheres, inside, strict=True) if held}
+        ):
+            self._set_collisions(sphere, enabled=1)
+            self._held.remove(sphere)
+
+    def _set_collisions(self, body: int, enabled: int) -> None:
+        """Between a body and the robot and workcell."""
+        for other in (self._world.body, *self._world.fixed):
+            for link in range(-1, self._bullet.getNumJoints(other, physicsClientId=self._client)):
+                self._bullet.setCollisionFilterPair(
+                    body, other, -1, link, enabled, physicsClientId=self._client
+                )
+
+    def _pose(self, body: int) -> _Pose:
+        position, quaternion = self._bullet.getBasePositionAndOrientation(
+            body, physicsClientId=self._client
+        )
+        return position, quaternion
+
+    def _add_cup(self, cup_in_tool: _Pose, pose: _Pose, settings: CupSettings) -> int:
+        bullet, client, world = self._bullet, self._client, self._world
+        halves, centres, turns = _cup_boxes(settings)
+        shape = bullet.createCollisionShapeArray(
+            shapeTypes=[bullet.GEOM_BOX] * len(halves),
+            halfExtents=halves,
+            collisionFramePositions=centres,
+            collisionFrameOrientations=turns,
+            physicsClientId=client,
+        )
+        cup = bullet.createMultiBody(settings.mass_kg, shape, -1, *pose, physicsClientId=client)
+        self._set_collisions(cup, enabled=0)
+        self._add_surface(cup, settings)
+        # a constraint counts from the centre of mass of the parent link
+        local = bullet.getDynamicsInfo(world.body, world.tool, physicsClientId=client)[3:5]
+        place = bullet.multiplyTransforms(*bullet.invertTransform(*local), *cup_in_tool)
+        grip = bullet.createConstraint(
+            world.body,
+            world.tool,
+            cup,
+            -1,
+            bullet.JOINT_FIXED,
+            (0, 0, 0),
+            place[0],
+            (0, 0, 0),
+            place[1],
+            physicsClientId=client,
+        )
+        bullet.changeConstraint(grip, maxForce=UNLIMITED, erp=0.8, physicsClientId=client)
+        return int(cup)
+
+    def _add_sphere(self, centre_in_cup: np.ndarray, settings: CupSettings) -> int:
+        bullet, client = self._bullet, self._client
+        shape = bullet.createCollisionShape(
+            bullet.GEOM_SPHERE, radius=settings.sphere_radius_m, physicsClientId=client
+        )
+        position, _ = bullet.multiplyTransforms(
+            *self._pose(self._cup), centre_in_cup.tolist(), (0, 0, 0, 1)
+        )
+        sphere = bullet.createMultiBody(
+            settings.sphere_mass_kg, shape, -1, position, physicsClientId=client
+        )
+        self._set_collisions(sphere, enabled=0)
+        self._add_surface(sphere, settings)
+        return int(sphere)
+
+    def _add_surface(self, body: int, settings: CupSettings) -> None:
+        self._bullet.changeDynamics(
+            body,
+            -1,
+            lateralFriction=settings.friction,
+            restitution=settings.restitution,
+            rollingFriction=1e-4,
+            spinningFriction=1e-4,
+            linearDamping=0.0,
+            angularDamping=0.0,
+            physicsClientId=self._client,
+        )
+
+
+def _checked(
+    robot: SerialRobot, joints: np.ndarray, times: np.ndarray, axis: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    q, t, direction = (np.asarray(values, dtype=np.float64) for values in (joints, times, axis))
+    if q.ndim != 2 or len(q) < 2 or q.shape[1] != robot.dof:
+        raise ExecutionError(
+            f"joints has shape {q.shape}: must be (T, {robot.dof}) with at least two rows"
+        )
+    if t.shape != q.shape[:1]:
+        raise ExecutionError(f"times has shape {t.shape}: must be ({len(q)},), one for each row")
+    if direction.shape != (3,):
+        raise ExecutionError(f"cup_axis_in_tool has shape {direction.shape}: must be (3,)")
+    for name, values in (("joints", q), ("times", t), ("cup_axis_in_tool", direction)):
+        if not np.isfinite(values).all():
+            raise ExecutionError(f"{name} = {values[~np.isfinite(values)][0]}: must be finite")
+    if not (np.diff(t) > 0).all():
+        row = int(np.diff(t).argmin())
+        raise ExecutionError(
+            f"times[{row + 1}] - times[{row}] = {t[row + 1] - t[row]}: must be positive"
+        )
+    length = float(np.linalg.norm(direction))
+    if not length > 0:
+        raise ExecutionError(f"cup_axis_in_tool = {direction.tolist()}: must not be zero")
+    return q, t, direction / length
+
+
+def _row_velocities(q: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Velocities at the rows of the parabolas through each row and its neighbours, and rest at both
+    ends.
+    """
+    dt = np.diff(t)[:, None]
+    v = np.diff(q, axis=0) / dt
+    inner = (dt[:-1] * v[1:] + dt[1:] * v[:-1]) / (dt[:-1] + dt[1:])
+    rest = np.zeros((1, q.shape[1]))
+    return np.concatenate([rest, inner, rest])
+
+
+def _cup_in_tool(axis: np.ndarray, settings: CupSettings) -> _Pose:
+    """Pose of the cup's centre in the tool frame: its opening along `axis`, all of it beyond the
+    gap along z.
+    """
+    across = np.eye(3)[np.abs(axis).argmin()]
+    across = np.cross(across, axis)
+    across /= np.linalg.norm(across)
+    rotation = np.column_stack([across, np.cross(axis, across), axis])
+    outer = settings.inner_radius_m + settings.wall_m
+    reach = outer * np.hypot(axis[0], axis[1]) + 0.5 * settings.height_m * abs(axis[2])
+    position = (0.0, 0.0, settings.gap_m + float(reach))
+    return position, tuple(Rotation.from_matrix(rotation).as_quat().tolist())
+
+
+def _cup_boxes(
+    settings: CupSettings,
+) -> tuple[list[list[float]], list[list[float]], list[list[float]]]:
+    """Half edges, centres and quaternions of the bottom and the walls in the cup's frame."""
+    half_wall = 0.5 * settings.wall_m
+    outer, middle = settings.inner_radius_m + settings.wall_m, settings.inner_radius_m + half_wall
+    halves = [[outer, outer, half_wall]]
+    centres = [[0.0, 0.0, half_wall - 0.5 * settings.height_m]]
+    turns = [[0.0, 0.0, 0.0, 1.0]]
+    for angle in 2.0 * np.pi * np.arange(settings.walls) / settings.walls:
+        halves.append([half_wall, outer * np.tan(np.pi / settings.walls), 0.5 * settings.height_m])
+        centres.append([middle * np.cos(angle), middle * np.sin(angle), 0.0])
+        turns.append([0.0, 0.0, np.sin(0.5 * angle), np.cos(0.5 * angle)])
+    return halves, centres, turns
+
+
+def _places(settings: CupSettings, rng: np.random.Generator) -> Float[np.ndarray, "S 3"]:
+    """Centres of the spheres in the cup's frame before they fall: rings of them, each turned by
+    chance.
+    """
+    apart = 2.2 * settings.sphere_radius_m
+    ring = settings.inner_radius_m - 0.5 * apart
+    per_layer = int(np.pi / np.arcsin(min(1.0, 0.5 * apart / ring)))
+    layer, place = np.divmod(np.arange(settings.spheres), per_layer)
+    angle = 2.0 * np.pi * (place / per_layer + rng.uniform(size=layer[-1] + 1)[layer])
+    radius = ring * (1.0 - 0.02 * rng.uniform(size=settings.spheres))
+    height = settings.wall_m - 0.5 * settings.height_m + apart * (layer + 0.6)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
+
+
+def _inside(
+    centres: np.ndarray, cup_pose: np.ndarray, settings: CupSettings
+) -> Bool[np.ndarray, "S"]:
+    """Which spheres have their centre in the cup, below its rim."""
+    local = Rotation.from_quat(cup_pose[3:]).inv().apply(centres - cup_pose[:3])
+    return (np.hypot(local[:, 0], local[:, 1]) < settings.inner_radius_m + settings.wall_m) & (
+        np.abs(local[:, 2]) < 0.5 * settings.height_m
+    )

@@ -1,0 +1,495 @@
+"""What the geometry core costs and how exact it is: rates against a naive implementation, errors,
+solver times.
+
+Everything is timed on one thread.  Rates are medians of several rounds in which the compared sides
+run in turn; a solver's times are those of one warm pass.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from threadpoolctl import threadpool_limits
+from torch import Tensor
+
+from constraint_geodesics.geodesics.environment import CurveEnv, CurveVecEnv, scalar_environments
+from constraint_geodesics.geodesics.episodes import episode_settings
+from constraint_geodesics.geodesics.gradient import GradientSolver
+from constraint_geodesics.geodesics.graph_search import CombinedSolver, GraphSolver
+from constraint_geodesics.geodesics.policy_search import Actor, PolicySolver, ppo_model
+from constraint_geodesics.geodesics.problem import (
+    ChartProblem,
+    Ends,
+    GeodesicProblem,
+    GeodesicSolver,
+    LearnedProblem,
+)
+from constraint_geodesics.geodesics.solver import geodesics_between
+from constraint_geodesics.geometry.curves import CurveFamily
+from constraint_geodesics.geometry.length import (
+    Collocation,
+    LengthRule,
+    Quadrature,
+    chord_length,
+    curve_length,
+    estimate_length,
+)
+from constraint_geodesics.geometry.manifold import EmbeddedManifold
+from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.learning.lift import correct_and_retract
+from constraint_geodesics.params import GeodesicParams, GeometryParams
+from constraint_geodesics.pipeline.machine import machine
+from constraint_geodesics.pipeline.progress import progress
+from constraint_geodesics.studies.analytic_search import (
+    MANIFOLDS,
+    PAIRS,
+    analytic_problem,
+    curve_family,
+    unseen_pairs,
+)
+
+SMALL_BATCHES = (1, 64)
+NAIVE_POINTS = 101
+REFERENCE_POINTS = 2000
+REFERENCE_DEGREE = 256
+"""Degree of the polynomials that retracted lengths are compared with."""
+SINGLE = 10
+"""Queries that each solver is asked one at a time."""
+NAIVE_CURVES = 40
+"""Curves a round of the naive implementation measures, one at a time."""
+RULES = (4, 6, 8, 12, 16, 24, 32, 48)
+"""Points a curve, beside its start, of the rules whose error and cost are compared."""
+GRID = (60, 60)
+SEED = 5
+LEARNED_ROLLOUTS = 10
+"""Rollouts of the batched environment for one of the scalar environments, whose rate is as steady.
+"""
+
+
+@dataclass(frozen=True)
+class GeometryBenchmark:
+    """The two problems measured, the same manifold without and with retraction, and how."""
+
+    plain: ChartProblem
+    retracted: LearnedProblem
+    geodesics: GeodesicParams
+    settings: GeometryParams
+
+    @property
+    def manifold(self) -> LearnedManifold:
+        """The learned manifold."""
+        return self.retracted.chart
+
+    def figures(self, actors: Mapping[str, Actor]) -> dict[str, Any]:
+        """Rates, errors and solvers.  actors: a trained policy of every analytic manifold."""
+        parts: dict[str, Callable[[], Any]] = {
+            "curve_length": self.curve_length,
+            "curve_length_retracted": self.curve_length_retracted,
+            "environment": lambda: self.environment(self.plain),
+            "environment_retracted": lambda: self.environment(self.retracted),
+        }
+        parts |= {
+            f"solvers/{name}": partial(self.analytic_solvers, name, actor)
+            for name, actor in actors.items()
+        }
+        parts["solvers/learned"] = self.learned_solvers
+        found: dict[str, Any] = {}
+        with one_thread(), progress("geometry benchmark", len(parts)) as advance:
+            for name, measure in parts.items():
+                found[name] = measure()
+                advance()
+        figures = {name: value for name, value in found.items() if "/" not in name} | {
+            "machine": machine()
+        }
+        return figures | {
+            "solvers": {name.split("/")[1]: value for name, value in found.items() if "/" in name}
+        }
+
+    def curve_length(self) -> dict[str, Any]:
+        """Lengths a second at the default accuracy, the ratio to the naive implementation, and the
+        error.
+        """
+        curves, _ = random_curves(self.plain, self.settings.batch)
+        with torch.no_grad():
+            ours = {
+                batch: partial(default_length, self.manifold, curves.first(batch))
+                for batch in self._batches()
+            }
+            few = curves.first(NAIVE_CURVES)
+            usual = {
+                "naive": partial(naive_length, self.manifold, few),
+                "naive_batched": partial(naive_length_batched, self.manifold, few),
+                "chords_batched": partial(_chords, self.manifold, few, NAIVE_POINTS - 1),
+            }
+            rates = self._rates(ours, usual)
+            naive_error = _relative(
+                naive_length(self.manifold, few), reference_length(self.manifold, few)
+            )
+        return rates | {"error": self.length_errors(), "naive_error": _spread(naive_error)}
+
+    def curve_length_retracted(self) -> dict[str, Any]:
+        """The same for curves that are decoded, corrected at their ends and retracted onto the
+        constraint.
+        """
+        curves, ends = random_curves(self.retracted, self.settings.batch)
+        phi = curves.phi.numpy()
+        ours = {
+            batch: partial(self.retracted.evaluate, phi[:batch], ends[np.arange(batch)])
+            for batch in self._batches()
+        }
+        naive = partial(naive_retracted_length, self.retracted, curves.first(NAIVE_CURVES), ends)
+        return self._rates(ours, {"naive": naive}) | {"error": self.retracted_errors()}
+
+    def retracted_errors(self) -> dict[str, float]:
+        """Relative error of retracted lengths (degree of params.yaml) against degree
+        REFERENCE_DEGREE, for the curves that both find feasible; a third of random ones jump
+        between branches and have no length.
+        """
+        curves, ends = random_curves(self.retracted, self.settings.checked)
+        fine = replace(self.retracted, degree=REFERENCE_DEGREE)
+        found, reference = (
+            problem.evaluate(curves.phi.numpy(), ends) for problem in (self.retracted, fine)
+        )
+        both = found.feasible & reference.feasible
+        error = np.abs(found.length[both] - reference.length[both]) / reference.length[both]
+        return {**_spread(error), "curves": len(error), "share_feasible": float(both.mean())}
+
+    def _batches(self) -> tuple[int, ...]:
+        return (*SMALL_BATCHES, self.settings.batch)
+
+    def _rates(
+        self, ours: Mapping[int, Callable[[], Any]], usual: Mapping[str, Callable[[], Any]]
+    ) -> dict[str, Any]:
+        runs = {**{str(batch): run for batch, run in ours.items()}, **usual}
+        seconds = alternately(runs, self.settings.rounds)
+        rates, largest = {batch: batch / seconds[str(batch)] for batch in ours}, max(ours)
+        theirs = {f"{name}_per_second": NAIVE_CURVES / seconds[name] for name in usual}
+        return {
+            "batch": largest,
+            "per_second": rates[largest],
+            **theirs,
+            "ratio_to_naive": rates[largest] / theirs["naive_per_second"],
+            "per_second_by_batch": {str(batch): rate for batch, rate in rates.items()},
+        }
+
+    def length_errors(self) -> dict[str, float]:
+        """Relative error of default lengths against 2 000 chords in double precision.
+
+        share_above_estimate: how often the error exceeds its own estimate.
+        """
+        curves, _ = random_curves(self.plain, self.settings.checked)
+        reference = reference_length(self.manifold, curves)
+        with torch.no_grad():
+            found = estimate_length(
+                self.manifold, curves.family, curves.phi, curves.start, curves.goal
+            )
+        error, estimate = _relative(found.length, reference), (found.error / reference).numpy()
+        return {
+            **_spread(error),
+            "share_above_estimate": float((error > estimate + SINGLE_PRECISION).mean()),
+            "curves": len(error),
+            "reference_points": REFERENCE_POINTS,
+        }
+
+    def quadrature_rows(self) -> list[dict[str, Any]]:
+        """Error and cost of three rules by the number of points: the rows of the figure that chose
+        the default.
+        """
+        curves, _ = random_curves(self.plain, self.settings.checked)
+        reference, rows = reference_length(self.manifold, curves), []
+        with one_thread(), torch.no_grad():
+            for count in RULES:
+                measures = {
+                    "chords": partial(_chords, self.manifold, curves, count),
+                    "gauss_legendre": partial(
+                        _by_rule, self.manifold, curves, Quadrature.gauss_legendre(count + 1)
+                    ),
+                    "collocation": partial(
+                        _by_rule, self.manifold, curves, Collocation.chebyshev(count)
+                    ),
+                }
+                seconds = alternately(measures, self.settings.rounds)
+                for rule, measure in measures.items():
+                    spread = {
+                        f"error_{name}": value
+                        for name, value in _spread(_relative(measure(), reference)).items()
+                    }
+                    cost = 1e6 * seconds[rule] / len(reference)
+                    rows.append({"rule": rule, "points": count + 1, "microseconds": cost, **spread})
+        return rows
+
+    def environment(self, problem: GeodesicProblem) -> dict[str, float]:
+        """Environment steps a second, PPO's learning included: all curves in one batch, and the
+        usual way, one scalar environment each.  Both learn with the same settings.
+        """
+        params, settings = self.geodesics, episode_settings(self.geodesics)
+        count, rollout = params.environments, params.environments * params.ppo.rollout_steps
+        batched = ppo_model(CurveVecEnv(problem, settings, count, seed=0), params, seed=0)
+        scalar = ppo_model(
+            scalar_environments(lambda: CurveEnv(problem, settings), count), params, seed=0
+        )
+        learn = {
+            # going on where the last round stopped: a reset would cost the scalar side one more
+            # evaluation a copy
+            "batched": partial(
+                batched.learn, LEARNED_ROLLOUTS * rollout, reset_num_timesteps=False
+            ),
+            "scalar": partial(scalar.learn, rollout, reset_num_timesteps=False),
+        }
+        seconds = alternately(learn, self.settings.rounds)
+        ours, usual = LEARNED_ROLLOUTS * rollout / seconds["batched"], rollout / seconds["scalar"]
+        return {
+            "environments": count,
+            "steps_per_second": ours,
+            "dummy_vec_env_steps_per_second": usual,
+            "ratio_to_dummy_vec_env": ours / usual,
+        }
+
+    def analytic_solvers(self, name: str, actor: Actor) -> dict[str, dict[str, float]]:
+        """Every solver on an analytic manifold; the graph stands on random points of the domain."""
+        problem, box = analytic_problem(name, curve_family(2, self.geodesics)), MANIFOLDS[name].box
+        ends, exact = unseen_pairs(name, problem)
+        points = box.sample(self.settings.graph_points, np.random.default_rng(SEED))
+        graph = GraphSolver.over_points(problem.manifold, points)
+        solvers: dict[str, GeodesicSolver] = {
+            "policy_search": PolicySolver(actor, self.geodesics),
+            "gradient": GradientSolver(),
+            "graph": graph,
+            "grid": GraphSolver.over_grid(problem.manifold, box.low, box.high, GRID),
+            "combined": CombinedSolver(graph),
+        }
+        return solver_figures(problem, ends, exact, solvers)
+
+    def learned_solvers(self) -> dict[str, dict[str, float]]:
+        """The solvers that need no training on the learned manifold; the graph stands on encoded
+        data.
+        """
+        rng, problem = np.random.default_rng(SEED), self.plain
+        graph = GraphSolver.over_points(
+            problem.manifold, problem.domain.sample(self.settings.graph_points, rng)
+        )
+        solvers: dict[str, GeodesicSolver] = {
+            "gradient": GradientSolver(),
+            "graph": graph,
+            "combined": CombinedSolver(graph),
+        }
+        return solver_figures(problem, problem.sample_ends(self.settings.pairs, rng), None, solvers)
+
+
+SINGLE_PRECISION = 1e-6
+"""Relative error that the network's single precision leaves in a length, whatever the rule."""
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Random curves (B, p) of one family between the given ends, as a search meets them."""
+
+    family: CurveFamily
+    phi: Float[Tensor, "B p"]
+    start: Float[Tensor, "B N"]
+    goal: Float[Tensor, "B N"]
+
+    def first(self, count: int) -> "Curves":
+        """The first of them."""
+        return Curves(self.family, self.phi[:count], self.start[:count], self.goal[:count])
+
+    def at(self, t: Float[Tensor, "T"]) -> tuple[Float[Tensor, "B T N"], Float[Tensor, "B T N"]]:
+        """Points and velocities."""
+        return self.family.evaluate(self.phi, self.start, self.goal, t)
+
+
+def random_curves(problem: GeodesicProblem, count: int) -> tuple[Curves, Ends]:
+    """Curves as the problem draws them, always the same."""
+    rng = np.random.default_rng(SEED)
+    ends = problem.sample_ends(count, rng)
+    arrays = (problem.sample_curves(ends, rng), ends.z_start, ends.z_goal)
+    return Curves(
+        problem.curve, *(torch.from_numpy(np.asarray(values, np.float64)) for values in arrays)
+    ), ends
+
+
+def default_length(manifold: EmbeddedManifold, curves: Curves) -> Float[Tensor, "B"]:
+    """Lengths at the default accuracy."""
+    return curve_length(manifold, curves.family, curves.phi, curves.start, curves.goal)
+
+
+def naive_length(manifold: EmbeddedManifold, curves: Curves) -> Float[Tensor, "B"]:
+    """Eq. 2 as one would write it down: per curve the full Jacobian at 101 points, M = JᵀJ, the
+    trapezium rule.
+    """
+    t = torch.linspace(0.0, 1.0, NAIVE_POINTS, dtype=curves.phi.dtype)
+    jacobian_at = torch.func.vmap(torch.func.jacfwd(manifold.embed))
+    lengths = []
+    for row in range(len(curves.phi)):
+        z, velocity = curves.family.evaluate(
+            curves.phi[row], curves.start[row], curves.goal[row], t
+        )
+        jacobian = jacobian_at(z).to(z)
+        metric = jacobian.mT @ jacobian
+        speed = (velocity[:, None] @ metric @ velocity[..., None]).squeeze().sqrt()
+        lengths.append(torch.trapezoid(speed, t))
+    return torch.stack(lengths)
+
+
+def naive_length_batched(manifold: EmbeddedManifold, curves: Curves) -> Float[Tensor, "B"]:
+    """The naive formula on all curves at once: what batching alone is worth."""
+    t = torch.linspace(0.0, 1.0, NAIVE_POINTS, dtype=curves.phi.dtype)
+    z, velocity = curves.at(t)
+    jacobian = torch.func.vmap(torch.func.vmap(torch.func.jacfwd(manifold.embed)))(z).to(z)
+    metric = jacobian.mT @ jacobian
+    speed = (velocity[..., None, :] @ metric @ velocity[..., None]).squeeze((-1, -2)).sqrt()
+    return torch.trapezoid(speed, t)
+
+
+def naive_retracted_length(
+    problem: LearnedProblem, curves: Curves, ends: Ends
+) -> Float[np.ndarray, "B"]:
+    """The same with retraction, one curve at a time: chords through 101 decoded and retracted
+    points.
+
+    The retraction itself is the compiled one of both sides.
+    """
+    t, dof = np.linspace(0.0, 1.0, NAIVE_POINTS), problem.manifold.robot.dof
+    lengths = []
+    for row in range(len(curves.phi)):
+        one = ends[np.array([row])]
+        embedded = problem.chart.embed_points(
+            problem.latent_points(curves.phi[row : row + 1].numpy(), one, t)
+        )
+        decoded = embedded[..., :dof].astype(np.float64)
+        lifted = correct_and_retract(
+            problem.manifold, decoded, t, one.q_start, one.q_goal, problem.retraction
+        )
+        path = np.concatenate([lifted.joints, embedded[..., dof:]], axis=-1)
+        lengths.append(np.linalg.norm(np.diff(path, axis=1), axis=-1).sum())
+    return np.array(lengths)
+
+
+def reference_length(manifold: LearnedManifold, curves: Curves) -> Float[Tensor, "B"]:
+    """Chords through 2 000 points of every curve, with the network in double precision."""
+    exact, t = manifold.double(), torch.linspace(0.0, 1.0, REFERENCE_POINTS, dtype=torch.float64)
+    with torch.no_grad():
+        return torch.stack([chord_length(exact.embed(points)) for points in curves.at(t)[0]])
+
+
+def _chords(manifold: EmbeddedManifold, curves: Curves, count: int) -> Float[Tensor, "B"]:
+    t = torch.linspace(0.0, 1.0, count + 1, dtype=torch.float64)
+    return chord_length(manifold.embed(curves.at(t)[0]))
+
+
+def _by_rule(manifold: EmbeddedManifold, curves: Curves, rule: LengthRule) -> Float[Tensor, "B"]:
+    return curve_length(manifold, curves.family, curves.phi, curves.start, curves.goal, rule)
+
+
+def _relative(found: Float[Tensor, "B"], reference: Float[Tensor, "B"]) -> Float[np.ndarray, "B"]:
+    return ((found - reference).abs() / reference).numpy()
+
+
+def _spread(error: Float[np.ndarray, "B"]) -> dict[str, float]:
+    return {
+        "median": float(np.median(error)),
+        "p95": float(np.quantile(error, 0.95)),
+        "max": float(error.max()),
+    }
+
+
+def solver_figures(
+    problem: ChartProblem,
+    ends: Ends,
+    exact: Float[np.ndarray, "P"] | None,
+    solvers: Mapping[str, GeodesicSolver],
+) -> dict[str, dict[str, float]]:
+    """Length over the exact distance, or over the shortest that any solver found, and what a query
+    costs.
+
+    Ratios are over the pairs that every solver found a curve for.  milliseconds: of one query at a
+    time, over the first SINGLE pairs; milliseconds_in_batch: its share where all pairs are asked
+    for at once.
+    """
+    found, single, together = {}, {}, {}
+    for name, solver in solvers.items():
+        pairs = [
+            (ends.z_start[k : k + 1], ends.z_goal[k : k + 1]) for k in range(min(SINGLE, len(ends)))
+        ]
+        geodesics_between(solver, problem, *pairs[0])  # warm: what is built once is built
+        asked = [partial(geodesics_between, solver, problem, *pair) for pair in pairs]
+        single[name] = np.median([_seconds(ask) for ask in asked])
+        began = time.perf_counter()
+        found[name] = geodesics_between(solver, problem, ends.z_start, ends.z_goal)
+        together[name] = (time.perf_counter() - began) / len(ends)
+    lengths = {name: np.array([geodesic.length for geodesic in found[name]]) for name in solvers}
+    shared = np.isfinite(list(lengths.values())).all(axis=0)
+    best = np.min(list(lengths.values()), axis=0) if exact is None else exact
+    return {
+        name: {
+            **_ratios(lengths[name][shared] / best[shared]),
+            "found": float(np.mean([geodesic.found for geodesic in found[name]])),
+            "converged": float(
+                np.mean([geodesic.status == "converged" for geodesic in found[name]])
+            ),
+            "milliseconds": 1e3 * float(single[name]),
+            "milliseconds_in_batch": 1e3 * together[name],
+        }
+        for name in solvers
+    }
+
+
+def _ratios(ratio: Float[np.ndarray, "P"]) -> dict[str, float]:
+    if not len(ratio):
+        return dict.fromkeys(("mean_ratio", "p95_ratio", "max_ratio"), np.nan)
+    return {
+        "mean_ratio": float(ratio.mean()),
+        "p95_ratio": float(np.quantile(ratio, 0.95)),
+        "max_ratio": float(ratio.max()),
+    }
+
+
+def _seconds(run: Callable[[], Any]) -> float:
+    began = time.perf_counter()
+    run()
+    return time.perf_counter() - began
+
+
+def policy_search_figures(metrics: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """What training on the analytic manifolds reported, with the domain of the pairs."""
+    return {
+        name: {
+            "mean_ratio": found["mean_ratio"],
+            "p95_ratio": found["p95_ratio"],
+            "first_mean_ratio": found["first_mean_ratio"],
+            "pairs": PAIRS,
+            "domain": MANIFOLDS[name].domain,
+        }
+        for name, found in metrics.items()
+    }
+
+
+def alternately(runs: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
+    """Median seconds of each run over several rounds, taken in turn so that a slow spell of the
+    machine hits all.
+    """
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for turn in range(rounds + 1):
+        for name, run in runs.items():
+            spent = _seconds(run)
+            if turn:  # the first round warms up: compiled kernels, caches, allocated memory
+                times[name].append(spent)
+    return {name: float(np.median(values)) for name, values in times.items()}
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Everything on one thread: what is compared must not differ by what runs beside it."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,552 @@
+"""What policies add: their curves beside the straight line, plain descent, random curves and the
+best of the family.
+
+Every method answers one query at a time with the best curve that it met, feasible ones first, then
+the cheapest, at the problem's own accuracy.  Afterwards `measured` judges all answers, whoever gave
+them, and `family_optimum` looks for the shortest curve of the same family.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float, Int
+
+from constraint_geodesics.constraints.projection import Retraction
+from constraint_geodesics.geodesics.episodes import EpisodeSettings
+from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, repeated
+from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
+from constraint_geodesics.geometry.manifold import GeometryError
+
+STRAIGHT, ONE_SEED, POLICIES = "straight latent line", "policy, one seed", "policies"
+SEPARATE, DESCENT, RANDOM = "separate policies", "descent", "random curves"
+FINE_DEGREE, POLISH_DEGREE = 64, 32
+"""Degrees of the polynomials that lengths are measured with at last, and while curves are polished.
+"""
+EXACT = Retraction(accuracy=1e-6, iterations=20)
+ROW_SPACING, LONGEST_STEP = 0.05, 0.1
+"""Distance of a path's rows, and the longest one that is no jump [rad]."""
+LIMIT_SLACK, VIOLATION_SLACK = 1e-3, 1e-6
+"""What a path may exceed joint limits by between the points that the search looked at, and the
+constraint by [rad].
+"""
+INFEASIBLE = 1e3
+"""Added to the cost of a curve that is not feasible [rad]: more than any curve costs."""
+LONGEST_STRIDE = 1.5
+"""Largest multiple of the problem's descent that is taken in one step."""
+NEAR = 0.02
+"""Curves whose coefficients differ by less, in units of the ends' distance, are polished once."""
+DIFFERENCE = 3e-4
+"""Half step of central differences, in units of the ends' distance: a cost is known to single
+precision.
+"""
+FIRST_STEP = 0.1
+"""Longest step of the polish, in units of the ends' distance."""
+HALVINGS, SUFFICIENT = 6, 1e-4
+"""Of the polish's line search: cuts by SHORTENED at most, and the share of the expected decrease
+that it asks for.
+"""
+SHORTENED = 0.35
+GAIN = 1e-6
+"""Relative decrease below which a curve is polished no more."""
+
+
+@dataclass(frozen=True)
+class OptimumSettings:
+    """Work spent on the optimum of each query.
+
+    random_starts: cheapest of `drawn` random curves, beside the given starts.  descent_steps: from
+    every start.
+    polished: different curves that quasi-Newton goes on with, polish_steps: its iterations at most.
+    """
+
+    random_starts: int = 32
+    drawn: int = 256
+    descent_steps: int = 20
+    polished: int = 4
+    polish_steps: int = 40
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class FamilyOptimum:
+    """The shortest feasible curve found for each query; length [rad] is nan where there is none."""
+
+    phi: Float[np.ndarray, "Q p"]
+    length: Float[np.ndarray, "Q"]
+    feasible: Bool[np.ndarray, "Q"]
+
+
+def policy_rows(
+    problem: LearnedProblem,
+    policies: Sequence[MeanPolicy],
+    separate: Sequence[MeanPolicy] | None,
+    settings: EpisodeSettings,
+    ends: Ends,
+    seed: int,
+    random_curves: int | None = None,
+    optimum: OptimumSettings | None = None,
+) -> pd.DataFrame:
+    """One row a query and method (and seed, for one policy alone): what it answers and what it
+    costs.
+
+    policies: seeds of one policy; with none, their methods are left out.  separate: policies
+    trained on this constraint alone.  random_curves: as many as `policies` meet unless given.
+    seed: of the random curves.
+    Columns: method, seed, query, feasible, length_rad (nan where not feasible), optimum_rad
+    (`family_optimum` or an answer, whichever is shorter; nan where there is neither), curves (met,
+    the straight line once), time_ms (of the answer, on a problem that has answered before).
+    Raises GeometryError if the problem does not retract or there is no query.
+    """
+    _require_queries(problem, ends)
+    methods = _methods(problem, policies, separate, settings, seed, random_curves)
+    queries, count = len(ends), len(methods)
+    phi, rows = np.empty((queries, count, problem.curve.coefficients)), []
+    claimed = np.empty((queries, count), dtype=bool)
+    for method in methods:
+        method.answer(ends[np.arange(1)], 0)
+    for query in range(queries):
+        one = ends[np.array([query])]
+        for k, method in enumerate(
+            methods
+        ):  # in turn, so that what else the machine does disturbs all alike
+            began = time.perf_counter()
+            phi[query, k], claimed[query, k] = method.answer(one, query)
+            spent = 1e3 * (time.perf_counter() - began)
+            rows.append(
+                {
+                    "method": method.name,
+                    "seed": method.seed,
+                    "query": query,
+                    "curves": method.curves,
+                    "time_ms": spent,
+                }
+            )
+    costs = measured(
+        problem, phi.reshape(queries * count, -1), ends[np.repeat(np.arange(queries), count)]
+    )
+    feasible = claimed & costs.feasible.reshape(queries, count)
+    length = np.where(feasible, costs.length.reshape(queries, count), np.nan)
+    best = np.fmin(
+        family_optimum(problem, ends, phi, optimum).length, np.fmin.reduce(length, axis=1)
+    )
+    table = pd.DataFrame(rows).assign(feasible=feasible.ravel(), length_rad=length.ravel())
+    table["optimum_rad"] = best[table["query"]]
+    return table[
+        ["method", "seed", "query", "feasible", "length_rad", "optimum_rad", "curves", "time_ms"]
+    ]
+
+
+def policy_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """One row a method: share of feasible answers, length over the optimum, curves and time; of one
+    constraint's rows.
+
+    Ratios are over the method's own feasible answers (ratio_*) and over the queries for which every
+    answer of every method is feasible (shared_ratio_*, `shared` of them), the only ones that
+    compare columns of different methods.
+    solvable: queries with an optimum, out of `queries`.
+    """
+    rows = rows.reset_index(drop=True)
+    solved = rows.groupby("query")["feasible"].all()
+    shared = rows["query"].map(solved)
+    ratio = rows["length_rad"] / rows["optimum_rad"]
+    table = []
+    for method, group in rows.groupby("method", sort=False):
+        own, common = group["feasible"], group.index[shared[group.index]]
+        table.append(
+            {
+                "method": method,
+                "queries": group["query"].nunique(),
+                "solvable": group.loc[group["optimum_rad"].notna(), "query"].nunique(),
+                "feasible": float(own.mean()),
+                **_spread("ratio", ratio[group.index[own]]),
+                "shared": int(solved.sum()),
+                **_spread("shared_ratio", ratio[common]),
+                "curves": int(group["curves"].max()),
+                "time_median_ms": float(group["time_ms"].median()),
+            }
+        )
+    return pd.DataFrame(table)
+
+
+def charts_together(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Rows of the same queries in several charts, by the charts' names, as one table with one
+    optimum.
+
+    A method becomes "method, chart"; optimum_rad the shortest of any chart's family.
+    """
+    rows = pd.concat(
+        [table.assign(method=table["method"] + f", {chart}") for chart, table in tables.items()]
+    )
+    rows["optimum_rad"] = rows.groupby("query")["optimum_rad"].transform("min")
+    return rows.reset_index(drop=True)
+
+
+def family_optimum(
+    problem: LearnedProblem,
+    ends: Ends,
+    starts: Float[np.ndarray, "Q K p"],
+    settings: OptimumSettings | None = None,
+) -> FamilyOptimum:
+    """The shortest feasible curve of the family for each query, as far as many starts find it.
+
+    From every start the problem's own descent with a step size for each curve, which stands where
+    the mean Jacobian and the projector are no longer exact; from there BFGS on the cost.  All
+    queries and starts go in one batch. Starts and what the descent made of them count as well, so
+    the answer is no longer than a feasible start.
+    Raises GeometryError if the problem does not retract, there is no query, or the starts are not
+    (Q, K, p).
+    """
+    _require_queries(problem, ends)
+    settings = settings or OptimumSettings()
+    queries, size = len(ends), problem.curve.coefficients
+    if starts.ndim != 3 or (len(starts), starts.shape[2]) != (queries, size):
+        raise GeometryError(f"starts has shape {starts.shape}: must be ({queries}, K, {size})")
+    phi = np.concatenate([starts, _random_starts(problem, ends, settings)], axis=1)
+    each = ends[np.repeat(np.arange(queries), phi.shape[1])]
+    moved = descended(problem, phi.reshape(-1, size), each, settings.descent_steps).reshape(
+        phi.shape
+    )
+    met = np.concatenate([phi, moved], axis=1)
+    finer = replace(problem, degree=POLISH_DEGREE, retraction=EXACT)
+    costs = finer.evaluate(met.reshape(-1, size), ends[np.repeat(np.arange(queries), met.shape[1])])
+    picked = _picked(problem, met, _lengths(costs).reshape(met.shape[:2]), ends, settings.polished)
+    final = np.take_along_axis(met, np.maximum(picked, 0)[..., None], axis=1)
+    query, place = np.nonzero(picked >= 0)
+    final[query, place] = polished(finer, final[query, place], ends[query], settings.polish_steps)
+    return _shortest(problem, np.concatenate([final, met], axis=1), ends)
+
+
+def measured(problem: LearnedProblem, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
+    """Costs at FINE_DEGREE; a feasible curve's executed path, besides, neither jumps nor leaves
+    what it must keep.
+    """
+    costs = _fine(problem).evaluate(phi, ends)
+    feasible = costs.feasible.copy()
+    for row in np.flatnonzero(feasible):
+        feasible[row] = is_sound(problem, phi[row], ends[np.array([row])])
+    return replace(costs, feasible=feasible)
+
+
+def is_sound(problem: LearnedProblem, phi: Float[np.ndarray, "p"], ends: Ends) -> bool:
+    """Whether one curve's path has no step above LONGEST_STEP and keeps limits and constraint.
+
+    Lengths look at a curve at a few points, between which it may change its branch unseen.
+    """
+    path = problem.path(phi, ends, ROW_SPACING)
+    return bool(
+        np.linalg.norm(np.diff(path, axis=0), axis=1).max() <= LONGEST_STEP
+        and problem.manifold.robot.limit_distance(path).min() >= -LIMIT_SLACK
+        and problem.manifold.violation(path).max() <= VIOLATION_SLACK
+    )
+
+
+def descended(
+    problem: LearnedProblem, phi: Float[np.ndarray, "B p"], ends: Ends, steps: int
+) -> Float[np.ndarray, "B p"]:
+    """Curves after steps along the problem's descent, each with a step size of its own; none gets
+    worse.
+    """
+    now = problem.look(phi, ends)
+    rank, descent, stride = _ranks(now.costs), now.descent, np.ones(len(phi))
+    for _ in range(steps):
+        moved = phi + stride[:, None] * descent
+        now = problem.look(moved, ends)
+        new = _ranks(now.costs)
+        better = new < rank
+        phi, descent = (
+            np.where(better[:, None], moved, phi),
+            np.where(better[:, None], now.descent, descent),
+        )
+        rank = np.where(better, new, rank)
+        stride = np.where(better, np.minimum(1.3 * stride, LONGEST_STRIDE), 0.4 * stride)
+    return phi
+
+
+def polished(
+    problem: LearnedProblem, phi: Float[np.ndarray, "B p"], ends: Ends, steps: int
+) -> Float[np.ndarray, "B p"]:
+    """Curves after BFGS on the cost with central differences (Nocedal and Wright, Numerical
+    Optimization, alg. 6.1).
+
+    Every feasible curve has its own inverse Hessian and goes on until a step gains less than GAIN;
+    none gets worse and none becomes infeasible.  The others stay as they are.
+    """
+    phi, size = phi.copy(), phi.shape[1]
+    value = _ranks(problem.evaluate(phi, ends)) if len(phi) else np.empty(0)
+    rows = np.flatnonzero(value < INFEASIBLE)
+    gradient = _gradients(problem, phi, ends, rows)
+    inverse = np.tile(np.eye(size), (len(phi), 1, 1))
+    fresh = np.ones(len(phi), dtype=bool)
+    for _ in range(steps):
+        if not len(rows):
+            break
+        direction = -(inverse[rows] @ gradient[rows, :, None])[..., 0]
+        far, length = FIRST_STEP * ends.distance[rows], np.linalg.norm(direction, axis=1)
+        direction *= np.minimum(1.0, far / np.maximum(length, 1e-12))[:, None]
+        slope = (direction * gradient[rows]).sum(axis=1)
+        moved, new = _line_search(problem, phi[rows], ends[rows], value[rows], direction, slope)
+        stuck = new >= value[rows]
+        going = np.where(stuck, ~fresh[rows], value[rows] - new > GAIN * value[rows])
+        inverse[rows[stuck]], fresh[rows[stuck]] = (
+            np.eye(size),
+            True,
+        )  # a kink spoils the Hessian: once more without
+        on = rows[going & ~stuck]
+        change = (moved - phi[rows])[going & ~stuck]
+        phi[rows], value[rows] = moved, new
+        slopes = _gradients(problem, phi, ends, on)
+        _update(inverse, fresh, on, change, slopes[on] - gradient[on])
+        gradient[on] = slopes[on]
+        rows = rows[going]
+    return phi
+
+
+@dataclass(frozen=True)
+class _Method:
+    """A way to answer a query (its ends and its number) with coefficients (p,) and whether they are
+    feasible.
+
+    curves: that it meets for one query.
+    """
+
+    name: str
+    seed: int
+    curves: int
+    answer: Callable[[Ends, int], tuple[Float[np.ndarray, "p"], bool]]
+
+
+def _methods(
+    problem: LearnedProblem,
+    policies: Sequence[MeanPolicy],
+    separate: Sequence[MeanPolicy] | None,
+    settings: EpisodeSettings,
+    seed: int,
+    random_curves: int | None,
+) -> list[_Method]:
+    met = len(policies) * settings.steps + 1
+    drawn = met if random_curves is None else random_curves
+    methods = [_Method(STRAIGHT, 0, 1, partial(_straight, problem))]
+    methods += [
+        _Method(ONE_SEED, k, settings.steps + 1, partial(_proposed, problem, [policy], settings))
+        for k, policy in enumerate(policies)
+    ]
+    if policies:
+        methods.append(_Method(POLICIES, 0, met, partial(_proposed, problem, policies, settings)))
+    if separate:
+        count = len(separate) * settings.steps + 1
+        methods.append(_Method(SEPARATE, 0, count, partial(_proposed, problem, separate, settings)))
+    methods.append(
+        _Method(DESCENT, 0, settings.steps + 1, partial(_followed, problem, settings.steps))
+    )
+    methods.append(_Method(RANDOM, 0, drawn, partial(_at_random, problem, drawn, seed)))
+    return methods
+
+
+def _straight(
+    problem: LearnedProblem,
+    ends: Ends,
+    query: int,  # noqa: ARG001
+) -> tuple[Float[np.ndarray, "p"], bool]:
+    phi = np.zeros((1, problem.curve.coefficients))
+    return phi[0], bool(problem.evaluate(phi, ends).feasible[0])
+
+
+def _proposed(
+    problem: LearnedProblem,
+    policies: Sequence[MeanPolicy],
+    settings: EpisodeSettings,
+    ends: Ends,
+    query: int,  # noqa: ARG001
+) -> tuple[Float[np.ndarray, "p"], bool]:
+    found = propose(problem, policies, settings, ends)
+    return _best(found.phi[:, 0], found.cost[:, 0], found.feasible[:, 0])
+
+
+def _followed(
+    problem: LearnedProblem,
+    steps: int,
+    ends: Ends,
+    query: int,  # noqa: ARG001
+) -> tuple[Float[np.ndarray, "p"], bool]:
+    """The problem's descent alone, whole steps from the straight line."""
+    phi = np.zeros((steps + 1, problem.curve.coefficients))
+    looks = [problem.look(phi[:1], ends)]
+    for step in range(1, steps + 1):
+        phi[step] = phi[step - 1] + looks[-1].descent[0]
+        looks.append(problem.look(phi[step : step + 1], ends))
+    costs = [look.costs for look in looks]
+    return _best(
+        phi, np.concatenate([c.cost for c in costs]), np.concatenate([c.feasible for c in costs])
+    )
+
+
+def _at_random(
+    problem: LearnedProblem, count: int, seed: int, ends: Ends, query: int
+) -> tuple[Float[np.ndarray, "p"], bool]:
+    """The straight line and random curves, `count` in all."""
+    many = repeated(ends, count)
+    phi = problem.sample_curves(many, np.random.default_rng((seed, query)))
+    phi[0] = 0.0
+    costs = problem.evaluate(phi, many)
+    return _best(phi, costs.cost, costs.feasible)
+
+
+def _best(
+    phi: Float[np.ndarray, "B p"], cost: Float[np.ndarray, "B"], feasible: Bool[np.ndarray, "B"]
+) -> tuple[Float[np.ndarray, "p"], bool]:
+    row = int(np.lexsort((cost, ~feasible))[0])
+    return phi[row], bool(feasible[row])
+
+
+def _ranks(costs: Costs) -> Float[np.ndarray, "B"]:
+    """Costs, with those of all curves that are not feasible behind the others'."""
+    return np.where(costs.feasible, costs.cost, costs.cost + INFEASIBLE)
+
+
+def _fine(problem: LearnedProblem) -> LearnedProblem:
+    return replace(problem, degree=FINE_DEGREE, retraction=EXACT)
+
+
+def _random_starts(
+    problem: LearnedProblem, ends: Ends, settings: OptimumSettings
+) -> Float[np.ndarray, "Q {settings.random_starts} p"]:
+    """The cheapest of many random curves for each query."""
+    queries, drawn = len(ends), settings.drawn
+    many = ends[np.repeat(np.arange(queries), drawn)]
+    phi = problem.sample_curves(many, np.random.default_rng(settings.seed))
+    order = np.argsort(_ranks(problem.evaluate(phi, many)).reshape(queries, drawn), axis=1)
+    kept = order[:, : settings.random_starts, None]
+    return np.take_along_axis(phi.reshape(queries, drawn, -1), kept, axis=1)
+
+
+def _shortest(
+    problem: LearnedProblem, phi: Float[np.ndarray, "Q M p"], ends: Ends
+) -> FamilyOptimum:
+    """The shortest sound curve of each query, as `measured` has it."""
+    queries, count, size = phi.shape
+    costs = _fine(problem).evaluate(
+        phi.reshape(-1, size), ends[np.repeat(np.arange(queries), count)]
+    )
+    length = _lengths(costs).reshape(queries, count)
+    best = _picked(problem, phi, length, ends, 1)
+    feasible, row = best[:, 0] >= 0, np.maximum(best, 0)
+    found = np.take_along_axis(phi, row[..., None], axis=1)[:, 0]
+    return FamilyOptimum(
+        np.where(feasible[:, None], found, 0.0),
+        np.where(feasible, np.take_along_axis(length, row, axis=1)[:, 0], np.nan),
+        feasible,
+    )
+
+
+def _picked(
+    problem: LearnedProblem,
+    phi: Float[np.ndarray, "Q M p"],
+    length: Float[np.ndarray, "Q M"],
+    ends: Ends,
+    count: int,
+) -> Int[np.ndarray, "Q {count}"]:
+    """Each query's shortest sound curves, no two of them near each other; -1 where there are no
+    more.
+    """
+    picked = np.full((len(phi), count), -1)
+    for query in range(len(phi)):
+        one, near, found = ends[np.array([query])], NEAR * ends.distance[query], 0
+        for k in np.argsort(length[query], kind="stable"):
+            if found == count or not np.isfinite(length[query, k]):
+                break
+            apart = np.linalg.norm(phi[query, picked[query, :found]] - phi[query, k], axis=1)
+            if (apart >= near).all() and is_sound(problem, phi[query, k], one):
+                picked[query, found] = k
+                found += 1
+    return picked
+
+
+def _lengths(costs: Costs) -> Float[np.ndarray, "B"]:
+    """Lengths of what is feasible, inf for the rest."""
+    return np.where(costs.feasible, costs.length, np.inf)
+
+
+def _gradients(
+    problem: LearnedProblem, phi: Float[np.ndarray, "B p"], ends: Ends, rows: Int[np.ndarray, "b"]
+) -> Float[np.ndarray, "B p"]:
+    """Of the cost, by central differences; zero but in the given rows."""
+    gradients, count, size = np.zeros_like(phi), len(rows), phi.shape[1]
+    if not count:
+        return gradients
+    step = DIFFERENCE * ends.distance[rows]
+    moves = np.concatenate([np.eye(size), -np.eye(size)])
+    tried = (phi[rows, None] + step[:, None, None] * moves).reshape(-1, size)
+    cost = problem.evaluate(tried, ends[np.repeat(rows, 2 * size)]).cost.reshape(count, 2, size)
+    gradients[rows] = (cost[:, 0] - cost[:, 1]) / (2.0 * step[:, None])
+    return gradients
+
+
+def _line_search(
+    problem: LearnedProblem,
+    phi: Float[np.ndarray, "B p"],
+    ends: Ends,
+    value: Float[np.ndarray, "B"],
+    direction: Float[np.ndarray, "B p"],
+    slope: Float[np.ndarray, "B"],
+) -> tuple[Float[np.ndarray, "B p"], Float[np.ndarray, "B"]]:
+    """The first of ever shorter steps whose decrease is sufficient (Armijo), else no step; with its
+    cost.
+    """
+    phi, new, share = phi.copy(), value.copy(), 1.0
+    rows = np.arange(len(phi))
+    for _ in range(HALVINGS):
+        tried = phi[rows] + share * direction[rows]
+        cost = _ranks(problem.evaluate(tried, ends[rows]))
+        enough = cost < value[rows] + SUFFICIENT * share * slope[rows]
+        phi[rows[enough]], new[rows[enough]] = tried[enough], cost[enough]
+        rows, share = rows[~enough], SHORTENED * share
+        if not len(rows):
+            break
+    return phi, new
+
+
+def _update(
+    inverse: Float[np.ndarray, "B p p"],
+    fresh: Bool[np.ndarray, "B"],
+    rows: np.ndarray,
+    change: Float[np.ndarray, "b p"],
+    turn: Float[np.ndarray, "b p"],
+) -> None:
+    """BFGS update of the inverse Hessians in `rows`, in place; skipped where the curvature is not
+    positive.
+
+    Before the first one a Hessian is scaled to the curvature met (Nocedal and Wright, eq. 6.20).
+    """
+    curvature = (change * turn).sum(axis=1)
+    kept = curvature > 1e-10
+    rows, s, y, sy = rows[kept], change[kept], turn[kept], curvature[kept]
+    scale = np.where(fresh[rows], sy / (y * y).sum(axis=1), 1.0)
+    h = scale[:, None, None] * inverse[rows]
+    left = np.eye(s.shape[1]) - s[:, :, None] * y[:, None] / sy[:, None, None]
+    inverse[rows] = (
+        left @ h @ left.transpose(0, 2, 1) + s[:, :, None] * s[:, None] / sy[:, None, None]
+    )
+    fresh[rows] = False
+
+
+def _spread(name: str, values: "pd.Series[float]") -> dict[str, Any]:
+    """Mean, median and 95th percentile; nan where there is no value."""
+    return {
+        f"{name}_mean": float(values.mean()),
+        f"{name}_median": float(values.median()),
+        f"{name}_p95": float(values.quantile(0.95)),
+    }
+
+
+def _require_queries(problem: LearnedProblem, ends: Ends) -> None:
+    if not problem.retract:
+        raise GeometryError(
+            "problem.retract = False: must be True, without it there is no descent to follow"
+        )
+    if not len(ends):
+        raise GeometryError("ends holds no query: must hold one at least")

@@ -1,0 +1,73 @@
+"""The planner as MLflow serves it: `mlflow models serve` answers planning requests with it.
+
+MLflow keeps a copy of this file with the model and runs it there, so a model holds no pickled
+object; the networks beside it are safetensors, whose checksums are verified.  Not to be imported:
+importing it hands a model to MLflow.
+"""
+
+import json
+import threading
+from collections.abc import Hashable, Mapping
+from typing import Any
+
+import mlflow
+import mlflow.pyfunc
+import pandas as pd
+
+from constraint_geodesics.constraints.pose import Constraint
+from constraint_geodesics.pipeline.threads import one_thread
+from constraint_geodesics.planner import Path, Planner
+
+
+class ServedPlanner(mlflow.pyfunc.PythonModel):
+    """A row is a query: start and goal [rad], and a constraint's name or its axes and tolerance as
+    JSON.
+    """
+
+    def load_context(self, context: Any) -> None:
+        """Load the planner whose files lie with the model."""
+        self.planner = Planner.load(context.artifacts["planner"])
+        self.free = (
+            threading.Lock()
+        )  # the server answers on several threads, and there is one world for collisions
+
+    def predict(
+        self, context: Any, model_input: pd.DataFrame, params: dict[str, Any] | None = None
+    ) -> Any:
+        """One answer a row, a query that has no path among them: status and explanation say why."""
+        with self.free, one_thread():
+            return [self.answer(row) for row in model_input.to_dict("records")]
+
+    def answer(self, row: Mapping[Hashable, Any]) -> dict[str, Any]:
+        """The path's summary with its rows [rad] and their times [s]; a bad query is an answer as
+        well.
+        """
+        try:
+            return with_rows(
+                self.planner.plan(row["start"], row["goal"], constraint_of(str(row["constraint"])))
+            )
+        except ValueError as error:  # one bad row must not cost the others their answers
+            return {"status": "bad_query", "explanation": str(error), "joints": [], "times": []}
+
+
+def constraint_of(text: str) -> str | Constraint:
+    """A constraint's name as it is, or {"axes": [...], "tolerance": [...]}, held where the start
+    has them.
+    """
+    if not text.lstrip().startswith("{"):
+        return text
+    try:
+        about = json.loads(text)
+        return Constraint(tuple(about["axes"]), tuple(about.get("tolerance", (0.0,) * 6)))
+    except (KeyError, TypeError) as error:
+        raise ValueError(
+            f"{text}: must have axes, and may have a tolerance, six numbers each: {error}"
+        ) from None
+
+
+def with_rows(path: Path) -> dict[str, Any]:
+    """A path as JSON takes it."""
+    return {**path.summary(), "joints": path.joints.tolist(), "times": path.times.tolist()}
+
+
+mlflow.models.set_model(ServedPlanner())

@@ -1,0 +1,21 @@
+"""The packaged planner's workcell and its judge, for the tests of its peers."""
+
+from collections.abc import Iterator
+
+import pytest
+from tests.planner_fixtures import packaged_planner
+
+from constraint_geodesics.certification.certifier import Certifier, Limits
+from constraint_geodesics.scene.world import World
+
+
+@pytest.fixture(scope="module")
+def world() -> Iterator[World]:
+    with packaged_planner().scene.world() as loaded:
+        yield loaded
+
+
+@pytest.fixture(scope="module")
+def certifier() -> Iterator[Certifier]:
+    with Certifier(packaged_planner().scene, Limits()) as loaded:
+        yield loaded

@@ -1,0 +1,61 @@
+"""Restarts keep the shortest, end in time, and ask no more where no seed changes the answer."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from tests.planner_fixtures import manifold_of, packaged_planner, pairs_of
+
+from constraint_geodesics.peers.restarts import Restarted
+from constraint_geodesics.problem import PlannedPath, PlanningProblem
+
+
+@dataclass
+class Listed:
+    """Answers with paths of the given lengths, one after another; nan for none."""
+
+    lengths: tuple[float, ...]
+    status: str = "solved"
+    seeds: list[int] = field(default_factory=list)
+    name: str = "listed"
+
+    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+        length = self.lengths[len(self.seeds) % len(self.lengths)]
+        self.seeds.append(seed)
+        if np.isnan(length):
+            return PlannedPath("not_found", np.empty((0, 6)), 0.0, 1)
+        return PlannedPath(self.status, np.array([[0.0] * 6, [length] + [0.0] * 5]), 0.0, 1)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def problem() -> PlanningProblem:
+    start, goal = pairs_of("free", 1, seed=1)[0]
+    return PlanningProblem(start, goal, manifold_of(packaged_planner(), "free"), lambda q: True)
+
+
+def test_the_shortest_of_all_attempts_is_the_answer(problem) -> None:
+    inner = Listed((np.nan, 3.0, 1.0, 2.0))
+    found = Restarted(inner, 0.05).plan(problem, 2)
+    assert found.status == "solved"
+    assert found.joints[1, 0] == 1.0
+    assert found.iterations == len(inner.seeds) > 4
+    assert inner.seeds == list(range(200_000, 200_000 + len(inner.seeds)))
+    assert found.time_s > 0.0
+
+
+def test_without_a_path_there_is_an_answer_all_the_same(problem) -> None:
+    found = Restarted(Listed((np.nan,)), 0.01).plan(problem, 0)
+    assert (found.status, found.joints.shape) == ("not_found", (0, 6))
+
+
+@pytest.mark.parametrize("status", ["not_applicable", "start_violates"])
+def test_what_no_seed_changes_is_asked_once(problem, status) -> None:
+    inner = Listed((1.0,), status)
+    assert Restarted(inner, 5.0).plan(problem, 0).status == status
+    assert len(inner.seeds) == 1
+
+
+def test_one_attempt_is_made_however_short_the_time(problem) -> None:
+    inner = Listed((2.0,))
+    assert Restarted(inner, 1e-9).plan(problem, 0).joints[1, 0] == 2.0
+    assert len(inner.seeds) == 1
