@@ -12,7 +12,7 @@ from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.planner import Planner
-from constraint_geodesics.problem import PlannedPath, PlanningProblem
+from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.world import World
 
@@ -71,7 +71,7 @@ def problems(world: World, name: str, count: int) -> list[PlanningProblem]:
     ]
 
 
-def assert_sound(path: PlannedPath, asked: PlanningProblem, certifier: Certifier) -> None:
+def assert_sound(path: Solution, asked: PlanningProblem, certifier: Certifier) -> None:
     """A peer's answer that the certifier accepts, its ends those of the problem to the bit."""
     assert path.status == "solved"
     assert path.time_s > 0.0

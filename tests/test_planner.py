@@ -20,7 +20,7 @@ from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.pose import ConstraintError, ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.params import SphereParams
-from constraint_geodesics.planner import Path as PlannedPath
+from constraint_geodesics.planner import Path as Solution
 from constraint_geodesics.planner import PlannerError, check_path, read_path
 from constraint_geodesics.recording.recording import read_recording
 from constraint_geodesics.search.candidates import Answer, Parts, Task, candidates, refined, rows_of
@@ -39,7 +39,7 @@ OTHER_WAY_ROUND = np.array([0.0, 2.0, -0.2, 0.0, 0.3, 0.1])
 
 
 @cache
-def solved(name: str) -> tuple[PlannedPath, ...]:
+def solved(name: str) -> tuple[Solution, ...]:
     """Paths of some queries of one constraint, those found over the graph among them."""
     planner = packaged_planner()
     paths = [planner.plan(*ends, name) for ends in pairs_of(name, 6, seed=1)]

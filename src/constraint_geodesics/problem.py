@@ -20,16 +20,9 @@ LIMIT_SLACK = 1e-9
 
 EndStatus = Literal["start_violates", "goal_violates", "out_of_limits"]
 Status = Literal[
-    EndStatus,
-    "solved",
-    "not_found",
-    "not_connected",
-    "start_in_collision",
-    "goal_in_collision",
-    "in_collision",
-    "not_applicable",
+    EndStatus, "solved", "not_found", "not_connected", "in_collision", "not_applicable"
 ]
-"""not_applicable: the planner cannot work on such a problem at all; `PlannedPath.explanation` says
+"""not_applicable: the planner cannot work on such a problem at all; `Solution.explanation` says
 why.
 """
 
@@ -50,7 +43,7 @@ class PlanningProblem:
 
 
 @dataclass(frozen=True)
-class PlannedPath:
+class Solution:
     """What a planner answers: a status, and the path if there is one."""
 
     status: Status
@@ -73,7 +66,7 @@ class PathPlanner(Protocol):
         """The name results are listed under."""
         ...
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """Look for a path; that there is none is an answer, not an error."""
         ...
 
@@ -85,10 +78,8 @@ def refusal(problem: PlanningProblem) -> Status | None:
     violated = ends_refused(problem.manifold, problem.start, problem.goal)
     if violated is not None:
         return violated
-    if not problem.is_free(problem.start):
-        return "start_in_collision"
-    if not problem.is_free(problem.goal):
-        return "goal_in_collision"
+    if not (problem.is_free(problem.start) and problem.is_free(problem.goal)):
+        return "in_collision"
     return None
 
 

@@ -25,7 +25,7 @@ from constraint_geodesics.benchmark.runner import (
 )
 from constraint_geodesics.params import load_params
 from constraint_geodesics.peers.elastic_band import StraightBand
-from constraint_geodesics.problem import PlannedPath
+from constraint_geodesics.problem import Solution
 from constraint_geodesics.scene.world import Sphere
 
 JUDGE = load_params(Path(__file__).parents[2] / "params.yaml").judge
@@ -40,7 +40,7 @@ class Liar:
 
     def plan(self, problem, seed):
         line = np.linspace(problem.start, problem.goal, 50 + seed)
-        return PlannedPath("solved", line, 0.001, 1)
+        return Solution("solved", line, 0.001, 1)
 
 
 @dataclass(frozen=True)

@@ -116,8 +116,8 @@ def test_refused_problems_say_why(world: World) -> None:
         (replace(asked, start=tilted), "start_violates"),
         (replace(asked, goal=tilted), "goal_violates"),
         (replace(asked, goal=beyond, manifold=free), "out_of_limits"),
-        (replace(asked, start=in_table, manifold=free), "start_in_collision"),
-        (replace(asked, goal=in_table, manifold=free), "goal_in_collision"),
+        (replace(asked, start=in_table, manifold=free), "in_collision"),
+        (replace(asked, goal=in_table, manifold=free), "in_collision"),
     ):
         path = PLANNER.plan(wrong, seed=0)
         assert (path.status, path.joints.shape, path.iterations) == (status, (0, 6), 0)

@@ -17,7 +17,7 @@ from constraint_geodesics.peers.elastic_band import (
     uniform_configurations,
 )
 from constraint_geodesics.peers.ompl import SamplingPlanner
-from constraint_geodesics.problem import PathPlanner, PlannedPath, PlanningProblem
+from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import Box, World
@@ -111,8 +111,8 @@ def test_refused_problems_say_why(planner: PathPlanner, world: World) -> None:
         (replace(asked, start=tilted), "start_violates"),
         (replace(asked, goal=tilted), "goal_violates"),
         (replace(asked, goal=beyond, manifold=free), "out_of_limits"),
-        (replace(asked, start=in_table, manifold=free), "start_in_collision"),
-        (replace(asked, goal=in_table, manifold=free), "goal_in_collision"),
+        (replace(asked, start=in_table, manifold=free), "in_collision"),
+        (replace(asked, goal=in_table, manifold=free), "in_collision"),
     ):
         path = planner.plan(wrong, seed=0)
         assert (path.status, path.joints.shape, path.iterations) == (status, (0, 6), 0)
@@ -151,13 +151,13 @@ def test_path_itself_where_every_band_touches_something(world: World) -> None:
 
     asked = walled(world, is_free)
     lines = [np.linspace(a, b, 40) for a, b in ((asked.start, corner), (corner, asked.goal))]
-    given = PlannedPath("solved", np.concatenate([lines[0], lines[1][1:]]), 0.5, 7)
+    given = Solution("solved", np.concatenate([lines[0], lines[1][1:]]), 0.5, 7)
     after = band_after(asked, given, BandSettings())
     assert after.status == "solved"
     assert length(after.joints) == pytest.approx(length(given.joints))
     np.testing.assert_array_equal(after.joints[[0, -1]], given.joints[[0, -1]])
     assert after.iterations > 7
-    nothing = PlannedPath("not_found", np.empty((0, 6)), 0.5, 7)
+    nothing = Solution("not_found", np.empty((0, 6)), 0.5, 7)
     assert band_after(asked, nothing, BandSettings()) is nothing
 
 

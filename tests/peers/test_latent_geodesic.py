@@ -9,7 +9,7 @@ from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.peers.latent_geodesic import GradientGeodesic, StraightLatent, executable
-from constraint_geodesics.problem import PlannedPath, PlanningProblem
+from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.world import Box, World
@@ -33,7 +33,7 @@ class Bench:
             start, goal, manifold or manifold_of(packaged_planner(), name), self.world.is_free
         )
 
-    def assert_sound(self, path: PlannedPath, problem: PlanningProblem) -> None:
+    def assert_sound(self, path: Solution, problem: PlanningProblem) -> None:
         np.testing.assert_array_equal(path.joints[[0, -1]], [problem.start, problem.goal])
         found = self.judge.certify(
             path.joints, problem.manifold.constraint, problem.start, problem.goal
@@ -48,7 +48,7 @@ def bench() -> Iterator[Bench]:
         yield Bench(LearnedManifold.from_arrays(planner.bundle.manifold), world, judge)
 
 
-def length(path: PlannedPath) -> float:
+def length(path: Solution) -> float:
     return float(np.linalg.norm(np.diff(path.joints, axis=0), axis=1).sum())
 
 
@@ -103,7 +103,7 @@ def test_refused_ends_come_without_a_path(bench: Bench) -> None:
     walled = PlanningProblem(
         problem.start, problem.goal, problem.manifold, lambda q: bool(q is problem.goal)
     )
-    assert StraightLatent(bench.chart).plan(walled, 0).status == "start_in_collision"
+    assert StraightLatent(bench.chart).plan(walled, 0).status == "in_collision"
 
 
 def test_a_chart_of_another_robot_does_not_apply(bench: Bench, kuka: SerialRobot) -> None:

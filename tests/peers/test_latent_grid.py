@@ -27,7 +27,7 @@ from constraint_geodesics.peers.latent_grid import (
     same_constraint,
     straight_lengths,
 )
-from constraint_geodesics.problem import PlannedPath, PlanningProblem
+from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
 
@@ -73,14 +73,14 @@ def grid_of(plane: LearnedManifold, name: str, params: Params, cells: int = 60) 
     return on_grid(plane, manifold, plane.encode(nodes_of("free")[0]), settings)
 
 
-def assert_sound(path: PlannedPath, asked: PlanningProblem) -> None:
+def assert_sound(path: Solution, asked: PlanningProblem) -> None:
     np.testing.assert_array_equal(path.joints[[0, -1]], [asked.start, asked.goal])
     with Certifier(packaged_planner().scene) as judge:
         found = judge.certify(path.joints, asked.manifold.constraint, asked.start, asked.goal)
     assert found.violation is None, found.violation
 
 
-def length(path: PlannedPath) -> float:
+def length(path: Solution) -> float:
     return float(np.linalg.norm(np.diff(path.joints, axis=0), axis=1).sum())
 
 

@@ -10,7 +10,7 @@ from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.params import BenchmarkParams
 from constraint_geodesics.peers.ompl import PlannerName, SamplingPlanner, plan_all
-from constraint_geodesics.problem import PlannedPath, PlanningProblem
+from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
 from constraint_geodesics.scene.world import Box, World, data_path
 
@@ -72,7 +72,7 @@ def problem(world: World, constraint: Constraint, seed: int) -> PlanningProblem:
     return PlanningProblem(start, goal, manifold, world.is_free)
 
 
-def assert_sound(path: PlannedPath, asked: PlanningProblem, world: World) -> None:
+def assert_sound(path: Solution, asked: PlanningProblem, world: World) -> None:
     assert path.status == "solved"
     assert path.iterations > 0
     assert 0.0 < path.time_s < SETTINGS.budget_s
@@ -176,8 +176,8 @@ def test_refused_problems_say_why(world: World) -> None:
         (tilted, goal, level, "start_violates"),
         (start, tilted, level, "goal_violates"),
         (start, beyond, free, "out_of_limits"),
-        (in_table, goal, free, "start_in_collision"),
-        (start, in_table, free, "goal_in_collision"),
+        (in_table, goal, free, "in_collision"),
+        (start, in_table, free, "in_collision"),
     ):
         path = SamplingPlanner("birrt", SETTINGS).plan(
             PlanningProblem(first, last, manifold, world.is_free), seed=0

@@ -7,7 +7,7 @@ import pytest
 from tests.planner_fixtures import manifold_of, packaged_planner, pairs_of
 
 from constraint_geodesics.peers.restarts import Restarted
-from constraint_geodesics.problem import PlannedPath, PlanningProblem
+from constraint_geodesics.problem import PlanningProblem, Solution
 
 
 @dataclass
@@ -19,12 +19,12 @@ class Listed:
     seeds: list[int] = field(default_factory=list)
     name: str = "listed"
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         length = self.lengths[len(self.seeds) % len(self.lengths)]
         self.seeds.append(seed)
         if np.isnan(length):
-            return PlannedPath("not_found", np.empty((0, 6)), 0.0, 1)
-        return PlannedPath(self.status, np.array([[0.0] * 6, [length] + [0.0] * 5]), 0.0, 1)  # type: ignore[arg-type]
+            return Solution("not_found", np.empty((0, 6)), 0.0, 1)
+        return Solution(self.status, np.array([[0.0] * 6, [length] + [0.0] * 5]), 0.0, 1)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")

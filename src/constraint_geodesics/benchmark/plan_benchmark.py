@@ -48,7 +48,7 @@ MULTI_START, BAND_AFTER, TANGENT = "band from many starts", "BiRRT + band", "BiR
 SOURCES = get_args(Source)
 
 
-class PlannedPath(Protocol):
+class Solution(Protocol):
     """What is asked of a planner's answer."""
 
     @property
@@ -87,7 +87,7 @@ class Planner(Protocol):
         constraint: Constraint,
         *,
         parts: Parts,
-    ) -> PlannedPath:
+    ) -> Solution:
         """One query, with some of its parts."""
         ...
 
@@ -96,7 +96,7 @@ class Planner(Protocol):
         starts: Float[np.ndarray, "B D"],
         goals: Float[np.ndarray, "B D"],
         constraint: Constraint,
-    ) -> Sequence[PlannedPath]:
+    ) -> Sequence[Solution]:
         """Many of them."""
         ...
 

@@ -26,7 +26,7 @@ from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import JudgeParams
-from constraint_geodesics.problem import PathPlanner, PlannedPath, PlanningProblem
+from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import Sphere
@@ -396,13 +396,13 @@ def _started(block: Block, case: Case, entry: Entry, seed: int) -> int:
     return before
 
 
-def _crashed(case: Case) -> PlannedPath:
-    return PlannedPath(
+def _crashed(case: Case) -> Solution:
+    return Solution(
         "not_found", np.empty((0, len(case.start))), 0.0, 0, "the process died in it twice"
     )
 
 
-def _planned(planner: PathPlanner, problem: PlanningProblem, seed: int) -> PlannedPath:
+def _planned(planner: PathPlanner, problem: PlanningProblem, seed: int) -> Solution:
     """The planner's answer; one that raises has failed on this query, which is a row as well."""
     began = time.perf_counter()
     try:
@@ -410,11 +410,11 @@ def _planned(planner: PathPlanner, problem: PlanningProblem, seed: int) -> Plann
     except Exception as error:  # a peer's library may raise anything
         nothing = np.empty((0, problem.manifold.robot.dof))
         text = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        return PlannedPath("not_found", nothing, time.perf_counter() - began, 0, text)
+        return Solution("not_found", nothing, time.perf_counter() - began, 0, text)
 
 
 def _row(
-    case: Case, entry: Entry, seed: int, found: PlannedPath, measures: PathMeasures, grown: float
+    case: Case, entry: Entry, seed: int, found: Solution, measures: PathMeasures, grown: float
 ) -> dict[str, Any]:
     latent = list(measures.latent_length.values())
     row = {
@@ -442,7 +442,7 @@ def _row(
     }
 
 
-def _measured_memory(work: Callable[[], PlannedPath]) -> tuple[PlannedPath, float]:
+def _measured_memory(work: Callable[[], Solution]) -> tuple[Solution, float]:
     """What the work returns, and by how much the process's memory grew at its peak [MB]; nan but on
     Linux.
 

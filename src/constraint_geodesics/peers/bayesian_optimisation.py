@@ -28,7 +28,7 @@ from constraint_geodesics.peers.latent_geodesic import (
     turned_away,
     without_path,
 )
-from constraint_geodesics.problem import PlannedPath, PlanningProblem
+from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.robot.kinematics import SerialRobot
 
 LIMIT_SAMPLES = 1000
@@ -83,7 +83,7 @@ class BayesianPlanner:
             if value < 1:
                 raise ValueError(f"{name} = {value}: must be at least 1")
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The cheapest curve met that is a path."""
         began = time.perf_counter()
         chart = self.chart or joint_chart(problem.manifold.robot)

@@ -23,7 +23,7 @@ from constraint_geodesics.learning.lift import Chart
 from constraint_geodesics.params import BenchmarkParams
 from constraint_geodesics.peers.elastic_band import is_clear, nothing, rows_along, settled
 from constraint_geodesics.peers.ompl import birrt_with_sampler
-from constraint_geodesics.problem import PlannedPath, PlanningProblem
+from constraint_geodesics.problem import PlanningProblem, Solution
 
 BATCH = 64
 """Samples that are decoded and projected at once."""
@@ -53,7 +53,7 @@ class DecoderSampling:
     iterations: int = 600
     name: str = "BiRRT, decoded samples"
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """Grow two trees until they meet or the iterations are used up."""
         began = time.perf_counter()
         early = settled(problem, began)
@@ -81,7 +81,7 @@ class DecoderSampling:
             return nothing(
                 problem, began, iterations, "its path touches something between its rows"
             )
-        return PlannedPath("solved", rows, time.perf_counter() - began, iterations)
+        return Solution("solved", rows, time.perf_counter() - began, iterations)
 
     def _misfit(self, manifold: ConstraintManifold) -> str:
         """Why the decoder or OMPL's space cannot serve the constraint; empty where they can."""

@@ -17,13 +17,7 @@ from jaxtyping import Float
 from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.learning.lift import densify
-from constraint_geodesics.problem import (
-    SATISFIED,
-    PathPlanner,
-    PlannedPath,
-    PlanningProblem,
-    refusal,
-)
+from constraint_geodesics.problem import SATISFIED, PathPlanner, PlanningProblem, Solution, refusal
 from constraint_geodesics.scene.clearance import no_clearance
 from constraint_geodesics.search.band import BandSettings, BandSpace, project, step_lengths
 from constraint_geodesics.search.candidates import (
@@ -67,7 +61,7 @@ class StraightBand:
     settings: BandSettings = field(default_factory=BandSettings)
     name: str = "straight + band"
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The relaxed line if it is sound; "not_found" if it jumps, leaves the limits or touches
         something.
         """
@@ -84,7 +78,7 @@ class StraightBand:
             candidate = refined(task, "straight", resample(straight, segments + 1))
             rows = None if candidate is None else free_rows(problem, task, candidate)
             if rows is not None:
-                return PlannedPath("solved", rows, time.perf_counter() - began, tried)
+                return Solution("solved", rows, time.perf_counter() - began, tried)
         return nothing(problem, began, tried)
 
 
@@ -101,7 +95,7 @@ class MultiStartBand:
     settings: BandSettings = field(default_factory=BandSettings)
     name: str = "band from many starts"
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """Relax all of them; the shortest that touches nothing is the answer."""
         began = time.perf_counter()
         early = settled(problem, began)
@@ -113,7 +107,7 @@ class MultiStartBand:
         for candidate in sorted((c for c in found if c is not None), key=lambda c: c.length):
             rows = free_rows(problem, task, candidate)
             if rows is not None:
-                return PlannedPath("solved", rows, time.perf_counter() - began, len(found))
+                return Solution("solved", rows, time.perf_counter() - began, len(found))
         return nothing(problem, began, len(found))
 
 
@@ -131,14 +125,12 @@ class BandAfter:
         """The other planner's, and the band."""
         return f"{self.inner.name} + band"
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """What the other planner answers, shortened; its time is part of the answer's."""
         return band_after(problem, self.inner.plan(problem, seed), self.settings)
 
 
-def band_after(
-    problem: PlanningProblem, planned: PlannedPath, settings: BandSettings
-) -> PlannedPath:
+def band_after(problem: PlanningProblem, planned: Solution, settings: BandSettings) -> Solution:
     """A planned path shortened by a band, time and iterations added to its own; without a path,
     what it was.
     """
@@ -161,7 +153,7 @@ def band_after(
                 rows = relaxed
                 break
     spent = time.perf_counter() - began
-    return PlannedPath("solved", rows, planned.time_s + spent, planned.iterations + iterations)
+    return Solution("solved", rows, planned.time_s + spent, planned.iterations + iterations)
 
 
 def _bands_along(task: Task, joints: Float[np.ndarray, "T D"]) -> Iterator[Candidate]:
@@ -273,17 +265,15 @@ def task_of(problem: PlanningProblem, settings: BandSettings) -> Task:
     return Task(problem.manifold, clearance, lambda: None, False, settings)
 
 
-def settled(problem: PlanningProblem, began: float) -> PlannedPath | None:
+def settled(problem: PlanningProblem, began: float) -> Solution | None:
     """The answer to a problem that needs no search: its refusal, or the path between ends that
     coincide.
     """
     refused = refusal(problem)
     if refused is not None:
-        return PlannedPath(
-            refused, np.empty((0, len(problem.start))), time.perf_counter() - began, 0
-        )
+        return Solution(refused, np.empty((0, len(problem.start))), time.perf_counter() - began, 0)
     if np.linalg.norm(problem.goal - problem.start) <= COINCIDENT:
-        return PlannedPath(
+        return Solution(
             "solved", np.stack([problem.start, problem.goal]), time.perf_counter() - began, 0
         )
     return None
@@ -291,10 +281,10 @@ def settled(problem: PlanningProblem, began: float) -> PlannedPath | None:
 
 def nothing(
     problem: PlanningProblem, began: float, iterations: int, explanation: str = ""
-) -> PlannedPath:
+) -> Solution:
     """The answer of a search that found no path."""
     empty = np.empty((0, len(problem.start)))
-    return PlannedPath("not_found", empty, time.perf_counter() - began, iterations, explanation)
+    return Solution("not_found", empty, time.perf_counter() - began, iterations, explanation)
 
 
 def free_rows(

@@ -23,8 +23,8 @@ from constraint_geodesics.learning.lift import as_executed, correct_and_retract
 from constraint_geodesics.problem import (
     LIMIT_SLACK,
     SATISFIED,
-    PlannedPath,
     PlanningProblem,
+    Solution,
     Status,
     refusal,
 )
@@ -73,7 +73,7 @@ class StraightLatent:
     chart: LearnedManifold
     name: str = "straight latent line"
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The line if it is a path; a jump to another branch, a limit or a collision leave it
         "not_found".
         """
@@ -128,7 +128,7 @@ class GradientGeodesic:
             if value < 1:
                 raise ValueError(f"{name} = {value}: must be at least 1")
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The shortest curve that is a path; the random starts depend on the seed."""
         began = time.perf_counter()
         refused = turned_away(problem, self.chart)
@@ -378,16 +378,16 @@ def is_clear(problem: PlanningProblem, rows: Float[np.ndarray, "T D"]) -> bool:
 
 def answer(
     joints: Float[np.ndarray, "T D"] | None, problem: PlanningProblem, began: float, iterations: int
-) -> PlannedPath:
+) -> Solution:
     """The record of a search that ends now; began: its clock reading [s]."""
     if joints is None:
         return without_path(problem, "not_found", "", began, iterations)
-    return PlannedPath("solved", joints, time.perf_counter() - began, iterations)
+    return Solution("solved", joints, time.perf_counter() - began, iterations)
 
 
 def without_path(
     problem: PlanningProblem, status: Status, explanation: str, began: float, iterations: int = 0
-) -> PlannedPath:
+) -> Solution:
     """The record of a planner that has no path to give."""
     nothing = np.empty((0, problem.manifold.robot.dof))
-    return PlannedPath(status, nothing, time.perf_counter() - began, iterations, explanation)
+    return Solution(status, nothing, time.perf_counter() - began, iterations, explanation)

@@ -40,7 +40,7 @@ from constraint_geodesics.peers.latent_geodesic import (
     turned_away,
     without_path,
 )
-from constraint_geodesics.problem import SATISFIED, PlannedPath, PlanningProblem
+from constraint_geodesics.problem import SATISFIED, PlanningProblem, Solution
 
 EDGE_CHORDS = 8
 """Chords that the length of a straight latent line is measured by; between two neighbours of a grid
@@ -112,7 +112,7 @@ class GridSearch:
         }.items():
             object.__setattr__(self, name, values)
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The path over the grid, if it can be made one that is executed; the seed plays no
         part.
         """
@@ -251,7 +251,7 @@ class LatentGraphSearch:
         first, last = (self.graph.latent[self.graph.edges[:, k]] for k in (0, 1))
         object.__setattr__(self, "_lengths", straight_lengths(self.chart, first, last))
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The shortest way over the graph that is free, shortened at random places that depend on
         the seed.
         """

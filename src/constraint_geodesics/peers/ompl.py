@@ -24,7 +24,7 @@ from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.learning.lift import as_executed
 from constraint_geodesics.params import BenchmarkParams
-from constraint_geodesics.problem import SATISFIED, PlannedPath, PlanningProblem, refusal
+from constraint_geodesics.problem import SATISFIED, PlanningProblem, Solution, refusal
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.world import Solid, World
 
@@ -54,7 +54,7 @@ class SamplingPlanner:
     simplify: bool = True
     row_spacing_rad: float | None = None
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """Look for a path until one is found (PRM, BiRRT) or the iterations are used up (RRT*
         always uses them).
 
@@ -67,10 +67,10 @@ class SamplingPlanner:
         nothing = np.empty((0, problem.manifold.robot.dof))
         refused = refusal(problem)
         if refused is not None:
-            return PlannedPath(refused, nothing, time.perf_counter() - began, 0)
+            return Solution(refused, nothing, time.perf_counter() - began, 0)
         misfit = self._misfit(problem.manifold)
         if misfit:
-            return PlannedPath("not_applicable", nothing, time.perf_counter() - began, 0, misfit)
+            return Solution("not_applicable", nothing, time.perf_counter() - began, 0, misfit)
         _start_random_numbers(seed)
         space = _Space(problem, self.settings)
         found, iterations = _SEARCHES[self.name](
@@ -80,7 +80,7 @@ class SamplingPlanner:
         if found is not None and self.row_spacing_rad is not None:
             joints = as_executed(problem.manifold, joints, self.row_spacing_rad)
         status: Literal["solved", "not_found"] = "not_found" if found is None else "solved"
-        return PlannedPath(status, joints, time.perf_counter() - began, iterations)
+        return Solution(status, joints, time.perf_counter() - began, iterations)
 
     def _misfit(self, manifold: ConstraintManifold) -> str:
         """Why OMPL has no space of this kind for the constraint; empty where it has one."""
@@ -131,7 +131,7 @@ def plan_all(
     starts: Float[np.ndarray, "n D"],
     goals: Float[np.ndarray, "n D"],
     seed: int,
-) -> list[PlannedPath]:
+) -> list[Solution]:
     """Plan n problems of one constraint with one planner and seed, one after another; a task for
     any process.
 

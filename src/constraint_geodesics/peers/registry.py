@@ -34,7 +34,7 @@ from constraint_geodesics.peers.restarts import Restarted
 from constraint_geodesics.peers.trajectory_optimisation import TrajectoryOptimisation
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.planner import Planner
-from constraint_geodesics.problem import PathPlanner, PlannedPath, PlanningProblem
+from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import Sphere
 from constraint_geodesics.search.candidates import ALL_PARTS, Parts
@@ -60,7 +60,7 @@ class ThePlanner:
     parts: Parts = ALL_PARTS
     budget_s: float | None = None
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:  # nothing in it is random
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:  # nothing in it is random
         """One query under the problem's constraint."""
         path = self.planner.plan(
             problem.start,
@@ -70,7 +70,7 @@ class ThePlanner:
             budget_s=self.budget_s,
         )
         explanation = "" if path.status == "solved" else path.explanation
-        return PlannedPath(path.status, path.joints, path.planning_time_s, 1, explanation)
+        return Solution(path.status, path.joints, path.planning_time_s, 1, explanation)
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Remembered:
     """
 
     inner: PathPlanner
-    _last: deque[tuple[PlanningProblem, int, PlannedPath]] = field(
+    _last: deque[tuple[PlanningProblem, int, Solution]] = field(
         default_factory=lambda: deque(maxlen=KEPT_ANSWERS)
     )
 
@@ -91,7 +91,7 @@ class Remembered:
         """The planner's."""
         return self.inner.name
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The planner's answer; for the same problem, as an object, and seed it is not asked
         again.
         """

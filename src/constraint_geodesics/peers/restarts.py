@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from constraint_geodesics.problem import PathPlanner, PlannedPath, PlanningProblem
+from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.search.band import step_lengths
 
 SEEDS = 100_000
@@ -31,7 +31,7 @@ class Restarted:
         """The planner's, and its budget."""
         return f"{self.inner.name}, restarted for {self.budget_s:g} s"
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The first of the shortest paths, or what the first attempt answered where none found
         one.
         """
@@ -48,8 +48,8 @@ class Restarted:
                 answer.status not in ("solved", "not_found")
                 or spent * (attempts + 1) / attempts > self.budget_s
             ):
-                return PlannedPath(best.status, best.joints, spent, iterations, best.explanation)
+                return Solution(best.status, best.joints, spent, iterations, best.explanation)
 
 
-def _length(answer: PlannedPath) -> float:
+def _length(answer: Solution) -> float:
     return float(step_lengths(answer.joints).sum()) if answer.status == "solved" else float(np.inf)

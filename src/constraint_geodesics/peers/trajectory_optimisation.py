@@ -33,7 +33,7 @@ from constraint_geodesics.peers.elastic_band import (
     task_of,
     uniform_configurations,
 )
-from constraint_geodesics.problem import PlannedPath, PlanningProblem
+from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.scene.clearance import clearance_row, link_clearances
 from constraint_geodesics.search.band import BandSettings
 from constraint_geodesics.search.candidates import Task, refined
@@ -146,7 +146,7 @@ class TrajectoryOptimisation:
         """With the method's name."""
         return f"trajectory optimisation ({self.method})"
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The shortest sound path of the first that are found; iterations counts the
         optimiser's.
         """
@@ -170,7 +170,7 @@ class TrajectoryOptimisation:
                 break
         if not found:
             return nothing(problem, began, iterations)
-        return PlannedPath(
+        return Solution(
             "solved",
             min(found, key=lambda each: each[0])[1],
             time.perf_counter() - began,

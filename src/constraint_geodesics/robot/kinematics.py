@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -46,6 +46,16 @@ class Robot(Protocol):
         ...
 
 
+class ChainArrays(NamedTuple):
+    """A chain as the compiled kernels take it; `Chain` says what the fields are."""
+
+    origins: np.ndarray
+    axes: np.ndarray
+    prismatic: np.ndarray
+    base: np.ndarray
+    tool: np.ndarray
+
+
 @dataclass(frozen=True)
 class Chain:
     """The serial chain from the root link to the tool link, as the compiled kernels take it (see
@@ -59,9 +69,9 @@ class Chain:
     tool: Float[np.ndarray, "4 4"]
 
     @property
-    def arrays(self) -> tuple[np.ndarray, ...]:
-        """The kernels' leading arguments, in their order."""
-        return self.origins, self.axes, self.prismatic, self.base, self.tool
+    def arrays(self) -> ChainArrays:
+        """For the kernels."""
+        return ChainArrays(self.origins, self.axes, self.prismatic, self.base, self.tool)
 
 
 @dataclass(frozen=True)

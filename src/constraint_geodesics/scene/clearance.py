@@ -11,6 +11,7 @@ given as meshes.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -32,6 +33,19 @@ GROUP = 12
 _COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 
 
+class ClearanceArrays(NamedTuple):
+    """A clearance model as the compiled kernels take it.
+
+    points (K, 3) [m]; shapes (B, 7 + D): boxes, their rounding and exempt links; groups (G, 7) of
+    neighbouring points, those of one joint together: centre and radius of a ball around them, the
+    first point, the one after the last, the joint.
+    """
+
+    points: np.ndarray
+    shapes: np.ndarray
+    groups: np.ndarray
+
+
 @dataclass(frozen=True)
 class ClearanceModel:
     """Points of the links, and the boxes they must keep clear of.
@@ -48,11 +62,8 @@ class ClearanceModel:
     exempt: Bool[np.ndarray, "B D"]
 
     @cached_property
-    def arrays(self) -> tuple[np.ndarray, ...]:
-        """For the kernels: points (K, 3), boxes with rounding and exempt links (B, 7 + D), and
-        neighbouring points in groups (G, 7), those of one joint together: centre and radius of a
-        ball around them, the first point, the one after the last, the joint.
-        """
+    def arrays(self) -> ClearanceArrays:
+        """For the kernels."""
         order, groups, first = [np.empty(0, np.int64)], [np.empty((0, 7))], 0
         for joint in np.unique(self.joints):
             for rows in _neighbours(self.points, np.flatnonzero(self.joints == joint)):
@@ -64,11 +75,8 @@ class ClearanceModel:
         boxes = np.concatenate(
             [self.boxes.reshape(-1, 6), self.rounding[:, None], self.exempt], axis=1
         )
-        return (
-            np.ascontiguousarray(self.points[np.concatenate(order)]),
-            boxes,
-            np.concatenate(groups),
-        )
+        points = np.ascontiguousarray(self.points[np.concatenate(order)])
+        return ClearanceArrays(points, boxes, np.concatenate(groups))
 
     def clearance(
         self, robot: SerialRobot, q: Float[np.ndarray, "*batch D"]

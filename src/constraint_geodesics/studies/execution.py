@@ -42,7 +42,7 @@ class ExecutionCheckError(ValueError):
     """
 
 
-class PlannedPath(Protocol):
+class Solution(Protocol):
     """What is asked of a planner's answer."""
 
     @property
@@ -61,7 +61,7 @@ class PlannedPath(Protocol):
         ...
 
 
-Plan = Callable[[Float[np.ndarray, "D"], Float[np.ndarray, "D"]], PlannedPath]
+Plan = Callable[[Float[np.ndarray, "D"], Float[np.ndarray, "D"]], Solution]
 """Plans from a start to a goal [rad] under the constraint that is looked at."""
 
 

@@ -34,7 +34,7 @@ from constraint_geodesics.learning.vae import JointVae
 from constraint_geodesics.params import ManifoldParams, Params
 from constraint_geodesics.peers.elastic_band import free_rows, nothing, settled, task_of
 from constraint_geodesics.pipeline.progress import progress
-from constraint_geodesics.problem import PathPlanner, PlannedPath, PlanningProblem
+from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.report.results import markdown_table
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.clearance import clearance_model
@@ -178,7 +178,7 @@ class BandAndTrees:
     settings: BandSettings = field(default_factory=BandSettings)
     name: str = "band and trees"
 
-    def plan(self, problem: PlanningProblem, seed: int) -> PlannedPath:
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The first candidate whose rows touch nothing.  The trees have seeds of their own: `seed`
         is ignored.
         """
@@ -195,7 +195,7 @@ class BandAndTrees:
             tried += 1
             rows = free_rows(problem, task, candidate)
             if rows is not None:
-                return PlannedPath("solved", rows, time.perf_counter() - began, tried)
+                return Solution("solved", rows, time.perf_counter() - began, tried)
         return nothing(problem, began, tried)
 
 
