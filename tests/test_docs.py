@@ -33,7 +33,8 @@ from constraint_geodesics.peers.registry import KINDS
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.tracking.experiment import tracked_stage
 from constraint_geodesics.tracking.registry import register_planner
-from tests.readme import TIMES_PAGE, with_stage_times
+from tests.readme import EXPERIMENTS as TIMES_PAGE
+from tests.readme import with_stage_times
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "constraint_geodesics"
