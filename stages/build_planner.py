@@ -43,7 +43,7 @@ def main(params: Params, layout: Layout) -> None:
             for name in params.constraints
         }
         roadmaps = {
-            n: Roadmap.from_submanifold(g)
+            n: Roadmap(g.joints, g.edges, g.lengths, g.labels)
             for n, g in graphs.items()
             if isinstance(g, GraphSubmanifold)
         }

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from constraint_geodesics import bundle, cli
-from constraint_geodesics.planner import read_path
 from constraint_geodesics.recording.recording import read_recording
+from constraint_geodesics.trajectory import read_trajectory
 from tests.planner_fixtures import NAMES, nodes_of, packaged_bundle, packaged_planner, pairs_of
 
 COMMAND = str(Path(sys.executable).parent / "geodesics")
@@ -103,7 +103,7 @@ def test_a_path_is_planned_and_its_files_are_written(command, query, tmp_path) -
     assert out.startswith("solved: ")
     assert out.count("\n") == 1
     assert err.strip() == f"planner: {bundle.PACKAGED}"
-    joints, times, constraint = read_path(csv)
+    joints, times, constraint = read_trajectory(csv)
     own = packaged_planner().plan(*pairs_of("level_cup", 1, seed=1)[0], "level_cup")
     assert joints.tobytes() == own.joints.tobytes()
     assert times.tobytes() == own.times.tobytes()

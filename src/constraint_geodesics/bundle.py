@@ -27,6 +27,7 @@ from constraint_geodesics.params import (
     RobotParams,
     WorkcellParams,
 )
+from constraint_geodesics.plugs import plug
 from constraint_geodesics.search.roadmap import Roadmap
 
 FORMAT = 1
@@ -115,9 +116,7 @@ def open_bundle(source: str | Path | None = None) -> tuple[Bundle, str]:
             return read_bundle(PIPELINE), f"the pipeline's outputs in {PIPELINE.resolve()}"
         return read_bundle(PACKAGED), "the files that come with the package"
     if isinstance(source, str) and ":/" in source:
-        from constraint_geodesics.tracking.experiment import fetch_artifacts
-
-        with fetch_artifacts(source) as folder:
+        with plug("mlflow")(source) as folder:
             return read_bundle(folder), f"MLflow's {source}"
     return read_bundle(Path(source)), str(source)
 

@@ -257,11 +257,11 @@ def check(
     what it breaks.
     """
     from constraint_geodesics.bundle import BundleError
-    from constraint_geodesics.planner import PlannerError, check_path
+    from constraint_geodesics.planner import PlannerError, check_trajectory
 
     try:
         with waiting(what_takes_time()):
-            certificate = check_path(file, constraint, planner)
+            certificate = check_trajectory(file, constraint, planner)
     except (BundleError, PlannerError) as error:
         raise SystemExit(_complain(error, WRONG_USAGE)) from None
     broken = certificate.violation
@@ -286,11 +286,11 @@ def check(
 
 KERNELS = (
     "robot/kernels",
-    "robot/clearance",
+    "scene/clearance",
     "constraints/kernels",
     "certification/kernels",
     "geometry/timing",
-    "geodesics/band_kernels",
+    "search/band_kernels",
 )
 """Modules that numba compiles before the first path; their code is kept beside them, until they
 change.

@@ -4,10 +4,8 @@ the same each time.
 Every figure is built on `Figure` itself, so that nothing depends on a global state or a screen.
 """
 
-import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +19,6 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
-from PIL import Image
 
 from constraint_geodesics.geometry.analytic import Sphere, Torus
 from constraint_geodesics.geometry.level_sets import LevelSet
@@ -39,8 +36,7 @@ from constraint_geodesics.palette import PURPLE as PURPLE
 from constraint_geodesics.palette import SKY, YELLOW, planner_colour
 from constraint_geodesics.palette import START as START
 from constraint_geodesics.palette import VERMILION as VERMILION
-
-DPI = 120
+from constraint_geodesics.recording.png import save_png as save_png
 
 COMPONENTS = (SKY, PURPLE, BLUE, YELLOW, GREEN)
 """Colours of a sub-manifold's components, the largest first; the smaller ones behind them share
@@ -93,18 +89,6 @@ class LatentCurves:
 
     learned: Float[np.ndarray, "S T 2"]
     straight: Float[np.ndarray, "T 2"]
-
-
-def save_png(figure: Figure, file: Path) -> None:
-    """Write a figure with at most 256 colours and no metadata: small, and equal bytes for equal
-    figures.
-    """
-    raw = io.BytesIO()
-    figure.savefig(raw, format="png", dpi=DPI, facecolor="white", metadata={"Software": None})
-    with Image.open(raw) as image:
-        reduced = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=2)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    reduced.save(file, format="PNG", optimize=True)
 
 
 def analytic_submanifolds() -> Figure:

@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.problem import Status
 from constraint_geodesics.scene.clearance import ClearanceModel, clearance_batch
 from constraint_geodesics.search.band import BandCurve, BandSettings, BandSpace, relax, step_lengths
 from constraint_geodesics.search.roadmap import Joined, Roadmap, join, resample, shortest_way
 from constraint_geodesics.search.tree import tree_way
 
-Status = Literal["not_connected", "not_found"]
 Source = Literal["straight", "policy", "graph", "tree", "bend"]
 
 CHECK_STEP = 0.1
