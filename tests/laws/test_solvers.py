@@ -22,7 +22,7 @@ from constraint_geodesics.geodesics.policy_search import Actor, PolicySolver
 from constraint_geodesics.geodesics.problem import Box, ChartProblem
 from constraint_geodesics.geodesics.solver import geodesics_between
 from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
-from constraint_geodesics.geometry.curves import PinnedPolynomial, PinnedSpline
+from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial, PinnedSpline
 from constraint_geodesics.geometry.grid import GridManifold
 from constraint_geodesics.geometry.length import curve_length
 from constraint_geodesics.geometry.manifold import (
@@ -356,9 +356,11 @@ def test_a_metric_that_is_not_finite_gives_no_short_curves() -> None:
     with pytest.raises(NonFiniteError, match="length"):
         curve_length(
             Disc(),
-            CUBIC,
-            torch.zeros(4, dtype=torch.float64),
-            *torch.tensor([[0.1, 0.1], [2.0, 2.0]]).double(),
+            Curves(
+                CUBIC,
+                torch.zeros(4, dtype=torch.float64),
+                *torch.tensor([[0.1, 0.1], [2.0, 2.0]]).double(),
+            ),
         )
 
 

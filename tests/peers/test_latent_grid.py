@@ -8,7 +8,7 @@ from tests.planner_fixtures import manifold_of, nodes_of, packaged_planner, pair
 
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
-from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.length import estimate_length
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
@@ -222,6 +222,6 @@ def test_chords_measure_what_the_metric_does(chart: LearnedManifold) -> None:
     last = first + 0.2 * (last - first)
     line, none = PinnedPolynomial(chart.dim, 1), torch.zeros(20, 0, dtype=torch.float64)
     expected = estimate_length(
-        chart, line, none, torch.from_numpy(first), torch.from_numpy(last)
+        chart, Curves(line, none, torch.from_numpy(first), torch.from_numpy(last))
     ).length
     np.testing.assert_allclose(straight_lengths(chart, first, last), expected.numpy(), rtol=5e-3)

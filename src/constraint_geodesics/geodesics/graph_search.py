@@ -24,7 +24,7 @@ from constraint_geodesics.geodesics.solver import (
     shortest_of,
     with_goals_bits,
 )
-from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
 from constraint_geodesics.geometry.graph import nearest_neighbour_edges, shortest_path
 from constraint_geodesics.geometry.length import estimate_length
 from constraint_geodesics.geometry.manifold import (
@@ -248,7 +248,7 @@ def _straight_lengths(
     last = first + torch.from_numpy(offset)
     with torch.no_grad():
         lengths = estimate_length(
-            manifold, line, first.new_zeros(len(first), 0), first, last
+            manifold, Curves(line, first.new_zeros(len(first), 0), first, last)
         ).length.numpy()
     if isinstance(manifold, BoundedManifold):
         t = torch.linspace(0.0, 1.0, ON_EDGE, dtype=first.dtype)[:, None]

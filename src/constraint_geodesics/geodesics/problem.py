@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.geodesics.pull_kernels import tangential_pull
-from constraint_geodesics.geometry.curves import CurveFamily, PinnedPolynomial
+from constraint_geodesics.geometry.curves import CurveFamily, Curves, PinnedPolynomial
 from constraint_geodesics.geometry.length import Collocation, Quadrature, estimate_length
 from constraint_geodesics.geometry.manifold import (
     BoundedManifold,
@@ -260,7 +260,9 @@ class ChartProblem:
         """
         free, start, goal = _tensors(phi, ends.z_start, ends.z_goal)
         with torch.no_grad():
-            length = estimate_length(self.manifold, self.curve, free, start, goal).length.numpy()
+            length = estimate_length(
+                self.manifold, Curves(self.curve, free, start, goal)
+            ).length.numpy()
         return Costs(length, length, np.isfinite(length) & self.stays_inside(phi, ends))
 
     def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:

@@ -17,6 +17,7 @@ from constraint_geodesics.geodesics.problem import (
     GeodesicSolver,
     Status,
 )
+from constraint_geodesics.geometry.curves import Curves
 from constraint_geodesics.geometry.length import estimate_length
 from constraint_geodesics.geometry.manifold import Manifold, PeriodicManifold
 
@@ -177,7 +178,7 @@ def _lengths(
     free, start, goal = (torch.from_numpy(values) for values in (phi, ends.z_start, ends.z_goal))
     with torch.no_grad():
         return estimate_length(
-            problem.manifold, problem.curve, free, start, goal, LENGTH_TOLERANCE
+            problem.manifold, Curves(problem.curve, free, start, goal), LENGTH_TOLERANCE
         ).length.numpy()
 
 

@@ -8,7 +8,7 @@ half the degree are among them, so the error estimate costs no further point, an
 estimate is too large are measured again with twice as many.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from constraint_geodesics.geometry.curves import CurveFamily
+from constraint_geodesics.geometry.curves import CurveFamily, Curves
 from constraint_geodesics.geometry.manifold import (
     EmbeddedManifold,
     GeometryError,
@@ -40,6 +40,8 @@ BLOCK = 4096
 """Points embedded at once: the temporaries of many more leave the processor's cache."""
 
 Breaks = tuple[float, ...]
+Objective = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""A function of (phi, start, goal)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +64,8 @@ class Quadrature:
             raise GeometryError(f"count = {count}: a quadrature rule needs at least one node")
         _require_breaks(breaks)
         x, w = np.polynomial.legendre.leggauss(count)
-        nodes = [low + (high - low) * (x + 1) / 2 for low, high in _pieces(breaks)]
-        weights = [(high - low) * w / 2 for low, high in _pieces(breaks)]
+        nodes = [low + (high - low) * (x + 1) / 2 for low, high in pairwise(breaks)]
+        weights = [(high - low) * w / 2 for low, high in pairwise(breaks)]
         return cls(
             torch.from_numpy(np.concatenate(nodes)), torch.from_numpy(np.concatenate(weights))
         )
@@ -124,13 +126,7 @@ class LengthEstimate:
 
 
 def curve_length(
-    manifold: Manifold,
-    curve: CurveFamily,
-    phi: Float[Tensor, "*#batch p"],
-    start: Float[Tensor, "*#batch N"],
-    goal: Float[Tensor, "*#batch N"],
-    rule: LengthRule | None = None,
-    tolerance: float = TOLERANCE,
+    manifold: Manifold, curves: Curves, rule: LengthRule | None = None, tolerance: float = TOLERANCE
 ) -> Float[Tensor, "*batch"]:
     """Length of curves on a manifold, eq. 2: L = ∫₀¹ √(γ̇ᵀ M(γ) γ̇) dt = ∫₀¹ ‖d f(γ)/dt‖ dt.
 
@@ -142,21 +138,16 @@ def curve_length(
     curves and the manifold differ in dimension, CurveError on a wrong shape.
     """
     if rule is None:
-        length = estimate_length(manifold, curve, phi, start, goal, tolerance).length
+        length = estimate_length(manifold, curves, tolerance).length
     else:
-        _check(manifold, curve, phi, start, goal)
-        length = length_function(manifold, curve, rule)(phi, start, goal)
+        _check(manifold, curves)
+        length = _length(manifold, curves, rule)
     require_finite(length, "length")
     return length
 
 
 def estimate_length(
-    manifold: Manifold,
-    curve: CurveFamily,
-    phi: Float[Tensor, "*#batch p"],
-    start: Float[Tensor, "*#batch N"],
-    goal: Float[Tensor, "*#batch N"],
-    tolerance: float = TOLERANCE,
+    manifold: Manifold, curves: Curves, tolerance: float = TOLERANCE
 ) -> LengthEstimate:
     """Lengths whose estimated relative error is below `tolerance`, and the estimate.
 
@@ -171,83 +162,61 @@ def estimate_length(
     """
     if not tolerance > 0:
         raise GeometryError(f"tolerance = {tolerance}: must be positive")
-    _check(manifold, curve, phi, start, goal)
-    batch = torch.broadcast_shapes(phi.shape[:-1], start.shape[:-1], goal.shape[:-1])
-    flat = [
-        values.expand(*batch, values.shape[-1]).reshape(batch.numel(), values.shape[-1])
-        for values in (phi, start, goal)
-    ]
-    ladder = rules(tuple(curve.breaks))
-    length, error = _measured(manifold, curve, flat, ladder[0])
+    _check(manifold, curves)
+    batch, flat = curves.batch, curves.flat()
+    ladder = rules(tuple(curves.family.breaks))
+    length, error = _measured(manifold, flat, ladder[0])
     for rule in ladder[1:]:
         rows = torch.nonzero((error > tolerance * length) & length.isfinite()).squeeze(-1)
         if not len(rows):
             break
-        finer, left = _measured(manifold, curve, [values[rows] for values in flat], rule)
+        finer, left = _measured(manifold, flat[rows], rule)
         length, error = length.index_copy(0, rows, finer), error.index_copy(0, rows, left)
     return LengthEstimate(length.reshape(batch), error.reshape(batch))
 
 
 def curve_energy(
-    manifold: Manifold,
-    curve: CurveFamily,
-    phi: Float[Tensor, "*#batch p"],
-    start: Float[Tensor, "*#batch N"],
-    goal: Float[Tensor, "*#batch N"],
-    rule: LengthRule | None = None,
+    manifold: Manifold, curves: Curves, rule: LengthRule | None = None
 ) -> Float[Tensor, "*batch"]:
     """Energy of curves on a manifold: E = ∫₀¹ γ̇ᵀ M(γ) γ̇ dt ≥ L², equal at constant speed only.
 
     In the square of the embedding's unit.  Smooth where the length is not; degree 16 for a curve of
     one piece by default.  Raises as `curve_length` does.
     """
-    _check(manifold, curve, phi, start, goal)
-    return energy_function(manifold, curve, rule or rules(tuple(curve.breaks))[1])(phi, start, goal)
+    _check(manifold, curves)
+    return _energy(manifold, curves, rule or rules(tuple(curves.family.breaks))[1])
 
 
-def energy_function(
-    manifold: Manifold, curve: CurveFamily, rule: LengthRule
-) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-    """The function (phi, start, goal) → `curve_energy`, free of checks, so that torch.func can
-    transform it.
-    """
-
-    def energy(phi: Tensor, start: Tensor, goal: Tensor) -> Tensor:
-        squares, weights = _squared_speeds(manifold, curve, phi, start, goal, rule)
-        return (squares @ weights.to(squares)).to(phi)
-
-    return energy
+def energy_function(manifold: Manifold, family: CurveFamily, rule: LengthRule) -> Objective:
+    """(phi, start, goal) → `curve_energy`, free of checks, for torch.func to transform."""
+    return lambda phi, start, goal: _energy(manifold, Curves(family, phi, start, goal), rule)
 
 
-def length_function(
-    manifold: Manifold, curve: CurveFamily, rule: LengthRule
-) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-    """The function (phi, start, goal) → `curve_length`, free of checks, so that torch.func can
-    transform it.
-    """
+def length_function(manifold: Manifold, family: CurveFamily, rule: LengthRule) -> Objective:
+    """(phi, start, goal) → `curve_length`, free of checks, for torch.func to transform."""
+    return lambda phi, start, goal: _length(manifold, Curves(family, phi, start, goal), rule)
 
-    def length(phi: Tensor, start: Tensor, goal: Tensor) -> Tensor:
-        squares, weights = _squared_speeds(manifold, curve, phi, start, goal, rule)
-        return (_root(squares) @ weights.to(squares)).to(phi)
 
-    return length
+def _energy(manifold: Manifold, curves: Curves, rule: LengthRule) -> Tensor:
+    squares, weights = _squared_speeds(manifold, curves, rule)
+    return (squares @ weights.to(squares)).to(curves.phi)
+
+
+def _length(manifold: Manifold, curves: Curves, rule: LengthRule) -> Tensor:
+    squares, weights = _squared_speeds(manifold, curves, rule)
+    return (_root(squares) @ weights.to(squares)).to(curves.phi)
 
 
 def curve_speeds(
-    manifold: Manifold,
-    curve: CurveFamily,
-    phi: Float[Tensor, "*#batch p"],
-    start: Float[Tensor, "*#batch N"],
-    goal: Float[Tensor, "*#batch N"],
-    t: Float[Tensor, "T"] | Float[Tensor, "*batch T"],
+    manifold: Manifold, curves: Curves, t: Float[Tensor, "*#batch T"]
 ) -> Float[Tensor, "*batch T"]:
     """Speed √(γ̇ᵀ M(γ) γ̇) of curves at times t, shared or one row a curve, in the unit of length.
 
     One forward product J_f(γ) γ̇ a point where there is an embedding f, never its Jacobian.  Raises
     as `curve_length` does.
     """
-    _check(manifold, curve, phi, start, goal)
-    return _root(_squares_at(manifold, curve, phi, start, goal, t)).to(phi)
+    _check(manifold, curves)
+    return _root(_squares_at(manifold, curves, t)).to(curves.phi)
 
 
 def chord_length(points: Float[Tensor, "*batch T A"]) -> Float[Tensor, "*batch"]:
@@ -272,69 +241,52 @@ def rules(breaks: Breaks = (0.0, 1.0)) -> tuple[Collocation, ...]:
     return tuple(Collocation.chebyshev(degree, breaks) for degree in DEGREES)
 
 
-def _measured(
-    manifold: Manifold, curve: CurveFamily, flat: Sequence[Tensor], rule: Collocation
-) -> tuple[Tensor, Tensor]:
-    """Length by a rule and its error estimate, from the same points: the difference to the rule of
-    half the degree.
-    """
-    (phi, start, goal), half = flat, rule.half
+def _measured(manifold: Manifold, curves: Curves, rule: Collocation) -> tuple[Tensor, Tensor]:
+    """Length by a rule and its error estimate: the difference to the rule of half the degree."""
+    half = rule.half
     assert half is not None
     assert half.half is not None
+    nested = ((rule, 1), (half, 2), (half.half, 4))
     if isinstance(manifold, EmbeddedManifold):
-        values = _embedded(manifold, curve.evaluate(phi, start, goal, rule.times.to(phi))[0])
-        lengths = [
-            part.length(values[:, ::step]) for part, step in ((rule, 1), (half, 2), (half.half, 4))
-        ]
+        values = _embedded(manifold, curves.at(rule.times.to(curves.phi))[0])
+        lengths = [part.length(values[:, ::step]) for part, step in nested]
     else:
-        speeds = _root(_squares_at(manifold, curve, phi, start, goal, rule.times))
-        nested = ((rule, 1), (half, 2), (half.half, 4))
+        speeds = _root(_squares_at(manifold, curves, rule.times))
         lengths = [speeds[:, ::step] @ part.own_weights.to(speeds) for part, step in nested]
-    length, coarse, coarsest = (part.to(phi) for part in lengths)
+    length, coarse, coarsest = (part.to(curves.phi) for part in lengths)
     length = torch.where(length.isfinite(), length, torch.inf)
     error = SAFETY * (length - coarse).abs()
-    if len(curve.breaks) > 2:
+    if len(curves.family.breaks) > 2:
         error = torch.maximum(error, (coarse - coarsest).abs() / ACCIDENT)
     return length, torch.where(error.isfinite(), error, torch.inf)
 
 
-def _check(
-    manifold: Manifold, curve: CurveFamily, phi: Tensor, start: Tensor, goal: Tensor
-) -> None:
-    for name, values in (("phi", phi), ("start", start), ("goal", goal)):
-        require_finite(values, name)
-    if curve.dim != manifold.dim:
+def _check(manifold: Manifold, curves: Curves) -> None:
+    for name in ("phi", "start", "goal"):
+        require_finite(getattr(curves, name), name)
+    if curves.family.dim != manifold.dim:
+        dim = curves.family.dim
         raise GeometryError(
-            f"the curve has dim {curve.dim}: must be that of the manifold, {manifold.dim}"
+            f"the curve has dim {dim}: must be that of the manifold, {manifold.dim}"
         )
 
 
-def _squared_speeds(
-    manifold: Manifold,
-    curve: CurveFamily,
-    phi: Tensor,
-    start: Tensor,
-    goal: Tensor,
-    rule: LengthRule,
-) -> tuple[Tensor, Tensor]:
+def _squared_speeds(manifold: Manifold, curves: Curves, rule: LengthRule) -> tuple[Tensor, Tensor]:
     """γ̇ᵀ M(γ) γ̇ (*batch, Q) at the nodes of a rule, and the nodes' weights."""
     if isinstance(rule, Quadrature):
-        return _squares_at(manifold, curve, phi, start, goal, rule.nodes), rule.weights
+        return _squares_at(manifold, curves, rule.nodes), rule.weights
     if not isinstance(manifold, EmbeddedManifold):
-        return _squares_at(manifold, curve, phi, start, goal, rule.times), rule.own_weights
-    points, _ = curve.evaluate(phi, start, goal, rule.times.to(phi))
+        return _squares_at(manifold, curves, rule.times), rule.own_weights
+    points, _ = curves.at(rule.times.to(curves.phi))
     return rule.slopes(_embedded(manifold, points)).square().sum(-1), rule.weights
 
 
-def _squares_at(
-    manifold: Manifold, curve: CurveFamily, phi: Tensor, start: Tensor, goal: Tensor, t: Tensor
-) -> Tensor:
+def _squares_at(manifold: Manifold, curves: Curves, t: Tensor) -> Tensor:
     """γ̇ᵀ M(γ) γ̇ (*batch, T) at times t."""
-    points, velocities = curve.evaluate(phi, start, goal, t.to(phi))
+    points, velocities = curves.at(t.to(curves.phi))
     if not isinstance(manifold, EmbeddedManifold):
-        return (
-            velocities * (manifold.metric(points).to(velocities) @ velocities[..., None])[..., 0]
-        ).sum(-1)
+        metric = manifold.metric(points).to(velocities)
+        return (velocities * (metric @ velocities[..., None])[..., 0]).sum(-1)
     blocks = zip(_blocks(points), _blocks(velocities), strict=True)
     products = torch.cat([torch.func.jvp(manifold.embed, (z,), (v,))[1] for z, v in blocks])
     return products.square().sum(-1).reshape(points.shape[:-1])
@@ -366,10 +318,6 @@ def _require_breaks(breaks: Breaks) -> None:
         raise GeometryError(f"breaks = {breaks}: must rise from 0 to 1")
 
 
-def _pieces(breaks: Breaks) -> list[tuple[float, float]]:
-    return list(pairwise(breaks))
-
-
 def _collocation(
     degree: int, breaks: Breaks
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -389,7 +337,7 @@ def _collocation(
     times, own_weights = np.empty(count * span + 1), np.zeros(count * span + 1)
     rows = np.zeros((count * len(gauss), count * span + 1))
     all_weights = np.empty(count * len(gauss))
-    for piece, (low, high) in enumerate(_pieces(breaks)):
+    for piece, (low, high) in enumerate(pairwise(breaks)):
         points = slice(piece * span, (piece + 1) * span + 1)
         nodes = slice(piece * len(gauss), (piece + 1) * len(gauss))
         half = (high - low) / 2

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from constraint_geodesics.geometry.curves import CurveFamily, shifted_legendre
+from constraint_geodesics.geometry.curves import Curves, shifted_legendre
 from constraint_geodesics.geometry.length import curve_speeds
 from constraint_geodesics.geometry.manifold import GeometryError, Manifold, require_finite
 
@@ -56,13 +56,7 @@ class _Panels:
 
 
 def constant_speed(
-    manifold: Manifold,
-    curve: CurveFamily,
-    phi: Float[Tensor, "*#batch p"],
-    start: Float[Tensor, "*#batch N"],
-    goal: Float[Tensor, "*#batch N"],
-    count: int,
-    tolerance: float = SPACING_TOLERANCE,
+    manifold: Manifold, curves: Curves, count: int, tolerance: float = SPACING_TOLERANCE
 ) -> Float[Tensor, "*batch {count}"]:
     """Times, from 0 to 1 exactly, at which points lie equally spaced along curves in the manifold's
     length.
@@ -80,37 +74,24 @@ def constant_speed(
     if not tolerance > 0:
         raise GeometryError(f"tolerance = {tolerance}: must be positive")
     with torch.no_grad():
-        edges = _first_edges(tuple(curve.breaks))
-        speeds = curve_speeds(
-            manifold, curve, phi, start, goal, _nodes(edges[:-1], edges[1:]).flatten()
-        )
+        edges = _first_edges(tuple(curves.family.breaks))
+        speeds = curve_speeds(manifold, curves, _nodes(edges[:-1], edges[1:]).flatten())
         require_finite(speeds, "speeds")
         batch = speeds.shape[:-1]
         if not speeds.numel():
-            return phi.new_zeros(*batch, count)
+            return curves.phi.new_zeros(*batch, count)
         row = torch.arange(batch.numel()).repeat_interleave(len(edges) - 1)
         low, high = (ends.repeat(batch.numel()) for ends in (edges[:-1], edges[1:]))
         panels = _panels(row, low, high, speeds.reshape(-1, NODES))
-        flat = [
-            values.expand(*batch, values.shape[-1]).reshape(-1, values.shape[-1])
-            for values in (phi, start, goal)
-        ]
-        panels = _refined(manifold, curve, flat, panels, count, tolerance)
-        return _inverted(panels, batch.numel(), count).reshape(*batch, count).to(phi)
+        panels = _refined(manifold, curves.flat(), panels, count, tolerance)
+        return _inverted(panels, batch.numel(), count).reshape(*batch, count).to(curves.phi)
 
 
 def _refined(
-    manifold: Manifold,
-    curve: CurveFamily,
-    flat: list[Tensor],
-    panels: _Panels,
-    count: int,
-    tolerance: float,
+    manifold: Manifold, curves: Curves, panels: _Panels, count: int, tolerance: float
 ) -> _Panels:
-    """Panels on which the series of the speed is good enough for so many times, by curve and
-    time.
-    """
-    length = panels.low.new_zeros(len(flat[0])).index_add(0, panels.row, panels.speed[:, 0])
+    """Panels, by curve and time, on which the series of the speed is good enough."""
+    length = panels.low.new_zeros(len(curves.phi)).index_add(0, panels.row, panels.speed[:, 0])
     # Standing still is run through as a straight line would be.
     panels.speed[:, 0] += torch.where(length[panels.row] > 0, 0.0, panels.high - panels.low)
     done = []
@@ -122,8 +103,7 @@ def _refined(
             break
         row, middle = panels.row.repeat(2), (panels.low + panels.high) / 2
         low, high = torch.cat([panels.low, middle]), torch.cat([middle, panels.high])
-        phi, start, goal = (values[row] for values in flat)
-        speeds = curve_speeds(manifold, curve, phi, start, goal, _nodes(low, high))
+        speeds = curve_speeds(manifold, curves[row], _nodes(low, high))
         require_finite(speeds, "speeds")
         panels = _panels(row, low, high, speeds)
     return _Panels.in_order([*done, panels])

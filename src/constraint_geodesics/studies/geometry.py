@@ -31,7 +31,7 @@ from constraint_geodesics.geodesics.problem import (
     LearnedProblem,
 )
 from constraint_geodesics.geodesics.solver import geodesics_between
-from constraint_geodesics.geometry.curves import CurveFamily
+from constraint_geodesics.geometry.curves import Curves
 from constraint_geodesics.geometry.length import (
     Collocation,
     LengthRule,
@@ -118,10 +118,10 @@ class GeometryBenchmark:
         curves, _ = random_curves(self.plain, self.settings.batch)
         with torch.no_grad():
             ours = {
-                batch: partial(default_length, self.manifold, curves.first(batch))
+                batch: partial(default_length, self.manifold, curves[:batch])
                 for batch in self._batches()
             }
-            few = curves.first(NAIVE_CURVES)
+            few = curves[:NAIVE_CURVES]
             usual = {
                 "naive": partial(naive_length, self.manifold, few),
                 "naive_batched": partial(naive_length_batched, self.manifold, few),
@@ -143,7 +143,7 @@ class GeometryBenchmark:
             batch: partial(self.retracted.evaluate, phi[:batch], ends[np.arange(batch)])
             for batch in self._batches()
         }
-        naive = partial(naive_retracted_length, self.retracted, curves.first(NAIVE_CURVES), ends)
+        naive = partial(naive_retracted_length, self.retracted, curves[:NAIVE_CURVES], ends)
         return self._rates(ours, {"naive": naive}) | {"error": self.retracted_errors()}
 
     def retracted_errors(self) -> dict[str, float]:
@@ -186,9 +186,7 @@ class GeometryBenchmark:
         curves, _ = random_curves(self.plain, self.settings.checked)
         reference = reference_length(self.manifold, curves)
         with torch.no_grad():
-            found = estimate_length(
-                self.manifold, curves.family, curves.phi, curves.start, curves.goal
-            )
+            found = estimate_length(self.manifold, curves)
         error, estimate = _relative(found.length, reference), (found.error / reference).numpy()
         return {
             **_spread(error),
@@ -286,24 +284,6 @@ SINGLE_PRECISION = 1e-6
 """Relative error that the network's single precision leaves in a length, whatever the rule."""
 
 
-@dataclass(frozen=True)
-class Curves:
-    """Random curves (B, p) of one family between the given ends, as a search meets them."""
-
-    family: CurveFamily
-    phi: Float[Tensor, "B p"]
-    start: Float[Tensor, "B N"]
-    goal: Float[Tensor, "B N"]
-
-    def first(self, count: int) -> "Curves":
-        """The first of them."""
-        return Curves(self.family, self.phi[:count], self.start[:count], self.goal[:count])
-
-    def at(self, t: Float[Tensor, "T"]) -> tuple[Float[Tensor, "B T N"], Float[Tensor, "B T N"]]:
-        """Points and velocities."""
-        return self.family.evaluate(self.phi, self.start, self.goal, t)
-
-
 def random_curves(problem: GeodesicProblem, count: int) -> tuple[Curves, Ends]:
     """Curves as the problem draws them, always the same."""
     rng = np.random.default_rng(SEED)
@@ -316,7 +296,7 @@ def random_curves(problem: GeodesicProblem, count: int) -> tuple[Curves, Ends]:
 
 def default_length(manifold: EmbeddedManifold, curves: Curves) -> Float[Tensor, "B"]:
     """Lengths at the default accuracy."""
-    return curve_length(manifold, curves.family, curves.phi, curves.start, curves.goal)
+    return curve_length(manifold, curves)
 
 
 def naive_length(manifold: EmbeddedManifold, curves: Curves) -> Float[Tensor, "B"]:
@@ -327,9 +307,7 @@ def naive_length(manifold: EmbeddedManifold, curves: Curves) -> Float[Tensor, "B
     jacobian_at = torch.func.vmap(torch.func.jacfwd(manifold.embed))
     lengths = []
     for row in range(len(curves.phi)):
-        z, velocity = curves.family.evaluate(
-            curves.phi[row], curves.start[row], curves.goal[row], t
-        )
+        z, velocity = curves[row].at(t)
         jacobian = jacobian_at(z).to(z)
         metric = jacobian.mT @ jacobian
         speed = (velocity[:, None] @ metric @ velocity[..., None]).squeeze().sqrt()
@@ -384,7 +362,7 @@ def _chords(manifold: EmbeddedManifold, curves: Curves, count: int) -> Float[Ten
 
 
 def _by_rule(manifold: EmbeddedManifold, curves: Curves, rule: LengthRule) -> Float[Tensor, "B"]:
-    return curve_length(manifold, curves.family, curves.phi, curves.start, curves.goal, rule)
+    return curve_length(manifold, curves, rule)
 
 
 def _relative(found: Float[Tensor, "B"], reference: Float[Tensor, "B"]) -> Float[np.ndarray, "B"]:

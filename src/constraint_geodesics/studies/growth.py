@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Float, Int
 
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
-from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
 from constraint_geodesics.geometry.length import Collocation, curve_length
 from constraint_geodesics.learning.dataset import Queries, draw_queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
@@ -487,7 +487,7 @@ def _latent_dimension(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sam
             for width in shapes
         )
         runs[dim] = partial(
-            curve_length, LearnedManifold(vae), family, BEND * phi, start, goal, rule
+            curve_length, LearnedManifold(vae), Curves(family, BEND * phi, start, goal), rule
         )
     what = f"{sizes.curves} curve lengths"
     with torch.no_grad():
