@@ -143,13 +143,9 @@ def look_for_trouble(
     """Look for what is wrong with this checkout and its environment, and say the mend.  Exit code
     1: a problem.
     """
-    from constraint_geodesics.doctor import report
+    from constraint_geodesics import doctor
 
-    findings = report.examine(Path())
-    print(
-        report.as_json(findings) if as_json else report.as_text(findings, report.terminal_colours())
-    )
-    raise SystemExit(report.exit_code(findings))
+    raise SystemExit(doctor.show(Path(), json_wanted=as_json))
 
 
 @app.command("constraints")
