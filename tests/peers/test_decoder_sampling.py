@@ -6,6 +6,7 @@ from tests.planner_fixtures import NAMES, assert_sound, manifold_of, packaged_pl
 
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.learning.inference import FrozenManifold
 from constraint_geodesics.params import BenchmarkParams
 from constraint_geodesics.peers.decoder_sampling import BATCH, DecoderSampling, decoded_samples
 from constraint_geodesics.peers.ompl import SamplingPlanner, birrt_with_sampler
@@ -24,7 +25,9 @@ SETTINGS = BenchmarkParams(
     delta_rad=0.05,
     range_rad=2.0,
 )
-PLANNER = DecoderSampling(packaged_planner().chart, SETTINGS, iterations=200)
+PLANNER = DecoderSampling(
+    FrozenManifold(packaged_planner().bundle.manifold), SETTINGS, iterations=200
+)
 
 
 def hard(world: World) -> PlanningProblem:
