@@ -30,7 +30,9 @@ from constraint_geodesics.recording.recording import (
 )
 from constraint_geodesics.recording.viewer import open_recordings
 from constraint_geodesics.robot.kinematics import load_robot, rotation_from_rpy
-from constraint_geodesics.scene.world import Body, Box, data_path
+from constraint_geodesics.scene.body import Body
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.urdf import data_path
 
 FRAMES = 25
 TABLE = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1))

@@ -148,7 +148,7 @@ SAME = """
 import sys
 import numpy as np
 from pathlib import Path
-from constraint_geodesics.scene.world import Box
+from constraint_geodesics.scene.box import Box
 from constraint_geodesics.studies.cup import CupSettings, execute
 from constraint_geodesics.robot.kinematics import load_robot
 

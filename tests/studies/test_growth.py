@@ -24,7 +24,8 @@ from constraint_geodesics.problem import PlanningProblem
 from constraint_geodesics.report.figures import save_png
 from constraint_geodesics.report.growth_figure import LABELS, growth_figure
 from constraint_geodesics.scene.clearance import clearance_model
-from constraint_geodesics.scene.world import Sphere, World
+from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.scene.world import World
 from constraint_geodesics.studies.growth import (
     AWAY_M,
     AXES,

@@ -143,8 +143,10 @@ def _urdf_names(root: Path, here: Surroundings) -> dict[str, str]:
         described.append((str(card), json.loads(card.read_text("utf-8"))))
     for where, parameters in described:
         named.setdefault(parameters["robot"]["urdf"], where)
-        for body in parameters["workcell"]["urdfs"].values():
-            named.setdefault(body["urdf"], where)
+        workcell = parameters["workcell"]
+        for shape in {**workcell.get("urdfs", {}), **workcell.get("shapes", {})}.values():
+            if "urdf" in shape:
+                named.setdefault(shape["urdf"], where)
     return named
 
 
