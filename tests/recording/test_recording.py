@@ -167,10 +167,10 @@ def test_body_of_the_workcell_stands_at_its_pose(xarm, tmp_path):
     manifold, joints = xarm
     record_path(tmp_path / "path.rrd", path_of(joints), manifold, [TABLE, TRAY], frames=FRAMES)
     pose = pose_of_link(tmp_path / "path.rrd", "tray/base_link", 0)
-    np.testing.assert_allclose(pose[:3, 3], TRAY.position, atol=1e-6)
-    np.testing.assert_allclose(pose[:3, :3], rotation_from_rpy(np.array(TRAY.rpy)), atol=1e-6)
+    np.testing.assert_allclose(pose[:3, 3], TRAY.position_m, atol=1e-6)
+    np.testing.assert_allclose(pose[:3, :3], rotation_from_rpy(np.array(TRAY.rpy_rad)), atol=1e-6)
     np.testing.assert_allclose(
-        column(tmp_path / "path.rrd", "/workcell/table", "Boxes3D:centers"), [[TABLE.centre]]
+        column(tmp_path / "path.rrd", "/workcell/table", "Boxes3D:centers"), [[TABLE.centre_m]]
     )
     half = column(tmp_path / "path.rrd", "/workcell/table", "Boxes3D:half_sizes")
     np.testing.assert_allclose(half, [[[1.2, 1.2, 0.05]]])
