@@ -20,7 +20,8 @@ from constraint_geodesics.planner import Planner
 from constraint_geodesics.report.figures import save_png
 from constraint_geodesics.report.growth_figure import growth_figure
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
-from constraint_geodesics.scene.scene import Scene, find_urdf
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.urdf import find_urdf
 from constraint_geodesics.studies.growth import (
     CONSTRAINT,
     BandAndTrees,

@@ -12,8 +12,9 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.training import train_manifold
 from constraint_geodesics.params import Params, load_params
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
+from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.world import Box, data_path
+from constraint_geodesics.scene.urdf import data_path
 from tests.kernels import compile_kernels
 
 ROOT = Path(__file__).resolve().parents[1]

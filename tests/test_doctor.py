@@ -38,8 +38,7 @@ from constraint_geodesics.doctor import (
     versions_in,
 )
 from constraint_geodesics.robot.kinematics import RobotError
-from constraint_geodesics.scene.scene import find_urdf
-from constraint_geodesics.scene.world import data_path
+from constraint_geodesics.scene.urdf import data_path, find_urdf
 from tests.test_cli_plan import strict
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -9,7 +9,11 @@ import pytest
 import yaml
 from dvc.utils.hydra import apply_overrides
 
-from constraint_geodesics.params import ParamsError, load_params
+from constraint_geodesics.params import ParamsError, WorkcellParams, load_params
+from constraint_geodesics.scene.body import Body
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.capsule import Capsule
+from constraint_geodesics.scene.sphere import Sphere
 
 ROOT = Path(__file__).resolve().parents[1]
 Change = Callable[[dict[str, Any]], Any]
@@ -23,6 +27,12 @@ def changed(tmp_path: Path, change: Change) -> Path:
     return file
 
 
+def shapes(raw: dict[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = raw["workcell"]["shapes"]
+    return found
+
+
+PIPE = {"kind": "capsule", "from_m": [0, 0, 1], "to_m": [1, 0, 1], "radius_m": 0.1}
 BAD: list[tuple[Change, tuple[str, ...]]] = [
     (lambda p: p.update(speed=1), ("speed=1", "no such parameter")),
     (lambda p: p["labels"].update(free_row=5), ("labels.free_row=5", "no such parameter")),
@@ -64,6 +74,13 @@ BAD: list[tuple[Change, tuple[str, ...]]] = [
     (lambda p: p["compute"].update(backend="dask"), ("compute", "dask_address")),
     (lambda p: p.pop("judge"), ("judge is missing",)),
     (lambda p: p["constraints"].pop("free"), ("constraints.free",)),
+    (lambda p: shapes(p)["table"].pop("kind"), ("workcell.shapes.table.kind is missing",)),
+    (lambda p: shapes(p)["table"].update(kind="cone"), ("workcell.shapes.table", "'capsule'")),
+    (lambda p: shapes(p)["table"].update(size_m=[1, 1, 0]), ("box.size_m.2=0", "greater than 0")),
+    (lambda p: shapes(p)["table"].update(centre_m=[0, 0, "1"]), ("box.centre_m.2='1'", "number")),
+    (lambda p: shapes(p)["table"].update(radius_m=1), ("box.radius_m=1", "no such parameter")),
+    (lambda p: shapes(p).update(pipe=PIPE | {"to_m": [0, 0]}), ("capsule.to_m.2 is missing",)),
+    (lambda p: shapes(p).update(pipe=PIPE | {"radius_m": -1}), ("capsule.radius_m=-1",)),
 ]
 
 
@@ -136,3 +153,27 @@ def test_an_unknown_constraint_is_named(tmp_path: Path) -> None:
     assert result.returncode == 2
     assert "level_cap" in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+def test_shapes_of_every_kind_come_from_params_and_go_back(tmp_path: Path) -> None:
+    given = {
+        "pipe": PIPE | {"exempt_links": ["link1"]},
+        "lamp": {"kind": "sphere", "centre_m": [0.5, 0.0, 1], "radius_m": 0.1},
+        "tray": {"kind": "urdf", "urdf": "tray/traybox.urdf", "rpy_rad": [0, 0, 1.5]},
+    }
+    workcell = load_params(changed(tmp_path, lambda p: shapes(p).update(given))).workcell
+    assert set(workcell.shapes) == {"table", "pipe", "lamp", "tray"}
+    assert workcell.shapes["pipe"] == Capsule("pipe", (0, 0, 1), (1, 0, 1), 0.1, ("link1",))
+    assert workcell.shapes["tray"] == Body("tray", "tray/traybox.urdf", rpy_rad=(0, 0, 1.5))
+    assert WorkcellParams.model_validate(workcell.model_dump(mode="json")) == workcell
+    assert WorkcellParams().including(*workcell.shapes.values()) == workcell
+
+
+def test_files_that_list_boxes_spheres_and_urdfs_apart_are_read_as_well() -> None:
+    box = {"centre_m": [0.0, 0.0, 1.0], "size_m": [1.0, 1.0, 1.0]}
+    ball = {"centre_m": [0.0, 0.0, 1.0], "radius_m": 0.1}
+    listed = {"boxes": {"a": box}, "spheres": {"b": ball}, "urdfs": {"c": {"urdf": "c.urdf"}}}
+    shapes = WorkcellParams.model_validate(listed).shapes
+    assert shapes["a"] == Box("a", (0.0, 0.0, 1.0), (1.0, 1.0, 1.0))
+    assert shapes["b"] == Sphere("b", (0.0, 0.0, 1.0), 0.1)
+    assert shapes["c"] == Body("c", "c.urdf")

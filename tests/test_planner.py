@@ -19,9 +19,9 @@ from constraint_geodesics import Constraint, Planner, Pose, Trajectory, bundle
 from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.pose import ConstraintError, ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
-from constraint_geodesics.params import SphereParams
 from constraint_geodesics.planner import PlannerError, check_trajectory
 from constraint_geodesics.recording.recording import read_recording
+from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.candidates import Answer, Parts, Task, candidates, refined, rows_of
 from constraint_geodesics.trajectory import read_trajectory
 from tests.planner_fixtures import (
@@ -874,8 +874,7 @@ def around(planner: Planner, name: str, seed: int) -> tuple[Planner, np.ndarray,
             continue
         middle = free.at(0.5)
         x, y, z = map(float, planner.scene.robot.forward(middle)[0])
-        ball = SphereParams(centre_m=(x, y, z), radius_m=0.1)
-        workcell = planner.bundle.workcell.model_copy(update={"spheres": {"ball": ball}})
+        workcell = planner.bundle.workcell.including(Sphere("ball", (x, y, z), 0.1))
         other = Planner(replace(planner.bundle, workcell=workcell), "with a sphere")
         with other.scene.world() as world:
             if (

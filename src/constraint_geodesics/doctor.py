@@ -491,8 +491,10 @@ def _urdf_names(root: Path, here: Surroundings) -> dict[str, str]:
         described.append((str(card), json.loads(card.read_text("utf-8"))))
     named: dict[str, str] = {}
     for where, parameters in described:
-        bodies = parameters["workcell"]["urdfs"].values()
-        for urdf in (parameters["robot"]["urdf"], *(body["urdf"] for body in bodies)):
+        workcell = parameters["workcell"]
+        bodies = {**workcell.get("urdfs", {}), **workcell.get("shapes", {})}.values()
+        named.setdefault(parameters["robot"]["urdf"], where)
+        for urdf in (body["urdf"] for body in bodies if "urdf" in body):
             named.setdefault(urdf, where)
     return named
 

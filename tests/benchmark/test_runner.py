@@ -26,7 +26,7 @@ from constraint_geodesics.benchmark.runner import (
 from constraint_geodesics.params import load_params
 from constraint_geodesics.peers.elastic_band import StraightBand
 from constraint_geodesics.problem import Solution
-from constraint_geodesics.scene.world import Sphere
+from constraint_geodesics.scene.sphere import Sphere
 
 JUDGE = load_params(Path(__file__).parents[2] / "params.yaml").judge
 ENTRIES = (Entry("band", (0,), "a"), Entry("liar", (0, 1), "b"), Entry("broken", (0,), "c"))

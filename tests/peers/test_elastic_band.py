@@ -18,9 +18,10 @@ from constraint_geodesics.peers.elastic_band import (
 )
 from constraint_geodesics.peers.ompl import SamplingPlanner
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
+from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.world import Box, World
+from constraint_geodesics.scene.world import World
 from constraint_geodesics.search.band import BandSettings
 
 BIRRT = SamplingPlanner(

@@ -11,8 +11,9 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.peers.latent_geodesic import GradientGeodesic, StraightLatent, executable
 from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.clearance import clearance_model
-from constraint_geodesics.scene.world import Box, World
+from constraint_geodesics.scene.world import World
 
 NAMES = ("free", "level_cup", "level_cup_relaxed", "slide", "fixed_orientation")
 

@@ -12,7 +12,9 @@ from constraint_geodesics.params import BenchmarkParams
 from constraint_geodesics.peers.ompl import PlannerName, SamplingPlanner, plan_all
 from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
-from constraint_geodesics.scene.world import Box, World, data_path
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.urdf import data_path
+from constraint_geodesics.scene.world import World
 
 PLANNERS: tuple[PlannerName, ...] = ("prm", "rrt_star", "birrt")
 SETTINGS = BenchmarkParams(

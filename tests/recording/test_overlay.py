@@ -32,7 +32,11 @@ from constraint_geodesics.recording.recording import (
 )
 from constraint_geodesics.recording.viewer import prepared, save_recordings
 from constraint_geodesics.robot.kinematics import load_robot
-from constraint_geodesics.scene.world import Body, Box, Solid, Sphere, data_path
+from constraint_geodesics.scene.body import Body
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.scene.urdf import data_path
 
 FRAMES = 10
 TABLE = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1))
@@ -67,7 +71,7 @@ class Writer:
         constraint: str = "level_cup",
         seed: int = 0,
         meshes: bool = False,
-        bodies: tuple[Solid, ...] = (TABLE,),
+        bodies: tuple[Shape, ...] = (TABLE,),
         latent: bool = False,
         frames: int = FRAMES,
     ) -> Path:

@@ -30,7 +30,9 @@ from constraint_geodesics.recording.recording import (
 )
 from constraint_geodesics.recording.viewer import open_recordings
 from constraint_geodesics.robot.kinematics import load_robot, rotation_from_rpy
-from constraint_geodesics.scene.world import Body, Box, data_path
+from constraint_geodesics.scene.body import Body
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.urdf import data_path
 
 FRAMES = 25
 TABLE = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1))
@@ -165,10 +167,10 @@ def test_body_of_the_workcell_stands_at_its_pose(xarm, tmp_path):
     manifold, joints = xarm
     record_path(tmp_path / "path.rrd", path_of(joints), manifold, [TABLE, TRAY], frames=FRAMES)
     pose = pose_of_link(tmp_path / "path.rrd", "tray/base_link", 0)
-    np.testing.assert_allclose(pose[:3, 3], TRAY.position, atol=1e-6)
-    np.testing.assert_allclose(pose[:3, :3], rotation_from_rpy(np.array(TRAY.rpy)), atol=1e-6)
+    np.testing.assert_allclose(pose[:3, 3], TRAY.position_m, atol=1e-6)
+    np.testing.assert_allclose(pose[:3, :3], rotation_from_rpy(np.array(TRAY.rpy_rad)), atol=1e-6)
     np.testing.assert_allclose(
-        column(tmp_path / "path.rrd", "/workcell/table", "Boxes3D:centers"), [[TABLE.centre]]
+        column(tmp_path / "path.rrd", "/workcell/table", "Boxes3D:centers"), [[TABLE.centre_m]]
     )
     half = column(tmp_path / "path.rrd", "/workcell/table", "Boxes3D:half_sizes")
     np.testing.assert_allclose(half, [[[1.2, 1.2, 0.05]]])

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
+from constraint_geodesics.scene.body import Body
+from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.clearance import (
     ClearanceModel,
     clearance_batch,
@@ -14,7 +16,9 @@ from constraint_geodesics.scene.clearance import (
     link_clearances,
     outermost,
 )
-from constraint_geodesics.scene.world import Body, Box, Sphere, World, data_path
+from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.scene.urdf import data_path
+from constraint_geodesics.scene.world import World
 
 TABLE = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1), ("link_base",))
 KUKA_TABLE = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1), ("lbr_iiwa_link_0",))

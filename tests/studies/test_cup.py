@@ -148,7 +148,7 @@ SAME = """
 import sys
 import numpy as np
 from pathlib import Path
-from constraint_geodesics.scene.world import Box
+from constraint_geodesics.scene.box import Box
 from constraint_geodesics.studies.cup import CupSettings, execute
 from constraint_geodesics.robot.kinematics import load_robot
 
@@ -170,8 +170,8 @@ def test_the_same_call_gives_the_same_in_a_fresh_process(
         tmp_path / "in.npz",
         urdf=str(scene.robot.urdf),
         tool=scene.robot.tool_link,
-        centre=table.centre,
-        size=table.size,
+        centre=table.centre_m,
+        size=table.size_m,
         path=path,
         times=timed(scene.robot, path),
         axis=UP_IN_TOOL,

@@ -24,7 +24,8 @@ from constraint_geodesics.problem import PlanningProblem
 from constraint_geodesics.report.figures import save_png
 from constraint_geodesics.report.growth_figure import LABELS, growth_figure
 from constraint_geodesics.scene.clearance import clearance_model
-from constraint_geodesics.scene.world import Sphere, World
+from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.scene.world import World
 from constraint_geodesics.studies.growth import (
     AWAY_M,
     AXES,
@@ -327,9 +328,9 @@ def queries(params, scene):
 
 def test_spheres_leave_room_around_both_ends(scene, queries):
     spheres = place_spheres(scene, queries, 5, 0.06, np.random.default_rng(2))
-    assert len({sphere.centre for sphere in spheres}) == len(spheres) == 5
+    assert len({sphere.centre_m for sphere in spheres}) == len(spheres) == 5
     assert spheres == place_spheres(scene, queries, 5, 0.06, np.random.default_rng(2))
-    wider = [replace(sphere, radius=sphere.radius + 0.9 * AWAY_M) for sphere in spheres]
+    wider = [replace(sphere, radius_m=sphere.radius_m + 0.9 * AWAY_M) for sphere in spheres]
     with World(scene.robot, (*scene.workcell, *wider)) as world:
         assert world.free(np.concatenate([queries.starts, queries.goals])).all()
 

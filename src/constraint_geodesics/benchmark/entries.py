@@ -27,7 +27,8 @@ from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.recording.benchmark_recording import PathRecorder
-from constraint_geodesics.scene.scene import Scene, find_urdf
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.urdf import find_urdf
 
 JUDGED_BY = "benchmark.runner"
 """The module that asks the planners and judges their answers: every row depends on what it imports.

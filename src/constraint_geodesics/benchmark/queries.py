@@ -11,7 +11,7 @@ from constraint_geodesics.benchmark.runner import KEEP_OUT, TABLE, Case
 from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.learning.dataset import DatasetError, draw_queries
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.world import Sphere
+from constraint_geodesics.scene.sphere import Sphere
 
 Plan = Callable[[Float[np.ndarray, "D"], Float[np.ndarray, "D"]], Float[np.ndarray, "T D"]]
 """The shortest path without obstacles that is known (T, D) [rad], or (0, D)."""

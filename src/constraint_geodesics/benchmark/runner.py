@@ -29,7 +29,7 @@ from constraint_geodesics.params import JudgeParams
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.world import Sphere
+from constraint_geodesics.scene.sphere import Sphere
 
 COLUMNS = (
     "planner",
@@ -263,7 +263,7 @@ def write_cases(cases: Sequence[Case], file: Path) -> None:
     rows = []
     for case in cases:
         ball = case.obstacle
-        place = ("", "", "", "") if ball is None else (*ball.centre, ball.radius)
+        place = ("", "", "", "") if ball is None else (*ball.centre_m, ball.radius_m)
         rows.append(
             {
                 "constraint": case.constraint,

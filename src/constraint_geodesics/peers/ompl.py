@@ -26,7 +26,8 @@ from constraint_geodesics.learning.lift import as_executed
 from constraint_geodesics.params import BenchmarkParams
 from constraint_geodesics.problem import SATISFIED, PlanningProblem, Solution, refusal
 from constraint_geodesics.robot.kinematics import SerialRobot
-from constraint_geodesics.scene.world import Solid, World
+from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.world import World
 
 PlannerName = Literal["prm", "prm_star", "rrt_star", "informed_rrt_star", "birrt"]
 
@@ -127,7 +128,7 @@ def plan_all(
     settings: BenchmarkParams,
     robot: SerialRobot,
     constraint: Constraint,
-    workcell: Sequence[Solid],
+    workcell: Sequence[Shape],
     starts: Float[np.ndarray, "n D"],
     goals: Float[np.ndarray, "n D"],
     seed: int,

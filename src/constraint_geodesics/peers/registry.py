@@ -23,7 +23,7 @@ from constraint_geodesics.learning.submanifold import (
     GridSubmanifold,
     load_submanifold,
 )
-from constraint_geodesics.params import BenchmarkParams, Params, SphereParams
+from constraint_geodesics.params import BenchmarkParams, Params
 from constraint_geodesics.peers.bayesian_optimisation import BayesianPlanner
 from constraint_geodesics.peers.decoder_sampling import DecoderSampling
 from constraint_geodesics.peers.elastic_band import BandAfter, MultiStartBand, StraightBand
@@ -36,7 +36,6 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.world import Sphere
 from constraint_geodesics.search.candidates import ALL_PARTS, Parts
 
 KEPT_ANSWERS = 16
@@ -217,17 +216,9 @@ def _planner(wanted: Wanted) -> PathPlanner:
 
 def _opened(wanted: Wanted) -> Planner:
     """The planner in the wanted scene, its graph and networks loaded."""
-    workcell, bundle = wanted.params.workcell, wanted.bundle
-    balls = {
-        body.name: SphereParams(
-            centre_m=body.centre, radius_m=body.radius, exempt_links=body.exempt_links
-        )
-        for body in wanted.scene.workcell
-        if isinstance(body, Sphere)
-    }
-    within = workcell.model_copy(update={"spheres": {**workcell.spheres, **balls}})
+    within = wanted.bundle.workcell.including(*wanted.scene.workcell)
     planner = wanted.opened.enter_context(
-        Planner(replace(bundle, workcell=within), "the pipeline's outputs")
+        Planner(replace(wanted.bundle, workcell=within), "the pipeline's outputs")
     )
     constraint = wanted.manifold.constraint
     planner.prepare(constraint)

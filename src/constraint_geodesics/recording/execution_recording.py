@@ -38,7 +38,7 @@ from constraint_geodesics.recording.recording import (
     write_recording,
 )
 from constraint_geodesics.robot.kinematics import SerialRobot
-from constraint_geodesics.scene.world import Solid
+from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.studies.cup import CupSettings, Execution
 
 TIME = "time"
@@ -72,7 +72,7 @@ def record_execution(
     file: Path,
     record: ExecutionRecord,
     robot: SerialRobot,
-    workcell: Sequence[Solid],
+    workcell: Sequence[Shape],
     *,
     meshes: bool = True,
 ) -> None:
@@ -109,7 +109,7 @@ def record_executions(
     folder: Path,
     records: Sequence[ExecutionRecord | None],
     robot: SerialRobot,
-    workcell: Sequence[Solid],
+    workcell: Sequence[Shape],
 ) -> list[str]:
     """Record executions, one file each without meshes; returns the file of each, or "" where there
     is None.

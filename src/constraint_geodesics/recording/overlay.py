@@ -44,7 +44,7 @@ from constraint_geodesics.recording.recording import (
     static,
     violation_panel,
 )
-from constraint_geodesics.scene.scene import find_urdf
+from constraint_geodesics.scene.urdf import find_urdf
 
 OTHERS_OPACITY = 0.45
 """Of the robots over the first one."""

@@ -29,8 +29,9 @@ from rerun.urdf import UrdfTree
 from constraint_geodesics import palette
 from constraint_geodesics.certification.certifier import Limits
 from constraint_geodesics.constraints.pose import AXES, ConstraintManifold
-from constraint_geodesics.robot.kinematics import SerialRobot, rotation_from_rpy
-from constraint_geodesics.scene.world import Box, Solid, Sphere, data_path
+from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.urdf import urdf_name
 
 APPLICATION = "constraint_geodesics"
 TIMELINE = "frame"
@@ -172,7 +173,7 @@ def record_path(
     file: Path,
     path: PathRecord,
     manifold: ConstraintManifold,
-    workcell: Sequence[Solid],
+    workcell: Sequence[Shape],
     *,
     frames: int,
     meshes: bool = True,
@@ -192,7 +193,7 @@ def record_frames(
     path: PathRecord,
     sampled: Frames,
     manifold: ConstraintManifold,
-    workcell: Sequence[Solid],
+    workcell: Sequence[Shape],
     *,
     meshes: bool,
 ) -> None:
@@ -344,7 +345,7 @@ def _interpolate(at: np.ndarray, length: np.ndarray, values: np.ndarray) -> np.n
 
 
 def scene_chunks(
-    robot: SerialRobot, workcell: Sequence[Solid], sampled: Frames, *, meshes: bool
+    robot: SerialRobot, workcell: Sequence[Shape], sampled: Frames, *, meshes: bool
 ) -> Iterator[Chunk]:
     """The robot over the timeline and the workcell, with their meshes or with the names of their
     URDFs alone.
@@ -352,13 +353,14 @@ def scene_chunks(
     Raises RecordingError if a mesh that is asked for is missing.
     """
     yield from _robot_chunks(robot, sampled)
-    for body in workcell:
-        yield from _body_chunks(body)
+    for shape in workcell:
+        yield from _shape_chunks(shape)
     if meshes:
         yield from mesh_chunks(robot.urdf, "/robot")
-        for body in workcell:
-            if not isinstance(body, (Box, Sphere)):
-                yield from mesh_chunks(body.urdf, _entity("workcell", body.name), f"{body.name}/")
+        for shape in workcell:
+            if placed := shape.urdf_model():
+                entity = _entity("workcell", shape.name)
+                yield from mesh_chunks(placed.file, entity, f"{shape.name}/")
 
 
 def _robot_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
@@ -380,60 +382,24 @@ def _robot_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
             yield static(entity, joint.compute_transform(0.0, clamp=False))
 
 
-def _body_chunks(body: Solid) -> Iterator[Chunk]:
-    """A body of the workcell at its place."""
-    entity = _entity("workcell", body.name)
-    if isinstance(body, Box):
-        yield static(
-            entity,
-            rr.Boxes3D(
-                centers=[body.centre],
-                sizes=[body.size],
-                colors=[_BOX],
-                fill_mode="solid",
-                labels=[body.name],
-                show_labels=False,
-            ),
-        )
+def _shape_chunks(shape: Shape) -> Iterator[Chunk]:
+    """A shape of the workcell at its place."""
+    entity, placed = _entity("workcell", shape.name), shape.urdf_model()
+    look = {"colors": [_BOX], "fill_mode": "solid", "labels": [shape.name], "show_labels": False}
+    archetype = shape.drawn(rr, look)
+    if archetype is not None:
+        yield static(entity, archetype)
+    if placed is None:
         return
-    if isinstance(body, Sphere):
-        yield static(
-            entity,
-            rr.Ellipsoids3D(
-                centers=[body.centre],
-                radii=[body.radius],
-                colors=[_BOX],
-                fill_mode="solid",
-                labels=[body.name],
-                show_labels=False,
-            ),
-        )
-        return
-    tree = UrdfTree.from_file_path(body.urdf, frame_prefix=f"{body.name}/")
-    yield static(entity, rr.AnyValues(urdf=urdf_name(body.urdf), frame_prefix=f"{body.name}/"))
-    yield static(
-        _entity("transforms", body.name, "base"),
-        rr.Transform3D(
-            translation=body.position,
-            mat3x3=rotation_from_rpy(np.array(body.rpy)),
-            parent_frame=ROOT_FRAME,
-            child_frame=f"{body.name}/{tree.root_link().name}",
-        ),
-    )
+    prefix = f"{shape.name}/"
+    tree = UrdfTree.from_file_path(placed.file, frame_prefix=prefix)
+    yield static(entity, rr.AnyValues(urdf=urdf_name(placed.file), frame_prefix=prefix))
+    root = {"parent_frame": ROOT_FRAME, "child_frame": prefix + tree.root_link().name}
+    pose = rr.Transform3D(translation=placed.position, mat3x3=placed.rotation, **root)
+    yield static(_entity("transforms", shape.name, "base"), pose)
     for joint in tree.joints():
-        yield static(
-            _entity("transforms", body.name, joint.name), joint.compute_transform(0.0, clamp=False)
-        )
-
-
-def urdf_name(urdf: Path) -> str:
-    """A URDF as params.yaml names it: within pybullet_data, within this checkout, or by its whole
-    path.
-    """
-    for folder in (data_path().resolve(), Path.cwd()):
-        if urdf.resolve().is_relative_to(folder):
-            return urdf.resolve().relative_to(folder).as_posix()
-    return urdf.resolve().as_posix()
+        place = _entity("transforms", shape.name, joint.name)
+        yield static(place, joint.compute_transform(0.0, clamp=False))
 
 
 def mesh_chunks(urdf: Path, entity: str, frame_prefix: str | None = None) -> list[Chunk]:

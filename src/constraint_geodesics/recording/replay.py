@@ -15,7 +15,7 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import GridSubmanifold, Submanifold
 from constraint_geodesics.params import RecordingParams
 from constraint_geodesics.recording.recording import LatentView, PathRecord, record_path
-from constraint_geodesics.scene.world import Solid
+from constraint_geodesics.scene.shape import Shape
 
 GRID_POINTS = 80
 """At most so many points a side of a latent grid in a recording: finer ones are larger and show
@@ -31,7 +31,7 @@ def record_rows(
     chart: LearnedManifold,
     manifold: ConstraintManifold,
     submanifold: Submanifold,
-    workcell: Sequence[Solid],
+    workcell: Sequence[Shape],
     params: RecordingParams,
 ) -> list[dict[str, Any]]:
     """Record the paths of the first queries, without meshes.

@@ -5,10 +5,7 @@ The only importer of pybullet.  Every world is a physics client of its own in DI
 is simulated here.
 """
 
-import contextlib
-import os
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -18,41 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from constraint_geodesics.robot.kinematics import SerialRobot
-
-
-@dataclass(frozen=True)
-class Box:
-    """A fixed box: its centre and edge lengths [m], and the robot's links that may touch it."""
-
-    name: str
-    centre: tuple[float, float, float]
-    size: tuple[float, float, float]
-    exempt_links: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Sphere:
-    """A fixed sphere: its centre and radius [m], and the robot's links that may touch it."""
-
-    name: str
-    centre: tuple[float, float, float]
-    radius: float
-    exempt_links: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Body:
-    """A fixed body read from a URDF at a pose [m, rad], and the robot's links that may touch it."""
-
-    name: str
-    urdf: Path
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    exempt_links: tuple[str, ...] = ()
-
-
-Solid = Box | Sphere | Body
-"""What can stand in a workcell."""
+from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.urdf import quiet
 
 
 @dataclass(frozen=True)
@@ -114,13 +78,6 @@ class LinkHull:
     points: Float[np.ndarray, "n 3"]
 
 
-def data_path() -> Path:
-    """Folder of the robots and meshes that ship with PyBullet."""
-    with _quiet():
-        import pybullet_data
-    return Path(pybullet_data.getDataPath())
-
-
 class World:
     """One robot among fixed bodies.  Adjacent links and exempt links may touch; nothing else may.
 
@@ -128,14 +85,14 @@ class World:
     robot's.
     """
 
-    def __init__(self, robot: SerialRobot, fixed: Sequence[Solid] = ()) -> None:
-        with _quiet():
+    def __init__(self, robot: SerialRobot, fixed: Sequence[Shape] = ()) -> None:
+        with quiet():
             import pybullet
         self._bullet = pybullet
         self.robot = robot
         self._client = pybullet.connect(pybullet.DIRECT)
         flags = pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
-        with _quiet():
+        with quiet():
             self._body = pybullet.loadURDF(
                 str(robot.urdf), useFixedBase=True, flags=flags, physicsClientId=self._client
             )
@@ -150,7 +107,9 @@ class World:
         ] = -1
         self._joints = [joint_index[name] for name in robot.joint_names]
         self._tool = self._link_index[robot.tool_link]
-        self._exempt = {self._add(body): self._links(body) for body in fixed}
+        with quiet():
+            bodies = [shape.add_to(pybullet, self._client) for shape in fixed]
+        self._exempt = dict(zip(bodies, map(self._links, fixed), strict=True))
         for body, links in self._exempt.items():
             for link in links:  # a pair that may touch need not be examined again and again
                 pybullet.setCollisionFilterPair(
@@ -271,7 +230,7 @@ class World:
         bullet = self._bullet
         kind, size = shape[2], np.array(shape[3])
         if kind == bullet.GEOM_MESH:
-            with _quiet():
+            with quiet():
                 mesh = bullet.getMeshData(self._body, link, physicsClientId=self._client)[1]
             if mesh:  # of a link with one shape; it is in the inertial frame already
                 return np.array(mesh).reshape(-1, 3)
@@ -327,37 +286,7 @@ class World:
                 workcell = True
         return own, workcell
 
-    def _add(self, body: Solid) -> int:
-        bullet, client = self._bullet, self._client
-        if isinstance(body, Box):
-            half = [0.5 * edge for edge in body.size]
-            shape = bullet.createCollisionShape(
-                bullet.GEOM_BOX, halfExtents=half, physicsClientId=client
-            )
-            return int(
-                bullet.createMultiBody(0, shape, basePosition=body.centre, physicsClientId=client)
-            )
-        if isinstance(body, Sphere):
-            shape = bullet.createCollisionShape(
-                bullet.GEOM_SPHERE, radius=body.radius, physicsClientId=client
-            )
-            return int(
-                bullet.createMultiBody(0, shape, basePosition=body.centre, physicsClientId=client)
-            )
-        if not body.urdf.is_file():
-            raise FileNotFoundError(f"workcell {body.name!r}: no such URDF file: {body.urdf}")
-        with _quiet():
-            return int(
-                bullet.loadURDF(
-                    str(body.urdf),
-                    basePosition=body.position,
-                    baseOrientation=bullet.getQuaternionFromEuler(body.rpy),
-                    useFixedBase=True,
-                    physicsClientId=client,
-                )
-            )
-
-    def _links(self, body: Solid) -> frozenset[int]:
+    def _links(self, body: Shape) -> frozenset[int]:
         unknown = [name for name in body.exempt_links if name not in self._link_index]
         if unknown:
             raise ValueError(
@@ -420,20 +349,3 @@ def physics(world: World) -> Physics:
         world._tool,
         tuple(world._exempt),
     )
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence the lines that the library writes past Python straight to the process's output."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    saved = [(stream, os.dup(stream)) for stream in (1, 2)]
-    try:
-        with open(os.devnull, "w") as nothing:
-            for stream, _ in saved:
-                os.dup2(nothing.fileno(), stream)
-        yield
-    finally:
-        for stream, copy in saved:
-            os.dup2(copy, stream)
-            os.close(copy)

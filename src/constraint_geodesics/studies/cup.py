@@ -14,7 +14,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.robot.kinematics import SerialRobot
-from constraint_geodesics.scene.world import Physics, Solid, World, physics
+from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.world import Physics, World, physics
 
 GRAVITY = 9.81
 """[m/s²], along the negative z axis of the base frame."""
@@ -128,7 +129,7 @@ class Execution:
 
 def execute(
     robot: SerialRobot,
-    workcell: Sequence[Solid],
+    workcell: Sequence[Shape],
     joints: Float[np.ndarray, "T D"],
     times: Float[np.ndarray, "T"],
     cup_axis_in_tool: Float[np.ndarray, "3"],

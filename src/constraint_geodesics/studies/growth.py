@@ -39,7 +39,8 @@ from constraint_geodesics.report.results import markdown_table
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.world import Sphere, World
+from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.scene.world import World
 from constraint_geodesics.search.band import BandSettings, BandSpace
 from constraint_geodesics.search.candidates import Answer, candidates
 from constraint_geodesics.search.roadmap import build_roadmap
