@@ -15,7 +15,7 @@ from constraint_geodesics.studies.ablation import (
     policy_variants,
     variant_task,
 )
-from constraint_geodesics.studies.analytic_search import run_analytic
+from constraint_geodesics.studies.geodesic_search import run_analytic
 from constraint_geodesics.tracking.experiment import tracked_stage
 
 STAGE = "ablate_analytic"

@@ -12,8 +12,12 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.studies.policy_benchmark import policy_table
-from constraint_geodesics.studies.policy_tasks import PolicyTask, policy_figures, run_policies
+from constraint_geodesics.studies.proposals import (
+    PolicyTask,
+    policy_figures,
+    policy_table,
+    run_policies,
+)
 from constraint_geodesics.tracking.experiment import tracked_stage
 
 STAGE = "benchmark_policies"

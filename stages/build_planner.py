@@ -12,7 +12,7 @@ import constraint_geodesics
 from constraint_geodesics.bundle import Bundle
 from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import read_queries
-from constraint_geodesics.learning.files import WEIGHTS
+from constraint_geodesics.learning.inference import WEIGHTS
 from constraint_geodesics.learning.submanifold import GraphSubmanifold, load_submanifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout

@@ -10,13 +10,13 @@ from constraint_geodesics.geodesics.policy_search import save_policy
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.studies.analytic_search import (
+from constraint_geodesics.studies.geodesic_search import (
     MANIFOLDS,
     AnalyticTask,
     curve_family,
     run_analytic,
+    write_table,
 )
-from constraint_geodesics.studies.geodesic_search import write_table
 from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 
 STAGE = "train_analytic"

@@ -11,8 +11,7 @@ from constraint_geodesics.benchmark.plan_benchmark import BAND_AFTER, figures_of
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.studies.execution import PLANNED, STRAIGHT
-from constraint_geodesics.studies.policy_benchmark import policy_table
-from constraint_geodesics.studies.policy_tasks import policy_figures
+from constraint_geodesics.studies.proposals import policy_figures, policy_table
 
 LENGTHS = {"planner": (2.0, 4.0, 3.0), BAND_AFTER: (2.2, 4.0, np.nan), "BiRRT": (3.0, 8.0, np.nan)}
 """Joint lengths of three queries; nan without a path."""

@@ -11,7 +11,7 @@ from constraint_geodesics.geodesics.policy_search import (
     search,
     train_policy,
 )
-from constraint_geodesics.studies.analytic_search import (
+from constraint_geodesics.studies.geodesic_search import (
     AnalyticTask,
     analytic_problem,
     curve_family,

@@ -13,18 +13,19 @@ from constraint_geodesics.geometry.curves import (
     PinnedPolynomial,
     PinnedSpline,
 )
-from constraint_geodesics.geometry.length import Quadrature, curve_speeds
+from constraint_geodesics.geometry.length import (
+    CROWD,
+    NODES,
+    SPACING_TOLERANCE,
+    Quadrature,
+    constant_speed,
+    curve_speeds,
+)
 from constraint_geodesics.geometry.manifold import (
     EmbeddedManifold,
     GeometryError,
     Manifold,
     NonFiniteError,
-)
-from constraint_geodesics.geometry.reparametrisation import (
-    CROWD,
-    NODES,
-    SPACING_TOLERANCE,
-    constant_speed,
 )
 
 CUBIC = PinnedPolynomial(2, 3)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
-from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
+from constraint_geodesics.geometry.analytic import LevelSet, Plane, Sphere, Torus
 from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
 from constraint_geodesics.geometry.grid import GridManifold
 from constraint_geodesics.geometry.length import (
@@ -23,7 +23,6 @@ from constraint_geodesics.geometry.length import (
     curve_energy,
     curve_length,
 )
-from constraint_geodesics.geometry.level_sets import LevelSet
 from constraint_geodesics.geometry.manifold import (
     EmbeddedManifold,
     MeasuredManifold,

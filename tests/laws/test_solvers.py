@@ -31,7 +31,7 @@ from constraint_geodesics.geometry.manifold import (
     OutsideError,
     pullback_metric,
 )
-from constraint_geodesics.studies.analytic_search import AnalyticTask, curve_family, run_analytic
+from constraint_geodesics.studies.geodesic_search import AnalyticTask, curve_family, run_analytic
 
 SEED = 3
 CUBIC = PinnedPolynomial(2, 3)

@@ -4,7 +4,7 @@ import torch
 
 from constraint_geodesics.geodesics.problem import LearnedProblem
 from constraint_geodesics.geometry.curves import PinnedPolynomial
-from constraint_geodesics.learning.joint_chart import JointChart
+from constraint_geodesics.learning.learned_manifold import JointChart
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from safetensors.numpy import load_file
 
-from constraint_geodesics.learning.files import WEIGHTS
-
 Arrays = Mapping[str, np.ndarray]
 SPREAD = 0.3
 """Standard deviation of samples around a centre, in its bandwidths: so wide, samples are as often
@@ -75,3 +73,10 @@ def perceptron(
         y @ arrays[f"{name}.nonlinear.{layer}.weight"].T + arrays[f"{name}.nonlinear.{layer}.bias"]
     )
     return last + x @ arrays[f"{name}.linear.weight"].T
+
+
+WEIGHTS, CARD = "weights.safetensors", "manifold.json"
+
+
+class ManifoldFileError(ValueError):
+    """A saved manifold that is missing, incomplete or altered; the message names the file."""

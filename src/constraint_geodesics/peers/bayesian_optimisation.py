@@ -16,8 +16,7 @@ from jaxtyping import Float
 
 from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, repeated
 from constraint_geodesics.geometry.curves import PinnedPolynomial
-from constraint_geodesics.learning.joint_chart import JointChart
-from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.learning.learned_manifold import JointChart, LearnedManifold
 from constraint_geodesics.peers.latent_geodesic import (
     EXACT,
     answer,

@@ -20,8 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 
-from constraint_geodesics.geometry.analytic import Sphere, Torus
-from constraint_geodesics.geometry.level_sets import LevelSet
+from constraint_geodesics.geometry.analytic import LevelSet, Sphere, Torus
 from constraint_geodesics.geometry.manifold import pullback_metric
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import GraphSubmanifold, GridSubmanifold

@@ -14,15 +14,16 @@ from constraint_geodesics.pipeline.layout import Layout, in_checkout
 from constraint_geodesics.report.blocks import Block, Look, Recorded, runs_link
 from constraint_geodesics.report.figures import PLANNERS
 from constraint_geodesics.report.results import markdown_table, read_metrics, short
-from constraint_geodesics.studies.policy_benchmark import (
+from constraint_geodesics.studies.proposals import (
     DESCENT,
+    JOINTS,
+    LEARNED,
     ONE_SEED,
     POLICIES,
     RANDOM,
     SEPARATE,
     STRAIGHT,
 )
-from constraint_geodesics.studies.policy_tasks import JOINTS, LEARNED
 
 PLAN_COLUMNS = (
     "planner",

@@ -19,13 +19,13 @@ from constraint_geodesics.geodesics.solver import geodesics_between
 from constraint_geodesics.geometry.manifold import pullback_metric
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import GeodesicParams
-from constraint_geodesics.studies.analytic_search import (
+from constraint_geodesics.studies.geodesic_search import (
     AnalyticTask,
+    SeedLog,
     analytic_problem,
     curve_family,
     unseen_pairs,
 )
-from constraint_geodesics.studies.geodesic_search import SeedLog
 
 PAIRS_SEED = 21
 POINTS = 101

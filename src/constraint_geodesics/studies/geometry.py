@@ -46,7 +46,7 @@ from constraint_geodesics.learning.lift import correct_and_retract
 from constraint_geodesics.params import GeodesicParams, GeometryParams
 from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.pipeline.progress import progress
-from constraint_geodesics.studies.analytic_search import (
+from constraint_geodesics.studies.geodesic_search import (
     MANIFOLDS,
     PAIRS,
     analytic_problem,

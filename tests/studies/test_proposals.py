@@ -16,7 +16,7 @@ from constraint_geodesics.geodesics.problem import LearnedProblem
 from constraint_geodesics.geodesics.proposals import MeanPolicy
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.manifold import GeometryError
-from constraint_geodesics.learning.joint_chart import JointChart
+from constraint_geodesics.learning.learned_manifold import JointChart
 from constraint_geodesics.studies import policy_benchmark as bench
 
 QUERIES, STEPS = 10, 3
