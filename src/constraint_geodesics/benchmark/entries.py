@@ -26,7 +26,7 @@ from constraint_geodesics.peers.registry import KINDS, PeerBuilder, PeerError
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
-from constraint_geodesics.recording.recorder import PathRecorder
+from constraint_geodesics.recording.benchmark_recording import PathRecorder
 from constraint_geodesics.scene.scene import Scene, find_urdf
 
 JUDGED_BY = "benchmark.runner"

@@ -1,11 +1,10 @@
 """Recordings of the paths that a table reports, one file a path, without meshes."""
 
 import math
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +15,6 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import GridSubmanifold, Submanifold
 from constraint_geodesics.params import RecordingParams
 from constraint_geodesics.recording.recording import LatentView, PathRecord, record_path
-from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import Solid
 
 GRID_POINTS = 80
@@ -76,70 +74,6 @@ class RowRecorder:
         points, curve = plane.transform(submanifold.latent), plane.transform(curve)
         names = ("first principal axis", "second principal axis")
         return LatentView(points, submanifold.labels, curve, names)
-
-
-class NamedQuery(Protocol):
-    """The names of a query."""
-
-    @property
-    def constraint(self) -> str:
-        """Of the constraint."""
-        ...
-
-    @property
-    def scene(self) -> str:
-        """Of the scene."""
-        ...
-
-    @property
-    def query(self) -> int:
-        """Its number."""
-        ...
-
-
-@dataclass(frozen=True)
-class PathRecorder:
-    """Records the first seed's path of the named planners and queries; picklable.
-
-    root: the checkout, which the file names are relative to.  queries: of each scene.  frames: of a
-    recording.
-    """
-
-    root: Path
-    folder: Path
-    planners: tuple[str, ...]
-    queries: Mapping[str, int]
-    frames: int
-
-    def __call__(
-        self,
-        case: NamedQuery,
-        planner: str,
-        seed: int,
-        joints: Float[np.ndarray, "T D"],
-        measures: Any,
-        scene: Scene,
-        manifold: ConstraintManifold,
-    ) -> str:
-        """The file, relative to the root if it lies there, or "" where this path is not recorded.
-
-        measures: a dataclass with valid, reason, length_rad, tool_length_m and max_violation_*, as
-        a row of text.
-        """
-        constraint, query = case.constraint, case.query
-        if planner not in self.planners or seed != 0 or self.queries.get(case.scene) != query:
-            return ""
-        plain = re.sub(r"[^a-z0-9]+", "_", planner.lower()).strip("_")
-        file = self.folder / constraint / f"{case.scene}-query{query}-{plain}.rrd"
-        row = {**asdict(measures), "planner": planner, "query": query, "seed": seed}
-        text = f"{status_text(row, constraint)}\n- scene `{case.scene}`"
-        path = PathRecord(
-            planner, constraint, query, seed, joints, text, scene=case.scene, meshes=False
-        )
-        record_path(file, path, manifold, scene.workcell, frames=self.frames)
-        # the root is mostly given as the folder one is in
-        file, root = file.resolve(), self.root.resolve()
-        return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.as_posix()
 
 
 def save_paths(
