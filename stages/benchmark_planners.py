@@ -14,7 +14,7 @@ from constraint_geodesics.learning.submanifold import load_submanifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.recording.replay import record_rows, save_paths
+from constraint_geodesics.recording.recorder import RowRecorder, save_paths
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.geodesic_search import write_table
 from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
@@ -50,17 +50,16 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
         rows = [row for result in results for row in result.rows]
         paths = [path for result in results for path in result.paths]
         save_paths(rows, paths, layout.benchmark(constraint))
-        rows = record_rows(
+        recorder = RowRecorder(
             layout.recordings(STAGE, constraint),
-            rows,
-            paths,
             constraint,
-            charts[shown],
             manifold,
-            load_submanifold(layout.submanifold(shown, constraint)),
             scene.workcell,
+            charts[shown],
+            load_submanifold(layout.submanifold(shown, constraint)),
             params.recording,
         )
+        rows = recorder.record(rows, paths)
         run.recordings(rows)
         write_table(rows, layout.report(STAGE, constraint, "csv"), constraint=constraint)
         run.report(planner_figures(results), layout.report(STAGE, constraint))

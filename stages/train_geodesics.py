@@ -12,7 +12,7 @@ from constraint_geodesics.learning.submanifold import load_submanifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.recording.replay import record_rows
+from constraint_geodesics.recording.recorder import RowRecorder
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.geodesic_search import (
     PLANNER,
@@ -83,17 +83,11 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         rows, paths = straight_rows(tasks[0])
         rows += [row for result in results for row in result.rows]
         paths += [path for result in results for path in result.paths]
-        rows = record_rows(
-            layout.recordings(STAGE, item),
-            rows,
-            paths,
-            constraint,
-            chart,
-            constrained,
-            submanifold,
-            scene.workcell,
-            params.recording,
+        folder, workcell = layout.recordings(STAGE, item), scene.workcell
+        recorder = RowRecorder(
+            folder, constraint, constrained, workcell, chart, submanifold, params.recording
         )
+        rows = recorder.record(rows, paths)
         run.recordings(rows, shown=PLANNER)
         write_table(
             rows, layout.report(STAGE, item, "csv"), manifold=manifold, constraint=constraint

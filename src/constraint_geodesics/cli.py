@@ -21,7 +21,7 @@ from constraint_geodesics.pipeline.threads import ONE_THREAD, one_thread
 if TYPE_CHECKING:
     import pandas as pd
 
-    from constraint_geodesics.recording.catalogue import Entry, Wanted
+    from constraint_geodesics.recording.catalogue import Filter, Listed
 
 WRONG_USAGE = 2
 NO_PATH = 3
@@ -457,10 +457,10 @@ def replay(
     With --constraint, --query and --planner what fits is opened; with fewer of them the list is
     narrowed.
     """
-    from constraint_geodesics.recording.catalogue import Wanted, as_records
+    from constraint_geodesics.recording.catalogue import Filter, as_records
 
-    wanted = Wanted(constraint, scene, query, tuple(planner or ()), tuple(seed or ()), manifold)
-    if recordings and (as_json or wanted != Wanted()):
+    wanted = Filter(constraint, scene, query, tuple(planner or ()), tuple(seed or ()), manifold)
+    if recordings and (as_json or wanted != Filter()):
         words = (
             "--json prints the list of recordings"
             if as_json
@@ -476,13 +476,13 @@ def replay(
     from constraint_geodesics.recording.viewer import open_recordings, save_recordings
 
     if save is not None:
-        save_recordings(files, save, beside=beside)
+        save_recordings(files, save, apart=beside)
         print(f"{save}: open it with geodesics replay {save}")
         return
-    raise SystemExit(open_recordings(files, web=web, beside=beside, web_port=web_port))
+    raise SystemExit(open_recordings(files, web=web, apart=beside, web_port=web_port))
 
 
-def _listed(wanted: "Wanted") -> "list[Entry]":
+def _listed(wanted: "Filter") -> "list[Listed]":
     """The recordings of this checkout that are as asked for."""
     from constraint_geodesics.recording.catalogue import catalogue, narrowed, read_entry
 
@@ -496,7 +496,7 @@ def _listed(wanted: "Wanted") -> "list[Entry]":
 
 def _named(words: Sequence[str]) -> list[Path]:
     """The files that some words name, by themselves or by their numbers in the list."""
-    from constraint_geodesics.recording.catalogue import Wanted, by_words
+    from constraint_geodesics.recording.catalogue import Filter, by_words
 
     for word in words:
         if not word.isdigit() and not Path(word).is_file():
@@ -506,12 +506,12 @@ def _named(words: Sequence[str]) -> list[Path]:
     numbers = [word for word in words if not Path(word).is_file()]
     files = {
         entry.number: Path(entry.file)
-        for entry in (by_words(_listed(Wanted()), numbers) if numbers else [])
+        for entry in (by_words(_listed(Filter()), numbers) if numbers else [])
     }
     return [Path(word) if Path(word).is_file() else files[int(word)] for word in words]
 
 
-def _chosen(listed: "list[Entry]", wanted: "Wanted") -> list[Path]:
+def _chosen(listed: "list[Listed]", wanted: "Filter") -> list[Path]:
     """What is opened of the list: what was asked for, or what a person at the terminal chooses;
     piped, nothing.
     """

@@ -271,7 +271,7 @@ def test_without_meshes_a_recording_is_small_and_names_the_urdfs(xarm, tmp_path)
     whole, slim = tmp_path / "whole.rrd", tmp_path / "slim.rrd"
     for file, meshes in ((whole, True), (slim, False)):
         record_path(
-            file, path_of(joints, latent=latent), manifold, [TABLE, TRAY], frames=100, meshes=meshes
+            file, path_of(joints, latent=latent, meshes=meshes), manifold, [TABLE, TRAY], frames=100
         )
     small, large = read_recording(slim), read_recording(whole)
     assert (small.meshes, large.meshes) == (0, 8)
@@ -286,7 +286,7 @@ def test_ids_tell_paths_apart_that_share_their_name(xarm, tmp_path):
     manifold, joints = xarm
     paths = {"one": joints, "same": joints.copy(), "other": joints[::-1]}
     for name, own in paths.items():
-        record_path(tmp_path / name, path_of(own), manifold, [], frames=FRAMES, meshes=False)
+        record_path(tmp_path / name, path_of(own, meshes=False), manifold, [], frames=FRAMES)
     one, same, other = (read_recording(tmp_path / name).recording_id for name in paths)
     assert one == same != other
 
@@ -453,7 +453,8 @@ def test_without_a_display_the_browser_is_named(xarm, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    record_path(tmp_path / "path.rrd", path_of(xarm[1]), xarm[0], [], frames=FRAMES, meshes=False)
+    path = path_of(xarm[1], meshes=False)
+    record_path(tmp_path / "path.rrd", path, xarm[0], [], frames=FRAMES)
     with pytest.raises(RecordingError, match="no display .* add --web"):
         open_recordings([tmp_path / "path.rrd"], web=False)
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.recording.recorder import status_text
 from constraint_geodesics.recording.recording import PathRecord, record_path
-from constraint_geodesics.recording.replay import status_text
 from constraint_geodesics.scene.scene import Scene
 
 
@@ -72,9 +72,9 @@ class PathRecorder:
         row = {**asdict(measures), "planner": planner, "query": case.query, "seed": seed}
         text = f"{status_text(row, case.constraint)}\n- scene `{case.scene}`"
         record = PathRecord(
-            planner, case.constraint, case.query, seed, joints, text, scene=case.scene
+            planner, case.constraint, case.query, seed, joints, text, scene=case.scene, meshes=False
         )
-        record_path(file, record, manifold, scene.workcell, frames=self.frames, meshes=False)
+        record_path(file, record, manifold, scene.workcell, frames=self.frames)
         file, root = (
             file.resolve(),
             self.root.resolve(),
