@@ -54,10 +54,10 @@ class Slab(Shape):
         turn = Rotation.from_rotvec(self.turn).as_matrix()
         return (RoundedBox(self.centre, self.half_edges, 0.0, turn),)
 
-    def add_to(self, bullet: Any, client: int) -> int:
+    def add_to(self, bullet: Any) -> int:
         turn, kind = Rotation.from_rotvec(self.turn).as_quat().tolist(), bullet.GEOM_BOX
         size = {"shapeType": kind, "halfExtents": self.half_edges}
-        return add_body(bullet, client, self.centre, turn, **size)
+        return add_body(bullet, self.centre, turn, **size)
 
     def drawn(self, rerun: Any, look: Mapping[str, Any]) -> Any:
         return None

@@ -28,7 +28,7 @@ class Body(Shape):
         turn = rotation_from_rpy(np.array(self.rpy_rad))
         return PlacedUrdf(find_urdf(self.urdf), self.position_m, turn)
 
-    def add_to(self, bullet: Any, client: int) -> int:
+    def add_to(self, bullet: Any) -> int:
         """All of the URDF, its moving joints at 0."""
         return int(
             bullet.loadURDF(
@@ -36,6 +36,5 @@ class Body(Shape):
                 basePosition=self.position_m,
                 baseOrientation=bullet.getQuaternionFromEuler(self.rpy_rad),
                 useFixedBase=True,
-                physicsClientId=client,
             )
         )

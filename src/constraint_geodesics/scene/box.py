@@ -27,10 +27,10 @@ class Box(Shape):
         """It is one, without rounding."""
         return (RoundedBox(self.centre_m, self._half_edges),)
 
-    def add_to(self, bullet: Any, client: int) -> int:
+    def add_to(self, bullet: Any) -> int:
         """A box of PyBullet."""
         kind = bullet.GEOM_BOX
-        return add_body(bullet, client, self.centre_m, shapeType=kind, halfExtents=self._half_edges)
+        return add_body(bullet, self.centre_m, shapeType=kind, halfExtents=self._half_edges)
 
     def drawn(self, rerun: Any, look: Mapping[str, Any]) -> Any:
         """A box of Rerun."""

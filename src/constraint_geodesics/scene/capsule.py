@@ -34,12 +34,12 @@ class Capsule(Shape):
         half_edges = (0.0, 0.0, 0.5 * self.length_m)
         return (RoundedBox((x, y, z), half_edges, self.radius_m, self._turn()),)
 
-    def add_to(self, bullet: Any, client: int) -> int:
+    def add_to(self, bullet: Any) -> int:
         """A capsule of PyBullet, which has it along its z axis."""
         (core,) = self.rounded_boxes()
         size = {"radius": self.radius_m, "height": self.length_m}
         kind = bullet.GEOM_CAPSULE
-        return add_body(bullet, client, core.centre, self._quaternion(), shapeType=kind, **size)
+        return add_body(bullet, core.centre, self._quaternion(), shapeType=kind, **size)
 
     def drawn(self, rerun: Any, look: Mapping[str, Any]) -> Any:
         """A capsule of Rerun, which begins at the origin and runs along its z axis."""

@@ -186,7 +186,7 @@ def link_clearances(chain, model, far, q, distances, normals, nearest, joint_ori
                     passed_over = min(passed_over, bound)
                     continue
                 for k in range(first, last):
-                    _nearer(frame, points[k], boxes[b], j, distances, normals, nearest)
+                    _nearer(frame, points[k], boxes[b], j, (distances, normals, nearest))
         if distances[j] > far:
             distances[j] = min(distances[j], passed_over)
 
@@ -203,10 +203,11 @@ def _from_centre(box, x, y, z):
 
 
 @njit(inline="always", **_COMPILE)
-def _nearer(frame, point, box, j, distances, normals, nearest):
+def _nearer(frame, point, box, j, found):
     """Take a point of the links that joint j carries for the nearest, if it is nearer to the box
-    than all before.
+    than all before; found: distances, normals and nearest points so far.
     """
+    distances, normals, nearest = found
     p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = frame
     x = p0 + r00 * point[0] + r01 * point[1] + r02 * point[2]
     y = p1 + r10 * point[0] + r11 * point[1] + r12 * point[2]

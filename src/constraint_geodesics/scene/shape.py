@@ -56,8 +56,8 @@ class Shape(ABC):
         return None
 
     @abstractmethod
-    def add_to(self, bullet: Any, client: int) -> int:
-        """Make its body in a world of PyBullet, the module `bullet`; the body's index."""
+    def add_to(self, bullet: Any) -> int:
+        """Make its body in a world, with `bullet`'s functions of PyBullet; the body's index."""
 
     def drawn(self, rerun: Any, look: Mapping[str, Any]) -> Any:
         """Its archetype of the module `rerun`, with the look that all shapes share; None if it is
@@ -66,13 +66,7 @@ class Shape(ABC):
         return None
 
 
-def add_body(
-    bullet: Any, client: int, position: Triple, turn: Any = (0, 0, 0, 1), **geometry: Any
-) -> int:
+def add_body(bullet: Any, position: Triple, turn: Any = (0, 0, 0, 1), **geometry: Any) -> int:
     """A fixed body of PyBullet with one collision shape, turned by a quaternion x, y, z, w."""
-    shape = bullet.createCollisionShape(physicsClientId=client, **geometry)
-    return int(
-        bullet.createMultiBody(
-            0, shape, basePosition=position, baseOrientation=turn, physicsClientId=client
-        )
-    )
+    shape = bullet.createCollisionShape(**geometry)
+    return int(bullet.createMultiBody(0, shape, basePosition=position, baseOrientation=turn))

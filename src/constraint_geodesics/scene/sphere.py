@@ -22,10 +22,10 @@ class Sphere(Shape):
         """A box without edges, rounded by the radius."""
         return (RoundedBox(self.centre_m, (0.0, 0.0, 0.0), self.radius_m),)
 
-    def add_to(self, bullet: Any, client: int) -> int:
+    def add_to(self, bullet: Any) -> int:
         """A sphere of PyBullet."""
         kind = bullet.GEOM_SPHERE
-        return add_body(bullet, client, self.centre_m, shapeType=kind, radius=self.radius_m)
+        return add_body(bullet, self.centre_m, shapeType=kind, radius=self.radius_m)
 
     def drawn(self, rerun: Any, look: Mapping[str, Any]) -> Any:
         """An ellipsoid of Rerun."""

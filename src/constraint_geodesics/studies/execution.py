@@ -209,7 +209,7 @@ def execute_queries(
                 if len(joints) < 2:
                     executed.append(Executed(query, kind, status))
                 else:
-                    found = execute(scene.robot, scene.workcell, joints, times, axis, cup)
+                    found = execute(scene, joints, times, axis, cup)
                     hit = world.first_collision(joints) is not None
                     executed.append(
                         Executed(query, kind, EXECUTED, polyline_length(joints), hit, found)
