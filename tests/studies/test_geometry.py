@@ -11,12 +11,12 @@ from constraint_geodesics.geodesics.graph_search import GraphSolver
 from constraint_geodesics.geodesics.problem import Box, ChartProblem, LearnedProblem, Samples
 from constraint_geodesics.geometry.analytic import Sphere
 from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.geometry.length import curve_length
 from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
 from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.studies.geometry import (
     GeometryBenchmark,
     alternately,
-    default_length,
     naive_length,
     naive_retracted_length,
     one_thread,
@@ -47,7 +47,7 @@ def test_all_sides_measure_the_same_lengths(benchmark) -> None:
     curves, _ = random_curves(benchmark.plain, 20)
     with torch.no_grad():
         ours, naive = (
-            measure(benchmark.manifold, curves) for measure in (default_length, naive_length)
+            measure(benchmark.manifold, curves) for measure in (curve_length, naive_length)
         )
     reference = reference_length(benchmark.manifold, curves)
     torch.testing.assert_close(ours, reference, rtol=1e-3, atol=0)

@@ -100,9 +100,7 @@ def begin(problem: GeodesicProblem, ends: Ends, phi: Float[np.ndarray, "B p"]) -
 
 
 def draw_episodes(problem: GeodesicProblem, count: int, rng: np.random.Generator) -> CurveStates:
-    """Episodes on random ends; every other one starts from a random curve, so that bad ones are met
-    as well.
-    """
+    """Episodes on random ends; every other one starts from a random curve, to meet bad ones."""
     ends = problem.sample_ends(count, rng)
     phi = problem.sample_curves(ends, rng) * rng.integers(2, size=(count, 1))
     return begin(problem, ends, phi)

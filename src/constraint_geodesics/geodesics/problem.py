@@ -1,6 +1,4 @@
-"""What a geodesic solver is asked and what it answers: ends, the cost of curves between them, the
-result.
-"""
+"""What a geodesic solver is asked and what it answers: ends, cost of curves, the result."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -26,10 +24,12 @@ from constraint_geodesics.geometry.manifold import (
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import (
     Lifted,
+    allowed_steps,
     as_executed,
-    correct_and_retract,
+    corrected,
     densify,
     jump_excess,
+    retracted,
 )
 
 REDRAWN = 10
@@ -56,9 +56,7 @@ SEEN_TOLERANCE = 0.2
 
 @dataclass(frozen=True)
 class Ends:
-    """Starts and goals of B curves, as chart points (B, N) and, on a robot's manifold, as joints
-    (B, D) [rad].
-    """
+    """Starts and goals of B curves, in the chart and, on a robot's manifold, as joints [rad]."""
 
     z_start: Float[np.ndarray, "B N"]
     z_goal: Float[np.ndarray, "B N"]
@@ -79,9 +77,7 @@ class Ends:
 
     @property
     def distance(self) -> Float[np.ndarray, "B"]:
-        """Distance of start and goal in the chart: the unit of coefficients, so that near and far
-        pairs look alike.
-        """
+        """Distance of start and goal in the chart, the unit of coefficients: scales look alike."""
         return np.maximum(np.linalg.norm(self.z_goal - self.z_start, axis=1), 1e-9)
 
     def replaced(self, rows: np.ndarray, other: "Ends") -> "Ends":
@@ -99,9 +95,7 @@ def repeated(ends: Ends, count: int) -> Ends:
 
 @dataclass(frozen=True)
 class Costs:
-    """Length of B curves, their cost (the length and what is wrong with them), and which are curves
-    one could use.
-    """
+    """Length of B curves, cost (the length and what is wrong), and which could be used."""
 
     length: Float[np.ndarray, "B"]
     cost: Float[np.ndarray, "B"]
@@ -175,11 +169,11 @@ class Geodesic:
     phi: Float[np.ndarray, "p"]
     start: Float[np.ndarray, "N"]
     goal: Float[np.ndarray, "N"]
-    length: float
-    straight_length: float
-    iterations: int
-    evaluations: int
-    time_s: float
+    length: float = np.nan
+    straight_length: float = np.nan
+    iterations: int = 0
+    evaluations: int = 0
+    time_s: float = 0.0
 
     @property
     def found(self) -> bool:
@@ -193,25 +187,17 @@ class Geodesic:
 
     @classmethod
     def nothing(
-        cls,
-        status: Status,
-        curve: CurveFamily,
-        start: Float[np.ndarray, "N"],
-        goal: Float[np.ndarray, "N"],
+        cls, status: Status, curve: CurveFamily, start: np.ndarray, goal: np.ndarray
     ) -> "Geodesic":
         """The answer where there is no curve: φ = 0, and no length."""
-        return cls(
-            status, curve, np.zeros(curve.coefficients), start, goal, np.nan, np.nan, 0, 0, 0.0
-        )
+        return cls(status, curve, np.zeros(curve.coefficients), start, goal)
 
 
 class GeodesicSolver(Protocol):
     """A way to find geodesics.  `geodesics_between` calls it with ends that it has checked."""
 
     def solve(self, problem: "ChartProblem", ends: Ends) -> list[Geodesic]:
-        """The shortest curve of the problem's family found between each start and goal, one record
-        each.
-        """
+        """The shortest curve of the problem's family found for each start and goal, in order."""
         ...
 
 
@@ -255,14 +241,11 @@ class ChartProblem:
     domain: Domain
 
     def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
-        """The cost is the length, at the default accuracy; a curve that leaves the manifold is not
-        feasible.
-        """
+        """The cost is the length; a curve that leaves the manifold is not feasible."""
         free, start, goal = _tensors(phi, ends.z_start, ends.z_goal)
         with torch.no_grad():
-            length = estimate_length(
-                self.manifold, Curves(self.curve, free, start, goal)
-            ).length.numpy()
+            curves = Curves(self.curve, free, start, goal)
+            length = estimate_length(self.manifold, curves).length.numpy()
         return Costs(length, length, np.isfinite(length) & self.stays_inside(phi, ends))
 
     def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:
@@ -294,9 +277,7 @@ class ChartProblem:
         return Ends(start, goal, start, goal)
 
     def sample_ends(self, count: int, rng: np.random.Generator) -> Ends:
-        """Random pairs of points of the domain; a set may hold one twice, so pairs of one point are
-        drawn again.
-        """
+        """Random pairs of points of the domain; pairs of one point are drawn again."""
         start, goal = self.domain.sample(count, rng), self.domain.sample(count, rng)
         for _ in range(REDRAWN):
             same = np.flatnonzero((start == goal).all(axis=1))
@@ -306,9 +287,7 @@ class ChartProblem:
         return Ends(start, goal, start, goal)
 
     def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
-        """Cubics with normal coefficients, whatever the family; the ends' distance is their
-        standard deviation.
-        """
+        """Cubics with normal coefficients of the ends' distance, whatever the family."""
         cubic = PinnedPolynomial(self.curve.dim, 3)
         phi = rng.normal(size=(len(ends), cubic.coefficients)) * ends.distance[:, None]
         if self.curve == cubic:
@@ -376,9 +355,7 @@ class LearnedProblem:
     def _decoded(
         self, phi: Float[np.ndarray, "B p"], ends: Ends
     ) -> tuple[Float[np.ndarray, "B S D"], Float[np.ndarray, "B S D"]]:
-        """Decoder mean and deviation along the curves, at the times lengths are measured with
-        [rad].
-        """
+        """Decoder mean and deviation [rad] at the times that lengths are measured with."""
         embedded = self.chart.embed_points(
             self.latent_points(phi, ends, _rule(self.degree).times.numpy())
         )
@@ -386,8 +363,9 @@ class LearnedProblem:
         return embedded[..., :dof].astype(np.float64), embedded[..., dof:]
 
     def _lifted(self, decoded: Float[np.ndarray, "B S D"], ends: Ends) -> Lifted:
-        t, retraction = _rule(self.degree).times.numpy(), self.retraction if self.retract else None
-        return correct_and_retract(self.manifold, decoded, t, ends.q_start, ends.q_goal, retraction)
+        t = _rule(self.degree).times.numpy()
+        joints = corrected(decoded, t, ends.q_start, ends.q_goal)
+        return retracted(self.manifold, joints, self.retraction if self.retract else None)
 
     def _costs(
         self,
@@ -402,18 +380,13 @@ class LearnedProblem:
         length, error = _length_and_error(rule, shape)
         outside = -np.minimum(self.manifold.robot.limit_distance(lifted.joints), 0.0).sum(-1)
         if not self.retract:
-            cost = (length + error) * (
-                1.0 + self.inclusion_weight * self.manifold.violation(decoded).mean(-1)
-            )
-            return Costs(length, cost + outside, outside == 0.0)
+            factor = 1.0 + self.inclusion_weight * self.manifold.violation(decoded).mean(-1)
+            return Costs(length, (length + error) * factor + outside, outside == 0.0)
         excess = jump_excess(lifted.joints, rule.times.numpy())
         left = lifted.violation.max(axis=-1)
         cost = length + error + JUMP_WEIGHT * excess + outside + left
-        return Costs(
-            length,
-            cost,
-            (excess == 0.0) & (outside == 0.0) & (left <= 10 * self.retraction.accuracy),
-        )
+        kept = left <= 10 * self.retraction.accuracy
+        return Costs(length, cost, (excess == 0.0) & (outside == 0.0) & kept)
 
     def _pulls(self, joints: Float[np.ndarray, "B S D"]) -> Float[np.ndarray, "B S D"]:
         manifold, robot = self.manifold, self.manifold.robot
@@ -448,10 +421,8 @@ class LearnedProblem:
         steps = np.diff(joints, axis=1)
         lengths = np.linalg.norm(steps, axis=-1)
         excess = np.maximum(lengths - allowed_steps(joints, t), 0.0)
-        jump = (
-            self._coefficients(steps * (excess / np.maximum(lengths, 1e-12))[..., None], between)
-            / far
-        )
+        beyond = steps * (excess / np.maximum(lengths, 1e-12))[..., None]
+        jump = self._coefficients(beyond, between) / far
         over = np.maximum(joints - robot.upper, 0.0) + np.minimum(joints - robot.lower, 0.0)
         outside = self._coefficients(over, basis) / far
         sizes = np.stack([excess.sum(1), np.abs(over).sum((1, 2)), lifted.violation.max(1)], axis=1)
@@ -520,15 +491,12 @@ class LearnedProblem:
         while True:
             t = np.linspace(0.0, 1.0, points)
             decoded = self.chart.decode(self.latent_points(phi[None], ends, t))
-            joints = correct_and_retract(
-                self.manifold, decoded, t, ends.q_start, ends.q_goal, exact
-            ).joints[0]
+            line = corrected(decoded, t, ends.q_start, ends.q_goal)
+            joints = retracted(self.manifold, line, exact).joints[0]
             if np.linalg.norm(np.diff(joints, axis=0), axis=-1).max() <= 0.1 or points > 1000:
-                return (
-                    as_executed(self.manifold, joints, spacing)
-                    if self.retract
-                    else densify(joints, spacing)
-                )
+                if self.retract:
+                    return as_executed(self.manifold, joints, spacing)
+                return densify(joints, spacing)
             points = 2 * points - 1
 
     def ends(self, start: Float[np.ndarray, "B D"], goal: Float[np.ndarray, "B D"]) -> Ends:
@@ -541,9 +509,7 @@ class LearnedProblem:
         return self.ends(self.joints[rows[0]], self.joints[rows[1]])
 
     def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
-        """Curves bent towards random configurations of the constraint's data: where a straight line
-        changes its branch, the way round leads past some of them.
-        """
+        """Curves bent towards random configurations of the data: the way round a branch."""
         past = self.chart.encode(self.joints[rng.integers(len(self.joints), size=len(ends))])
         share = rng.uniform(size=(len(ends), 1))
         bend = share * (past - 0.5 * (ends.z_start + ends.z_goal))
@@ -558,14 +524,6 @@ class LearnedProblem:
         return str(
             joblib.hash((weights, chain, vars(self.manifold.constraint), self.joints, settings))
         )
-
-
-def allowed_steps(
-    joints: Float[np.ndarray, "B S D"], t: Float[np.ndarray, "S"]
-) -> Float[np.ndarray, "B S-1"]:
-    """Longest steps [rad] of curves that do not jump, as `jump_excess` has them."""
-    direct = np.linalg.norm(joints[:, -1] - joints[:, 0], axis=-1)
-    return 0.05 + 4.0 * direct[:, None] * np.diff(t)
 
 
 @dataclass(frozen=True)
@@ -586,8 +544,7 @@ class ProblemSet:
             same = replace(member, manifold=first.manifold, joints=first.joints) == first
             if not (same and member.retract and member.manifold.robot is first.manifold.robot):
                 raise GeometryError(
-                    "members of a problem set differ in more than constraint and data, or do "
-                    "not retract"
+                    "members of a set differ in more than constraint and data, or do not retract"
                 )
 
     @property
@@ -610,9 +567,8 @@ class ProblemSet:
         for member, rows in self._rows(ends):
             pulls[rows] = member._pulls(lifted.joints[rows])
         constraint = np.stack([member._constraint for member in self.members])[ends.member]
-        return first._look(
-            first._costs(lifted, decoded, deviation), lifted, pulls, constraint, ends
-        )
+        costs = first._costs(lifted, decoded, deviation)
+        return first._look(costs, lifted, pulls, constraint, ends)
 
     def _lifted(self, decoded: Float[np.ndarray, "B S D"], ends: Ends) -> Lifted:
         lifted = Lifted(np.empty_like(decoded), np.empty(decoded.shape[:2]))

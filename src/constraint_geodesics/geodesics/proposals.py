@@ -1,6 +1,4 @@
-"""Proposals of trained policies for new queries, with numpy alone: no noise, no random curves, no
-learning library.
-"""
+"""Proposals of trained policies for new queries, with numpy alone and without noise."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -47,9 +45,7 @@ class MeanPolicy:
 
 @dataclass(frozen=True)
 class Proposals:
-    """The best curve that each of A policies met for each of B queries: feasible if any was, then
-    the cheapest.
-    """
+    """The best curve of each of A policies for each of B queries: feasible, then cheap."""
 
     phi: Float[np.ndarray, "A B p"]
     cost: Float[np.ndarray, "A B"]
@@ -64,9 +60,7 @@ class Proposals:
 def propose(
     problem: GeodesicProblem, policies: Sequence[MeanPolicy], settings: EpisodeSettings, ends: Ends
 ) -> Proposals:
-    """Follow every policy's mean from the straight line for one episode; the straight line is met
-    too.
-    """
+    """Follow every policy's mean from the straight line, which counts too, for one episode."""
     count, queries = len(policies), len(ends)
     states = begin(
         problem,

@@ -49,9 +49,7 @@ class Plane:
     def distance(
         self, a: Float[Tensor, "*#batch N"], b: Float[Tensor, "*#batch N"]
     ) -> Float[Tensor, "*batch"]:
-        """Euclidean distance.  Raises NonFiniteError with the place of the first coordinate that is
-        not finite.
-        """
+        """Euclidean distance.  Raises NonFiniteError with the place of the first bad coordinate."""
         _require_points(self.dim, a, b)
         return torch.linalg.vector_norm(b - a, dim=-1)
 
@@ -81,9 +79,7 @@ class Sphere:
 
     @property
     def periods(self) -> tuple[float, float]:
-        """The azimuth wraps at 2π; the elevation has a reflection beyond the poles, but no period
-        of its own.
-        """
+        """The azimuth wraps at 2π; the elevation is reflected at the poles, but has no period."""
         return math.inf, 2 * math.pi
 
     def embed(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch 3"]:
@@ -124,9 +120,7 @@ class Sphere:
         return 2 * self.radius * torch.atan2(near.clamp(min=0).sqrt(), far.clamp(min=0).sqrt())
 
     def elevation(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch"]:
-        """Elevation of the embedded point, −π/2 to π/2 [rad]: Fig. 2a's sub-manifolds are its level
-        sets.
-        """
+        """Elevation of the embedded point, −π/2 to π/2 [rad]; Fig. 2a shows its level sets."""
         require_dim(z, self.dim, "z")
         return torch.atan2(torch.sin(z[..., 0]), torch.cos(z[..., 0]).abs())
 
@@ -346,9 +340,7 @@ class LevelSet:
         return tuple(self._circle(min(level.number for level in group)) for group in self._groups())
 
     def component_of(self, z: Float[Tensor, "*batch 2"]) -> Int[Tensor, "*batch"]:
-        """Index of each point's component in `components()`, −1 where the constraint doesn't
-        hold.
-        """
+        """Each point's place in `components()`, −1 where the constraint doesn't hold."""
         component = [0] * len(self.levels)
         for index, group in enumerate(self._groups()):
             for level in group:
@@ -398,9 +390,7 @@ class LevelSet:
 
 
 class _Level(NamedTuple):
-    """A level by its value on the chart's coordinate, wrapped to [−π, π] if that repeats, and its
-    place in `levels`.
-    """
+    """A level's value, wrapped to [−π, π] if the coordinate repeats, and its place in `levels`."""
 
     value: float
     number: int

@@ -1,6 +1,4 @@
-"""Graphs over points of a manifold: neighbours, connected components, shortest paths; nodes are
-numbered from 0.
-"""
+"""Graphs over points of a manifold: neighbours, components, shortest paths; nodes count from 0."""
 
 from typing import NamedTuple
 
@@ -17,15 +15,11 @@ OUTSIDE = -1
 
 
 class GraphError(GeometryError):
-    """A graph can't be built or searched; the message names the input, its value and what is
-    allowed.
-    """
+    """A graph can't be built or searched; names the input, its value and what is allowed."""
 
 
 class ShortestPath(NamedTuple):
-    """A path as its nodes from source to target (k,), and its length; no nodes and inf where there
-    is none.
-    """
+    """Nodes from source to target (k,) and the length; no nodes and inf where there is none."""
 
     nodes: Int[np.ndarray, "k"]
     length: float

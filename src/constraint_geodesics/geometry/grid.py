@@ -1,6 +1,4 @@
-"""A plane with a conformal metric known at the nodes of a regular grid, as metrics of latent spaces
-are exchanged.
-"""
+"""A plane with a conformal metric known at the nodes of a regular grid."""
 
 import math
 from dataclasses import dataclass, field
@@ -24,9 +22,7 @@ WALL = 100.0
 
 
 class GridError(GeometryError):
-    """Arrays or bounds that are no grid of a metric; the message names the input, its value and
-    what is allowed.
-    """
+    """Arrays or bounds that are no grid of a metric; names the input and what is allowed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +99,7 @@ class GridManifold:
         return first, second
 
     def nodes(self) -> Float[Tensor, "rows*columns 2"]:
-        """Chart points of the nodes, row by row; the first and the last lie on `lower` and `upper`
-        to the bit.
-        """
+        """Chart points of the nodes, row by row; first and last lie on the bounds to the bit."""
         rows, columns = self.values.shape
         return _nodes((rows, columns), self.lower, self.upper, self.values)
 
@@ -129,9 +123,7 @@ class GridManifold:
         return factor[..., None, None] * torch.eye(self.dim, dtype=factor.dtype, device=z.device)
 
     def contains(self, z: Float[Tensor, "*batch N"]) -> Bool[Tensor, "*batch"]:
-        """Whether each point is finite, on the grid (its border included), and nearest to a node
-        that isn't blocked.
-        """
+        """Whether each point is finite, on the grid or its border, and nearest to a free node."""
         require_dim(z, self.dim, "z")
         lower, upper = (
             torch.tensor(bound, dtype=z.dtype, device=z.device)
@@ -173,9 +165,7 @@ def _nodes(
 def _with_walls(
     values: Float[Tensor, "rows columns"], blocked: Bool[Tensor, "rows columns"], spacing: Bounds
 ) -> Float[Tensor, "rows columns"]:
-    """The values with those of blocked nodes replaced by walls that rise with the distance to the
-    free ones.
-    """
+    """The values, with blocked nodes as walls that rise with the distance to the free ones."""
     depth = ndimage.distance_transform_edt(blocked.cpu().numpy(), sampling=spacing) / min(spacing)
     walls = WALL * values[~blocked].max() * torch.from_numpy(depth).to(values)
     return torch.where(blocked, walls, values)

@@ -45,9 +45,7 @@ Objective = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Quadrature:
-    """A rule ∫₀¹ g dt ≈ Σ_i weights_i g(nodes_i): nodes (Q,) inside [0, 1], weights (Q,) that sum
-    to 1.
-    """
+    """A rule ∫₀¹ g dt ≈ Σ_i weights_i g(nodes_i): nodes inside [0, 1], weights that sum to 1."""
 
     nodes: Float[Tensor, "Q"]
     weights: Float[Tensor, "Q"]
@@ -489,9 +487,7 @@ def _inverted(panels: _Panels, curves: int, count: int) -> Float[Tensor, "{curve
 def _lengths_passed(
     panels: _Panels, curves: int
 ) -> tuple[Float[Tensor, "{curves} P+1"], Int[Tensor, "{curves}"]]:
-    """Length passed at the panels' edges, the shorter rows filled with the whole, and each curve's
-    first panel.
-    """
+    """Length passed at the panels' edges, the whole beyond; and each curve's first panel."""
     many = panels.row.bincount(minlength=curves)
     first = many.cumsum(0) - many
     place = torch.arange(len(panels.row)) - first[panels.row]
@@ -502,9 +498,7 @@ def _lengths_passed(
 def _reached(
     series: Float[Tensor, "*batch k"], target: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch"]:
-    """Where in [0, 1] rising Legendre series reach their targets, by Newton's method kept within a
-    bracket.
-    """
+    """Where rising Legendre series on [0, 1] reach their targets: Newton within a bracket."""
     low, high = torch.zeros_like(target), torch.ones_like(target)
     u = (target / series.sum(-1)).nan_to_num(nan=0.5).clamp(0.0, 1.0)
     for _ in range(NEWTON_STEPS):
@@ -528,9 +522,7 @@ def _first_edges(breaks: tuple[float, ...]) -> Float[Tensor, "P+1"]:
 
 @cache
 def _to_series() -> Float[np.ndarray, "n n"]:
-    """Takes values at the Gauss-Legendre nodes to the Legendre series of the polynomial through
-    them.
-    """
+    """From values at the Gauss-Legendre nodes to the Legendre series through them."""
     x, weights = np.polynomial.legendre.leggauss(NODES)
     return (
         np.polynomial.legendre.legvander(x, NODES - 1) * weights[:, None] * (np.arange(NODES) + 0.5)

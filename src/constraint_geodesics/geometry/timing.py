@@ -251,9 +251,7 @@ def _fastest_next_to(known, step, acceleration):
 
 @njit(**_COMPILE)
 def _used(q, times, velocity, acceleration):
-    """Factor by which times may shrink, or must grow if above 1, for all differences of the rows to
-    keep the limits.
-    """
+    """Factor by which times may shrink, or must grow if above 1, to keep the limits everywhere."""
     worst = 0.0
     last = q.shape[0] - 1
     for j in range(q.shape[1]):

@@ -75,9 +75,7 @@ class Ends(NamedTuple):
 
 
 class Advance(NamedTuple):
-    """What geodesics gain on a stretch of the tube: ring angle `turn` = U [rad] and `action` =
-    W.
-    """
+    """What geodesics gain on a stretch of tube: ring angle `turn` = U [rad], `action` = W."""
 
     turn: Numbers
     action: Numbers
@@ -155,9 +153,7 @@ def _outward_length(hole: float, ends: Ends) -> Numbers:
 
 
 def _inward_length(hole: float, ends: Ends) -> Numbers:
-    """Lengths in the inward family, c = hole + t below the ring of the inner equator; no meaning
-    unless opposite.
-    """
+    """Lengths in the inward family, c = hole + t; no meaning unless opposite."""
     equator = Parallels(np.zeros_like(ends.turn), np.ones_like(ends.turn))
     stops = ends.near, ends.far
     gaps = [np.where(ends.opposite, end.inner, 0.0) for end in stops]

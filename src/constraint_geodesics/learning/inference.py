@@ -49,9 +49,7 @@ class FrozenManifold:
         return (self.arrays["centre"] + self.arrays["scale"] * decoded).astype(np.float64)
 
     def sample(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count N"]:
-        """Latent points spread like the training data: normal around the centres of the precision
-        network.
-        """
+        """Latent points spread like the training data, about the precision network's centres."""
         centres, width = self.arrays["precision.centres"], self.arrays["precision.bandwidth"]
         chosen = rng.integers(len(centres), size=count)
         return centres[chosen] + SPREAD * width[chosen, None] * rng.normal(size=(count, self.dim))

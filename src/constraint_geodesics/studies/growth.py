@@ -17,19 +17,20 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import torch
 from jaxtyping import Float, Int
+from scipy.stats import linregress
 
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
 from constraint_geodesics.geometry.length import Collocation, curve_length
 from constraint_geodesics.learning.dataset import Queries, draw_queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.training import train_manifold
+from constraint_geodesics.learning.training import TrainingRun, train_manifold
 from constraint_geodesics.learning.vae import JointVae
 from constraint_geodesics.params import ManifoldParams, Params
 from constraint_geodesics.peers.elastic_band import free_rows, nothing, settled, task_of
@@ -128,9 +129,7 @@ class GrowthSizes:
 
 
 class Sample(NamedTuple):
-    """One timing: of what, at which size of which axis, and whether the query was solved, or the
-    share of a batch that was; nan where nothing is asked.
-    """
+    """One timing: of what, at which size of which axis; solved share, nan if nothing is asked."""
 
     axis: str
     value: int
@@ -171,17 +170,13 @@ class Subject:
 
 @dataclass(frozen=True)
 class BandAndTrees:
-    """The project's own search without anything learned: the straight line's band, and two trees
-    where that fails.
-    """
+    """The project's own search, nothing learned: the straight line's band, then two trees."""
 
     settings: BandSettings = field(default_factory=BandSettings)
     name: str = "band and trees"
 
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
-        """The first candidate whose rows touch nothing.  The trees have seeds of their own: `seed`
-        is ignored.
-        """
+        """The first candidate that touches nothing; `seed` is ignored, trees have their own."""
         began = time.perf_counter()
         del seed
         early = settled(problem, began)
@@ -239,25 +234,19 @@ def measure_growth(
 
 def _summary(samples: Sequence[Sample]) -> pd.DataFrame:
     """The table of `measure_growth`, by axis in their order, then by size, then as they came."""
-    every = pd.DataFrame(samples)
-    rows = []
-    for (axis, value, what), own in every.groupby(["axis", "value", "what"], sort=False):
-        low, median, high = np.quantile(own["seconds"], [0.25, 0.5, 0.75])
-        rows.append(
-            {
-                "axis": axis,
-                "value": value,
-                "what": what,
-                "seconds": median,
-                "low": low,
-                "high": high,
-                "repeats": len(own),
-                "solved": own["solved"].mean(),
-                "mean": own["seconds"].mean(),
-            }
-        )
-    rows.sort(key=lambda row: (AXES.index(row["axis"]), row["value"]))
-    return pd.DataFrame(rows)
+    by = pd.DataFrame(samples).groupby(["axis", "value", "what"], sort=False)
+    low, median, high = (by["seconds"].quantile(q) for q in (0.25, 0.5, 0.75))
+    columns = {"seconds": median, "low": low, "high": high, "repeats": by.size()}
+    columns |= {"solved": by["solved"].mean(), "mean": by["seconds"].mean()}
+    return (
+        pd.DataFrame(columns)
+        .reset_index()
+        .sort_values(["axis", "value"], key=_in_order, kind="stable", ignore_index=True)
+    )
+
+
+def _in_order(column: "pd.Series[Any]") -> "pd.Series[Any]":
+    return column.map(AXES.index) if column.name == "axis" else column
 
 
 def slopes(table: pd.DataFrame) -> pd.DataFrame:
@@ -272,20 +261,10 @@ def slopes(table: pd.DataFrame) -> pd.DataFrame:
     for (axis, what), own in table.groupby(["axis", "what"], sort=False):
         value, seconds = own["value"].to_numpy(float), own["seconds"].to_numpy(float)
         used = (value > 0) & (seconds > 0) & np.isfinite(seconds)
-        slope, error, intercept = _line(np.log(value[used]), np.log(seconds[used]))
-        rows.append(
-            {
-                "axis": axis,
-                "what": what,
-                "slope": slope,
-                "standard_error": error,
-                "seconds_at_1": float(np.exp(intercept)),
-                "points": int(used.sum()),
-            }
-        )
-    return pd.DataFrame(
-        rows, columns=["axis", "what", "slope", "standard_error", "seconds_at_1", "points"]
-    )
+        line = _line(np.log(value[used]), np.log(seconds[used]))
+        rows.append((axis, what, *line, int(used.sum())))
+    columns = ["axis", "what", "slope", "standard_error", "seconds_at_1", "points"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def slopes_markdown(fits: pd.DataFrame) -> str:
@@ -301,16 +280,12 @@ def slopes_markdown(fits: pd.DataFrame) -> str:
 
 
 def _line(x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"]) -> tuple[float, float, float]:
-    """Slope, its standard error and the intercept of a least-squares line."""
+    """Slope of a least-squares line, its standard error, and exp of the intercept."""
     if len(np.unique(x)) < 2:
         return np.nan, np.nan, np.nan
-    from_mean = x - x.mean()
-    spread = float(from_mean @ from_mean)
-    slope = float(from_mean @ y) / spread
-    intercept = float(y.mean() - slope * x.mean())
-    residual = y - intercept - slope * x
-    error = np.sqrt(float(residual @ residual) / (len(x) - 2) / spread) if len(x) > 2 else np.nan
-    return slope, float(error), intercept
+    found = linregress(x, y)
+    error = float(found.stderr) if len(x) > 2 else np.nan
+    return float(found.slope), error, float(np.exp(found.intercept))
 
 
 def epoch_seconds(
@@ -327,38 +302,24 @@ def epoch_seconds(
     epoch nor what comes after the last one is part of them.
     """
     stamps: list[float] = []
-    longer = {
-        "epochs": epochs + 1,
-        "variance_epochs": epochs + 1,
-        "patience": epochs + 2,
-    }  # the first is not counted
-    train_manifold(
-        joints,
-        robot,
-        settings.model_copy(update=longer),
-        scratch,
-        lambda *_: stamps.append(time.perf_counter()),
-        progress=False,
-    )
+    # one more, since the first is not counted
+    longer = {"epochs": epochs + 1, "variance_epochs": epochs + 1, "patience": epochs + 2}
+    run = TrainingRun(scratch, lambda *_: stamps.append(time.perf_counter()), progress=False)
+    train_manifold(joints, robot, settings.model_copy(update=longer), run)
     phases = np.diff(np.reshape(stamps, (2, epochs + 1)), axis=1)
     return dict(zip(("mean", "variance"), phases.tolist(), strict=True))
 
 
 def place_spheres(
-    scene: Scene,
-    queries: Queries,
-    count: int,
-    radius_m: float,
-    rng: np.random.Generator,
-    tries: int = TRIES,
+    scene: Scene, queries: Queries, count: int, radius_m: float, rng: np.random.Generator
 ) -> list[Sphere]:
     """Spheres around random places that the tool can be at, none within AWAY_M of the arm at an end
     of a query.
 
-    Raises ValueError if `tries` random configurations are not enough.
+    Raises ValueError if TRIES random configurations are not enough.
     """
     ends, kept = np.concatenate([queries.starts, queries.goals]), list[Sphere]()
-    for q in _free_configurations(scene, rng, tries):
+    for q in _free_configurations(scene, rng):
         if len(kept) == count:
             break
         x, y, z = scene.robot.forward(q)[0].tolist()
@@ -373,7 +334,7 @@ def place_spheres(
 
 
 @dataclass(frozen=True)
-class _Case:
+class _Asked:
     """Some queries of one constraint in one scene."""
 
     scene: Scene
@@ -397,19 +358,19 @@ def _joints(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
     poses = [_references(scene, sizes) for scene in scenes]
     for k in range(sizes.references):
         for scene, own in zip(scenes, poses, strict=True):
-            case = _held(scene, LEVEL, own[k], k, sizes)
+            asked = _held(scene, LEVEL, own[k], k, sizes)
             if k == 0:
-                _warmed(subject, case)
-            yield _planned(subject, "joints", scene.robot.dof, case)
+                _warmed(subject, asked)
+            yield _planned(subject, "joints", scene.robot.dof, asked)
 
 
 def _codimension(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
     for k, pose in enumerate(_references(subject.scene, sizes)):
         for count in sizes.codimensions:
-            case = _held(subject.scene, HELD[count], pose, k, sizes)
+            asked = _held(subject.scene, HELD[count], pose, k, sizes)
             if k == 0:
-                _warmed(subject, case)
-            yield _planned(subject, "codimension", count, case)
+                _warmed(subject, asked)
+            yield _planned(subject, "codimension", count, asked)
 
 
 def _obstacles(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
@@ -420,43 +381,41 @@ def _obstacles(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
         )
         spheres = place_spheres(scene, queries, max(sizes.spheres), sizes.radius_m, rng)
         for count in sizes.spheres:
-            case = _Case(Scene(scene.robot, (*scene.workcell, *spheres[:count])), manifold, queries)
+            asked = _Asked(
+                Scene(scene.robot, (*scene.workcell, *spheres[:count])), manifold, queries
+            )
             if k == 0:
-                _warmed(subject, case)
-            yield _planned(subject, "obstacles", count, case)
+                _warmed(subject, asked)
+            yield _planned(subject, "obstacles", count, asked)
 
 
 def _queries(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
     scene, manifold, peer = subject.scene, subject.manifold, subject.planners[subject.peer]
     pool = draw_queries(scene, manifold, CONSTRAINT, max(sizes.all_batches), sizes.seed)
     with scene.world() as world:
-        problems = _Case(scene, manifold, pool).problems(world)
+        problems = _Asked(scene, manifold, pool).problems(world)
 
         def one_by_one(rows: Int[np.ndarray, "B"]) -> Sequence[bool]:
-            return [
-                peer.plan(replace(problems[row]), seed=int(row)).status == "solved" for row in rows
-            ]
+            answers = [peer.plan(replace(problems[row]), seed=int(row)) for row in rows]
+            return [answer.status == "solved" for answer in answers]
 
         def together(rows: Int[np.ndarray, "B"]) -> Sequence[bool]:
             return subject.batch(pool.starts[rows], pool.goals[rows])
 
-        together(
-            np.arange(len(pool))
-        )  # all of them: some parts are loaded by the first query that needs them
+        # all of them: some parts are loaded by the first query that needs them
+        together(np.arange(len(pool)))
         one_by_one(np.arange(1))
         asked = ((PLANNER, together, sizes.batches), (subject.peer, one_by_one, sizes.peer_batches))
         most = max(map(sizes.turns, sizes.all_batches))
         for turn in range(most):
             found = []
             for count in sizes.all_batches:
-                own, late = divmod(
-                    turn, most // sizes.turns(count)
-                )  # the large ones are spread over the time as well
+                # the large ones are spread over the time as well
+                own, late = divmod(turn, most // sizes.turns(count))
                 if late or own >= sizes.turns(count):
                     continue
-                rows = (own * count + np.arange(count)) % len(
-                    pool
-                )  # other queries, as long as there are any
+                # other queries, as long as there are any
+                rows = (own * count + np.arange(count)) % len(pool)
                 for name, answer, counts in asked:
                     if count in counts:
                         began = time.perf_counter()
@@ -467,28 +426,21 @@ def _queries(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
 
 
 def _latent_dimension(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
-    """Lengths of random cubics by the rule that searches use, on networks with untrained weights:
-    with the rule given, the arithmetic is the same whatever the weights.
-    """
+    """Lengths of random cubics on untrained networks: the arithmetic is the same."""
     settings, dof = subject.learned, subject.scene.robot.dof
     rule = Collocation.chebyshev(subject.params.geodesics.length_degree)
     generator = torch.Generator().manual_seed(sizes.seed)
     runs: dict[int, Callable[[], object]] = {}
     for dim in sizes.latent_dims:
-        vae = (
-            JointVae(dof, dim, settings.hidden, settings.variance_centres)
-            .eval()
-            .requires_grad_(False)
-        )
+        vae = JointVae(dof, dim, settings.hidden, settings.variance_centres)
+        manifold = LearnedManifold(vae.eval().requires_grad_(False))
         family = PinnedPolynomial(dim, CURVE_DEGREE)
-        shapes = (family.coefficients, dim, dim)
         phi, start, goal = (
             torch.randn(sizes.curves, width, generator=generator, dtype=torch.float64)
-            for width in shapes
+            for width in (family.coefficients, dim, dim)
         )
-        runs[dim] = partial(
-            curve_length, LearnedManifold(vae), Curves(family, BEND * phi, start, goal), rule
-        )
+        curves = Curves(family, BEND * phi, start, goal)
+        runs[dim] = partial(curve_length, manifold, curves, rule)
     what = f"{sizes.curves} curve lengths"
     with torch.no_grad():
         turns = [
@@ -527,49 +479,45 @@ def _roadmaps(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
 
 
 def _free_configurations(
-    scene: Scene, rng: np.random.Generator, tries: int
+    scene: Scene, rng: np.random.Generator
 ) -> Iterator[Float[np.ndarray, "D"]]:
-    """Those of so many random configurations [rad] that touch nothing."""
+    """Those of TRIES random configurations [rad] that touch nothing."""
     with scene.world() as world:
-        yield from (q for q in scene.robot.sample(tries, rng) if world.is_free(q))
+        yield from (q for q in scene.robot.sample(TRIES, rng) if world.is_free(q))
 
 
 def _references(scene: Scene, sizes: GrowthSizes) -> list[Pose]:
     """Tool poses of random free configurations."""
-    found = list(
-        islice(
-            _free_configurations(scene, np.random.default_rng(sizes.seed), TRIES), sizes.references
-        )
-    )
-    if len(found) < sizes.references:
+    free, count = _free_configurations(scene, np.random.default_rng(sizes.seed)), sizes.references
+    found = list(islice(free, count))
+    if len(found) < count:
         raise ValueError(
-            f"only {len(found)} of {TRIES} random configurations are free: {sizes.references} "
-            f"are needed"
+            f"only {len(found)} of {TRIES} random configurations are free, not {count}"
         )
     return [Pose(*scene.robot.forward(q)) for q in found]
 
 
-def _held(scene: Scene, axes: tuple[int, ...], pose: Pose, k: int, sizes: GrowthSizes) -> _Case:
+def _held(scene: Scene, axes: tuple[int, ...], pose: Pose, k: int, sizes: GrowthSizes) -> _Asked:
     """Queries with some axes held at a pose, the k-th of the references."""
     manifold = ConstraintManifold(scene.robot, Constraint(axes, reference=pose))
-    return _Case(
+    return _Asked(
         scene, manifold, draw_queries(scene, manifold, f"held_{k}", sizes.queries_each, sizes.seed)
     )
 
 
-def _warmed(subject: Subject, case: _Case) -> None:
+def _warmed(subject: Subject, asked: _Asked) -> None:
     """One query that does not count: it loads compiled code."""
-    with case.scene.world() as world:
-        problem = case.problems(world)[0]
+    with asked.scene.world() as world:
+        problem = asked.problems(world)[0]
         for planner in subject.planners.values():
             planner.plan(problem, seed=0)
 
 
-def _planned(subject: Subject, axis: str, value: int, case: _Case) -> list[Sample]:
-    """Every planner on every query of a case, the planners in turn."""
+def _planned(subject: Subject, axis: str, value: int, asked: _Asked) -> list[Sample]:
+    """Every planner on every query, the planners in turn."""
     found = []
-    with case.scene.world() as world:
-        for seed, problem in enumerate(case.problems(world)):
+    with asked.scene.world() as world:
+        for seed, problem in enumerate(asked.problems(world)):
             for name, planner in subject.planners.items():
                 own = replace(problem)  # a planner may remember the very problem that it answered
                 began = time.perf_counter()
