@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from constraint_geodesics.geodesics.problem import Ends, GeodesicProblem
+from constraint_geodesics.geodesics.problem import Ends, GeodesicProblem, Phi
 from constraint_geodesics.params import GeodesicParams, RewardParams
 
 DESCENT_SCALE = 0.5
@@ -52,7 +52,7 @@ class CurveStates:
     cheapest curve met so far.
     """
 
-    phi: Float[np.ndarray, "B p"]
+    phi: Phi
     ends: Ends
     length: Float[np.ndarray, "B"]
     cost: Float[np.ndarray, "B"]
@@ -61,7 +61,7 @@ class CurveStates:
     features: Float[np.ndarray, "B f"]
     straight_cost: Float[np.ndarray, "B"]
     step: Int[np.ndarray, "B"]
-    best_phi: Float[np.ndarray, "B p"]
+    best_phi: Phi
     best_cost: Float[np.ndarray, "B"]
 
     def replaced(self, rows: np.ndarray, other: "CurveStates") -> "CurveStates":
@@ -76,7 +76,7 @@ class CurveStates:
         return CurveStates(**fields)
 
 
-def begin(problem: GeodesicProblem, ends: Ends, phi: Float[np.ndarray, "B p"]) -> CurveStates:
+def begin(problem: GeodesicProblem, ends: Ends, phi: Phi) -> CurveStates:
     """First states of B episodes."""
     now = problem.look(phi, ends)
     costs, straight_cost = now.costs, now.costs.cost.copy()
@@ -107,10 +107,7 @@ def draw_episodes(problem: GeodesicProblem, count: int, rng: np.random.Generator
 
 
 def advance(
-    problem: GeodesicProblem,
-    settings: EpisodeSettings,
-    states: CurveStates,
-    actions: Float[np.ndarray, "B p"],
+    problem: GeodesicProblem, settings: EpisodeSettings, states: CurveStates, actions: Phi
 ) -> tuple[CurveStates, Float[np.ndarray, "B"]]:
     """One step of B episodes: new states and rewards (eq. 15).
 

@@ -38,6 +38,7 @@ from constraint_geodesics.geodesics.problem import (
     Ends,
     Geodesic,
     GeodesicProblem,
+    Phi,
     Status,
     repeated,
 )
@@ -73,9 +74,7 @@ class Actor(nn.Module):
         """Mean actions."""
         return self.mean(self.body(observation))
 
-    def act(
-        self, observation: Float[np.ndarray, "B o"], noise: Float[np.ndarray, "B p"]
-    ) -> Float[np.ndarray, "B p"]:
+    def act(self, observation: Float[np.ndarray, "B o"], noise: Phi) -> Phi:
         """Mean actions plus the given multiples of the standard deviation."""
         with torch.no_grad():
             mean = self(torch.from_numpy(observation)).numpy()
@@ -170,7 +169,7 @@ class PolicySolver:
 class _Curves:
     """Candidates of one query that were measured together: one step of the search."""
 
-    phi: Float[np.ndarray, "B p"]
+    phi: Phi
     costs: Costs
 
 

@@ -32,6 +32,11 @@ from constraint_geodesics.learning.lift import (
     retracted,
 )
 
+Phi = Float[np.ndarray, "B p"]
+"""Coefficients of B curves."""
+Paths = Float[np.ndarray, "B S D"]
+"""Joints [rad] along B curves."""
+
 REDRAWN = 10
 """Times that a goal equal to its start is drawn again."""
 FITTED = 65
@@ -124,11 +129,11 @@ class GeodesicProblem(Protocol):
         """The family searched."""
         ...
 
-    def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
+    def evaluate(self, phi: Phi, ends: Ends) -> Costs:
         """Cost of the curves with coefficients phi."""
         ...
 
-    def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:
+    def look(self, phi: Phi, ends: Ends) -> Look:
         """The same costs with what else a policy sees of these curves."""
         ...
 
@@ -136,7 +141,7 @@ class GeodesicProblem(Protocol):
         """Ends to train on."""
         ...
 
-    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
+    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Phi:
         """Coefficients of one random curve between each of the given ends."""
         ...
 
@@ -240,7 +245,7 @@ class ChartProblem:
     curve: CurveFamily
     domain: Domain
 
-    def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
+    def evaluate(self, phi: Phi, ends: Ends) -> Costs:
         """The cost is the length; a curve that leaves the manifold is not feasible."""
         free, start, goal = _tensors(phi, ends.z_start, ends.z_goal)
         with torch.no_grad():
@@ -248,11 +253,11 @@ class ChartProblem:
             length = estimate_length(self.manifold, curves).length.numpy()
         return Costs(length, length, np.isfinite(length) & self.stays_inside(phi, ends))
 
-    def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:
+    def look(self, phi: Phi, ends: Ends) -> Look:
         """Costs alone."""
         return Look(self.evaluate(phi, ends), np.zeros((len(phi), 0)), np.zeros((len(phi), 0)))
 
-    def stays_inside(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Bool[np.ndarray, "B"]:
+    def stays_inside(self, phi: Phi, ends: Ends) -> Bool[np.ndarray, "B"]:
         """Whether all of INSIDE_POINTS points of each curve belong to the manifold."""
         if not isinstance(self.manifold, BoundedManifold):
             return np.ones(len(phi), dtype=bool)
@@ -286,7 +291,7 @@ class ChartProblem:
             goal[same] = self.domain.sample(len(same), rng)
         return Ends(start, goal, start, goal)
 
-    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
+    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Phi:
         """Cubics with normal coefficients of the ends' distance, whatever the family."""
         cubic = PinnedPolynomial(self.curve.dim, 3)
         phi = rng.normal(size=(len(ends), cubic.coefficients)) * ends.distance[:, None]
@@ -322,7 +327,7 @@ class LearnedProblem:
     inclusion_weight: float
     retraction: Retraction = field(default_factory=lambda: Retraction(accuracy=1e-3, iterations=6))
 
-    def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
+    def evaluate(self, phi: Phi, ends: Ends) -> Costs:
         """Length and cost; a curve is feasible if it has no jump, stays within the limits and,
         retracted, converged.
 
@@ -332,7 +337,7 @@ class LearnedProblem:
         decoded, deviation = self._decoded(phi, ends)
         return self._costs(self._lifted(decoded, ends), decoded, deviation)
 
-    def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:
+    def look(self, phi: Phi, ends: Ends) -> Look:
         """Costs, descent and features; both describe the constraint by what it does to the curve.
 
         descent: K⁻¹ ∫ (J̄⁺ P q̈) b_k dt in the chart, with P the projector on the tangent space of
@@ -352,9 +357,7 @@ class LearnedProblem:
         costs = self._costs(lifted, decoded, deviation)
         return self._look(costs, lifted, self._pulls(lifted.joints), constraint, ends)
 
-    def _decoded(
-        self, phi: Float[np.ndarray, "B p"], ends: Ends
-    ) -> tuple[Float[np.ndarray, "B S D"], Float[np.ndarray, "B S D"]]:
+    def _decoded(self, phi: Phi, ends: Ends) -> tuple[Paths, Paths]:
         """Decoder mean and deviation [rad] at the times that lengths are measured with."""
         embedded = self.chart.embed_points(
             self.latent_points(phi, ends, _rule(self.degree).times.numpy())
@@ -362,17 +365,12 @@ class LearnedProblem:
         dof = self.manifold.robot.dof
         return embedded[..., :dof].astype(np.float64), embedded[..., dof:]
 
-    def _lifted(self, decoded: Float[np.ndarray, "B S D"], ends: Ends) -> Lifted:
+    def _lifted(self, decoded: Paths, ends: Ends) -> Lifted:
         t = _rule(self.degree).times.numpy()
         joints = corrected(decoded, t, ends.q_start, ends.q_goal)
         return retracted(self.manifold, joints, self.retraction if self.retract else None)
 
-    def _costs(
-        self,
-        lifted: Lifted,
-        decoded: Float[np.ndarray, "B S D"],
-        deviation: Float[np.ndarray, "B S D"],
-    ) -> Costs:
+    def _costs(self, lifted: Lifted, decoded: Paths, deviation: Paths) -> Costs:
         rule = _rule(self.degree)
         shape = np.concatenate(
             [lifted.joints if self.retract else decoded, deviation], axis=-1, dtype=np.float32
@@ -388,7 +386,7 @@ class LearnedProblem:
         kept = left <= 10 * self.retraction.accuracy
         return Costs(length, cost, (excess == 0.0) & (outside == 0.0) & kept)
 
-    def _pulls(self, joints: Float[np.ndarray, "B S D"]) -> Float[np.ndarray, "B S D"]:
+    def _pulls(self, joints: Paths) -> Paths:
         manifold, robot = self.manifold, self.manifold.robot
         pulls = np.empty_like(joints)
         tangential_pull(
@@ -409,7 +407,7 @@ class LearnedProblem:
         self,
         costs: Costs,
         lifted: Lifted,
-        pulls: Float[np.ndarray, "B S D"],
+        pulls: Paths,
         constraint: Float[np.ndarray, "B 12"],
         ends: Ends,
     ) -> Look:
@@ -437,9 +435,7 @@ class LearnedProblem:
         )
         return Look(costs, descent, np.concatenate(seen, axis=1))
 
-    def _coefficients(
-        self, joints: Float[np.ndarray, "B S D"], basis: Float[np.ndarray, "S m"]
-    ) -> Float[np.ndarray, "B p"]:
+    def _coefficients(self, joints: Paths, basis: Float[np.ndarray, "S m"]) -> Phi:
         """Σ_s J̄⁺ q_s b_k(t_s), preconditioned by K⁻¹, as coefficients of the family."""
         weights = basis @ self._stiffness
         summed = (joints.transpose(0, 2, 1) @ weights).transpose(0, 2, 1) @ self._to_latent.T
@@ -471,7 +467,7 @@ class LearnedProblem:
         return np.concatenate([self.manifold.held, self.manifold.tolerance / SEEN_TOLERANCE])
 
     def latent_points(
-        self, phi: Float[np.ndarray, "B p"], ends: Ends, t: Float[np.ndarray, "T"]
+        self, phi: Phi, ends: Ends, t: Float[np.ndarray, "T"]
     ) -> Float[np.ndarray, "B T N"]:
         """γ_φ(t) in the latent space, eqs. 9-11."""
         free, start, goal, times = _tensors(phi, ends.z_start, ends.z_goal, t)
@@ -508,7 +504,7 @@ class LearnedProblem:
         rows = rng.integers(len(self.joints), size=(2, count))
         return self.ends(self.joints[rows[0]], self.joints[rows[1]])
 
-    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
+    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Phi:
         """Curves bent towards random configurations of the data: the way round a branch."""
         past = self.chart.encode(self.joints[rng.integers(len(self.joints), size=len(ends))])
         share = rng.uniform(size=(len(ends), 1))
@@ -552,13 +548,13 @@ class ProblemSet:
         """The family of all members."""
         return self.members[0].curve
 
-    def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
+    def evaluate(self, phi: Phi, ends: Ends) -> Costs:
         """Each row as its member measures it."""
         first = self.members[0]
         decoded, deviation = first._decoded(phi, ends)
         return first._costs(self._lifted(decoded, ends), decoded, deviation)
 
-    def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:
+    def look(self, phi: Phi, ends: Ends) -> Look:
         """Each row as its member sees it."""
         first = self.members[0]
         decoded, deviation = first._decoded(phi, ends)
@@ -570,7 +566,7 @@ class ProblemSet:
         costs = first._costs(lifted, decoded, deviation)
         return first._look(costs, lifted, pulls, constraint, ends)
 
-    def _lifted(self, decoded: Float[np.ndarray, "B S D"], ends: Ends) -> Lifted:
+    def _lifted(self, decoded: Paths, ends: Ends) -> Lifted:
         lifted = Lifted(np.empty_like(decoded), np.empty(decoded.shape[:2]))
         for member, rows in self._rows(ends):
             part = member._lifted(decoded[rows], ends[rows])
@@ -586,7 +582,7 @@ class ProblemSet:
             joints[:, rows] = member.joints[rng.integers(len(member.joints), size=(2, len(rows)))]
         return replace(self.members[0].ends(*joints), member=chosen)
 
-    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
+    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Phi:
         """Each curve as its member draws it."""
         phi = np.empty((len(ends), self.curve.coefficients))
         for member, rows in self._rows(ends):
@@ -602,7 +598,7 @@ class ProblemSet:
         return [(member, r) for member, r in zip(self.members, rows, strict=True) if len(r)]
 
 
-def bent_halfway(curve: CurveFamily, bend: Float[np.ndarray, "B N"]) -> Float[np.ndarray, "B p"]:
+def bent_halfway(curve: CurveFamily, bend: Float[np.ndarray, "B N"]) -> Phi:
     """Coefficients of parabolas that pass `bend` away from the straight line halfway."""
     t = torch.linspace(0.0, 1.0, 4 * curve.functions + 3, dtype=torch.float64)
     height = (4.0 * t * (1.0 - t))[:, None]

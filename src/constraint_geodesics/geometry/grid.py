@@ -84,10 +84,7 @@ class GridManifold:
             volume.reshape(shape), lower, upper, None if blocked is None else blocked.reshape(shape)
         )
 
-    @property
-    def dim(self) -> int:
-        """2."""
-        return 2
+    dim = 2
 
     @property
     def spacing(self) -> Bounds:

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.geodesics.episodes import EpisodeSettings, episode_settings
-from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, repeated
+from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, Phi, repeated
 from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.manifold import GeometryError
@@ -216,7 +216,7 @@ def family_optimum(
     return _shortest(problem, np.concatenate([final, met], axis=1), ends)
 
 
-def measured(problem: LearnedProblem, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
+def measured(problem: LearnedProblem, phi: Phi, ends: Ends) -> Costs:
     """Costs at FINE_DEGREE; a feasible curve's executed path is sound besides."""
     costs = _fine(problem).evaluate(phi, ends)
     feasible = costs.feasible.copy()
@@ -238,9 +238,7 @@ def is_sound(problem: LearnedProblem, phi: Float[np.ndarray, "p"], ends: Ends) -
     )
 
 
-def descended(
-    problem: LearnedProblem, phi: Float[np.ndarray, "B p"], ends: Ends, steps: int
-) -> Float[np.ndarray, "B p"]:
+def descended(problem: LearnedProblem, phi: Phi, ends: Ends, steps: int) -> Phi:
     """Curves after steps along the problem's descent, with step sizes of their own; none worse."""
     now = problem.look(phi, ends)
     rank, descent, stride = _ranks(now.costs), now.descent, np.ones(len(phi))
@@ -256,9 +254,7 @@ def descended(
     return phi
 
 
-def polished(
-    problem: LearnedProblem, phi: Float[np.ndarray, "B p"], ends: Ends, steps: int
-) -> Float[np.ndarray, "B p"]:
+def polished(problem: LearnedProblem, phi: Phi, ends: Ends, steps: int) -> Phi:
     """Curves after BFGS on the cost with central differences (Nocedal and Wright, Numerical
     Optimization, alg. 6.1).
 
@@ -365,7 +361,7 @@ def _at_random(
 
 
 def _best(
-    phi: Float[np.ndarray, "B p"], cost: Float[np.ndarray, "B"], feasible: Bool[np.ndarray, "B"]
+    phi: Phi, cost: Float[np.ndarray, "B"], feasible: Bool[np.ndarray, "B"]
 ) -> tuple[Float[np.ndarray, "p"], bool]:
     row = int(np.lexsort((cost, ~feasible))[0])
     return phi[row], bool(feasible[row])
@@ -437,9 +433,7 @@ def _lengths(costs: Costs) -> Float[np.ndarray, "B"]:
     return np.where(costs.feasible, costs.length, np.inf)
 
 
-def _gradients(
-    problem: LearnedProblem, phi: Float[np.ndarray, "B p"], ends: Ends, rows: Int[np.ndarray, "b"]
-) -> Float[np.ndarray, "B p"]:
+def _gradients(problem: LearnedProblem, phi: Phi, ends: Ends, rows: Int[np.ndarray, "b"]) -> Phi:
     """Of the cost, by central differences; zero but in the given rows."""
     gradients, count, size = np.zeros_like(phi), len(rows), phi.shape[1]
     if not count:
@@ -455,16 +449,14 @@ def _gradients(
 class _Line(NamedTuple):
     """Curves with their cost, and a direction (B, p) to search along with the cost's slope."""
 
-    phi: Float[np.ndarray, "B p"]
+    phi: Phi
     ends: Ends
     value: Float[np.ndarray, "B"]
-    direction: Float[np.ndarray, "B p"]
+    direction: Phi
     slope: Float[np.ndarray, "B"]
 
 
-def _line_search(
-    problem: LearnedProblem, line: _Line
-) -> tuple[Float[np.ndarray, "B p"], Float[np.ndarray, "B"]]:
+def _line_search(problem: LearnedProblem, line: _Line) -> tuple[Phi, Float[np.ndarray, "B"]]:
     """The first of ever shorter steps whose decrease is sufficient (Armijo), else no step."""
     phi, new, share = line.phi.copy(), line.value.copy(), 1.0
     rows = np.arange(len(phi))
