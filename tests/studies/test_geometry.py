@@ -8,7 +8,7 @@ import torch
 
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.graph_search import GraphSolver
-from constraint_geodesics.geodesics.problem import Box, ChartProblem, LearnedProblem, Samples
+from constraint_geodesics.geodesics.problem import ChartBox, ChartProblem, LearnedProblem, Samples
 from constraint_geodesics.geometry.analytic import Sphere
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.length import curve_length
@@ -99,7 +99,7 @@ def test_finer_rules_err_less(benchmark) -> None:
 
 
 def test_solvers_are_compared_with_the_exact_distance_or_with_the_best() -> None:
-    problem = ChartProblem(Sphere(), PinnedPolynomial(2, 3), Box((-0.6, -0.6), (0.6, 0.6)))
+    problem = ChartProblem(Sphere(), PinnedPolynomial(2, 3), ChartBox((-0.6, -0.6), (0.6, 0.6)))
     ends = problem.sample_ends(5, np.random.default_rng(0))
     graph = GraphSolver.over_points(Sphere(), problem.domain.sample(100, np.random.default_rng(1)))
     solvers = {"gradient": GradientSolver(), "graph": graph}

@@ -335,7 +335,7 @@ def test_spheres_leave_room_around_both_ends(scene, queries):
 def test_spheres_that_do_not_fit_are_an_error(scene, queries, monkeypatch):
     monkeypatch.setattr(growth, "TRIES", 10)
     with pytest.raises(
-        ValueError, match="no room for 3 spheres of 1.0 m beside the ends of 4 queries"
+        ValueError, match="no room for 3 spheres of 1.0 m near the ends of 4 queries"
     ):
         place_spheres(scene, queries, 3, 1.0, np.random.default_rng(2))
 

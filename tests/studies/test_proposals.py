@@ -16,7 +16,7 @@ from constraint_geodesics.geodesics.problem import LearnedProblem
 from constraint_geodesics.geodesics.proposals import MeanPolicy
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.manifold import GeometryError
-from constraint_geodesics.learning.learned_manifold import JointChart
+from constraint_geodesics.learning.learned_manifold import JointManifold
 from constraint_geodesics.studies import policy_benchmark as bench
 
 QUERIES, STEPS = 10, 3
@@ -47,7 +47,7 @@ def problems(scene, level, trained) -> dict[str, LearnedProblem]:
     return {
         "trained": level,
         "unseen": constrained(trained.manifold, ConstraintManifold(scene.robot, shelf), trained),
-        "joints": replace(level, chart=JointChart.of(trained.joints)),
+        "joints": replace(level, chart=JointManifold.of(trained.joints)),
     }
 
 
@@ -130,7 +130,7 @@ def test_without_policies_their_methods_are_left_out(problems, settings) -> None
 
 
 def test_the_optimum_without_constraint_is_the_straight_joint_line(scene, params, trained) -> None:
-    chart, free = JointChart.of(trained.joints), scene.manifold(params.constraints["free"])
+    chart, free = JointManifold.of(trained.joints), scene.manifold(params.constraints["free"])
     problem = LearnedProblem(chart, free, PinnedPolynomial(6, 3), trained.joints, 16, True, 1.0)
     rng = np.random.default_rng(2)
     ends = problem.sample_ends(12, rng)
@@ -250,7 +250,7 @@ def test_the_table_compares_over_the_queries_that_all_methods_solve() -> None:
 
 
 def test_charts_side_by_side_have_one_optimum(measured_rows) -> None:
-    both = bench.charts_together(
+    both = bench.spaces_together(
         {"latent": measured_rows["trained"], "joints": measured_rows["joints"]}
     )
     assert len(both) == 2 * len(measured_rows["joints"])

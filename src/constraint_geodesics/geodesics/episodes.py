@@ -1,7 +1,6 @@
-"""Episodes of the search for a curve, eqs. 9-15, as pure functions of numpy arrays: a state is a
-curve, an action changes its coefficients.
+"""Episodes of the search for a curve, eqs. 9-15, as pure functions of numpy arrays.
 
-Nothing here learns or needs a library for it: training and planning step through the same
+A state is a curve, an action changes its coefficients.  Training and planning share these
 functions.
 """
 
@@ -47,9 +46,9 @@ def episode_settings(params: GeodesicParams) -> EpisodeSettings:
 
 @dataclass(frozen=True)
 class CurveStates:
-    """B curves under way: coefficients (in the chart's unit), ends, length, cost and feasibility
-    now, descent and features of the `Look` at them, cost of the straight line, steps taken, and the
-    cheapest curve met so far.
+    """B curves under way, and the cheapest one that each has met.
+
+    phi: in the chart's unit.  descent, features: of what is `Observed` at it.  step: steps taken.
     """
 
     phi: Phi
@@ -78,7 +77,7 @@ class CurveStates:
 
 def begin(problem: GeodesicProblem, ends: Ends, phi: Phi) -> CurveStates:
     """First states of B episodes."""
-    now = problem.look(phi, ends)
+    now = problem.observed(phi, ends)
     costs, straight_cost = now.costs, now.costs.cost.copy()
     bent = np.flatnonzero(phi.any(axis=1))
     if len(bent):
@@ -116,7 +115,7 @@ def advance(
     far from it.
     """
     phi = states.phi + strides(settings, states)[:, None] * np.clip(actions, -1.0, 1.0)
-    now = problem.look(phi, states.ends)
+    now = problem.observed(phi, states.ends)
     costs = now.costs
     reward = rewards(settings.reward, states.cost, costs.cost, states.straight_cost)
     better = costs.cost < states.best_cost
@@ -205,6 +204,6 @@ def observe(settings: EpisodeSettings, states: CurveStates) -> Float[np.ndarray,
 def observation_size(problem: GeodesicProblem) -> int:
     """Length of an observation."""
     ends = problem.sample_ends(1, np.random.default_rng(0))
-    look = problem.look(np.zeros((1, problem.curve.coefficients)), ends)
+    look = problem.observed(np.zeros((1, problem.curve.coefficients)), ends)
     seen = look.descent.shape[1] + 1 + look.features.shape[1] if look.descent.shape[1] else 0
     return problem.curve.coefficients + 2 * problem.curve.dim + 3 + seen

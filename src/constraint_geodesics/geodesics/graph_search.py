@@ -1,9 +1,7 @@
-"""Geodesics by a shortest path on a graph over points of the manifold: data for any N, a grid for N
-= 2.
+"""Geodesics by a shortest path on a graph over points of the manifold: data, or a grid for N = 2.
 
-The second is how the work the paper follows searches its latent plane.  Either way the path is
-fitted with one curve of the problem's family; `CombinedSolver` then lets it slide down to a
-geodesic.
+The path is fitted with one curve of the problem's family; `CombinedSolver` then lets it slide down
+to a geodesic.
 """
 
 import time
@@ -172,8 +170,7 @@ class GraphSolver:
 
 @dataclass(frozen=True)
 class CombinedSolver:
-    """The path of a graph finds the way, the gradient makes it a geodesic; the straight line
-    competes.
+    """A graph's path made a geodesic by the gradient; the straight line competes.
 
     The graph decides what is connected.
     """

@@ -39,7 +39,7 @@ from constraint_geodesics.geodesics.problem import (
     Geodesic,
     GeodesicProblem,
     Phi,
-    Status,
+    SearchStatus,
     repeated,
 )
 from constraint_geodesics.geodesics.solver import to_nearest_images
@@ -94,9 +94,9 @@ def train_policy(
 ) -> TrainedPolicy:
     """Train one policy on random ends.
 
-    scratch: folder of the checkpoints; training interrupted at any time goes on from the last one
-    and ends as if it had never stopped.  report: called with (environment steps, figures) after
-    every rollout.
+    scratch: of the checkpoints, from which an interrupted training goes on as if it had never
+    stopped.
+    report: called with (environment steps, figures) after every rollout.
     """
     torch.manual_seed(seed)
     environment = CurveVecEnv(problem, episode_settings(params), params.environments, seed)
@@ -215,7 +215,7 @@ def _first_accepted(
         candidates = np.append(candidates, 0)
     row = next((int(row) for row in candidates if accept(phi[row])), None)
     if row is None:
-        status: Status = "not_found"
+        status: SearchStatus = "not_found"
         row, length = int(order[0]), float("nan")
     else:
         late = len(steps) > 1 and row >= len(phi) - len(steps[-1].phi)

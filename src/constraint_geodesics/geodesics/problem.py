@@ -108,17 +108,22 @@ class Costs:
 
 
 @dataclass(frozen=True)
-class Look:
-    """What a policy sees of B curves beside their coefficients.
+class Observed:
+    """What a policy sees of B curves apart from their coefficients.
 
-    descent: the step that a preconditioned descent of the energy would take, in the chart's unit;
-    no columns where a problem has none.  features: numbers of order 1, the same in number for every
-    problem of a class.
+    descent: the step of a preconditioned descent of the energy, in the chart's unit; no columns
+    where a problem has none.  features: numbers of order 1, as many for every problem of a class.
     """
 
     costs: Costs
     descent: Float[np.ndarray, "B d"]
     features: Float[np.ndarray, "B f"]
+
+    @classmethod
+    def alone(cls, costs: Costs) -> "Observed":
+        """Costs with neither descent nor features."""
+        nothing = np.zeros((len(costs.cost), 0))
+        return cls(costs, nothing, nothing)
 
 
 class GeodesicProblem(Protocol):
@@ -133,7 +138,7 @@ class GeodesicProblem(Protocol):
         """Cost of the curves with coefficients phi."""
         ...
 
-    def look(self, phi: Phi, ends: Ends) -> Look:
+    def observed(self, phi: Phi, ends: Ends) -> Observed:
         """The same costs with what else a policy sees of these curves."""
         ...
 
@@ -150,26 +155,23 @@ class GeodesicProblem(Protocol):
         ...
 
 
-Status = Literal["converged", "iteration_limit", "not_found", "not_connected"]
+SearchStatus = Literal["converged", "iteration_limit", "not_found", "not_connected"]
 
 
 @dataclass(frozen=True)
 class Geodesic:
     """What a solver found between one start and goal: the one record of every solver.
 
-    status: "converged" (more of the same work would not shorten the curve: the gradient stands at a
-    local minimum, the graph has given its shortest path, the last step of the policy's roll-outs
-    met nothing shorter), "iteration_limit" (it was still getting shorter), "not_found" (every curve
-    tried jumps, collides, or leaves the limits or the manifold), "not_connected" (start and goal
-    are not joined, as far as the graph that was searched knows).
+    status: "converged" (more of the same work would not shorten the curve), "iteration_limit" (it
+    was still getting shorter), "not_found" (every curve tried jumps, collides, or leaves the limits
+    or the manifold), "not_connected" (not joined, as far as the graph that was searched knows).
     curve, phi, start, goal: γ_φ; on a periodic chart the goal may be another image of the one asked
     for.
-    length: of γ_φ, in the unit of the manifold; nan where nothing was found.  straight_length: of
-    the straight chart line to the nearest image of the goal.  iterations: steps of the solver.
-    evaluations: curves measured.
+    length: of γ_φ, nan where nothing was found.  straight_length: of the straight chart line to the
+    nearest image of the goal.  iterations: steps of the solver.  evaluations: curves measured.
     """
 
-    status: Status
+    status: SearchStatus
     curve: CurveFamily
     phi: Float[np.ndarray, "p"]
     start: Float[np.ndarray, "N"]
@@ -192,14 +194,14 @@ class Geodesic:
 
     @classmethod
     def nothing(
-        cls, status: Status, curve: CurveFamily, start: np.ndarray, goal: np.ndarray
+        cls, status: SearchStatus, curve: CurveFamily, start: np.ndarray, goal: np.ndarray
     ) -> "Geodesic":
         """The answer where there is no curve: φ = 0, and no length."""
         return cls(status, curve, np.zeros(curve.coefficients), start, goal)
 
 
 class GeodesicSolver(Protocol):
-    """A way to find geodesics.  `geodesics_between` calls it with ends that it has checked."""
+    """A solver of geodesics.  `geodesics_between` calls it with ends that it has checked."""
 
     def solve(self, problem: "ChartProblem", ends: Ends) -> list[Geodesic]:
         """The shortest curve of the problem's family found for each start and goal, in order."""
@@ -215,7 +217,7 @@ class Domain(Protocol):
 
 
 @dataclass(frozen=True)
-class Box:
+class ChartBox:
     """Points uniform in a box of the chart."""
 
     low: tuple[float, ...]
@@ -253,9 +255,9 @@ class ChartProblem:
             length = estimate_length(self.manifold, curves).length.numpy()
         return Costs(length, length, np.isfinite(length) & self.stays_inside(phi, ends))
 
-    def look(self, phi: Phi, ends: Ends) -> Look:
+    def observed(self, phi: Phi, ends: Ends) -> Observed:
         """Costs alone."""
-        return Look(self.evaluate(phi, ends), np.zeros((len(phi), 0)), np.zeros((len(phi), 0)))
+        return Observed.alone(self.evaluate(phi, ends))
 
     def stays_inside(self, phi: Phi, ends: Ends) -> Bool[np.ndarray, "B"]:
         """Whether all of INSIDE_POINTS points of each curve belong to the manifold."""
@@ -311,10 +313,10 @@ class ChartProblem:
 class LearnedProblem:
     """Geodesics on a learned manifold under a constraint, between configurations that satisfy it.
 
-    With `retract` the curve is decoded, its ends corrected, every point retracted onto the
-    constraint, and the length is that of the retracted path with the decoder's deviation beside it:
-    ∫ √(‖q̇‖² + ‖σ̇‖²) dt. Without, it is the length of the latent curve as the paper measures it, ∫
-    ‖ḟ‖ dt, and the cost rises by `inclusion_weight` times the mean of ι_C along the curve.
+    With `retract` curves are decoded, their ends corrected, every point retracted onto the
+    constraint, and the length is that of the path with the decoder's deviation: ∫ √(‖q̇‖² + ‖σ̇‖²)
+    dt.  Without, it is the length of the latent curve as the paper measures it, ∫ ‖ḟ‖ dt, and the
+    cost rises by `inclusion_weight` times the mean of ι_C along the curve.
     degree: of the polynomials that lengths are measured with (Collocation), on one point more.
     """
 
@@ -337,7 +339,7 @@ class LearnedProblem:
         decoded, deviation = self._decoded(phi, ends)
         return self._costs(self._lifted(decoded, ends), decoded, deviation)
 
-    def look(self, phi: Phi, ends: Ends) -> Look:
+    def observed(self, phi: Phi, ends: Ends) -> Observed:
         """Costs, descent and features; both describe the constraint by what it does to the curve.
 
         descent: K⁻¹ ∫ (J̄⁺ P q̈) b_k dt in the chart, with P the projector on the tangent space of
@@ -350,12 +352,12 @@ class LearnedProblem:
         embedding.
         """
         if not self.retract:
-            return Look(self.evaluate(phi, ends), np.zeros((len(phi), 0)), np.zeros((len(phi), 0)))
+            return Observed.alone(self.evaluate(phi, ends))
         decoded, deviation = self._decoded(phi, ends)
         lifted = self._lifted(decoded, ends)
         constraint = np.broadcast_to(self._constraint, (len(phi), 12))
         costs = self._costs(lifted, decoded, deviation)
-        return self._look(costs, lifted, self._pulls(lifted.joints), constraint, ends)
+        return self._observed(costs, lifted, self._pulls(lifted.joints), constraint, ends)
 
     def _decoded(self, phi: Phi, ends: Ends) -> tuple[Paths, Paths]:
         """Decoder mean and deviation [rad] at the times that lengths are measured with."""
@@ -403,14 +405,14 @@ class LearnedProblem:
         )
         return pulls
 
-    def _look(
+    def _observed(
         self,
         costs: Costs,
         lifted: Lifted,
         pulls: Paths,
         constraint: Float[np.ndarray, "B 12"],
         ends: Ends,
-    ) -> Look:
+    ) -> Observed:
         t, (basis, between) = _rule(self.degree).times.numpy(), self._bases
         robot, joints, far = self.manifold.robot, lifted.joints, ends.distance[:, None]
         descent = self._coefficients(pulls, basis)
@@ -433,7 +435,7 @@ class LearnedProblem:
             shown.reshape(len(joints), -1) / np.pi,
             constraint,
         )
-        return Look(costs, descent, np.concatenate(seen, axis=1))
+        return Observed(costs, descent, np.concatenate(seen, axis=1))
 
     def _coefficients(self, joints: Paths, basis: Float[np.ndarray, "S m"]) -> Phi:
         """Σ_s J̄⁺ q_s b_k(t_s), preconditioned by K⁻¹, as coefficients of the family."""
@@ -524,12 +526,10 @@ class LearnedProblem:
 
 @dataclass(frozen=True)
 class ProblemSet:
-    """Several constraints on one learned manifold as one problem: each pair of ends belongs to one
-    member.
+    """Several constraints on one learned manifold as one problem: each pair of ends has its member.
 
-    Rows are decoded and priced together; only the retraction and the pull go by members.
-    Raises GeometryError if the members differ in anything but the constraint and its data, or do
-    not retract.
+    Curves are decoded and priced together; only what depends on the constraint goes by members.
+    Raises GeometryError if the members differ in more than constraint and data, or do not retract.
     """
 
     members: Sequence[LearnedProblem]
@@ -554,7 +554,7 @@ class ProblemSet:
         decoded, deviation = first._decoded(phi, ends)
         return first._costs(self._lifted(decoded, ends), decoded, deviation)
 
-    def look(self, phi: Phi, ends: Ends) -> Look:
+    def observed(self, phi: Phi, ends: Ends) -> Observed:
         """Each row as its member sees it."""
         first = self.members[0]
         decoded, deviation = first._decoded(phi, ends)
@@ -564,7 +564,7 @@ class ProblemSet:
             pulls[rows] = member._pulls(lifted.joints[rows])
         constraint = np.stack([member._constraint for member in self.members])[ends.member]
         costs = first._costs(lifted, decoded, deviation)
-        return first._look(costs, lifted, pulls, constraint, ends)
+        return first._observed(costs, lifted, pulls, constraint, ends)
 
     def _lifted(self, decoded: Paths, ends: Ends) -> Lifted:
         lifted = Lifted(np.empty_like(decoded), np.empty(decoded.shape[:2]))

@@ -44,7 +44,7 @@ class MeanPolicy:
 
 
 @dataclass(frozen=True)
-class Proposals:
+class BestCurves:
     """The best curve of each of A policies for each of B queries: feasible, then cheap."""
 
     phi: Float[np.ndarray, "A B p"]
@@ -59,7 +59,7 @@ class Proposals:
 
 def propose(
     problem: GeodesicProblem, policies: Sequence[MeanPolicy], settings: EpisodeSettings, ends: Ends
-) -> Proposals:
+) -> BestCurves:
     """Follow every policy's mean from the straight line, which counts too, for one episode."""
     count, queries = len(policies), len(ends)
     states = begin(
@@ -79,7 +79,7 @@ def propose(
         )
         phi = np.where(better[:, None], states.phi, phi)
         cost, feasible = np.where(better, states.cost, cost), feasible | states.feasible
-    return Proposals(
+    return BestCurves(
         phi.reshape(count, queries, -1),
         cost.reshape(count, queries),
         feasible.reshape(count, queries),

@@ -14,7 +14,7 @@ from constraint_geodesics.geodesics.problem import (
     Ends,
     Geodesic,
     GeodesicSolver,
-    Status,
+    SearchStatus,
 )
 from constraint_geodesics.geometry.curves import Curves
 from constraint_geodesics.geometry.length import estimate_length
@@ -132,7 +132,7 @@ def shortest_of(
     for query in range(len(ends)):
         rows = np.flatnonzero(candidates.query == query)
         best = rows[np.argmin(rank[rows])]
-        status: Status = "converged" if converged[best] else "iteration_limit"
+        status: SearchStatus = "converged" if converged[best] else "iteration_limit"
         if not np.isfinite(length[best]):
             status = "not_found"
         found = candidates.phi[best], candidates.start[best], candidates.goal[best]

@@ -26,13 +26,9 @@ class ShortestPath(NamedTuple):
 
 
 def nearest_neighbour_edges(points: Float[np.ndarray, "n d"], neighbours: int) -> Edges:
-    """Undirected edges from every point to its `neighbours` nearest others: unique pairs i < j, in
-    lexical order.
+    """Undirected edges from every point to its `neighbours` nearest: unique pairs i < j, in order.
 
-    A point has more edges where others count it among their neighbours; points that coincide are
-    joined too.
-    Raises NonFiniteError with the place of the first coordinate that is not finite, GraphError if
-    neighbours < 1.
+    Raises NonFiniteError with the first bad coordinate, GraphError if neighbours < 1.
     """
     if neighbours < 1:
         raise GraphError(f"neighbours = {neighbours}: must be at least 1")

@@ -27,18 +27,14 @@ class GridError(GeometryError):
 
 @dataclass(frozen=True, eq=False)
 class GridManifold:
-    """The metric M(z) = g(z) I on a rectangle of the plane, g given at the nodes of a grid,
-    bilinear between them.
+    """The metric M(z) = g(z) I on a rectangle, g given at the nodes of a grid and bilinear between.
 
-    values: g (rows, columns), rows along the first coordinate: positive, in the square of the unit
-    of length over that of the chart.  lower, upper: chart coordinates of the first node of both
-    axes and of the last.
-    blocked: nodes that don't belong to the manifold; what `values` holds there is never read.  None
-    blocks no node. A point is blocked where its nearest node is.  In a blocked region g still leads
-    out: a blocked node carries WALL times the largest free value, times its distance to the nearest
-    free node in steps of the finer axis, so that g falls towards the free nodes from everywhere in
-    it.  By bilinearity the half of a cell that is free next to a blocked node takes part in that
-    slope.
+    values: g (rows, columns), rows along the first coordinate, positive.  lower, upper: chart
+    coordinates of the first and last node of both axes.
+    blocked: nodes that don't belong to the manifold, None for none; what `values` holds there is
+    never read.  A point is blocked where its nearest node is.  There g still leads out: a blocked
+    node carries WALL times the largest free value, times its distance to the nearest free node in
+    steps of the finer axis.
     Raises GridError on a shape that is no grid, bounds that don't rise, values that aren't positive
     and finite at the free nodes, or if every node is blocked.
     """
@@ -64,15 +60,13 @@ class GridManifold:
         shape: tuple[int, int],
         dtype: torch.dtype = torch.float64,
     ) -> "GridManifold":
-        """The volume √det M of another manifold's metric at the nodes of a grid, taken for the
-        conformal factor g.
+        """The volume √det M of another manifold's metric at the nodes of a grid, as the factor g.
 
-        For a conformal metric M = g I the volume is g itself, and distances agree as the grid gets
-        finer; of any other metric only the volume of small regions is kept, not its lengths in
-        single directions.
+        For a conformal metric M = g I distances agree as the grid gets finer; of any other only the
+        volume of small regions is kept.
         shape: nodes along both axes.  dtype: what the manifold computes in.  Nodes that a
-        BoundedManifold doesn't contain are blocked.  Raises GridError unless the manifold has dim
-        2, and where the volume isn't positive.
+        BoundedManifold doesn't contain are blocked.  Raises GridError unless dim is 2 and the
+        volume positive.
         """
         if manifold.dim != 2:
             raise GridError(f"manifold has dim {manifold.dim}: must be 2")

@@ -1,8 +1,7 @@
-"""Labelled joint configurations: drawn in shards, projected onto a constraint, judged by PyBullet,
-kept as parquet.
+"""Labelled joint configurations: drawn in shards, projected, judged by PyBullet, kept as parquet.
 
-A shard's rows depend on its seed alone, and every shard opens a physics world of its own (a world
-remembers contacts), so the bytes written are the same whatever the number of workers.
+A shard's rows depend on its seed alone, and each opens a physics world of its own (a world
+remembers contacts), so the bytes are the same for any number of workers.
 """
 
 import zlib

@@ -58,7 +58,7 @@ class FrozenManifold:
 def perceptron(
     arrays: Arrays, name: str, x: Float[np.ndarray, "*batch I"]
 ) -> Float[np.ndarray, "*batch O"]:
-    """Output of the `vae.Perceptron` called `name`: SiLU layers with a linear path beside them."""
+    """Output of the `vae.Perceptron` called `name`: SiLU layers plus a linear path."""
     y, layer = x, 0
     while f"{name}.nonlinear.{layer + 2}.weight" in arrays:
         y = (

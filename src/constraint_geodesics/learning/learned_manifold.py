@@ -142,7 +142,7 @@ PRECISION = 1e12
 """
 
 
-class JointChart(LearnedManifold):
+class JointManifold(LearnedManifold):
     """The chart z = (q − c) / s of joint space: a learned manifold whose networks are the identity,
     in float64.
 
@@ -150,7 +150,7 @@ class JointChart(LearnedManifold):
     """
 
     @classmethod
-    def of(cls, joints: Float[np.ndarray, "n D"]) -> "JointChart":
+    def of(cls, joints: Float[np.ndarray, "n D"]) -> "JointManifold":
         """The chart in which the given configurations [rad] have mean 0 and, over the joints, mean
         variance 1.
 

@@ -1,9 +1,7 @@
-"""The sub-manifold of a learned manifold on which a constraint holds: {z : ι_C(z) = 0} and its
-components, eq. 8.
+"""The sub-manifold on which a constraint holds, {z : ι_C(z) = 0}, and its components, eq. 8.
 
-In two latent dimensions it is drawn on a grid; in more, configurations on the constraint are
-encoded and joined by a nearest-neighbour graph whose edges were checked.  The learned manifold is
-used as it is, never retrained.
+In two latent dimensions on a grid; in more as a graph of configurations on the constraint whose
+edges were checked.  The learned manifold is used as it is, never retrained.
 """
 
 import json

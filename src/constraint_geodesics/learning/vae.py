@@ -1,8 +1,7 @@
 """The variational autoencoder of joint configurations: modules and pure losses, no training loop.
 
-Phase one trains the encoder and the decoder mean (eq. 4 with a fixed variance), phase two the
-variance network with both frozen, as the work the paper follows does.  Joints are scaled to [−1, 1]
-by the robot's limits inside.
+Phase one trains the encoder and the decoder mean (eq. 4), phase two the variance network alone.
+Joints are scaled to [−1, 1] by the robot's limits inside.
 """
 
 import math

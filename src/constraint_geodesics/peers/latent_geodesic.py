@@ -240,11 +240,11 @@ def descended(
     before.
     """
     many = repeated(ends, len(phi))
-    seen = learned.look(phi, many)
+    seen = learned.observed(phi, many)
     value, descent, stride = ranks(seen.costs), seen.descent, np.ones((len(phi), 1))
     for _ in range(steps):
         tried = phi + stride * descent
-        seen = learned.look(tried, many)
+        seen = learned.observed(tried, many)
         cheaper = (ranks(seen.costs) < value)[:, None]
         phi, descent = np.where(cheaper, tried, phi), np.where(cheaper, seen.descent, descent)
         value = np.minimum(ranks(seen.costs), value)

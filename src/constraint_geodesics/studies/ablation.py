@@ -163,12 +163,11 @@ class LearnedAblation:
 def path_figures(
     chart: LearnedManifold, z: Float[np.ndarray, "P T N"], free: Free
 ) -> dict[str, float]:
-    """What decoded latent curves are like.
+    """What decoded latent curves are like; all nan where there is none.
 
-    length_rad: of the decoded joints, mean.  deviation_rad: largest norm of σ along a curve, mean
-    over the curves; it rises where no data is.  collision_free: share of the curves of which no
-    configuration touches anything.
-    collision_free_points: share of the configurations.  All nan where there is no curve.
+    length_rad: of the decoded joints, mean.  deviation_rad: largest norm of σ along a curve, mean;
+    it rises where no data is.  collision_free: share of curves that touch nothing.
+    collision_free_points: share of configurations.
     """
     if not len(z):
         return dict.fromkeys(

@@ -1,9 +1,8 @@
 """What a planned path is worth to a robot that carries an open cup, executed in simulation.
 
-Each query is executed twice: along the planner's path, and along the straight joint line between
-the same ends, both near time-optimal within the same limits.  Only queries are taken whose line
-tips the cup.  Tilt is not all: a fast swing can hold the spheres in a cup that hangs upside down,
-and throw one over the rim of a cup that stays level.
+Each query is executed along the planner's path and along the straight joint line, both near
+time-optimal within the same limits.  Only queries are taken whose line tips the cup.  Tilt is not
+all: a fast swing can hold the spheres upside down, or throw one out of a level cup.
 """
 
 from collections.abc import Callable, Iterator

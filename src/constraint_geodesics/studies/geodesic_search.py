@@ -29,7 +29,7 @@ from constraint_geodesics.geodesics.policy_search import (
     train_policy,
 )
 from constraint_geodesics.geodesics.problem import (
-    Box,
+    ChartBox,
     ChartProblem,
     Ends,
     Geodesic,
@@ -70,7 +70,7 @@ class SeedTask:
     scene: Scene
     params: GeodesicParams
     judge: JudgeParams
-    chart_name: str
+    manifold_name: str
     queries: Queries
     connected: Bool[np.ndarray, "Q"]
     connection_s: Float[np.ndarray, "Q"]
@@ -176,11 +176,10 @@ def connected_queries(
     free: Free,
     params: SubmanifoldParams,
 ) -> tuple[Bool[np.ndarray, "Q"], Float[np.ndarray, "Q"]]:
-    """Which queries have both ends in one component, as far as the sampled graph knows, and the
-    time each took [s].
+    """Which queries have both ends in one component of the sampled graph, and the time it took [s].
 
     A drawn latent plane says nothing about the exact set; an end that no edge reaches counts as
-    connected.
+    joined.
     """
     if not isinstance(submanifold, GraphSubmanifold):
         return np.ones(len(queries), dtype=bool), np.zeros(len(queries))
@@ -247,7 +246,7 @@ def _measured(
         ends.q_start[0],
         ends.q_goal[0],
         problem.manifold,
-        {task.chart_name: problem.chart},
+        {task.manifold_name: problem.chart},
         certifier,
         task.judge.spacing_rad,
     )
@@ -299,18 +298,18 @@ class Member:
     """A manifold with a known answer, and the box of its chart that ends are drawn from."""
 
     manifold: MeasuredManifold
-    box: Box
+    box: ChartBox
     domain: str
 
 
 MANIFOLDS = {
-    "plane": Member(Plane(), Box((-1.5, -1.5), (1.5, 1.5)), "|x|, |y| ≤ 1.5"),
+    "plane": Member(Plane(), ChartBox((-1.5, -1.5), (1.5, 1.5)), "|x|, |y| ≤ 1.5"),
     "sphere": Member(
-        Sphere(), Box((-1.2, -1.4), (1.2, 1.4)), "|elevation| ≤ 1.2 rad, |azimuth| ≤ 1.4 rad"
+        Sphere(), ChartBox((-1.2, -1.4), (1.2, 1.4)), "|elevation| ≤ 1.2 rad, |azimuth| ≤ 1.4 rad"
     ),
     "torus": Member(
         Torus(),
-        Box((-1.2, -1.2), (1.2, 1.2)),
+        ChartBox((-1.2, -1.2), (1.2, 1.2)),
         "R = 2, r = 1, |ring angle| ≤ 1.2 rad, |tube angle| ≤ 1.2 rad",
     ),
 }

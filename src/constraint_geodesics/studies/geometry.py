@@ -1,8 +1,7 @@
-"""What the geometry core costs and how exact it is: rates against a naive implementation, errors,
-solver times.
+"""What the geometry core costs and how exact it is: rates, errors, solver times.
 
-Everything is timed on one thread.  Rates are medians of several rounds in which the compared sides
-run in turn; a solver's times are those of one warm pass.
+Everything is timed on one thread.  Rates are medians of rounds in which the compared sides run in
+turn; a solver's times are those of one warm pass.
 """
 
 import time
@@ -63,7 +62,7 @@ SINGLE = 10
 NAIVE_CURVES = 40
 """Curves a round of the naive implementation measures, one at a time."""
 RULES = (4, 6, 8, 12, 16, 24, 32, 48)
-"""Points a curve, beside its start, of the rules whose error and cost are compared."""
+"""Points a curve, apart from its start, of the rules whose error and cost are compared."""
 GRID = (60, 60)
 SEED = 5
 LEARNED_ROLLOUTS = 10
@@ -351,12 +350,10 @@ def solver_figures(
     exact: Float[np.ndarray, "P"] | None,
     solvers: Mapping[str, GeodesicSolver],
 ) -> dict[str, dict[str, float]]:
-    """Length over the exact distance, or over the shortest that any solver found, and what a query
-    costs.
+    """Length over the exact distance, or the shortest found, and the cost of a query, by solver.
 
-    Ratios are over the pairs that every solver found a curve for.  milliseconds: of one query at a
-    time, over the first SINGLE pairs; milliseconds_in_batch: its share where all pairs are asked
-    for at once.
+    Ratios are over the pairs that every solver found a curve for.  milliseconds: one query at a
+    time, the first SINGLE pairs; milliseconds_in_batch: a pair's share of all at once.
     """
     found, single, together = {}, {}, {}
     for name, solver in solvers.items():
@@ -425,7 +422,7 @@ def alternately(runs: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str,
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Everything on one thread: what is compared must not differ by what runs beside it."""
+    """Everything on one thread: what is compared must not differ by what else runs."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,14 +1,10 @@
-"""How cost grows: seconds of planning, of curve lengths and of training against the size of what is
-asked.
+"""How cost grows: seconds of planning, of curve lengths and of training against the size asked.
 
-Six axes, each a row of sizes with everything else held fixed: joints, held task axes (the
-codimension), obstacles, queries, latent dimension, dataset rows.  Everything runs on one thread,
-compiled code has answered once before it is timed, and what is compared is timed in turn, so that a
-slow spell of the machine hits all.  A query without an answer is timed like any other; `solved`
-says how many have one, by the planner's own word: validity is judged elsewhere.
-
-The growth in each size is summed up as the exponent p of seconds ∝ size^p, the slope of a straight
-line in log-log.
+Six axes, each a row of sizes with all else fixed: joints, held task axes (the codimension),
+obstacles, queries, latent dimension, dataset rows.  One thread; compiled code is warm; what is
+compared is timed in turn.  A query without an answer is timed like any other; `solved` says how
+many have one, by the planner's own word.  The growth is summed up as the exponent p of
+seconds ∝ size^p, the slope of a straight line in log-log.
 """
 
 import time
@@ -80,14 +76,13 @@ Batch = Callable[[Float[np.ndarray, "B D"], Float[np.ndarray, "B D"]], Sequence[
 
 @dataclass(frozen=True)
 class GrowthSizes:
-    """What is measured: the sizes along each axis, and how often.
+    """The sizes along each axis, and how often each is measured.
 
-    references: reference poses for the axes `joints` and `codimension`, each with `queries_each`
-    queries.  layouts: of the spheres, each with `obstacle_queries_each`.  batches: of the planner,
-    and peer_batches of its peer, each timed `batch_repeats` times at least, and until
-    `batch_queries` were asked.  curves: measured at once, `length_repeats` times.  rows: trained on
-    for `epochs` that are timed, `training_repeats` times.  nodes: of a roadmap, built
-    `roadmap_repeats` times.
+    references: poses for the axes joints and codimension, with `queries_each`.  layouts: of
+    spheres, with `obstacle_queries_each`.  batches, peer_batches: of the planner and its peer, each
+    timed `batch_repeats` times at least, and until `batch_queries` were asked.  curves: measured at
+    once, `length_repeats` times.  rows: trained on for `epochs`, `training_repeats` times.  nodes:
+    of a roadmap, built `roadmap_repeats` times.
     """
 
     references: int = 8
@@ -142,10 +137,10 @@ class Sample(NamedTuple):
 class Subject:
     """What is measured on.
 
-    scene: the robot of params.yaml in its workcell.  other: a robot with another number of joints.
-    planners: asked one query at a time, by name.  batch: answers many queries of `CONSTRAINT`;
-    peer: which of the planners it is compared with.  joints (n, D): configurations to train on
-    [rad].  scratch: where training keeps its checkpoints.
+    scene: params.yaml's robot and workcell.  other: a robot with another number of joints.
+    planners: asked one query at a time.  batch: answers many queries of `CONSTRAINT`; peer: the
+    planner that it is compared with.  joints: to train on [rad].  scratch: for checkpoints of
+    training.
     """
 
     params: Params
@@ -199,23 +194,17 @@ def measure_growth(
 ) -> pd.DataFrame:
     """Measure all axes, with progress under `description` (none if it is empty).
 
-    Columns: axis; value, the size; what, whose time it is; seconds, the median, between the
-    quartiles low and high; repeats, how many timings these are of; solved, the share of queries
-    with an answer, nan where none is asked; mean, of the same seconds, which is far above the
-    median where some queries are easy and others take a search. Seconds are of one query on the
-    axes joints, codimension and obstacles; of all queries together on the axis queries, where the
-    median of one query leaves out the slow ones that a large batch holds, so that its slope may
-    exceed 1; of a whole batch of curves on latent dimension; of one training epoch or one roadmap
-    on dataset rows.
+    Columns: axis; value, the size; what is timed; seconds, the median, between the quartiles low
+    and high; repeats; solved, nan where nothing is asked; mean of the seconds, far above the median
+    where some queries take a search.  Seconds are of one query on the axes joints, codimension and
+    obstacles, of all queries together on queries, of a batch of curves on latent dimension, of one
+    training epoch or roadmap on dataset rows.
 
-    joints: a level tool (roll and pitch held), no workcell; codimension: params.yaml's workcell and
-    `HELD`.  What a query costs depends on where the constraint is held and where the spheres stand,
-    so several references are taken, each the tool pose of a random free configuration and the same
-    for all codimensions, and several layouts, of which a larger number of spheres holds the smaller
-    ones.
-    Raises DatasetError if hardly any configuration under such a constraint is free, ValueError if
-    hardly any is without one, if there is no room for the spheres, or if there are fewer
-    configurations than are to be trained on.
+    joints: a level tool, no workcell; codimension: params.yaml's workcell and `HELD`.  Several
+    references are taken, each the tool pose of a random free configuration, the same for all
+    codimensions, and several layouts, where more spheres hold the fewer.
+    Raises DatasetError if hardly any configuration under a constraint is free, ValueError if hardly
+    any is without one, there is no room for the spheres, or too few configurations to train on.
     """
     sizes = sizes or GrowthSizes()
     axes = (_joints, _codimension, _obstacles, _queries, _latent_dimension, _epochs, _roadmaps)
@@ -252,10 +241,9 @@ def _in_order(column: "pd.Series[Any]") -> "pd.Series[Any]":
 def slopes(table: pd.DataFrame) -> pd.DataFrame:
     """Exponents: for each (axis, what) the least-squares line of log seconds over log value.
 
-    Columns: axis, what, slope, its standard_error (nan with two points, which leave no residual),
-    seconds_at_1 (the line at value 1) and points.  A value of 0 (no obstacle, no held axis) has no
-    logarithm and is left out of the fit, as are times that are not positive and finite.  All nan
-    where fewer than 2 distinct positive values remain.
+    Columns: axis, what, slope, standard_error (nan with two points), seconds_at_1 and points.
+    Values of 0 and times that are not positive and finite are left out; all nan where fewer than
+    two distinct values remain.
     """
     rows = []
     for (axis, what), own in table.groupby(["axis", "what"], sort=False):
@@ -295,12 +283,7 @@ def epoch_seconds(
     epochs: int,
     scratch: Path,
 ) -> dict[str, list[float]]:
-    """Seconds of single epochs of both training phases, mean and variance: training, validation,
-    checkpoint.
-
-    Taken between the reports of successive epochs, so that neither what comes before the first
-    epoch nor what comes after the last one is part of them.
-    """
+    """Seconds of single epochs of both training phases, between the reports of successive ones."""
     stamps: list[float] = []
     # one more, since the first is not counted
     longer = {"epochs": epochs + 1, "variance_epochs": epochs + 1, "patience": epochs + 2}
@@ -328,7 +311,7 @@ def place_spheres(
                 kept.append(Sphere(f"sphere_{len(kept)}", (x, y, z), radius_m))
     if len(kept) < count:
         raise ValueError(
-            f"no room for {count} spheres of {radius_m} m beside the ends of {len(queries)} queries"
+            f"no room for {count} spheres of {radius_m} m near the ends of {len(queries)} queries"
         )
     return kept
 

@@ -1,9 +1,8 @@
-"""What policies add: their curves beside the straight line, plain descent, random curves and the
-best of the family.
+"""What policies add to the straight line, plain descent, random curves and the best of the family.
 
 Every method answers one query at a time with the best curve that it met, feasible ones first, then
-the cheapest, at the problem's own accuracy.  Afterwards `measured` judges all answers, whoever gave
-them, and `family_optimum` looks for the shortest curve of the same family.
+the cheapest, at the problem's own accuracy.  Then `measured` judges all answers alike, and
+`family_optimum` looks for the shortest curve of the same family.
 """
 
 import time
@@ -25,7 +24,7 @@ from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.manifold import GeometryError
 from constraint_geodesics.learning.dataset import ShardTask, draw_free, draw_queries, seed_of
-from constraint_geodesics.learning.learned_manifold import JointChart, LearnedManifold
+from constraint_geodesics.learning.learned_manifold import JointManifold, LearnedManifold
 from constraint_geodesics.params import GeodesicParams
 from constraint_geodesics.scene.scene import Scene
 
@@ -66,9 +65,9 @@ GAIN = 1e-6
 class OptimumSettings:
     """Work spent on the optimum of each query.
 
-    random_starts: cheapest of `drawn` random curves, beside the given starts.  descent_steps: from
-    every start.
-    polished: different curves that quasi-Newton goes on with, polish_steps: its iterations at most.
+    random_starts: cheapest of `drawn` random curves, added to the given starts.  descent_steps:
+    from every start.  polished: curves that quasi-Newton goes on with.  polish_steps: its
+    iterations at most.
     """
 
     random_starts: int = 32
@@ -145,10 +144,8 @@ def policy_rows(
 def policy_table(rows: pd.DataFrame) -> pd.DataFrame:
     """One row a method of one constraint: feasible share, length over the optimum, curves, time.
 
-    Ratios are over the method's own feasible answers (ratio_*) and over the queries for which every
-    answer of every method is feasible (shared_ratio_*, `shared` of them), the only ones that
-    compare columns of different methods.
-    solvable: queries with an optimum, out of `queries`.
+    ratio_*: over the method's own feasible answers.  shared_ratio_*: over the `shared` queries that
+    every method answers, the only ones that compare methods.  solvable: queries with an optimum.
     """
     rows = rows.reset_index(drop=True)
     solved = rows.groupby("query")["feasible"].all()
@@ -171,11 +168,10 @@ def policy_table(rows: pd.DataFrame) -> pd.DataFrame:
     return table.reset_index()
 
 
-def charts_together(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Rows of the same queries in several charts, by the charts' names, as one table with one
-    optimum.
+def spaces_together(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Rows of the same queries in several spaces, by their names, as one table with one optimum.
 
-    A method becomes "method, chart"; optimum_rad the shortest of any chart's family.
+    A method becomes "method, space"; optimum_rad is the shortest of any space's family.
     """
     named = [table.assign(method=table["method"] + f", {name}") for name, table in tables.items()]
     rows = pd.concat(named, ignore_index=True)
@@ -191,10 +187,9 @@ def family_optimum(
 ) -> FamilyOptimum:
     """The shortest feasible curve of the family for each query, as far as many starts find it.
 
-    From every start the problem's own descent with a step size for each curve, which stands where
-    the mean Jacobian and the projector are no longer exact; from there BFGS on the cost.  All
-    queries and starts go in one batch. Starts and what the descent made of them count as well, so
-    the answer is no longer than a feasible start.
+    From every start the problem's own descent, then BFGS on the cost, all queries in one batch.
+    Starts and what the descent made of them count too, so no feasible start is shorter than the
+    answer.
     Raises GeometryError if the problem does not retract, there is no query, or the starts are not
     (Q, K, p).
     """
@@ -240,11 +235,11 @@ def is_sound(problem: LearnedProblem, phi: Float[np.ndarray, "p"], ends: Ends) -
 
 def descended(problem: LearnedProblem, phi: Phi, ends: Ends, steps: int) -> Phi:
     """Curves after steps along the problem's descent, with step sizes of their own; none worse."""
-    now = problem.look(phi, ends)
+    now = problem.observed(phi, ends)
     rank, descent, stride = _ranks(now.costs), now.descent, np.ones(len(phi))
     for _ in range(steps):
         moved = phi + stride[:, None] * descent
-        now = problem.look(moved, ends)
+        now = problem.observed(moved, ends)
         new = _ranks(now.costs)
         better = new < rank
         phi = np.where(better[:, None], moved, phi)
@@ -255,11 +250,9 @@ def descended(problem: LearnedProblem, phi: Phi, ends: Ends, steps: int) -> Phi:
 
 
 def polished(problem: LearnedProblem, phi: Phi, ends: Ends, steps: int) -> Phi:
-    """Curves after BFGS on the cost with central differences (Nocedal and Wright, Numerical
-    Optimization, alg. 6.1).
+    """Curves after BFGS on the cost with central differences (Nocedal and Wright, alg. 6.1).
 
-    Every feasible curve has its own inverse Hessian and goes on until a step gains less than GAIN;
-    none gets worse and none becomes infeasible.  The others stay as they are.
+    Every feasible curve goes on until a step gains less than GAIN; none gets worse or infeasible.
     """
     phi, size = phi.copy(), phi.shape[1]
     value = _ranks(problem.evaluate(phi, ends)) if len(phi) else np.empty(0)
@@ -292,8 +285,7 @@ def polished(problem: LearnedProblem, phi: Phi, ends: Ends, steps: int) -> Phi:
 
 @dataclass(frozen=True)
 class _Method:
-    """A way to answer a query (its ends and its number) with coefficients (p,) and whether they are
-    feasible.
+    """Answers a query (its ends and number) with coefficients (p,) and whether they are feasible.
 
     curves: that it meets for one query.
     """
@@ -341,10 +333,10 @@ def _followed(
 ) -> tuple[Float[np.ndarray, "p"], bool]:
     """The problem's descent alone, whole steps from the straight line."""
     phi = np.zeros((steps + 1, problem.curve.coefficients))
-    looks = [problem.look(phi[:1], ends)]
+    looks = [problem.observed(phi[:1], ends)]
     for step in range(1, steps + 1):
         phi[step] = phi[step - 1] + looks[-1].descent[0]
-        looks.append(problem.look(phi[step : step + 1], ends))
+        looks.append(problem.observed(phi[step : step + 1], ends))
     cost = np.concatenate([look.costs.cost for look in looks])
     return _best(phi, cost, np.concatenate([look.costs.feasible for look in looks]))
 
@@ -540,7 +532,7 @@ def run_policies(task: PolicyTask) -> pd.DataFrame:
     separate = None
     if task.separate is not None:
         separate = [MeanPolicy.load(task.separate, seed) for seed in task.settings.seeds]
-    joint_space = JointChart.of(task.scene.robot.sample(PAST_ROWS, np.random.default_rng(0)))
+    joint_space = JointManifold.of(task.scene.robot.sample(PAST_ROWS, np.random.default_rng(0)))
     settings, tables = task.settings, {}
     episodes = episode_settings(settings)
     for name, chart in ((LEARNED, task.chart), (JOINTS, joint_space)):
@@ -551,7 +543,7 @@ def run_policies(task: PolicyTask) -> pd.DataFrame:
         drawn = len(shared) * episodes.steps + 1
         compared = Compared(*policies, episodes, task.seed, drawn)
         tables[name] = policy_rows(problem, problem.ends(queries.starts, queries.goals), compared)
-    return charts_together(tables)
+    return spaces_together(tables)
 
 
 def policy_figures(table: pd.DataFrame) -> dict[str, Any]:
