@@ -14,6 +14,7 @@ from constraint_geodesics.recording.execution_recording import ExecutionRecord, 
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.cup import CupSettings
 from constraint_geodesics.studies.execution import (
+    Carrying,
     execute_queries,
     execution_figures,
     tipping_queries,
@@ -42,19 +43,11 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
         root=layout.root,
         subject=about,
     ) as run:
-        found = tipping_queries(
-            scene, manifold, constraint, settings.queries, settings.least_tilt_rad, settings.seed
-        )
+        found = tipping_queries(scene, manifold, constraint, settings)
+        carrying = Carrying(constraint, scene, manifold, params.planner.acceleration_rad_s2, cup)
         with Planner(read_bundle(layout.planner), str(layout.planner)) as planner:
-            table, executed = execute_queries(
-                partial(planner.plan, constraint=constraint),
-                scene,
-                manifold,
-                constraint,
-                found.queries,
-                params.planner.acceleration_rad_s2,
-                cup,
-            )
+            plan = partial(planner.plan, constraint=constraint)
+            table, executed = execute_queries(plan, carrying, found.queries)
         records = [
             None
             if one.execution is None or one.query >= settings.recorded

@@ -6,9 +6,11 @@ import sys
 
 from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import (
+    ShardTask,
     data_card,
     draw_queries,
     draw_shard,
+    seed_of,
     shard_tasks,
     write_joints,
     write_queries,
@@ -41,7 +43,9 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
         root=layout.root,
         subject=about,
     ) as run:
-        tasks = shard_tasks(scene, manifold, constraint, rows, labels.shard_rows, labels.seed)
+        tasks = shard_tasks(
+            ShardTask(scene, manifold, rows, seed_of(constraint, labels.seed)), labels.shard_rows
+        )
         shards = parallel_map(draw_shard, tasks, params.compute, description=f"label {constraint}")
         queries = draw_queries(
             scene, manifold, constraint, params.queries.count, params.queries.seed

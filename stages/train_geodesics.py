@@ -79,7 +79,8 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         run.summarise(
             [result.figures() for result in results], [result.policy.curve for result in results]
         )
-        save_seeds(results, queries, layout, STAGE, manifold, constraint)
+        folder = layout.geodesics(manifold, constraint)
+        save_seeds(results, queries, folder, layout.report(STAGE, f"{item}-learning", "csv"))
         rows, paths = straight_rows(tasks[0])
         rows += [row for result in results for row in result.rows]
         paths += [path for result in results for path in result.paths]

@@ -6,7 +6,7 @@ import pandas as pd
 
 from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import read_joints
-from constraint_geodesics.learning.training import train_manifold
+from constraint_geodesics.learning.training import TrainingRun, train_manifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.scene.scene import robot_from
@@ -33,8 +33,7 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
             joints,
             robot_from(params.robot),
             settings,
-            layout.scratch(STAGE, manifold),
-            run.metric_logger(),
+            TrainingRun(layout.scratch(STAGE, manifold), run.metric_logger()),
         )
         trained.manifold.save(layout.manifold(manifold))
         run.report({"rows": len(joints), **trained.metrics}, layout.report(STAGE, manifold))

@@ -15,10 +15,11 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import (
     GraphSubmanifold,
     GridSubmanifold,
+    Surface,
     on_graph,
     on_grid,
 )
-from constraint_geodesics.learning.training import train_manifold
+from constraint_geodesics.learning.training import TrainingRun, train_manifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.peers.latent_grid import (
     GridSearch,
@@ -53,7 +54,7 @@ def plane(
     joints = nodes_of("free")[0]
     folder = tmp_path_factory.mktemp("plane")
     return train_manifold(
-        joints, scene.robot, small, folder, lambda *_: None, progress=False
+        joints, scene.robot, small, TrainingRun(folder, lambda *_: None, False)
     ).manifold
 
 
@@ -64,7 +65,7 @@ def problem(world: World, name: str, seed: int) -> PlanningProblem:
 
 def graph_of(chart: LearnedManifold, name: str, world: World, params: Params) -> GraphSubmanifold:
     manifold, joints = manifold_of(packaged_planner(), name), nodes_of(name)[0]
-    return on_graph(chart, manifold, joints, world.free, params.submanifold)
+    return on_graph(Surface(chart, manifold, world.free), joints, params.submanifold)
 
 
 def grid_of(plane: LearnedManifold, name: str, params: Params, cells: int = 60) -> GridSubmanifold:

@@ -17,14 +17,20 @@ from tests.benchmark.plan_fixtures import write_plan_reports
 from tests.report.pages import DASHBOARD, check_page
 
 from constraint_geodesics.learning.dataset import (
+    ShardTask,
     data_card,
     draw_shard,
     read_joints,
-    shard_tasks,
+    seed_of,
     write_joints,
 )
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.submanifold import extract, save_submanifold, submanifold_figures
+from constraint_geodesics.learning.submanifold import (
+    Surface,
+    extract,
+    save_submanifold,
+    submanifold_figures,
+)
 from constraint_geodesics.learning.vae import JointVae
 from constraint_geodesics.palette import planner_colour
 from constraint_geodesics.params import load_params
@@ -227,7 +233,10 @@ def run(tmp_path_factory):
     rng = np.random.default_rng(0)
     for name in CONSTRAINTS:
         manifold = scene.manifold(params.constraints[name])
-        shards = [draw_shard(task) for task in shard_tasks(scene, manifold, name, 120, 120, 1)]
+        shards = [
+            draw_shard(task)
+            for task in shard_tasks(ShardTask(scene, manifold, 120, seed_of(name, 1)), 120)
+        ]
         write_joints(shards, layout.joints(name), {"seed": "1"})
         write_json(layout.report("label_joints", name), data_card(shards))
         write_csv(layout.report("benchmark_planners", name, "csv"), sampled_rows())
@@ -245,11 +254,10 @@ def run(tmp_path_factory):
                     read_joints(layout.joints(c)).free_joints for c in ("free", constraint)
                 )
                 constrained = scene.manifold(params.constraints[constraint])
-                found = extract(chart, constrained, free, own, world.free, params.submanifold)
+                surface = Surface(chart, constrained, world.free)
+                found = extract(surface, free, own, params.submanifold)
                 save_submanifold(found, layout.submanifold(name, constraint))
-                figures = submanifold_figures(
-                    found, chart, constrained, free, own, params.submanifold
-                )
+                figures = submanifold_figures(found, surface, free, own, params.submanifold)
                 write_json(layout.report("extract_submanifold", f"{name}-{constraint}"), figures)
     for manifold, constraint in searched_items(params):
         item, own = f"{manifold}-{constraint}", read_joints(layout.joints(constraint)).free_joints

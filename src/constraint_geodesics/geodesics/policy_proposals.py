@@ -13,7 +13,7 @@ from constraint_geodesics.geodesics.problem import LearnedProblem
 from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.lift import correct_and_retract
+from constraint_geodesics.learning.lift import corrected
 from constraint_geodesics.params import GeodesicParams
 
 KEPT = 32
@@ -67,7 +67,7 @@ class PolicyProposals:
         decoded = self.chart.decode(
             problem.latent_points(phi, ends[np.zeros(len(phi), dtype=int)], t)
         )
-        return correct_and_retract(manifold, decoded, t, ends.q_start, ends.q_goal, None).joints
+        return corrected(decoded, t, ends.q_start, ends.q_goal)
 
     def _problem(self, manifold: ConstraintManifold) -> LearnedProblem:
         key = id(manifold)

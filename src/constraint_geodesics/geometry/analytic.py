@@ -17,6 +17,8 @@ from constraint_geodesics.geometry.graph import OUTSIDE
 from constraint_geodesics.geometry.manifold import GeometryError, require_dim, require_finite
 from constraint_geodesics.geometry.torus_distance import torus_distance
 
+Points = Float[Tensor, "*#batch N"]
+
 
 @dataclass(frozen=True)
 class Plane:
@@ -46,12 +48,8 @@ class Plane:
         require_dim(z, self.dim, "z")
         return torch.eye(self.dim, dtype=z.dtype, device=z.device).expand(*z.shape, self.dim)
 
-    def distance(
-        self, a: Float[Tensor, "*#batch N"], b: Float[Tensor, "*#batch N"]
-    ) -> Float[Tensor, "*batch"]:
-        """Euclidean distance.  Raises NonFiniteError with the place of the first coordinate that is
-        not finite.
-        """
+    def distance(self, a: Points, b: Points) -> Float[Tensor, "*batch"]:
+        """Euclidean distance.  Raises NonFiniteError with the place of the first bad coordinate."""
         _require_points(self.dim, a, b)
         return torch.linalg.vector_norm(b - a, dim=-1)
 
@@ -69,22 +67,10 @@ class Sphere:
     def __post_init__(self) -> None:
         _require_positive("radius", self.radius)
 
-    @property
-    def dim(self) -> int:
-        """2."""
-        return 2
-
-    @property
-    def ambient_dim(self) -> int:
-        """3."""
-        return 3
-
-    @property
-    def periods(self) -> tuple[float, float]:
-        """The azimuth wraps at 2π; the elevation has a reflection beyond the poles, but no period
-        of its own.
-        """
-        return math.inf, 2 * math.pi
+    dim = 2
+    ambient_dim = 3
+    periods = (math.inf, 2 * math.pi)
+    """The azimuth wraps; the elevation is reflected at the poles, but has no period."""
 
     def embed(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch 3"]:
         """The point r (cos θ cos α, cos θ sin α, sin θ)."""
@@ -104,16 +90,14 @@ class Sphere:
             torch.stack([torch.ones_like(ring), ring**2], dim=-1)
         )
 
-    def distance(
-        self, a: Float[Tensor, "*#batch N"], b: Float[Tensor, "*#batch N"]
-    ) -> Float[Tensor, "*batch"]:
+    def distance(self, a: Points, b: Points) -> Float[Tensor, "*batch"]:
         """Length of the shorter great circle arc, 0 to πr.
 
         The arc is 2r atan2(sin(δ/2), cos(δ/2)), with both squares written as sums in the chart
         (haversines), so that inside the chart nothing cancels: coincident and antipodal points keep
         full accuracy, where acos(a·b) loses half its digits.  Elevations beyond a pole are
         understood, with an error of up to 5e-8 r.
-        Raises NonFiniteError with the place of the first coordinate that is not finite.
+        Raises NonFiniteError with the first bad coordinate.
         """
         _require_points(self.dim, a, b)
         half_rise, half_turn = ((b - a) / 2).unbind(-1)
@@ -124,9 +108,7 @@ class Sphere:
         return 2 * self.radius * torch.atan2(near.clamp(min=0).sqrt(), far.clamp(min=0).sqrt())
 
     def elevation(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch"]:
-        """Elevation of the embedded point, −π/2 to π/2 [rad]: Fig. 2a's sub-manifolds are its level
-        sets.
-        """
+        """Elevation of the embedded point, −π/2 to π/2 [rad]; Fig. 2a shows its level sets."""
         require_dim(z, self.dim, "z")
         return torch.atan2(torch.sin(z[..., 0]), torch.cos(z[..., 0]).abs())
 
@@ -152,20 +134,9 @@ class Torus:
                 f"itself"
             )
 
-    @property
-    def dim(self) -> int:
-        """2."""
-        return 2
-
-    @property
-    def ambient_dim(self) -> int:
-        """3."""
-        return 3
-
-    @property
-    def periods(self) -> tuple[float, float]:
-        """Both angles wrap at 2π."""
-        return 2 * math.pi, 2 * math.pi
+    dim = 2
+    ambient_dim = 3
+    periods = (2 * math.pi, 2 * math.pi)
 
     def embed(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch 3"]:
         """The point ((R + r cos v) cos u, (R + r cos v) sin u, r sin v)."""
@@ -185,9 +156,7 @@ class Torus:
             torch.stack([ring**2, torch.full_like(ring, self.minor**2)], dim=-1)
         )
 
-    def distance(
-        self, a: Float[Tensor, "*#batch N"], b: Float[Tensor, "*#batch N"]
-    ) -> Float[Tensor, "*batch"]:
+    def distance(self, a: Points, b: Points) -> Float[Tensor, "*batch"]:
         """Length of the shortest of all geodesics between two points, whichever way round the ring
         and the tube.
 
@@ -195,7 +164,7 @@ class Torus:
         is a few 1e-15 R for R ≥ 1.1 r and grows to 2e-13 R at R = 1.0001 r.  Symmetric to the bit,
         0 where a equals b.
         An oracle, not a loss: the result carries no gradient.
-        Raises NonFiniteError with the place of the first coordinate that is not finite.
+        Raises NonFiniteError with the first bad coordinate.
         """
         _require_points(self.dim, a, b)
         dtype = torch.promote_types(torch.result_type(a, b), torch.float32)
@@ -248,20 +217,9 @@ class LevelCircle:
         _require_coordinate(self.manifold, self.coordinate)
         _require_level(self.manifold, "level", self.level)
 
-    @property
-    def dim(self) -> int:
-        """1."""
-        return 1
-
-    @property
-    def ambient_dim(self) -> int:
-        """3."""
-        return self.manifold.ambient_dim
-
-    @property
-    def periods(self) -> tuple[float]:
-        """The coordinate wraps at 2π."""
-        return (2 * math.pi,)
+    dim = 1
+    ambient_dim = 3
+    periods = (2 * math.pi,)
 
     @property
     def radius(self) -> float:
@@ -284,17 +242,13 @@ class LevelCircle:
         free = 1 - self.coordinate
         return self.manifold.metric(self.point(u))[..., free : free + 1, free : free + 1]
 
-    def distance(
-        self, a: Float[Tensor, "*#batch 1"], b: Float[Tensor, "*#batch 1"]
-    ) -> Float[Tensor, "*batch"]:
+    def distance(self, a: Points, b: Points) -> Float[Tensor, "*batch"]:
         """Length of the shorter arc, 0 to π times the radius: the way on the circle, not across the
         manifold.
 
-        Raises NonFiniteError with the place of the first coordinate that is not finite.
+        Raises NonFiniteError with the first bad coordinate.
         """
-        for name, points in (("a", a), ("b", b)):
-            require_dim(points, self.dim, name)
-            require_finite(points, name)
+        _require_points(self.dim, a, b)
         return self.radius * _wrapped(b - a)[..., 0].abs()
 
 
@@ -333,7 +287,7 @@ class LevelSet:
         beyond `tolerance`.
 
         Zero to the bit where the constraint holds.  Elevations beyond a pole are understood.
-        Raises NonFiniteError with the place of the first coordinate that is not finite.
+        Raises NonFiniteError with the first bad coordinate.
         """
         return (self._deviations(z).amin(-1) - self.tolerance).clamp(min=0)
 
@@ -346,9 +300,7 @@ class LevelSet:
         return tuple(self._circle(min(level.number for level in group)) for group in self._groups())
 
     def component_of(self, z: Float[Tensor, "*batch 2"]) -> Int[Tensor, "*batch"]:
-        """Index of each point's component in `components()`, −1 where the constraint doesn't
-        hold.
-        """
+        """Each point's place in `components()`, −1 where the constraint doesn't hold."""
         component = [0] * len(self.levels)
         for index, group in enumerate(self._groups()):
             for level in group:
@@ -398,9 +350,7 @@ class LevelSet:
 
 
 class _Level(NamedTuple):
-    """A level by its value on the chart's coordinate, wrapped to [−π, π] if that repeats, and its
-    place in `levels`.
-    """
+    """A level's value, wrapped to [−π, π] if the coordinate repeats, and its place in `levels`."""
 
     value: float
     number: int

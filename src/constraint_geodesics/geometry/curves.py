@@ -209,10 +209,7 @@ class PinnedPolynomial(CurveFamily):
         """K − 1."""
         return self.degree - 1
 
-    @property
-    def breaks(self) -> tuple[float, ...]:
-        """0 and 1: one piece."""
-        return (0.0, 1.0)
+    breaks = (0.0, 1.0)
 
     def basis(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
         """Basis b_k(t) = t (1 − t) P*_k(t), zero at t = 0 and t = 1."""

@@ -45,9 +45,7 @@ Objective = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Quadrature:
-    """A rule ∫₀¹ g dt ≈ Σ_i weights_i g(nodes_i): nodes (Q,) inside [0, 1], weights (Q,) that sum
-    to 1.
-    """
+    """A rule ∫₀¹ g dt ≈ Σ_i weights_i g(nodes_i): nodes inside [0, 1], weights that sum to 1."""
 
     nodes: Float[Tensor, "Q"]
     weights: Float[Tensor, "Q"]
@@ -129,12 +127,10 @@ def curve_length(
 ) -> Float[Tensor, "*batch"]:
     """Length of curves on a manifold, eq. 2: L = ∫₀¹ √(γ̇ᵀ M(γ) γ̇) dt = ∫₀¹ ‖d f(γ)/dt‖ dt.
 
-    In the unit of the embedding.  Without a rule the estimated relative error is brought below
-    `tolerance`, as `estimate_length` does; with one it is whatever the rule gives.  Differentiable
-    in phi, start and goal.
-    Raises NonFiniteError with the place of the first entry of phi, start, goal or of the length
-    that is not finite (a curve that leaves the metric's domain, or overflows), GeometryError if the
-    curves and the manifold differ in dimension, CurveError on a wrong shape.
+    In the unit of the embedding; differentiable.  Without a rule the estimated relative error is
+    brought below `tolerance`, as `estimate_length` does.
+    Raises NonFiniteError with the first bad entry of phi, start, goal or the length, GeometryError
+    if curves and manifold differ in dimension, CurveError on a wrong shape.
     """
     if rule is None:
         length = estimate_length(manifold, curves, tolerance).length
@@ -150,13 +146,12 @@ def estimate_length(
 ) -> LengthEstimate:
     """Lengths whose estimated relative error is below `tolerance`, and the estimate.
 
-    The estimate is twice the change from the rule of half the degree, so the length of a smooth
-    curve is better by orders.  It is no bound: where a curve turns back on itself both rules may
-    err alike, and about one such curve in a hundred misses the tolerance; on a grid with walls or
-    rough values, whose metric has kinks, far more do.  Curves that no degree resolves keep the last
-    length, and their estimate says so.  An embedding in single precision adds its rounding: about
-    1e-7 of its values, which between ends 1e-4 apart is a thousandth of the length. Length and
-    estimate are inf where a curve meets points at which the metric is not finite.
+    The estimate is twice the change from the rule of half the degree.  It is no bound: where a
+    curve turns back both rules may err alike, and about one such curve in a hundred misses the
+    tolerance; on grids with walls, whose metric has kinks, far more do.  Curves that no degree
+    resolves keep the last length, and their estimate says so.  An embedding in single precision
+    adds its rounding, about 1e-7 of its values.  Both are inf where a curve meets points at which
+    the metric is not finite.
     Raises as `curve_length` does, and GeometryError unless tolerance is positive.
     """
     if not tolerance > 0:
@@ -219,12 +214,9 @@ def curve_speeds(
 
 
 def chord_length(points: Float[Tensor, "*batch T A"]) -> Float[Tensor, "*batch"]:
-    """Length of the polygon through embedded points: Σ_i ‖x_{i+1} − x_i‖, in their unit.
+    """Length of the polygon through embedded points, Σ_i ‖x_{i+1} − x_i‖; never above the curve's.
 
-    It is never longer than the curve the points lie on, and blind to what that curve does between
-    them.
-    Raises GeometryError for fewer than two points, NonFiniteError with the place of the first entry
-    that is not finite.
+    Raises GeometryError for fewer than two points, NonFiniteError with the first bad entry.
     """
     if points.ndim < 2 or points.shape[-2] < 2:
         raise GeometryError(
@@ -392,16 +384,12 @@ class _Panels:
 def constant_speed(
     manifold: Manifold, curves: Curves, count: int, tolerance: float = SPACING_TOLERANCE
 ) -> Float[Tensor, "*batch {count}"]:
-    """Times, from 0 to 1 exactly, at which points lie equally spaced along curves in the manifold's
-    length.
+    """Times, from 0 to 1 exactly, of points equally spaced along curves in the manifold's length.
 
-    Row by row they are times for `curve.evaluate`.  Each length between neighbours differs from
-    their mean by less than `tolerance` of it, up to the rounding of the embedding: panels of time
-    are halved until the speed is a polynomial on each, which takes more of them next to points
-    where a curve turns back.  A curve of no length gets even times.  No gradient: the times are
-    constants.
-    Raises as `curve_length` does, GeometryError unless count is at least 2 and tolerance positive,
-    and NonFiniteError where a speed overflows.
+    Each length between neighbours differs from their mean by less than `tolerance` of it: panels of
+    time are halved until the speed is a polynomial on each.  A curve of no length gets even times.
+    The times are constants, without gradient.
+    Raises as `curve_length` does, GeometryError unless count is at least 2 and tolerance positive.
     """
     if count < 2:
         raise GeometryError(f"count = {count}: must be at least 2")
@@ -489,9 +477,7 @@ def _inverted(panels: _Panels, curves: int, count: int) -> Float[Tensor, "{curve
 def _lengths_passed(
     panels: _Panels, curves: int
 ) -> tuple[Float[Tensor, "{curves} P+1"], Int[Tensor, "{curves}"]]:
-    """Length passed at the panels' edges, the shorter rows filled with the whole, and each curve's
-    first panel.
-    """
+    """Length passed at the panels' edges, the whole beyond; and each curve's first panel."""
     many = panels.row.bincount(minlength=curves)
     first = many.cumsum(0) - many
     place = torch.arange(len(panels.row)) - first[panels.row]
@@ -502,9 +488,7 @@ def _lengths_passed(
 def _reached(
     series: Float[Tensor, "*batch k"], target: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch"]:
-    """Where in [0, 1] rising Legendre series reach their targets, by Newton's method kept within a
-    bracket.
-    """
+    """Where rising Legendre series on [0, 1] reach their targets: Newton within a bracket."""
     low, high = torch.zeros_like(target), torch.ones_like(target)
     u = (target / series.sum(-1)).nan_to_num(nan=0.5).clamp(0.0, 1.0)
     for _ in range(NEWTON_STEPS):
@@ -528,9 +512,7 @@ def _first_edges(breaks: tuple[float, ...]) -> Float[Tensor, "P+1"]:
 
 @cache
 def _to_series() -> Float[np.ndarray, "n n"]:
-    """Takes values at the Gauss-Legendre nodes to the Legendre series of the polynomial through
-    them.
-    """
+    """From values at the Gauss-Legendre nodes to the Legendre series through them."""
     x, weights = np.polynomial.legendre.leggauss(NODES)
     return (
         np.polynomial.legendre.legvander(x, NODES - 1) * weights[:, None] * (np.arange(NODES) + 0.5)

@@ -38,7 +38,7 @@ _ROUNDING = 1e-11
 off.
 """
 _NUDGE = 1e-3
-"""Relative change of a ratio of speeds by which the side of the better ratios is told."""
+"""Relative change of a ratio of speeds that shows the side of the better ratios."""
 _SECTIONS = 20
 """Golden sections of an interval of ratios: they leave less than 1e-4 of it."""
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
@@ -150,8 +150,7 @@ def _times(q, spacing, velocity, acceleration, times):
 
 @njit(**_COMPILE)
 def _controllable(directions, spacing, acceleration, fastest, ratios):
-    """Lowers `fastest` (T-1,) to the largest speeds from which the goal can be reached, from the
-    last step backward.
+    """Lowers `fastest` (T-1,) to the largest speeds from which the goal can be reached, backward.
 
     ratios[i]: speed of step i + 1 over that of step i with which the largest speed of step i is
     reached; it is allowed at every slower speed too.
@@ -178,12 +177,10 @@ def _controllable(directions, spacing, acceleration, fastest, ratios):
 
 @njit(**_COMPILE)
 def _ratio_window(s, s_next):
-    """Smallest and largest ratio of a step's speed to that of the step before it, at constant
-    acceleration along both.
+    """Smallest and largest ratio of a step's speed to the one before, at constant acceleration.
 
-    The extremes are those of an arm that comes to rest at the end of the second step or starts at
-    rest into the first. Beyond them the differences would allow any change of speed, because a slow
-    step's time makes it look gentle.
+    Beyond them (coming to rest, starting at rest) the differences would allow any change of speed,
+    because a slow step's time makes it look gentle.
     """
     return 1.0 / (1.0 + np.sqrt(1.0 + s / s_next)), 1.0 + np.sqrt(1.0 + s_next / s)
 
@@ -251,9 +248,7 @@ def _fastest_next_to(known, step, acceleration):
 
 @njit(**_COMPILE)
 def _used(q, times, velocity, acceleration):
-    """Factor by which times may shrink, or must grow if above 1, for all differences of the rows to
-    keep the limits.
-    """
+    """Factor by which times may shrink, or must grow if above 1, to keep the limits everywhere."""
     worst = 0.0
     last = q.shape[0] - 1
     for j in range(q.shape[1]):

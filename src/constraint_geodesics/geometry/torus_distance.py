@@ -58,7 +58,7 @@ class Parallels(NamedTuple):
     outer: Numbers
 
 
-class Ends(NamedTuple):
+class EndPair(NamedTuple):
     """Both ends of the curves sought: the one nearer to the inner equator, the other, and what lies
     between them.
 
@@ -75,9 +75,7 @@ class Ends(NamedTuple):
 
 
 class Advance(NamedTuple):
-    """What geodesics gain on a stretch of the tube: ring angle `turn` = U [rad] and `action` =
-    W.
-    """
+    """What geodesics gain on a stretch of tube: ring angle `turn` = U [rad], `action` = W."""
 
     turn: Numbers
     action: Numbers
@@ -117,10 +115,10 @@ def torus_distance(
     return 2 * minor * np.minimum(outward, inward)
 
 
-def _ends(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]) -> Ends:
+def _ends(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]) -> EndPair:
     tube = _wrapped(np.stack([a[:, 1], b[:, 1]]))
     near, far = np.abs(tube).max(axis=0), np.abs(tube).min(axis=0)
-    return Ends(
+    return EndPair(
         near=Parallels(np.cos(near / 2) ** 2, np.sin(near / 2) ** 2),
         far=Parallels(np.cos(far / 2) ** 2, np.sin(far / 2) ** 2),
         gap=np.sin((near - far) / 2) * np.sin((near + far) / 2),
@@ -129,7 +127,7 @@ def _ends(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]) -> Ends:
     )
 
 
-def _outward_length(hole: float, ends: Ends) -> Numbers:
+def _outward_length(hole: float, ends: EndPair) -> Numbers:
     """Lengths in the outward family.
 
     It is run through by one number t: c = ρ + t below the ring ρ of the nearer end, then c = ρ − t,
@@ -154,10 +152,8 @@ def _outward_length(hole: float, ends: Ends) -> Numbers:
     return (ring - np.abs(t)) * ends.turn + family(t).action
 
 
-def _inward_length(hole: float, ends: Ends) -> Numbers:
-    """Lengths in the inward family, c = hole + t below the ring of the inner equator; no meaning
-    unless opposite.
-    """
+def _inward_length(hole: float, ends: EndPair) -> Numbers:
+    """Lengths in the inward family, c = hole + t; no meaning unless opposite."""
     equator = Parallels(np.zeros_like(ends.turn), np.ones_like(ends.turn))
     stops = ends.near, ends.far
     gaps = [np.where(ends.opposite, end.inner, 0.0) for end in stops]

@@ -49,9 +49,7 @@ class FrozenManifold:
         return (self.arrays["centre"] + self.arrays["scale"] * decoded).astype(np.float64)
 
     def sample(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count N"]:
-        """Latent points spread like the training data: normal around the centres of the precision
-        network.
-        """
+        """Latent points spread like the training data, about the precision network's centres."""
         centres, width = self.arrays["precision.centres"], self.arrays["precision.bandwidth"]
         chosen = rng.integers(len(centres), size=count)
         return centres[chosen] + SPREAD * width[chosen, None] * rng.normal(size=(count, self.dim))
@@ -60,7 +58,7 @@ class FrozenManifold:
 def perceptron(
     arrays: Arrays, name: str, x: Float[np.ndarray, "*batch I"]
 ) -> Float[np.ndarray, "*batch O"]:
-    """Output of the `vae.Perceptron` called `name`: SiLU layers with a linear path beside them."""
+    """Output of the `vae.Perceptron` called `name`: SiLU layers plus a linear path."""
     y, layer = x, 0
     while f"{name}.nonlinear.{layer + 2}.weight" in arrays:
         y = (

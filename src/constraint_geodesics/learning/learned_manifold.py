@@ -1,6 +1,4 @@
-"""A trained manifold: the stochastic embedding f(z) = (μ(z), σ(z)), its pullback metric (eq. 5),
-and its files.
-"""
+"""A trained manifold: embedding f(z) = (μ(z), σ(z)), pullback metric (eq. 5), and its files."""
 
 import copy
 import hashlib
@@ -75,9 +73,7 @@ class LearnedManifold:
             )
 
     def embed_joints(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch A"]:
-        """The embedding of encoded configurations: where a joint path lies on the manifold
-        [rad].
-        """
+        """The embedding of encoded configurations: where a joint path lies on the manifold."""
         with torch.no_grad():
             return self.embed(self.vae.encode(self.tensor(q))[0]).numpy().astype(np.float64)
 
@@ -124,9 +120,7 @@ class LearnedManifold:
 
     @classmethod
     def load(cls, folder: Path) -> "LearnedManifold":
-        """Read what `save` wrote.  Raises ManifoldFileError if a file is missing or its checksum
-        differs.
-        """
+        """Read what `save` wrote.  Raises ManifoldFileError if a file is missing or altered."""
         try:
             card = json.loads((folder / CARD).read_text())
             found = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
@@ -148,7 +142,7 @@ PRECISION = 1e12
 """
 
 
-class JointChart(LearnedManifold):
+class JointManifold(LearnedManifold):
     """The chart z = (q − c) / s of joint space: a learned manifold whose networks are the identity,
     in float64.
 
@@ -156,7 +150,7 @@ class JointChart(LearnedManifold):
     """
 
     @classmethod
-    def of(cls, joints: Float[np.ndarray, "n D"]) -> "JointChart":
+    def of(cls, joints: Float[np.ndarray, "n D"]) -> "JointManifold":
         """The chart in which the given configurations [rad] have mean 0 and, over the joints, mean
         variance 1.
 

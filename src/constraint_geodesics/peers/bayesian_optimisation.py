@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, repeated
 from constraint_geodesics.geometry.curves import PinnedPolynomial
-from constraint_geodesics.learning.learned_manifold import JointChart, LearnedManifold
+from constraint_geodesics.learning.learned_manifold import JointManifold, LearnedManifold
 from constraint_geodesics.peers.latent_geodesic import (
     EXACT,
     answer,
@@ -191,6 +191,6 @@ class _Cost:
         return max(float(np.linalg.norm(self.problem.goal - self.problem.start)), 1e-9)
 
 
-def joint_chart(robot: SerialRobot) -> JointChart:
+def joint_chart(robot: SerialRobot) -> JointManifold:
     """Joint space in units of its own size: the scale of configurations spread over the limits."""
-    return JointChart.of(robot.sample(LIMIT_SAMPLES, np.random.default_rng(0)))
+    return JointManifold.of(robot.sample(LIMIT_SAMPLES, np.random.default_rng(0)))

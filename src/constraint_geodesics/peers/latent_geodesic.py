@@ -19,7 +19,7 @@ from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, repeated
 from constraint_geodesics.geometry.curves import CurveFamily, PinnedPolynomial, PinnedSpline
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.lift import as_executed, correct_and_retract
+from constraint_geodesics.learning.lift import as_executed, corrected, retracted
 from constraint_geodesics.problem import (
     LIMIT_SLACK,
     SATISFIED,
@@ -240,11 +240,11 @@ def descended(
     before.
     """
     many = repeated(ends, len(phi))
-    seen = learned.look(phi, many)
+    seen = learned.observed(phi, many)
     value, descent, stride = ranks(seen.costs), seen.descent, np.ones((len(phi), 1))
     for _ in range(steps):
         tried = phi + stride * descent
-        seen = learned.look(tried, many)
+        seen = learned.observed(tried, many)
         cheaper = (ranks(seen.costs) < value)[:, None]
         phi, descent = np.where(cheaper, tried, phi), np.where(cheaper, seen.descent, descent)
         value = np.minimum(ranks(seen.costs), value)
@@ -280,9 +280,8 @@ class _Cost:
             return value
         t, manifold = self._times, self.learned.manifold
         decoded = self.learned.chart.decode(self.learned.latent_points(phi, many, t))
-        joints = correct_and_retract(
-            manifold, decoded, t, many.q_start, many.q_goal, self.learned.retraction
-        ).joints
+        line = corrected(decoded, t, many.q_start, many.q_goal)
+        joints = retracted(manifold, line, self.learned.retraction).joints
         missing = np.maximum(
             MARGIN - self.clearance.clearance(manifold.robot, joints[:, 1:-1]), 0.0
         )

@@ -20,16 +20,17 @@ from scipy.spatial import KDTree
 from constraint_geodesics.constraints.pose import Constraint
 from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.geodesics.graph_search import KNIGHT
-from constraint_geodesics.geodesics.problem import Ends, LearnedProblem, allowed_steps
+from constraint_geodesics.geodesics.problem import Ends, LearnedProblem
 from constraint_geodesics.geometry.curves import PinnedSpline
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.graph import OUTSIDE, shortest_path
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.lift import lift
+from constraint_geodesics.learning.lift import allowed_steps, corrected, retracted
 from constraint_geodesics.learning.submanifold import (
     Free,
     GraphSubmanifold,
     GridSubmanifold,
+    Surface,
     check_edges,
 )
 from constraint_geodesics.peers.latent_geodesic import (
@@ -210,9 +211,8 @@ class GridSearch:
         t = np.linspace(0.0, 1.0, LOOKED_AT)
         z = learned.latent_points(phi[None], ends, t)
         retraction = Retraction() if self.retracted else None
-        joints = lift(
-            self.chart, problem.manifold, z, t, ends.q_start, ends.q_goal, retraction
-        ).joints
+        line = corrected(self.chart.decode(z), t, ends.q_start, ends.q_goal)
+        joints = retracted(problem.manifold, line, retraction).joints
         jumps = np.linalg.norm(np.diff(joints[0], axis=0), axis=1) > allowed_steps(joints, t)[0]
         wrong = np.concatenate([jumps, [False]]) | (
             problem.manifold.robot.limit_distance(joints[0]) < 0.0
@@ -309,17 +309,11 @@ class LatentGraphSearch:
         near = np.argsort(np.linalg.norm(joints[:nodes] - joints[end], axis=1), kind="stable")[
             :TRIED
         ]
+        surface = Surface(self.chart, problem.manifold, _all_free(problem))
         found: list[int] = []
         for block in np.array_split(near, max(len(near) // 8, 1)):
             starts = np.broadcast_to(joints[end], (len(block), joints.shape[1]))
-            lengths = check_edges(
-                self.chart,
-                problem.manifold,
-                starts,
-                joints[block],
-                _all_free(problem),
-                self.edge_points,
-            )
+            lengths = check_edges(surface, starts, joints[block], self.edge_points)
             found += [int(node) for node in block[np.isfinite(lengths)]]
             if len(found) >= ENOUGH:
                 break
@@ -334,9 +328,8 @@ class LatentGraphSearch:
         t = np.linspace(0.0, 1.0, int(np.ceil(np.linalg.norm(goal - start) / EDGE_SPACING)) + 2)
         z_start, z_goal = self.chart.encode(np.stack([start, goal]))
         z = (1.0 - t[:, None]) * z_start + t[:, None] * z_goal
-        lifted = lift(
-            self.chart, problem.manifold, z[None], t, start[None], goal[None], Retraction()
-        )
+        line = corrected(self.chart.decode(z[None]), t, start[None], goal[None])
+        lifted = retracted(problem.manifold, line, Retraction())
         joints = lifted.joints[0]
         longest = np.linalg.norm(np.diff(joints, axis=0), axis=1).max()
         if longest > 3.0 * EDGE_SPACING or lifted.violation.max() > SATISFIED:
