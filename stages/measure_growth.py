@@ -18,7 +18,7 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.report.figures import save_png
-from constraint_geodesics.report.growth_figure import growth_figure
+from constraint_geodesics.report.growth_figure import growth_figure, slopes_markdown
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.urdf import find_urdf
@@ -29,7 +29,6 @@ from constraint_geodesics.studies.growth import (
     Subject,
     measure_growth,
     slopes,
-    slopes_markdown,
 )
 
 STAGE = "measure_growth"

@@ -114,10 +114,8 @@ def _complain(error: Exception, code: int | None = None) -> int:
 
 @app.command("params")
 def check_params(
-    file: Annotated[Path, typer.Argument(help="The file to check.")] = Path("params.yaml"),
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the verdict as one JSON object.")
-    ] = False,
+    file: Path = typer.Argument(Path("params.yaml"), help="The file to check."),
+    as_json: bool = typer.Option(False, "--json", help="Print the verdict as one JSON object."),
 ) -> None:
     """Check a params.yaml: one line naming the first bad entry, or "ok".  Exit code 0: good; 2:
     bad.
@@ -129,16 +127,13 @@ def check_params(
             raise
         print(json.dumps({"file": str(file), "valid": False, "error": str(error)}))
         raise SystemExit(WRONG_USAGE) from None
-    print(
-        json.dumps({"file": str(file), "valid": True, "error": None}) if as_json else f"{file}: ok"
-    )
+    verdict = {"file": str(file), "valid": True, "error": None}
+    print(json.dumps(verdict) if as_json else f"{file}: ok")
 
 
 @app.command("doctor")
 def look_for_trouble(
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the findings as one JSON object.")
-    ] = False,
+    as_json: bool = typer.Option(False, "--json", help="Print the findings as one JSON object."),
 ) -> None:
     """Look for what is wrong with this checkout and its environment, and say the mend.  Exit code
     1: a problem.
@@ -150,24 +145,15 @@ def look_for_trouble(
 
 @app.command("constraints")
 def list_constraints(
-    planner: Annotated[
-        str | None, typer.Option(help="Where the planner comes from, as for `plan`.")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
+    planner: str | None = typer.Option(None, help="Where the planner comes from, as for `plan`."),
+    as_json: bool = typer.Option(False, "--json", help="One JSON object."),
 ) -> None:
     """List the constraints that `plan` knows by name."""
     from constraint_geodesics.bundle import open_bundle
 
     constraints = open_bundle(planner)[0].constraints
     if as_json:
-        print(
-            json.dumps(
-                {
-                    name: constraint.model_dump(mode="json")
-                    for name, constraint in constraints.items()
-                }
-            )
-        )
+        print(json.dumps({name: own.model_dump(mode="json") for name, own in constraints.items()}))
         return
     for name, constraint in constraints.items():
         print(f"{name:20s} {' '.join(map(str, constraint.axes))}  {constraint.description}")
@@ -316,33 +302,23 @@ def _joints(text: str, option: str) -> list[float]:
 
 @app.command("bench")
 def bench(
-    queries: Annotated[int, typer.Option(help="Queries of each constraint and scene.", min=1)] = 1,
-    seeds: Annotated[
-        int, typer.Option(help="Seeds of each planner that chance plays a part in.", min=1)
-    ] = 1,
-    constraint: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="One of params.yaml's; by default all.",
-            shell_complete=completion.listed_constraints,
-        ),
-    ] = None,
-    planner: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="One of params.yaml's bench.planners; by default all.",
-            shell_complete=completion.benchmarked_planners,
-        ),
-    ] = None,
-    longest: Annotated[
-        float, typer.Option(help="Leave out planners that are given more seconds a query.")
-    ] = 2.0,
-    out: Annotated[Path, typer.Option(help="Folder of rows, table and summary.")] = Path(
-        ".geodesics/bench"
+    queries: int = typer.Option(1, help="Queries of each constraint and scene.", min=1),
+    seeds: int = typer.Option(1, help="Seeds of each planner that chance plays a part in.", min=1),
+    constraint: list[str] | None = typer.Option(
+        None,
+        help="One of params.yaml's; by default all.",
+        shell_complete=completion.listed_constraints,
     ),
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the summary as one JSON object.")
-    ] = False,
+    planner: list[str] | None = typer.Option(
+        None,
+        help="One of params.yaml's bench.planners; by default all.",
+        shell_complete=completion.benchmarked_planners,
+    ),
+    longest: float = typer.Option(
+        2.0, help="Leave out planners that are given more seconds a query."
+    ),
+    out: Path = typer.Option(Path(".geodesics/bench"), help="Folder of rows, table and summary."),
+    as_json: bool = typer.Option(False, "--json", help="Print the summary as one JSON object."),
 ) -> None:
     """Hold planners against each other on a few of the benchmark's queries; what is done is not
     done again.
@@ -360,36 +336,28 @@ def bench(
     order = {name: k for k, name in enumerate(some.bench.planners)}
     table = table.sort_values("planner", key=lambda names: names.map(order), kind="stable")
     summary = benchmark_summary(all_constraints(table), next(iter(some.bench.planners)))
+    in_python = ("ompl", "decoder_sampling")
     text = overview_markdown(
-        summary,
-        [n for n, e in some.bench.planners.items() if e.kind in ("ompl", "decoder_sampling")],
+        summary, [name for name, own in some.bench.planners.items() if own.kind in in_python]
     )
     (out / "overview.md").write_text(text)
+    rows = out / "benchmark.csv"
     if as_json:
-        print(
-            json.dumps(
-                {
-                    "rows": str(out / "benchmark.csv"),
-                    "overview": _records(summary),
-                    "left_out": left_out,
-                }
-            )
-        )
+        answer = {"rows": str(rows), "overview": _records(summary), "left_out": left_out}
+        print(json.dumps(answer))
         return
     print(text)
     if left_out:
-        print(
-            f"left out, as they are given more than {longest:g} s a query (--longest): "
-            f"{', '.join(left_out)}"
-        )
-    print(f"rows: {out / 'benchmark.csv'}")
+        why = f"as they are given more than {longest:g} s a query (--longest)"
+        print(f"left out, {why}: {', '.join(left_out)}")
+    print(f"rows: {rows}")
 
 
 @app.command("results")
 def show_results(
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the table's rows as one JSON object.")
-    ] = False,
+    as_json: bool = typer.Option(
+        False, "--json", help="Print the table's rows as one JSON object."
+    ),
 ) -> None:
     """Print the committed result table and how to look further."""
     table = Layout().root / "reports" / ("table.csv" if as_json else "table.md")
@@ -400,56 +368,46 @@ def show_results(
 
         print(json.dumps({"rows": _records(pd.read_csv(table, float_precision="round_trip"))}))
         return
-    recordings = recordings_of(Layout())
+    recordings = _recordings(Path())
     print(table.read_text().rstrip())
     print("\nOpen the runs in MLflow:    make ui")
     if recordings:
-        print(f"Replay a path in Rerun:     make replay FILE={recordings[0]}")
+        print(f"Replay a path in Rerun:     make replay FILE={recordings[0].file}")
     print("Read the report offline:    reports/index.html")
 
 
 @app.command("replay")
 def replay(
-    recordings: Annotated[
-        list[str] | None,
-        typer.Argument(
-            help="Files to open, or their numbers in the list; none lists them.",
-            shell_complete=completion.recordings,
-        ),
-    ] = None,
-    constraint: Annotated[
-        str | None,
-        typer.Option(help="Only of this constraint.", shell_complete=completion.listed_constraints),
-    ] = None,
-    query: Annotated[int | None, typer.Option(help="Only of this query.", min=0)] = None,
-    planner: Annotated[
-        list[str] | None, typer.Option(help="Only of this planner; may be given several times.")
-    ] = None,
-    scene: Annotated[str | None, typer.Option(help="Only in this scene of the benchmark.")] = None,
-    manifold: Annotated[
-        str | None, typer.Option(help="Only of paths searched on this learned manifold.")
-    ] = None,
-    seed: Annotated[
-        list[int] | None, typer.Option(help="Only of this seed; may be given several times.")
-    ] = None,
-    beside: Annotated[
-        bool,
-        typer.Option(
-            "--side-by-side", help="A view for each recording, instead of one over the other."
-        ),
-    ] = False,
-    web: Annotated[
-        bool, typer.Option("--web", help="Open in a browser on this machine instead of a window.")
-    ] = False,
-    web_port: Annotated[
-        int, typer.Option(help="Port of the page on 127.0.0.1.", min=1, max=65535)
-    ] = 9090,
-    save: Annotated[
-        Path | None, typer.Option(help="Write what would be opened as one file, to hand on.")
-    ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the list as one JSON object.")
-    ] = False,
+    recordings: list[str] | None = typer.Argument(
+        None,
+        help="Files to open, or their numbers in the list; none lists them.",
+        shell_complete=completion.recordings,
+    ),
+    constraint: str | None = typer.Option(
+        None, help="Only of this constraint.", shell_complete=completion.listed_constraints
+    ),
+    query: int | None = typer.Option(None, help="Only of this query.", min=0),
+    planner: list[str] | None = typer.Option(
+        None, help="Only of this planner; may be given several times."
+    ),
+    scene: str | None = typer.Option(None, help="Only in this scene of the benchmark."),
+    manifold: str | None = typer.Option(
+        None, help="Only of paths searched on this learned manifold."
+    ),
+    seed: list[int] | None = typer.Option(
+        None, help="Only of this seed; may be given several times."
+    ),
+    apart: bool = typer.Option(
+        False, "--side-by-side", help="A view for each recording, instead of one over the other."
+    ),
+    web: bool = typer.Option(
+        False, "--web", help="Open in a browser on this machine instead of a window."
+    ),
+    web_port: int = typer.Option(9090, help="Port of the page on 127.0.0.1.", min=1, max=65535),
+    save: Path | None = typer.Option(
+        None, help="Write what would be opened as one file, to hand on."
+    ),
+    as_json: bool = typer.Option(False, "--json", help="Print the list as one JSON object."),
 ) -> None:
     """Replay recorded paths in Rerun, several at once over each other; without any, list the
     recordings.
@@ -457,40 +415,50 @@ def replay(
     With --constraint, --query and --planner what fits is opened; with fewer of them the list is
     narrowed.
     """
-    from constraint_geodesics.recording.catalogue import Filter, as_records
+    from constraint_geodesics.recording.catalogue import Filter
 
     wanted = Filter(constraint, scene, query, tuple(planner or ()), tuple(seed or ()), manifold)
-    if recordings and (as_json or wanted != Filter()):
-        words = (
-            "--json prints the list of recordings"
-            if as_json
-            else "--constraint, --query, ... choose from the list"
-        )
-        raise SystemExit(_complain(ValueError(f"{words}: give no file"), WRONG_USAGE))
-    if as_json:
-        print(json.dumps({"recordings": as_records(_listed(wanted))}))
-        return
-    files = _named(recordings) if recordings else _chosen(_listed(wanted), wanted)
+    files = _files(recordings or [], wanted, as_json)
     if not files:
         return
     from constraint_geodesics.recording.viewer import open_recordings, save_recordings
 
     if save is not None:
-        save_recordings(files, save, apart=beside)
+        save_recordings(files, save, apart=apart)
         print(f"{save}: open it with geodesics replay {save}")
         return
-    raise SystemExit(open_recordings(files, web=web, apart=beside, web_port=web_port))
+    raise SystemExit(open_recordings(files, web=web, apart=apart, web_port=web_port))
+
+
+def _files(words: Sequence[str], wanted: "Filter", as_json: bool) -> list[Path]:
+    """What is opened; nothing where the list is printed."""
+    from constraint_geodesics.recording.catalogue import Filter, as_records
+
+    if words and (as_json or wanted != Filter()):
+        choosing = "--constraint, --query, ... choose from the list"
+        what = "--json prints the list of recordings" if as_json else choosing
+        raise SystemExit(_complain(ValueError(f"{what}: give no file"), WRONG_USAGE))
+    if as_json:
+        print(json.dumps({"recordings": as_records(_listed(wanted))}))
+        return []
+    return _named(words) if words else _chosen(_listed(wanted), wanted)
+
+
+def _recordings(root: Path) -> "list[Listed]":
+    """All recordings of a checkout, learned paths that keep a cup level first."""
+    from constraint_geodesics.recording.catalogue import catalogue, read_entry
+
+    return catalogue(root, read_entry)
 
 
 def _listed(wanted: "Filter") -> "list[Listed]":
     """The recordings of this checkout that are as asked for."""
-    from constraint_geodesics.recording.catalogue import catalogue, narrowed, read_entry
+    from constraint_geodesics.recording.catalogue import narrowed
 
-    entries = catalogue(Path(), read_entry)
+    entries = _recordings(Path())
     if not entries:
-        raise FileNotFoundError(
-            "data/recordings: no recordings yet; run `make plan` for one, or `make repro` for all"
-        )
+        none = "data/recordings: no recordings yet"
+        raise FileNotFoundError(f"{none}; run `make plan` for one, or `make repro` for all")
     return narrowed(entries, wanted)
 
 
@@ -498,17 +466,15 @@ def _named(words: Sequence[str]) -> list[Path]:
     """The files that some words name, by themselves or by their numbers in the list."""
     from constraint_geodesics.recording.catalogue import Filter, by_words
 
-    for word in words:
-        if not word.isdigit() and not Path(word).is_file():
-            raise FileNotFoundError(
-                f"{word}: no such recording; `geodesics replay` lists those there are"
-            )
-    numbers = [word for word in words if not Path(word).is_file()]
-    files = {
-        entry.number: Path(entry.file)
-        for entry in (by_words(_listed(Filter()), numbers) if numbers else [])
-    }
-    return [Path(word) if Path(word).is_file() else files[int(word)] for word in words]
+    files = {word: Path(word) for word in words if Path(word).is_file()}
+    numbers = [word for word in words if word not in files]
+    if missing := next((word for word in numbers if not word.isdigit()), None):
+        none = f"{missing}: no such recording"
+        raise FileNotFoundError(f"{none}; `geodesics replay` lists those there are")
+    if numbers:
+        found = by_words(_listed(Filter()), numbers)
+        files |= {word: Path(entry.file) for word, entry in zip(numbers, found, strict=True)}
+    return [files[word] for word in words]
 
 
 def _chosen(listed: "list[Listed]", wanted: "Filter") -> list[Path]:
@@ -535,10 +501,8 @@ def _chosen(listed: "list[Listed]", wanted: "Filter") -> list[Path]:
 
 @app.command("ui")
 def ui(
-    port: Annotated[int, typer.Option(help="Port on 127.0.0.1.", min=1, max=65535)] = 5000,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the address as one JSON object.")
-    ] = False,
+    port: int = typer.Option(5000, help="Port on 127.0.0.1.", min=1, max=65535),
+    as_json: bool = typer.Option(False, "--json", help="Print the address as one JSON object."),
 ) -> None:
     """Open MLflow's dashboard for this checkout, on this machine only; it runs until it is
     stopped.
@@ -546,10 +510,8 @@ def ui(
     from constraint_geodesics.tracking.experiment import ui_command
 
     command, address = ui_command(Path().resolve(), port), f"http://127.0.0.1:{port}"
-    print(
-        json.dumps({"address": address}) if as_json else f"{address}  (stop with Ctrl-C)",
-        flush=True,
-    )
+    text = json.dumps({"address": address}) if as_json else f"{address}  (stop with Ctrl-C)"
+    print(text, flush=True)
     os.execvp(command[0], command)
 
 
@@ -557,13 +519,6 @@ def _records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
     """The rows of a table for JSON: what is not a finite number there is null."""
     records: list[dict[str, Any]] = json.loads(frame.to_json(orient="records", double_precision=15))
     return records
-
-
-def recordings_of(layout: Layout) -> list[Path]:
-    """All recordings of this checkout, learned paths that keep a cup level first."""
-    from constraint_geodesics.recording.catalogue import catalogue, read_entry
-
-    return [layout.root / entry.file for entry in catalogue(layout.root, read_entry)]
 
 
 if __name__ == "__main__":

@@ -9,16 +9,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from click import Context, Parameter
 from click.shell_completion import CompletionItem
 
 PIPELINE = Path("data") / "planner" / "planner.json"
 PACKAGED = Path(__file__).parent / "pretrained" / "planner.json"
 
 
-def planned_constraints(
-    context: Context, parameter: Parameter, incomplete: str
-) -> list[CompletionItem]:
+def planned_constraints(context: Any, parameter: Any, incomplete: str) -> list[Any]:
     """Constraints that the planner knows by name: that of --planner, the pipeline's, or the
     package's.
     """
@@ -28,33 +25,25 @@ def planned_constraints(
     return _items(_described(_json(card).get("constraints")), incomplete)
 
 
-def listed_constraints(
-    context: Context, parameter: Parameter, incomplete: str
-) -> list[CompletionItem]:
+def listed_constraints(context: Any, parameter: Any, incomplete: str) -> list[Any]:
     """Constraints of params.yaml."""
     del context, parameter
     return _items(_described(_params().get("constraints")), incomplete)
 
 
-def benchmarked_planners(
-    context: Context, parameter: Parameter, incomplete: str
-) -> list[CompletionItem]:
+def benchmarked_planners(context: Any, parameter: Any, incomplete: str) -> list[Any]:
     """Planners of the benchmark."""
     del context, parameter
     planners = (_params().get("bench") or {}).get("planners") or {}
-    return _items(
-        {name: str(entry.get("kind", "")) for name, entry in planners.items()}, incomplete
-    )
+    kinds = {name: str(entry.get("kind", "")) for name, entry in planners.items()}
+    return _items(kinds, incomplete)
 
 
-def recordings(context: Context, parameter: Parameter, incomplete: str) -> list[CompletionItem]:
+def recordings(context: Any, parameter: Any, incomplete: str) -> list[Any]:
     """Recordings of this checkout, and those in the folder that the word names."""
     del context, parameter
-    made = [
-        str(file)
-        for folder in ("data/recordings", "first_path")
-        for file in sorted(Path(folder).rglob("*.rrd"))
-    ]
+    folders = ("data/recordings", "first_path")
+    made = [str(file) for folder in folders for file in sorted(Path(folder).rglob("*.rrd"))]
     folder = incomplete[: incomplete.rfind("/") + 1]
     near = [folder + file.name for file in sorted(Path(folder or ".").glob("*.rrd"))]
     return _items(dict.fromkeys([*made, *near], ""), incomplete)

@@ -35,11 +35,11 @@ from constraint_geodesics.learning.vae import JointVae
 from constraint_geodesics.palette import planner_colour
 from constraint_geodesics.params import load_params
 from constraint_geodesics.pipeline.layout import Layout, in_checkout
-from constraint_geodesics.report.blocks import Recorded
 from constraint_geodesics.report.figures import PLANNERS
+from constraint_geodesics.report.page import Recorded
 from constraint_geodesics.report.pipeline_figures import latent_curves
 from constraint_geodesics.report.pipeline_page import write_report
-from constraint_geodesics.report.pipeline_tables import ablation_blocks, recorded_paths
+from constraint_geodesics.report.pipeline_tables import ablation_tables, recorded_paths
 from constraint_geodesics.report.results import (
     ReportError,
     compare_planners,
@@ -383,7 +383,7 @@ def test_links_to_runs_are_filters_that_mlflow_takes(checked):
 
 
 def test_ablations_say_what_their_stages_measured(run):
-    searched, variance, families = ablation_blocks(*run)
+    searched, variance, families = ablation_tables(*run)
     rows = {row[0]: row[1:] for row in searched.rows}
     assert rows["plane, corrected reward, cubic"] == ["0.200", "0.100", "0.300", "2", "0.020"]
     assert rows["plane, reward as printed"] == ["3.000", "2.000", "4.000", "2", "0.020"]

@@ -21,7 +21,7 @@ from constraint_geodesics.peers.elastic_band import StraightBand
 from constraint_geodesics.peers.ompl import SamplingPlanner
 from constraint_geodesics.problem import PlanningProblem
 from constraint_geodesics.report.figures import save_png
-from constraint_geodesics.report.growth_figure import LABELS, growth_figure
+from constraint_geodesics.report.growth_figure import LABELS, growth_figure, slopes_markdown
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.scene.world import World
@@ -39,7 +39,6 @@ from constraint_geodesics.studies.growth import (
     measure_growth,
     place_spheres,
     slopes,
-    slopes_markdown,
 )
 
 SIZES = GrowthSizes(

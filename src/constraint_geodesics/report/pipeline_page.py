@@ -14,11 +14,11 @@ from constraint_geodesics.report.figures import PLANNERS
 from constraint_geodesics.report.page import Picture, write_page
 from constraint_geodesics.report.pipeline_figures import Drawn, draw_data_cards, draw_figures
 from constraint_geodesics.report.pipeline_tables import (
-    ablation_blocks,
-    data_card_block,
-    metric_blocks,
-    published_block,
-    result_blocks,
+    ablation_tables,
+    data_card_table,
+    metric_tables,
+    published_table,
+    result_tables,
 )
 from constraint_geodesics.report.plan_report import (
     execution_block,
@@ -61,9 +61,8 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
     (reports / "policies.md").write_text(policies_markdown(params, layout))
     pictures = [save_figure(layout, entry) for entry in drawn]
     described = [save_figure(layout, entry) for entry in cards]
-    ablated, others = (
-        [p for p in pictures if (p.name == ABLATION) is wanted] for wanted in (True, False)
-    )
+    ablated = [picture for picture in pictures if picture.name == ABLATION]
+    others = [picture for picture in pictures if picture.name != ABLATION]
     write_page(layout, "index", drawn=others, ablated=ablated, cards=described, **content)
     return [picture.file for picture in (*pictures, *described)]
 
@@ -76,7 +75,7 @@ def save_figure(layout: Layout, entry: Drawn) -> Picture:
 
 
 def page_content(params: Params, layout: Layout, table: pd.DataFrame) -> dict[str, Any]:
-    """What the page says beside its figures."""
+    """What the page says besides its figures."""
     metrics = {
         name: read_metrics(layout.report("train_manifold", name)) for name in params.manifolds
     }
@@ -85,13 +84,11 @@ def page_content(params: Params, layout: Layout, table: pd.DataFrame) -> dict[st
         "params": params,
         "learned": PLANNERS[LEARNED].label,
         "findings": findings(params, table, metrics),
-        "published": [
-            published_block(params, layout, table, constraint) for constraint in compared
-        ],
+        "published": [published_table(params, layout, table, name) for name in compared],
         "plans": [*plan_blocks(params, layout), execution_block(params, layout)],
         "proposals": policy_blocks(params, layout),
-        "results": result_blocks(params, layout, table),
-        "ablations": ablation_blocks(params, layout),
-        "metrics": metric_blocks(params, layout, metrics),
-        "data": data_card_block(params, layout),
+        "results": result_tables(params, layout, table),
+        "ablations": ablation_tables(params, layout),
+        "metrics": metric_tables(params, layout, metrics),
+        "data": data_card_table(params, layout),
     }

@@ -11,8 +11,8 @@ import pandas as pd
 from constraint_geodesics.benchmark.plan_benchmark import BAND_AFTER, MULTI_START, PARTS, TANGENT
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout, in_checkout
-from constraint_geodesics.report.blocks import Block, Look, Recorded, runs_link
 from constraint_geodesics.report.figures import PLANNERS
+from constraint_geodesics.report.page import Links, Recorded, Table, runs_link
 from constraint_geodesics.report.results import markdown_table, read_metrics, short
 from constraint_geodesics.studies.proposals import (
     DESCENT,
@@ -71,7 +71,7 @@ METHODS = (STRAIGHT, RANDOM, DESCENT, ONE_SEED, POLICIES, SEPARATE)
 """The order of the proposals, each on the learned manifold first."""
 
 
-def plan_blocks(params: Params, layout: Layout) -> list[Block]:
+def plan_blocks(params: Params, layout: Layout) -> list[Table]:
     """The planner, its parts and its peers under the constraint of the plans, then under the unseen
     ones.
     """
@@ -95,10 +95,10 @@ def plan_blocks(params: Params, layout: Layout) -> list[Block]:
         f"{_sources(rows['planner'])}; ratios are over each planner's own valid paths, but in "
         f"the column with failures"
     )
-    look = Look(runs_link("benchmark_plans", name))
+    link = Links(runs_link("benchmark_plans", name))
     title, cells = f"{name}, whole and in parts", [_plan_row(*row) for row in rows.items()]
     blocks = [
-        Block(title, note, PLAN_COLUMNS, cells, planners=list(rows), looks=[look] * len(rows))
+        Table(title, note, PLAN_COLUMNS, cells, planners=list(rows), links=[link] * len(rows))
     ]
     unseen = [
         (constraint, planner, found)
@@ -118,23 +118,23 @@ def plan_blocks(params: Params, layout: Layout) -> list[Block]:
             _plan_row(f"{constraint}, {planner}", found) for constraint, planner, found in unseen
         ]
         planners = [planner for _, planner, _ in unseen]
-        looks = [look] * len(unseen)
+        links = [link] * len(unseen)
         blocks.append(
-            Block("Unseen constraints", note, header, cells, planners=planners, looks=looks)
+            Table("Unseen constraints", note, header, cells, planners=planners, links=links)
         )
     return blocks
 
 
-def policy_blocks(params: Params, layout: Layout) -> list[Block]:
+def policy_blocks(params: Params, layout: Layout) -> list[Table]:
     """What the policies propose before any refinement, one block a constraint."""
     found = read_metrics(layout.report("benchmark_policies", params.geodesics.searched[0]))
     names = [name for name in (params.plans.constraint, *params.plans.unseen) if name in found]
     named = [f"{method}, {chart}" for method in METHODS for chart in (LEARNED, JOINTS)]
-    look = Look(runs_link("benchmark_policies", params.geodesics.searched[0]))
-    return [_policy_block(name, _ordered(found[name], named), look) for name in names]
+    link = Links(runs_link("benchmark_policies", params.geodesics.searched[0]))
+    return [_policy_block(name, _ordered(found[name], named), link) for name in names]
 
 
-def execution_block(params: Params, layout: Layout) -> Block:
+def execution_block(params: Params, layout: Layout) -> Table:
     """What an open cup keeps of its content on planned paths and on straight joint lines."""
     found = read_metrics(layout.report("execute_paths", params.plans.constraint))
     kinds = {kind: row for kind, row in found.items() if isinstance(row, Mapping)}
@@ -160,8 +160,8 @@ def execution_block(params: Params, layout: Layout) -> Block:
         for kind, row in kinds.items()
     ]
     link, recorded = runs_link("execute_paths", params.plans.constraint), _executed(params, layout)
-    looks = [Look(link, recorded.get(kind, ())) for kind in kinds]
-    return Block("Execution", note, EXECUTION_COLUMNS, rows, planners=list(kinds), looks=looks)
+    links = [Links(link, recorded.get(kind, ())) for kind in kinds]
+    return Table("Execution", note, EXECUTION_COLUMNS, rows, planners=list(kinds), links=links)
 
 
 def _executed(params: Params, layout: Layout) -> dict[str, list[Recorded]]:
@@ -198,7 +198,7 @@ def _ordered(
     return {name: rows[name] for name in dict.fromkeys([*names, *rows]) if name in rows}
 
 
-def _markdown(block: Block) -> str:
+def _markdown(block: Table) -> str:
     return f"**{block.title}** ({block.note}):\n\n{markdown_table([block.header, *block.rows])}"
 
 
@@ -227,7 +227,7 @@ def _solvable(rows: Mapping[str, Mapping[str, Any]]) -> str:
     return f"{first['solvable']} of {first['queries']}"
 
 
-def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]], look: Look) -> Block:
+def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]], link: Links) -> Table:
     first = next(iter(rows.values()))
     note = (
         f"{first['queries']} queries, {first['solvable']} of which have a curve of the "
@@ -244,9 +244,9 @@ def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]], look: 
         ]
         for method, row in rows.items()
     ]
-    looks = [look] * len(rows)
-    return Block(
-        f"{constraint}, proposals", note, POLICY_COLUMNS, cells, planners=list(rows), looks=looks
+    links = [link] * len(rows)
+    return Table(
+        f"{constraint}, proposals", note, POLICY_COLUMNS, cells, planners=list(rows), links=links
     )
 
 

@@ -32,7 +32,6 @@ from constraint_geodesics.params import ManifoldParams, Params
 from constraint_geodesics.peers.elastic_band import free_rows, nothing, settled, task_of
 from constraint_geodesics.pipeline.progress import progress
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
-from constraint_geodesics.report.results import markdown_table
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
@@ -254,18 +253,6 @@ def slopes(table: pd.DataFrame) -> pd.DataFrame:
         rows.append((axis, what, *line, int(used.sum())))
     columns = ["axis", "what", "slope", "standard_error", "seconds_at_1", "points"]
     return pd.DataFrame(rows, columns=columns)
-
-
-def slopes_markdown(fits: pd.DataFrame) -> str:
-    """The exponents as a table, axis by axis."""
-    rows: list[Sequence[str]] = [("grows with", "what", "exponent", "± standard error", "points")]
-    for row in fits.to_dict("records"):
-        slope, error = (
-            f"{row[name]:.2f}" if np.isfinite(row[name]) else "–"
-            for name in ("slope", "standard_error")
-        )
-        rows.append((row["axis"], row["what"], slope, error, str(row["points"])))
-    return f"{markdown_table(rows)}\n"
 
 
 def _line(x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"]) -> tuple[float, float, float]:
