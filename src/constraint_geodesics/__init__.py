@@ -1,12 +1,17 @@
 """Shortest robot paths that keep a task constraint, by policy search on one learned manifold."""
 
+import os
 from typing import TYPE_CHECKING, Any
+
+from constraint_geodesics.kernel_digest import LOCATORS
 
 if TYPE_CHECKING:
     from constraint_geodesics.constraints.pose import Constraint as Constraint
     from constraint_geodesics.constraints.pose import Pose as Pose
     from constraint_geodesics.planner import Path as Path
     from constraint_geodesics.planner import Planner as Planner
+
+os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", LOCATORS)  # numba reads it when it compiles
 
 __all__ = ["Constraint", "Path", "Planner", "Pose"]
 

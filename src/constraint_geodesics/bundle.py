@@ -115,7 +115,7 @@ def open_bundle(source: str | Path | None = None) -> tuple[Bundle, str]:
             return read_bundle(PIPELINE), f"the pipeline's outputs in {PIPELINE.resolve()}"
         return read_bundle(PACKAGED), "the files that come with the package"
     if isinstance(source, str) and ":/" in source:
-        from constraint_geodesics.tracking.experiment import fetch_artifacts
+        from constraint_geodesics.tracking.store import fetch_artifacts
 
         with fetch_artifacts(source) as folder:
             return read_bundle(folder), f"MLflow's {source}"

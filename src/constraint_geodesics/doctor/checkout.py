@@ -1,8 +1,7 @@
-"""Checks of the checkout itself: git, room, the robot's files and compiled kernels."""
+"""Checks of the checkout itself: git, room and the robot's files."""
 
 from __future__ import annotations
 
-import ast
 import json
 import re
 import shlex
@@ -13,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 from constraint_geodesics.doctor.surroundings import (
-    PACKAGE,
     Surroundings,
     answer_of,
     completing,
@@ -24,8 +22,6 @@ from constraint_geodesics.doctor.surroundings import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from constraint_geodesics.doctor.surroundings import Look
 
 LEAST_FREE = 2_000_000_000
@@ -160,54 +156,3 @@ def _reinstall_pybullet(root: Path) -> str:
         f"python -m pip install --force-reinstall --no-deps "
         f"pybullet{f'=={wanted}' if wanted else ''}"
     )
-
-
-def check_kernels(root: Path, here: Surroundings) -> Look:
-    """Numba notices a change of the file a kernel stands in, but not of one whose kernels it calls.
-
-    Caches older than their own file are of no use to numba, so they are not counted.
-    """
-    package = root / "src" / PACKAGE if is_checkout(root) else here.package
-    texts = {file: file.read_text("utf-8") for file in package.rglob("*.py")}
-    changed = {file: file.stat().st_mtime for file, text in texts.items() if "numba" in text}
-    caches, stale, newer = 0, [], set()
-    for file, own in changed.items():
-        called = [
-            other for other in _reached(file, package, texts) if other in changed and other != file
-        ]
-        for cache in (file.parent / "__pycache__").glob(f"{file.stem}.*.nb[ic]"):
-            caches += 1
-            made = cache.stat().st_mtime
-            later = [other for other in called if own <= made < changed[other]]
-            if later:
-                stale.append(cache)
-                newer.update(later)
-    if not stale:
-        return f"{caches} files of compiled kernels, none older than a kernel that it calls"
-    names = few(sorted(file.relative_to(package).as_posix() for file in newer))
-    folder = "src" if is_checkout(root) else shlex.quote(str(package))
-    mend = f"find {folder} -name '*.nb[ic]' -delete"
-    yield (
-        "problem",
-        f"{len(stale)} of {caches} files of compiled kernels are older than {names}, which "
-        f"they call",
-        mend,
-    )
-    return ""
-
-
-def _reached(file: Path, package: Path, texts: Mapping[Path, str]) -> set[Path]:
-    """All files of the package that a file imports, those that they import, and so on."""
-    found: set[Path] = set()
-    left = [file]
-    while left:
-        own = left.pop()
-        if own in found or own not in texts:
-            continue
-        found.add(own)
-        for node in ast.walk(ast.parse(texts[own])):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == PACKAGE:
-                folder = package.joinpath(*str(node.module).split(".")[1:])
-                left.append(folder.with_suffix(".py"))
-                left += [folder / f"{name.name}.py" for name in node.names]
-    return found

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from constraint_geodesics.doctor.checkout import check_disk, check_git, check_kernels, check_robot
+from constraint_geodesics.doctor.checkout import check_disk, check_git, check_robot
 from constraint_geodesics.doctor.environment import (
     check_install,
     check_packages,
@@ -49,7 +49,6 @@ CHECKS: Mapping[str, Check] = {
     "git": check_git,
     "disk": check_disk,
     "robot": check_robot,
-    "kernels": check_kernels,
     "display": check_display,
     "recordings": check_recordings,
     "mlflow": check_mlflow,

@@ -2,73 +2,60 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from sklearn.decomposition import PCA
 
 from constraint_geodesics.certification.certifier import Limits
 from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import GridSubmanifold, Submanifold
-from constraint_geodesics.params import RecordingParams
 from constraint_geodesics.recording.recording import LatentView, PathRecord, record_path
 from constraint_geodesics.scene.world import Solid
 
+PRINCIPAL = ("first principal axis", "second principal axis")
 GRID_POINTS = 80
 """At most so many points a side of a latent grid in a recording: finer ones are larger and show
 nothing more.
 """
 
 
+@dataclass(frozen=True)
+class Setting:
+    """What a table's paths keep and stand in: the robot's constraint, its part of a learned
+    manifold, and the workcell.
+    """
+
+    constraint: str
+    manifold: ConstraintManifold
+    learned: LearnedManifold
+    submanifold: Submanifold
+    workcell: Sequence[Solid]
+
+
 def record_rows(
-    folder: Path,
+    setting: Setting,
     rows: Sequence[Mapping[str, Any]],
     paths: Sequence[Float[np.ndarray, "T D"]],
-    constraint: str,
-    chart: LearnedManifold,
-    manifold: ConstraintManifold,
-    submanifold: Submanifold,
-    workcell: Sequence[Solid],
-    params: RecordingParams,
-) -> list[dict[str, Any]]:
-    """Record the paths of the first queries, without meshes.
-
-    Returns the rows with the file of each, or "", as `recording`.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    named = []
-    for row, joints in zip(rows, paths, strict=True):
-        file = folder / f"query{row['query']}-{row['planner']}-seed{row['seed']}.rrd"
-        recorded = row["query"] < params.queries and len(joints) > 1
-        if recorded:
-            latent = latent_view(submanifold, chart, joints)
-            record = PathRecord(
-                row["planner"],
-                constraint,
-                row["query"],
-                row["seed"],
-                joints,
-                status_text(row, constraint),
-                latent,
-            )
-            record_path(file, record, manifold, workcell, frames=params.frames, meshes=False)
-        named.append({**row, "recording": file.as_posix() if recorded else ""})
-    return named
-
-
-def save_paths(
-    rows: Sequence[Mapping[str, Any]], paths: Sequence[Float[np.ndarray, "T D"]], folder: Path
+    frames: int,
 ) -> None:
-    """All joint paths [rad] of a table in one npz, named <planner>-<query>-<seed>."""
-    folder.mkdir(parents=True, exist_ok=True)
-    named = {
-        f"{row['planner']}-{row['query']}-{row['seed']}": path
-        for row, path in zip(rows, paths, strict=True)
-    }
-    np.savez_compressed(folder / "paths.npz", **named)  # type: ignore[arg-type]
+    """Record the path of each row in the file that its `recording` names, without meshes."""
+    for row, joints in zip(rows, paths, strict=True):
+        record = PathRecord(
+            row["planner"],
+            setting.constraint,
+            row["query"],
+            row["seed"],
+            joints,
+            status_text(row, setting.constraint),
+            latent_view(setting.submanifold, setting.learned, joints),
+        )
+        file = Path(row["recording"])
+        file.parent.mkdir(parents=True, exist_ok=True)
+        record_path(file, record, setting.manifold, setting.workcell, frames=frames, meshes=False)
 
 
 def latent_view(
@@ -84,11 +71,21 @@ def latent_view(
         points = np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1).reshape(-1, 2)
         values = submanifold.inclusion[::stride, ::stride].reshape(-1)
         return LatentView(points, values, curve, ("z1", "z2"))
-    plane = PCA(2, svd_solver="full").fit(submanifold.latent)
-    names = ("first principal axis", "second principal axis")
-    return LatentView(
-        plane.transform(submanifold.latent), submanifold.labels, plane.transform(curve), names
-    )
+    centre, axes = principal_plane(submanifold.latent)
+    points, names = (submanifold.latent - centre) @ axes.T, PRINCIPAL
+    return LatentView(points, submanifold.labels, (curve - centre) @ axes.T, names)
+
+
+def principal_plane(
+    points: Float[np.ndarray, "n d"],
+) -> tuple[Float[np.ndarray, "d"], Float[np.ndarray, "2 d"]]:
+    """Mean of some points and their first two principal axes, each with its largest entry
+    positive.
+    """
+    centre = points.mean(axis=0)
+    axes = np.linalg.svd(points - centre, full_matrices=False)[2][:2]
+    largest = np.abs(axes).argmax(axis=1)
+    return centre, axes * np.sign(axes[np.arange(len(axes)), largest])[:, None]
 
 
 def status_text(row: Mapping[str, Any], constraint: str) -> str:

@@ -23,6 +23,7 @@ from constraint_geodesics.report.results import (
     records,
     searched_items,
     short,
+    studies_at_hand,
     table_cells,
 )
 
@@ -203,7 +204,8 @@ def metric_blocks(
         for stage, title, items in named
         if items
     ]
-    return [*blocks, *_geometry_blocks(layout)]
+    measured = "geometry" in studies_at_hand(params, layout)
+    return [*blocks, *(_geometry_blocks(layout) if measured else [])]
 
 
 def _geometry_blocks(layout: Layout) -> list[Block]:
