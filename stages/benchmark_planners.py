@@ -7,37 +7,30 @@ from constraint_geodesics.benchmark.planner_benchmark import (
     planner_figures,
     run_planner,
 )
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import read_queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.submanifold import load_submanifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.recording.recorder import RowRecorder, save_paths
+from constraint_geodesics.pipeline.paths import named_recordings, save_paths
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.geodesic_search import write_table
-from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
+from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "benchmark_planners"
 
 
 def main(params: Params, layout: Layout, constraint: str) -> None:
-    """Write data/benchmark/<constraint>/, its recordings, rows and figures."""
+    """Write data/benchmark/<constraint>/, its rows and figures."""
     source, settings = layout.queries(constraint), params.benchmark
     scene = Scene.from_params(params)
     manifold = scene.manifold(params.constraints[constraint])
     charts = {name: LearnedManifold.load(layout.manifold(name)) for name in params.manifolds}
-    queries, shown = read_queries(source), params.geodesics.searched[0]
+    queries = read_queries(source)
     about = subject_of(params, constraint=constraint)
     with tracked_stage(
-        STAGE,
-        constraint,
-        settings,
-        [source],
-        experiment=params.tracking.experiment,
-        root=layout.root,
-        subject=about,
+        Work(STAGE, constraint, settings, [source], about), params.tracking.experiment, layout.root
     ) as run:
         tasks = [
             PlannerTask(planner, seed, scene, manifold, charts, queries, settings, params.judge)
@@ -50,16 +43,8 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
         rows = [row for result in results for row in result.rows]
         paths = [path for result in results for path in result.paths]
         save_paths(rows, paths, layout.benchmark(constraint))
-        recorder = RowRecorder(
-            layout.recordings(STAGE, constraint),
-            constraint,
-            manifold,
-            scene.workcell,
-            charts[shown],
-            load_submanifold(layout.submanifold(shown, constraint)),
-            params.recording,
-        )
-        rows = recorder.record(rows, paths)
+        folder = layout.recordings(STAGE, constraint)
+        rows = named_recordings(rows, paths, folder, params.recording.queries)
         run.recordings(rows)
         write_table(rows, layout.report(STAGE, constraint, "csv"), constraint=constraint)
         run.report(planner_figures(results), layout.report(STAGE, constraint))

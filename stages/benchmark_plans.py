@@ -14,15 +14,15 @@ from constraint_geodesics.benchmark.plan_benchmark import (
     save_arrays,
 )
 from constraint_geodesics.bundle import read_bundle
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.learning.dataset import draw_queries, write_queries
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.scene import constraint_from
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "benchmark_plans"
 
@@ -37,12 +37,7 @@ def main(params: Params, layout: Layout) -> None:
     described = {**params.constraints, **settings.unseen}
     with (
         tracked_stage(
-            STAGE,
-            settings.constraint,
-            settings,
-            [],
-            experiment=params.tracking.experiment,
-            root=layout.root,
+            Work(STAGE, settings.constraint, settings, []), params.tracking.experiment, layout.root
         ) as run,
         Planner(read_bundle(layout.planner), "the pipeline's outputs") as planner,
     ):

@@ -10,14 +10,14 @@ from safetensors.numpy import load_file
 
 import constraint_geodesics
 from constraint_geodesics.bundle import Bundle
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import read_queries
 from constraint_geodesics.learning.inference import WEIGHTS
 from constraint_geodesics.learning.submanifold import GraphSubmanifold, load_submanifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.search.roadmap import Roadmap
-from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
+from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 from constraint_geodesics.tracking.registry import register_planner
 
 STAGE = "build_planner"
@@ -30,13 +30,9 @@ def main(params: Params, layout: Layout) -> None:
     sources = [layout.manifold(manifold), layout.policies(manifold), layout.queries(shown)]
     about = subject_of(params, manifold=manifold)
     with tracked_stage(
-        STAGE,
-        "planner",
-        params.planner,
-        sources,
-        experiment=params.tracking.experiment,
-        root=layout.root,
-        subject=about,
+        Work(STAGE, "planner", params.planner, sources, about),
+        params.tracking.experiment,
+        layout.root,
     ) as run:
         graphs = {
             name: load_submanifold(layout.submanifold(manifold, name))

@@ -4,7 +4,6 @@ as it is.
 
 import sys
 
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import (
@@ -15,8 +14,9 @@ from constraint_geodesics.learning.submanifold import (
 )
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
+from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "extract_submanifold"
 
@@ -30,13 +30,9 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     about = subject_of(params, constraint=constraint, manifold=manifold)
     with (
         tracked_stage(
-            STAGE,
-            item,
-            params.submanifold,
-            sources,
-            experiment=params.tracking.experiment,
-            root=layout.root,
-            subject=about,
+            Work(STAGE, item, params.submanifold, sources, about),
+            params.tracking.experiment,
+            layout.root,
         ) as run,
         scene.world() as world,
     ):

@@ -10,12 +10,12 @@ from jaxtyping import Float
 
 from constraint_geodesics.benchmark.runner import write_table
 from constraint_geodesics.bundle import read_bundle
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.params import Params
 from constraint_geodesics.peers.registry import PeerBuilder
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import run_header
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.report.figures import save_png
 from constraint_geodesics.report.growth_figure import growth_figure, slopes_markdown

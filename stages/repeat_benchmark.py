@@ -8,9 +8,9 @@ import sys
 from constraint_geodesics.benchmark.entries import answered, blocks_of, ends_by_counting
 from constraint_geodesics.benchmark.runner import read_table
 from constraint_geodesics.benchmark.statistics import repeated
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.benchmark_tables import repeated_markdown
 
 STAGE = "repeat_benchmark"

@@ -14,9 +14,9 @@ from constraint_geodesics.benchmark.statistics import (
     break_even_table,
     ours_against_peers,
 )
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.params import Params, PeerParams
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report import benchmark_figures
 from constraint_geodesics.report.benchmark_tables import (
     ahead_markdown,

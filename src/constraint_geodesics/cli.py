@@ -1,29 +1,28 @@
-"""The command `geodesics`, and how a stage starts."""
+"""The command `geodesics`."""
 
-import inspect
 import json
 import math
 import os
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from constraint_geodesics import completion
-from constraint_geodesics.params import Params, ParamsError, load_params
+from constraint_geodesics.kernel_digest import are_compiled
+from constraint_geodesics.params import ParamsError, load_params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.progress import waiting
-from constraint_geodesics.pipeline.threads import ONE_THREAD, one_thread
+from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
+from constraint_geodesics.pipeline.threads import ONE_THREAD
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from constraint_geodesics.recording.catalogue import Filter, Listed
 
-WRONG_USAGE = 2
 NO_PATH = 3
 
 app = typer.Typer(
@@ -43,73 +42,19 @@ def main() -> None:
     try:
         app()
     except (ValueError, OSError, RuntimeError) as error:
-        raise SystemExit(_complain(error)) from None
+        raise SystemExit(complain(error)) from None
 
 
-def run_stage(stage: Callable[..., None], arguments: Sequence[str]) -> None:
-    """Run one stage in this checkout: check params.yaml first, and report a bad input in one line.
+@app.command("package")
+def package() -> None:
+    """Copy the planner that the pipeline built into the package, for those who install it."""
+    import shutil
 
-    What runs in this process computes on one thread, libraries that are loaded already too, so that
-    results are those of `make`; more cores are used by `parallel_map`.
-    arguments: the names after (params, layout), as dvc.yaml passes them; each must be one that
-    params.yaml has.
-    """
-    began = time.perf_counter()
-    try:
-        params = load_params()
-        _check_names(params, stage, arguments)
-        with one_thread(), waiting(" ".join([Path(sys.argv[0]).stem, *arguments])):
-            stage(params, Layout(), *arguments)
-        note_stage_time(
-            Layout().stage_times, Path(sys.argv[0]).stem, arguments, time.perf_counter() - began
-        )
-    except (ValueError, OSError, RuntimeError) as error:
-        if os.environ.get("GEODESICS_TRACEBACK"):
-            raise
-        raise SystemExit(_complain(error)) from None
-
-
-def note_stage_time(file: Path, stage: str, names: Sequence[str], seconds: float) -> None:
-    """Keep how long the last finished run of each stage took, workers and all: what training costs
-    is read from it.
-    """
-    file.parent.mkdir(parents=True, exist_ok=True)
-    own = " ".join([stage, *names])
-    kept = (
-        dict(line.split(",") for line in file.read_text().splitlines()[1:])
-        if file.is_file()
-        else {}
-    )
-    kept[own] = f"{seconds:.1f}"
-    file.write_text(
-        "\n".join(["stage,seconds", *(f"{name},{kept[name]}" for name in sorted(kept))]) + "\n"
-    )
-
-
-def _check_names(params: Params, stage: Callable[..., None], arguments: Sequence[str]) -> None:
-    """Each argument must be a name of the kind that the stage's own parameter is called after."""
-    kinds = list(inspect.signature(stage).parameters)[2:]
-    if len(kinds) != len(arguments):
-        raise ParamsError(
-            f"this stage takes {len(kinds)} names ({', '.join(kinds)}), not {len(arguments)}"
-        )
-    names: dict[str, list[str]] = {
-        "constraint": list(params.constraints),
-        "manifold": list(params.manifolds),
-        "analytic": list(params.geodesics.analytic),
-    }
-    for kind, name in zip(kinds, arguments, strict=True):
-        if name not in names[kind]:
-            raise ParamsError(
-                f"params.yaml: there is no {kind} {name!r}: must be one of {names[kind]}"
-            )
-
-
-def _complain(error: Exception, code: int | None = None) -> int:
-    print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-    if code is not None:
-        return code
-    return WRONG_USAGE if isinstance(error, ParamsError) else 1
+    layout = Layout()
+    if not (layout.planner / "planner.json").is_file():
+        raise OSError(f"{layout.planner}: holds no planner; `dvc repro build_planner` makes it")
+    shutil.copytree(layout.planner, layout.pretrained, dirs_exist_ok=True)
+    print(f"{layout.planner} -> {layout.pretrained}")
 
 
 @app.command("params")
@@ -203,7 +148,7 @@ def plan(
             path = loaded.plan(first, last, constraint, budget_s=budget)
             source = loaded.source
     except (BundleError, PlannerError) as error:
-        raise SystemExit(_complain(error, WRONG_USAGE)) from None
+        raise SystemExit(complain(error, WRONG_USAGE)) from None
     print(f"planner: {source}", file=sys.stderr)
     if path.status == "solved":
         if out is not None:
@@ -245,7 +190,7 @@ def check(
         with waiting(what_takes_time()):
             certificate = check_trajectory(file, constraint, planner)
     except (BundleError, PlannerError) as error:
-        raise SystemExit(_complain(error, WRONG_USAGE)) from None
+        raise SystemExit(complain(error, WRONG_USAGE)) from None
     broken = certificate.violation
     untimed = (
         " (no times: velocity and acceleration not looked at)"
@@ -266,27 +211,11 @@ def check(
     raise SystemExit(0 if broken is None else NO_PATH)
 
 
-KERNELS = (
-    "robot/kernels",
-    "scene/clearance",
-    "constraints/kernels",
-    "certification/kernels",
-    "geometry/timing",
-    "search/band_kernels",
-)
-"""Modules that numba compiles before the first path; their code is kept beside them, until they
-change.
-"""
-
-
-def what_takes_time(package: Path = Path(__file__).parent) -> str:
+def what_takes_time() -> str:
     """What a planner's user waits for: the compiler where a kernel has no compiled code yet."""
-    for name in KERNELS:
-        source = package / f"{name}.py"
-        kept = (source.parent / "__pycache__").glob(f"{source.stem}.*.nbi")
-        if not any(cache.stat().st_mtime >= source.stat().st_mtime for cache in kept):
-            return "compiling the numerical kernels, once for this environment: a minute or two"
-    return "loading the planner"
+    if are_compiled():
+        return "loading the planner"
+    return "compiling the numerical kernels, once for this environment: a minute or two"
 
 
 def _joints(text: str, option: str) -> list[float]:
@@ -437,7 +366,7 @@ def _files(words: Sequence[str], wanted: "Filter", as_json: bool) -> list[Path]:
     if words and (as_json or wanted != Filter()):
         choosing = "--constraint, --query, ... choose from the list"
         what = "--json prints the list of recordings" if as_json else choosing
-        raise SystemExit(_complain(ValueError(f"{what}: give no file"), WRONG_USAGE))
+        raise SystemExit(complain(ValueError(f"{what}: give no file"), WRONG_USAGE))
     if as_json:
         print(json.dumps({"recordings": as_records(_listed(wanted))}))
         return []
@@ -507,7 +436,7 @@ def ui(
     """Open MLflow's dashboard for this checkout, on this machine only; it runs until it is
     stopped.
     """
-    from constraint_geodesics.tracking.experiment import ui_command
+    from constraint_geodesics.tracking.store import ui_command
 
     command, address = ui_command(Path().resolve(), port), f"http://127.0.0.1:{port}"
     text = json.dumps({"address": address}) if as_json else f"{address}  (stop with Ctrl-C)"

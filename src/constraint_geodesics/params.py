@@ -225,6 +225,13 @@ class GeodesicParams(_Record):
     rollouts: Count
     checkpoint_steps: Count
 
+    def of_training(self, *more: str) -> dict[str, Any]:
+        """What one policy is trained with, and what else is named; the rest says what is trained
+        besides.
+        """
+        own = {"seeds", "degree", "steps", "environments", "episode_steps", "reward", "ppo"}
+        return self.model_dump(mode="json", include=own | set(more))
+
 
 class GeometryParams(_Record):
     """Benchmark and ablation of the geometry core."""

@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import Any
 
 PLUGS = {
-    "mlflow": "tracking.experiment:fetch_artifacts",
+    "mlflow": "tracking.store:fetch_artifacts",
     "learned samples": "learning.inference:FrozenManifold",
     "learned proposals": "geodesics.policy_proposals:PolicyProposals",
 }

@@ -16,11 +16,11 @@ from constraint_geodesics.benchmark.entries import (
     spread,
     uses_clearance,
 )
-from constraint_geodesics.cli import note_stage_time
 from constraint_geodesics.params import Params, PeerParams
 from constraint_geodesics.peers.elastic_band import StraightBand
 from constraint_geodesics.peers.registry import KINDS, PeerBuilder, PeerError, Remembered
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import note_stage_time
 from constraint_geodesics.problem import PlanningProblem
 
 

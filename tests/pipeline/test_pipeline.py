@@ -18,7 +18,7 @@ from mlflow.tracking import MlflowClient
 
 from constraint_geodesics.benchmark.runner import read_table
 from constraint_geodesics.recording.recording import read_recording, same_recordings
-from constraint_geodesics.tracking.experiment import fetch_artifacts
+from constraint_geodesics.tracking.store import fetch_artifacts
 from tests.pipeline import smoke
 
 pytestmark = [pytest.mark.xdist_group("pipeline"), pytest.mark.timeout(600)]

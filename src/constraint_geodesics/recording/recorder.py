@@ -13,10 +13,10 @@ from constraint_geodesics.certification.certifier import Limits
 from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import GridSubmanifold, Submanifold
-from constraint_geodesics.params import RecordingParams
 from constraint_geodesics.recording.recording import LatentView, PathRecord, record_path
 from constraint_geodesics.scene.shape import Shape
 
+PRINCIPAL = ("first principal axis", "second principal axis")
 GRID_POINTS = 80
 """At most so many points a side of a latent grid in a recording: finer ones are larger and show
 nothing more.
@@ -25,44 +25,31 @@ nothing more.
 
 @dataclass(frozen=True)
 class RowRecorder:
-    """Records the paths of the first queries of one constraint, searched on one learned manifold or
-    shown on it.
-    """
+    """Records the paths of one constraint, searched on one learned manifold or shown on it."""
 
-    folder: Path
     constraint: str
     manifold: ConstraintManifold
     workcell: Sequence[Shape]
     learned: LearnedManifold
     submanifold: Submanifold
-    params: RecordingParams
+    frames: int
 
     def record(
         self, rows: Sequence[Mapping[str, Any]], paths: Sequence[Float[np.ndarray, "T D"]]
-    ) -> list[dict[str, Any]]:
-        """The rows with the file of each, or "", as `recording`."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        return [
-            {**row, "recording": self._record(row, joints)}
-            for row, joints in zip(rows, paths, strict=True)
-        ]
-
-    def _record(self, row: Mapping[str, Any], joints: Float[np.ndarray, "T D"]) -> str:
-        if row["query"] >= self.params.queries or len(joints) < 2:
-            return ""
-        planner, query, seed = row["planner"], row["query"], row["seed"]
-        file = self.folder / f"query{query}-{planner}-seed{seed}.rrd"
-        text, latent = status_text(row, self.constraint), self._latent_view(joints)
-        path = PathRecord(planner, self.constraint, query, seed, joints, text, latent, meshes=False)
-        record_path(file, path, self.manifold, self.workcell, frames=self.params.frames)
-        return file.as_posix()
+    ) -> None:
+        """Record the path of each row in the file that its `recording` names."""
+        for row, joints in zip(rows, paths, strict=True):
+            text, latent = status_text(row, self.constraint), self._latent_view(joints)
+            key = row["planner"], self.constraint, row["query"], row["seed"]
+            path = PathRecord(*key, joints, text, latent, meshes=False)
+            file = Path(row["recording"])
+            file.parent.mkdir(parents=True, exist_ok=True)
+            record_path(file, path, self.manifold, self.workcell, frames=self.frames)
 
     def _latent_view(self, joints: Float[np.ndarray, "T D"]) -> LatentView:
         """The sub-manifold and the encoded path: the latent plane itself, or its first two
         principal axes.
         """
-        from sklearn.decomposition import PCA
-
         curve, submanifold = self.learned.encode(joints), self.submanifold
         if isinstance(submanifold, GridSubmanifold):
             stride = math.ceil(len(submanifold.first_axis) / GRID_POINTS)
@@ -70,20 +57,21 @@ class RowRecorder:
             points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
             values = submanifold.inclusion[::stride, ::stride].reshape(-1)
             return LatentView(points, values, curve, ("z1", "z2"))
-        plane = PCA(2, svd_solver="full").fit(submanifold.latent)
-        points, curve = plane.transform(submanifold.latent), plane.transform(curve)
-        names = ("first principal axis", "second principal axis")
-        return LatentView(points, submanifold.labels, curve, names)
+        centre, plane = principal_plane(submanifold.latent)
+        points, labels = (submanifold.latent - centre) @ plane.T, submanifold.labels
+        return LatentView(points, labels, (curve - centre) @ plane.T, PRINCIPAL)
 
 
-def save_paths(
-    rows: Sequence[Mapping[str, Any]], paths: Sequence[Float[np.ndarray, "T D"]], folder: Path
-) -> None:
-    """All joint paths [rad] of a table in one npz, named <planner>-<query>-<seed>."""
-    folder.mkdir(parents=True, exist_ok=True)
-    names = [f"{row['planner']}-{row['query']}-{row['seed']}" for row in rows]
-    named = dict(zip(names, paths, strict=True))
-    np.savez_compressed(folder / "paths.npz", **named)  # type: ignore[arg-type]
+def principal_plane(
+    points: Float[np.ndarray, "n d"],
+) -> tuple[Float[np.ndarray, "d"], Float[np.ndarray, "2 d"]]:
+    """Mean of some points and their first two principal axes, each with its largest entry
+    positive.
+    """
+    centre = points.mean(axis=0)
+    axes = np.linalg.svd(points - centre, full_matrices=False)[2][:2]
+    largest = np.abs(axes).argmax(axis=1)
+    return centre, axes * np.sign(axes[np.arange(len(axes)), largest])[:, None]
 
 
 def status_text(row: Mapping[str, Any], constraint: str) -> str:

@@ -30,6 +30,7 @@ from constraint_geodesics.report.results import (
     read_paths,
     searched_items,
     short,
+    studies_at_hand,
 )
 
 DRAWN_QUERY = 0
@@ -63,7 +64,9 @@ def draw_figures(params: Params, layout: Layout, table: pd.DataFrame) -> list[Dr
     drawn = [_draw_analytic_submanifolds()]
     if "plane" in params.geodesics.analytic:
         drawn.append(_draw_plane_search(layout))
-    drawn += [_draw_length_rules(layout), *_draw_ablation(params, layout)]
+    studies = studies_at_hand(params, layout)
+    drawn += [_draw_length_rules(layout)] if "geometry" in studies else []
+    drawn += _draw_ablation(params, layout) if "ablations" in studies else []
     planes = [name for name in params.geodesics.illustrated if learned[name].dim == 2]
     if planes and params.geodesics.illustrated_constraints:
         drawn += _draw_plane(params, layout, planes[0], learned[planes[0]], data[planes[0]])

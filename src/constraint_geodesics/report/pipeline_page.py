@@ -35,6 +35,7 @@ from constraint_geodesics.report.results import (
     geometry_table,
     read_metrics,
     result_table,
+    studies_at_hand,
 )
 
 ABLATION = "ablation"
@@ -56,9 +57,13 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
     reports = layout.root / "reports"
     table.to_csv(reports / "table.csv", index=False, float_format="%.6g")
     (reports / "table.md").write_text(result_table(layout))
-    (reports / "geometry.md").write_text(geometry_table(layout))
-    (reports / "plans.md").write_text(plans_markdown(params, layout))
-    (reports / "policies.md").write_text(policies_markdown(params, layout))
+    studies = studies_at_hand(params, layout)
+    if "geometry" in studies:
+        (reports / "geometry.md").write_text(geometry_table(layout))
+    if "plans" in studies:
+        (reports / "plans.md").write_text(plans_markdown(params, layout))
+    if "policies" in studies:
+        (reports / "policies.md").write_text(policies_markdown(params, layout))
     pictures = [save_figure(layout, entry) for entry in drawn]
     described = [save_figure(layout, entry) for entry in cards]
     ablated = [picture for picture in pictures if picture.name == ABLATION]
@@ -80,15 +85,17 @@ def page_content(params: Params, layout: Layout, table: pd.DataFrame) -> dict[st
         name: read_metrics(layout.report("train_manifold", name)) for name in params.manifolds
     }
     compared = params.geodesics.illustrated_constraints[:1]
+    studies = studies_at_hand(params, layout)
+    plans = plan_blocks(params, layout) if "plans" in studies else []
     return {
         "params": params,
         "learned": PLANNERS[LEARNED].label,
         "findings": findings(params, table, metrics),
         "published": [published_table(params, layout, table, name) for name in compared],
-        "plans": [*plan_blocks(params, layout), execution_block(params, layout)],
-        "proposals": policy_blocks(params, layout),
+        "plans": [*plans, execution_block(params, layout)],
+        "proposals": policy_blocks(params, layout) if "policies" in studies else [],
         "results": result_tables(params, layout, table),
-        "ablations": ablation_tables(params, layout),
+        "ablations": ablation_tables(params, layout) if "ablations" in studies else [],
         "metrics": metric_tables(params, layout, metrics),
         "data": data_card_table(params, layout),
     }

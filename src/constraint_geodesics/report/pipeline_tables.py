@@ -24,6 +24,7 @@ from constraint_geodesics.report.results import (
     records,
     searched_items,
     short,
+    studies_at_hand,
     table_cells,
 )
 
@@ -157,7 +158,8 @@ def metric_tables(
     for stage, title, items in named:
         runs = [runs_link(stage, name.replace(", ", "-")) for name in items]
         tables += [_metric_table(title, f"reports/{stage}/", items, runs)] if items else []
-    return [*tables, *_geometry_tables(layout)]
+    measured = "geometry" in studies_at_hand(params, layout)
+    return [*tables, *(_geometry_tables(layout) if measured else [])]
 
 
 def _geometry_tables(layout: Layout) -> list[Table]:

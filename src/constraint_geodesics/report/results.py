@@ -130,6 +130,24 @@ def result_table(layout: Layout) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def studies_at_hand(params: Params, layout: Layout) -> frozenset[str]:
+    """Which studies of `make bench` have left all of their reports: the pipeline runs without."""
+    manifold, analytic = params.geodesics.searched[0], map(str, params.geodesics.analytic)
+    files = {
+        "geometry": [
+            layout.root / "reports" / "geometry.json",
+            layout.report("benchmark_geometry", "quadrature", "csv"),
+        ],
+        "ablations": [
+            *(layout.report("ablate_analytic", name) for name in analytic),
+            *(layout.report("ablate_manifold", name) for name in params.manifolds),
+        ],
+        "policies": [layout.report("benchmark_policies", manifold)],
+        "plans": [layout.report("benchmark_plans", "plans")],
+    }
+    return frozenset(n for n, own in files.items() if all(file.is_file() for file in own))
+
+
 def geometry_table(layout: Layout) -> str:
     """What the geometry core reaches, as Markdown, from reports/geometry.json."""
     geometry = read_metrics(layout.root / "reports" / "geometry.json")

@@ -6,7 +6,8 @@ all: a fast swing can hold the spheres upside down, or throw one out of a level 
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -222,3 +223,15 @@ def execution_figures(table: pd.DataFrame, found: TippingQueries) -> dict[str, A
             "duration_mean_s": float(done["duration_s"].mean()),
         }
     return figures
+
+
+def save_execution(file: Path, execution: Execution) -> None:
+    """What became of a path, for `load_execution`."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(file, **asdict(execution))
+
+
+def load_execution(file: Path) -> Execution:
+    """An execution that was kept in a file."""
+    with np.load(file) as kept:
+        return Execution(**{n: v if v.ndim else v.item() for n, v in kept.items()})
