@@ -12,6 +12,8 @@ from typing import Any
 from click import Context, Parameter
 from click.shell_completion import CompletionItem
 
+from constraint_geodesics.plugs import METHODS
+
 PIPELINE = Path("data") / "planner" / "planner.json"
 PACKAGED = Path(__file__).parent / "pretrained" / "planner.json"
 
@@ -45,6 +47,12 @@ def benchmarked_planners(
     return _items(
         {name: str(entry.get("kind", "")) for name, entry in planners.items()}, incomplete
     )
+
+
+def methods(context: Context, parameter: Parameter, incomplete: str) -> list[CompletionItem]:
+    """Methods of the planner."""
+    del context, parameter
+    return _items(dict.fromkeys(METHODS, ""), incomplete)
 
 
 def recordings(context: Context, parameter: Parameter, incomplete: str) -> list[CompletionItem]:
