@@ -11,6 +11,7 @@ from constraint_geodesics.bundle import Bundle, read_bundle
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
+from constraint_geodesics.geodesics.learned_method import FOLDER, LearnedFiles, read_learned
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.scene.clearance import clearance_model
@@ -27,6 +28,11 @@ def packaged_bundle() -> Bundle:
 @cache
 def packaged_planner() -> Planner:
     return Planner.load(bundle.PACKAGED)
+
+
+@cache
+def packaged_learned() -> LearnedFiles:
+    return read_learned(bundle.PACKAGED / FOLDER)
 
 
 def manifold_of(planner: Planner, name: str) -> ConstraintManifold:

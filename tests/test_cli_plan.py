@@ -415,6 +415,16 @@ def test_a_budget_is_used(command, query) -> None:
     assert longer["length_rad"] <= first["length_rad"]
 
 
+@pytest.mark.parametrize("method", ["planner", "learned", "learned+band"])
+def test_a_method_is_chosen_by_its_name_and_named_in_the_answer(command, query, method) -> None:
+    words = ("--start", query[0], "--goal", query[1], "--constraint", "level_cup", "--json")
+    code, out, _ = command("plan", *words, "--method", method)
+    assert (code, strict(out)["method"]) == (0, method)
+    code, out, err = command("plan", *words, "--method", "paper")
+    assert (code, out) == (2, "")
+    assert "no method 'paper'" in error_line(err)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -132,6 +132,15 @@ def plan(
             help="Look for shorter paths until so many seconds have passed; by default do not."
         ),
     ] = None,
+    method: Annotated[
+        str,
+        typer.Option(
+            help="planner: straight line, roadmap and trees, refined; nothing in it is learned.  "
+            "learned: trained policies on the learned manifold alone, as in the paper.  "
+            "learned+band: the same, refined by the planner's elastic band.",
+            shell_complete=completion.methods,
+        ),
+    ] = "planner",
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the answer as one JSON object.")
     ] = False,
@@ -144,7 +153,7 @@ def plan(
 
     try:
         first, last = _joints(start, "--start"), _joints(goal, "--goal")
-        with waiting(what_takes_time()), Planner.load(planner) as loaded:
+        with waiting(what_takes_time()), Planner.load(planner, method) as loaded:
             path = loaded.plan(first, last, constraint, budget_s=budget)
             source = loaded.source
     except (BundleError, PlannerError) as error:

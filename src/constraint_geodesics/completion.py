@@ -11,6 +11,8 @@ from typing import Any
 
 from click.shell_completion import CompletionItem
 
+from constraint_geodesics.plugs import METHODS
+
 PIPELINE = Path("data") / "planner" / "planner.json"
 PACKAGED = Path(__file__).parent / "pretrained" / "planner.json"
 
@@ -37,6 +39,12 @@ def benchmarked_planners(context: Any, parameter: Any, incomplete: str) -> list[
     planners = (_params().get("bench") or {}).get("planners") or {}
     kinds = {name: str(entry.get("kind", "")) for name, entry in planners.items()}
     return _items(kinds, incomplete)
+
+
+def methods(context: Any, parameter: Any, incomplete: str) -> list[Any]:
+    """Methods of the planner."""
+    del context, parameter
+    return _items(dict.fromkeys(METHODS, ""), incomplete)
 
 
 def recordings(context: Any, parameter: Any, incomplete: str) -> list[Any]:

@@ -1,15 +1,18 @@
-"""How a planner looks for curves: the methods by their names, in this one place.
+"""How a planner looks for curves.  `plugs.METHODS` has the methods by their names.
 
-A further method is one file with a class that implements `Method`, and one line here.  A method of
-the lab is named by its module, and imported when it is asked for.
+A further method is one file with a class that implements `Method`, and one line there.
 """
 
-from collections.abc import Callable, Iterator
-from typing import Protocol
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Protocol, Self
 
 import numpy as np
 from jaxtyping import Float
 
+from constraint_geodesics.bundle import Bundle
+from constraint_geodesics.plugs import METHODS, plug
+from constraint_geodesics.problem import PlannerError
 from constraint_geodesics.search.candidates import (
     Answer,
     Candidate,
@@ -19,16 +22,24 @@ from constraint_geodesics.search.candidates import (
     candidates,
     improvements,
 )
-
-DEFAULT = "planner"
+from constraint_geodesics.search.preparation import Draw
+from constraint_geodesics.search.roadmap import Roadmap
 
 
 class Method(Protocol):
-    """Proposes curves for a query; the planner has them certified."""
+    """Proposes curves for a query; the planner has them certified.
 
-    @property
-    def name(self) -> str:
-        """The name that users choose it by."""
+    name: users choose it by this.  roadmaps: by constraint, instead of the planner's; None for
+    those.  draw: of the configurations that further roadmaps are made of; None for uniform ones.
+    """
+
+    name: str
+    roadmaps: Mapping[str, Roadmap] | None
+    draw: Draw | None
+
+    @classmethod
+    def open(cls, source: str | Path | None, bundle: Bundle) -> Self:
+        """For a planner's files.  Raises BundleError if files of its own are missing or altered."""
         ...
 
     def candidates(
@@ -47,13 +58,20 @@ class Method(Protocol):
 class SearchMethod:
     """The planner's own: straight line, roadmap and trees, each refined by an elastic band.
 
-    proposals: a plug for learned curves, asked for when a query needs them.
+    proposals: a plug for curves of another kind, learned ones for example.
     """
 
-    name = DEFAULT
+    name = "planner"
+    roadmaps: Mapping[str, Roadmap] | None = None
+    draw: Draw | None = None
 
     def __init__(self, proposals: Callable[[], Proposals | None] = lambda: None) -> None:
         self.proposals = proposals
+
+    @classmethod
+    def open(cls, source: str | Path | None, bundle: Bundle) -> Self:
+        """It has no files of its own."""
+        return cls()
 
     def candidates(
         self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts
@@ -66,3 +84,11 @@ class SearchMethod:
     ) -> Iterator[Candidate | None]:
         """Bent lines and new trees."""
         return improvements(task, start, goal, parts)
+
+
+def open_method(name: str, source: str | Path | None, bundle: Bundle) -> Method:
+    """A method by its name.  Raises PlannerError if there is none of that name."""
+    if name not in METHODS:
+        raise PlannerError(f"there is no method {name!r}: must be one of {', '.join(METHODS)}")
+    method: Method = plug(METHODS[name]).open(source, bundle)
+    return method

@@ -8,7 +8,6 @@ trajectory = planner.plan(start, goal, "level_cup")
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Self
 
@@ -21,22 +20,14 @@ from constraint_geodesics.constraints.pose import AXES, Constraint, Pose
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.goal import ArrayLike, Goal, as_goal, checked_configuration
-from constraint_geodesics.methods import Method, SearchMethod
+from constraint_geodesics.methods import Method, SearchMethod, open_method
 from constraint_geodesics.params import JudgeParams, PlannerParams
-from constraint_geodesics.plugs import plug
 from constraint_geodesics.problem import PlannerError as PlannerError
 from constraint_geodesics.problem import Status
 from constraint_geodesics.scene.scene import Scene, constraint_from, robot_from, workcell_from
-from constraint_geodesics.search.candidates import (
-    ALL_PARTS,
-    Answer,
-    Candidate,
-    Parts,
-    Proposals,
-    rows_of,
-)
+from constraint_geodesics.search.candidates import ALL_PARTS, Answer, Candidate, Parts, rows_of
 from constraint_geodesics.search.explanations import not_connected, refused_ends
-from constraint_geodesics.search.preparation import Draw, Preparation, Query
+from constraint_geodesics.search.preparation import Preparation, Query
 from constraint_geodesics.trajectory import Asked, Statistics, Trajectory, read_trajectory
 
 COINCIDENT_RAD = 1e-7
@@ -67,27 +58,29 @@ class Planner:
         self.source, self.bundle = source, bundle
         self.scene = Scene(robot_from(bundle.robot), workcell_from(bundle.workcell))
         self.constraints = {name: constraint_from(c) for name, c in bundle.constraints.items()}
-        self.method = method or SearchMethod(cache(lambda: _learned_proposals(bundle)))
+        self.method: Method = method or SearchMethod()
         dof, settings = self.scene.robot.dof, bundle.planner
         self._acceleration = np.full(dof, settings.acceleration_rad_s2)
         self._certifier = Certifier(self.scene, limits_of(settings, bundle.judge, dof))
         self._world = self.scene.world()
-        draw = cache(lambda: _learned_samples(bundle))
-        self._preparation = Preparation(
-            self.scene, self._world, settings, lambda count, rng: draw()(count, rng)
-        )
-        self._preparation.supply(self.constraints, bundle.roadmaps)
+        self._preparation = Preparation(self.scene, self._world, settings, self.method.draw)
+        roadmaps = bundle.roadmaps if self.method.roadmaps is None else self.method.roadmaps
+        self._preparation.supply(self.constraints, roadmaps)
         self.band = self._preparation.band
 
     @classmethod
-    def load(cls, source: str | Path | None = None) -> Self:
+    def load(cls, source: str | Path | None = None, method: str = SearchMethod.name) -> Self:
         """From a folder, an MLflow address (models:/… or runs:/…), or by default from the
         pipeline's outputs in this checkout, else from the files that come with the package.
         `planner.source` says which it was.
 
-        Raises BundleError if the files are missing or altered.
+        method: how curves are looked for.  "planner": straight line, roadmap and trees, refined;
+        nothing in it is learned.  "learned": by policies on the learned manifold alone, as the
+        paper does; "learned+band": the same, refined by the planner's elastic band.
+        Raises BundleError if files are missing or altered, PlannerError for another method.
         """
-        return cls(*open_bundle(source))
+        bundle, where = open_bundle(source)
+        return cls(bundle, where, open_method(method, source, bundle))
 
     def __enter__(self) -> Self:
         self._require_open()
@@ -304,17 +297,6 @@ def _batch(
         if len(wrong):
             raise PlannerError(f"{name}[{wrong[0]}] = {ends[wrong[0]].tolist()}: must be finite")
     return first, last
-
-
-def _learned_proposals(bundle: Bundle) -> Proposals | None:
-    if not bundle.policies:
-        return None
-    return plug("learned proposals").from_arrays(bundle.manifold, bundle.policies, bundle.policy)
-
-
-def _learned_samples(bundle: Bundle) -> Draw:
-    chart = plug("learned samples")(bundle.manifold)
-    return lambda count, rng: chart.decode(chart.sample(count, rng))
 
 
 def limits_of(settings: PlannerParams, judge: JudgeParams, dof: int) -> Limits:

@@ -1,18 +1,20 @@
-"""What the planner's core reaches of the lab, by name: imported when it is asked for, so that the
-core imports nothing of it.
+"""What the planner's core reaches by name: imported when it is asked for, so that the core imports
+nothing of the lab.
 """
 
 from importlib import import_module
 from typing import Any
 
-PLUGS = {
-    "mlflow": "tracking.store:fetch_artifacts",
-    "learned samples": "learning.inference:FrozenManifold",
-    "learned proposals": "geodesics.policy_proposals:PolicyProposals",
+MLFLOW = "tracking.store:fetch_artifacts"
+METHODS = {
+    "planner": "methods:SearchMethod",
+    "learned": "geodesics.learned_method:LearnedMethod",
+    "learned+band": "geodesics.learned_method:RefinedLearnedMethod",
 }
+"""How a planner may look for curves, each a class that `methods.Method` describes."""
 
 
-def plug(name: str) -> Any:
-    """The object behind a name."""
-    module, attribute = PLUGS[name].split(":")
+def plug(address: str) -> Any:
+    """The object at a module's attribute."""
+    module, attribute = address.split(":")
     return getattr(import_module(f"constraint_geodesics.{module}"), attribute)

@@ -2,7 +2,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.planner_fixtures import NAMES, assert_sound, manifold_of, packaged_planner, problems
+from tests.planner_fixtures import (
+    NAMES,
+    assert_sound,
+    manifold_of,
+    packaged_learned,
+    packaged_planner,
+    problems,
+)
 
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
@@ -25,9 +32,7 @@ SETTINGS = BenchmarkParams(
     delta_rad=0.05,
     range_rad=2.0,
 )
-PLANNER = DecoderSampling(
-    FrozenManifold(packaged_planner().bundle.manifold), SETTINGS, iterations=200
-)
+PLANNER = DecoderSampling(FrozenManifold(packaged_learned().manifold), SETTINGS, iterations=200)
 
 
 def hard(world: World) -> PlanningProblem:

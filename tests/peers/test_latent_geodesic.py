@@ -3,7 +3,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from tests.planner_fixtures import manifold_of, packaged_planner, pairs_of
+from tests.planner_fixtures import manifold_of, packaged_learned, packaged_planner, pairs_of
 
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
@@ -46,7 +46,7 @@ class Bench:
 def bench() -> Iterator[Bench]:
     planner = packaged_planner()
     with planner.scene.world() as world, Certifier(planner.scene) as judge:
-        yield Bench(LearnedManifold.from_arrays(planner.bundle.manifold), world, judge)
+        yield Bench(LearnedManifold.from_arrays(packaged_learned().manifold), world, judge)
 
 
 def length(path: Solution) -> float:

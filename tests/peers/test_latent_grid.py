@@ -4,7 +4,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.planner_fixtures import manifold_of, nodes_of, packaged_planner, pairs_of
+from tests.planner_fixtures import (
+    manifold_of,
+    nodes_of,
+    packaged_learned,
+    packaged_planner,
+    pairs_of,
+)
 
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
@@ -41,7 +47,7 @@ def world() -> Iterator[World]:
 
 @pytest.fixture(scope="module")
 def chart() -> LearnedManifold:
-    return LearnedManifold.from_arrays(packaged_planner().bundle.manifold)
+    return LearnedManifold.from_arrays(packaged_learned().manifold)
 
 
 @pytest.fixture(scope="module")

@@ -131,7 +131,7 @@ def test_a_model_has_a_signature_an_example_and_nothing_pickled(root: Path) -> N
         "served_model.py",
         "input_example.json",
         "planner.json",
-        "manifold.safetensors",
+        "roadmaps.safetensors",
     } <= files
     assert not [name for name in files if name.endswith((".pkl", ".pickle"))]
     needed = (model.parent / "requirements.txt").read_text().split()

@@ -222,14 +222,8 @@ def _opened(wanted: Wanted) -> Planner:
     )
     constraint = wanted.manifold.constraint
     planner.prepare(constraint)
-    nodes = planner.nodes(constraint)
-    for parts in (
-        Parts(straight=False, graph=False, tree=False),
-        Parts(straight=False, graph=False, policy=False),
-    ):
-        planner.plan(
-            nodes[0], nodes[-1], constraint, parts=parts
-        )  # loads the networks and the trees' compiled code
+    nodes, trees = planner.nodes(constraint), Parts(straight=False, graph=False)
+    planner.plan(nodes[0], nodes[-1], constraint, parts=trees)  # loads the trees' compiled code
     return planner
 
 
@@ -305,9 +299,13 @@ def _decoded(wanted: Wanted) -> PathPlanner:
     benchmark = wanted.params.benchmark.model_copy(update=own)
     made = wanted.remembered(
         settings | own | {"kind": "decoder_sampling"},
-        lambda: DecoderSampling(FrozenManifold(wanted.bundle.manifold), benchmark, **settings),
+        lambda: DecoderSampling(_frozen(wanted), benchmark, **settings),
     )
     return BandAfter(made) if band else made
+
+
+def _frozen(wanted: Wanted) -> FrozenManifold:
+    return FrozenManifold.load(wanted.layout.manifold(wanted.searched))
 
 
 def _bayesian(wanted: Wanted) -> PathPlanner:

@@ -54,6 +54,11 @@ class Layout:
         return self.root / "data" / "planner"
 
     @property
+    def learned(self) -> Path:
+        """Folder of the learned method's files (safetensors and JSON)."""
+        return self.root / "data" / "learned"
+
+    @property
     def pretrained(self) -> Path:
         """Their copy that travels with the package."""
         return self.root / "src" / "constraint_geodesics" / "pretrained"

@@ -5,17 +5,18 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
+from constraint_geodesics.geometry.graph import components
 from constraint_geodesics.params import PlannerParams
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
-from constraint_geodesics.search.band import BandSettings
+from constraint_geodesics.search.band import BandSettings, project
 from constraint_geodesics.search.candidates import ALL_PARTS, Parts, Task
-from constraint_geodesics.search.roadmap import Roadmap, build_roadmap
+from constraint_geodesics.search.roadmap import EDGE_STEP, Roadmap, build_roadmap
 
 KEPT_TASKS = 64
 """Constraints without a name that are remembered, with their roadmaps."""
@@ -91,6 +92,54 @@ class Preparation:
                 build_roadmap(space, nodes, settings.roadmap_neighbours) if len(nodes) > 1 else None
             )
         return self._roadmaps[key]
+
+
+def named_roadmaps(
+    scene: Scene, constraints: Mapping[str, Constraint], settings: PlannerParams
+) -> dict[str, Roadmap]:
+    """Checked roadmaps of constraints, from uniform samples projected onto each; none for one that
+    hardly any configuration keeps.
+    """
+    found = {}
+    with scene.world() as world:
+        preparation = Preparation(scene, world, settings)
+        for name, constraint in constraints.items():
+            task, rng = preparation.task(constraint), np.random.default_rng(settings.seed)
+            count, draw = settings.roadmap_nodes, scene.robot.sample
+            nodes = free_configurations(task.manifold, world, draw, count, rng)
+            if len(nodes) > 1:
+                found[name] = checked_roadmap(task, world, nodes, settings.roadmap_neighbours)
+    return found
+
+
+def checked_roadmap(
+    task: Task, world: World, nodes: Float[np.ndarray, "n D"], neighbours: int
+) -> Roadmap:
+    """The roadmap over these configurations whose edges PyBullet finds free of collision as well,
+    those of the arm with itself among them.
+    """
+    roadmap = build_roadmap(task.clear, nodes, neighbours)
+    points, edge = edge_points(task.clear, roadmap)
+    touched = np.zeros(len(roadmap.edges), bool)
+    np.logical_or.at(touched, edge, ~world.free(points))
+    edges, lengths = roadmap.edges[~touched], roadmap.lengths[~touched]
+    return Roadmap(nodes, edges, lengths, components(len(nodes), edges))
+
+
+def edge_points(
+    space: tuple, roadmap: Roadmap
+) -> tuple[Float[np.ndarray, "m D"], Int[np.ndarray, "m"]]:
+    """Points on the constraint between the ends of every edge, at most EDGE_STEP apart [rad], and
+    the edge that each belongs to.
+    """
+    first, last = roadmap.joints[roadmap.edges[:, 0]], roadmap.joints[roadmap.edges[:, 1]]
+    pieces = np.ceil(np.linalg.norm(last - first, axis=1) / EDGE_STEP).astype(int) + 1
+    edge = np.repeat(np.arange(len(pieces)), pieces - 1)
+    inner = np.arange(len(edge)) - np.repeat(np.cumsum(pieces - 1) - (pieces - 1), pieces - 1) + 1
+    share = (inner / pieces[edge])[:, None]
+    points = (1.0 - share) * first[edge] + share * last[edge]
+    project(space, points)
+    return points, edge
 
 
 def free_configurations(
