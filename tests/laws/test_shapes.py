@@ -59,7 +59,7 @@ class Slab(Shape):
         size = {"shapeType": kind, "halfExtents": self.half_edges}
         return add_body(bullet, self.centre, turn, **size)
 
-    def drawn(self, rerun: Any, look: Mapping[str, Any]) -> Any:
+    def drawn(self, rerun: Any, style: Mapping[str, Any]) -> Any:
         return None
 
 

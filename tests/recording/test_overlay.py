@@ -34,6 +34,7 @@ from constraint_geodesics.recording.viewer import prepared, save_recordings
 from constraint_geodesics.robot.kinematics import load_robot
 from constraint_geodesics.scene.body import Body
 from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.scene.urdf import data_path
@@ -42,6 +43,7 @@ FRAMES = 10
 TABLE = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1))
 TRAY = Body("tray", data_path() / "tray" / "traybox.urdf", (0.6, 0.3, 0.1), (0.1, -0.2, 0.5))
 BALL = Sphere("keep_out", (0.3, 0.3, 0.6), 0.1)
+PIPE = Capsule("pipe", (-0.4, 0.2, 0.5), (-0.4, 0.5, 0.8), 0.05)
 LEVEL = Constraint(
     (0, 0, 0, 1, 1, 0),
     (0, 0, 0, 0.1, 0.1, 0),
@@ -196,7 +198,7 @@ def test_every_series_has_one_line_a_planner(write: Writer, tmp_path: Path) -> N
 
 
 def test_what_is_shared_is_there_once(write: Writer, tmp_path: Path) -> None:
-    bodies = (TABLE, TRAY, BALL)
+    bodies = (TABLE, TRAY, BALL, PIPE)
     sources = [
         write(name, latent=True, bodies=bodies, meshes=name == "prm")
         for name in ("planner", "birrt", "prm")
@@ -205,6 +207,7 @@ def test_what_is_shared_is_there_once(write: Writer, tmp_path: Path) -> None:
     for shared in (
         "workcell/table",
         "workcell/keep_out",
+        "workcell/pipe",
         "latent/submanifold",
         "tool/start",
         "tool/goal",

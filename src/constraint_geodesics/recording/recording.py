@@ -358,8 +358,8 @@ def _robot_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
 def _shape_chunks(shape: Shape) -> Iterator[Chunk]:
     """A shape of the workcell at its place."""
     entity, placed = _entity("workcell", shape.name), shape.urdf_model()
-    look = {"colors": [_BOX], "fill_mode": "solid", "labels": [shape.name], "show_labels": False}
-    archetype = shape.drawn(rr, look)
+    style = {"colors": [_BOX], "fill_mode": "solid", "labels": [shape.name], "show_labels": False}
+    archetype = shape.drawn(rr, style)
     if archetype is not None:
         yield static(entity, archetype)
     if placed is None:

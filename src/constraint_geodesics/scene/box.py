@@ -32,6 +32,6 @@ class Box(Shape):
         kind = bullet.GEOM_BOX
         return add_body(bullet, self.centre_m, shapeType=kind, halfExtents=self._half_edges)
 
-    def drawn(self, rerun: Any, look: Mapping[str, Any]) -> Any:
+    def drawn(self, rerun: Any, style: Mapping[str, Any]) -> Any:
         """A box of Rerun."""
-        return rerun.Boxes3D(centers=[self.centre_m], sizes=[self.size_m], **look)
+        return rerun.Boxes3D(centers=[self.centre_m], sizes=[self.size_m], **style)

@@ -41,11 +41,11 @@ class Capsule(Shape):
         kind = bullet.GEOM_CAPSULE
         return add_body(bullet, core.centre, self._quaternion(), shapeType=kind, **size)
 
-    def drawn(self, rerun: Any, look: Mapping[str, Any]) -> Any:
+    def drawn(self, rerun: Any, style: Mapping[str, Any]) -> Any:
         """A capsule of Rerun, which begins at the origin and runs along its z axis."""
         turn = rerun.Quaternion(xyzw=self._quaternion())
         size = {"lengths": [self.length_m], "radii": [self.radius_m]}
-        return rerun.Capsules3D(translations=[self.from_m], quaternions=[turn], **size, **look)
+        return rerun.Capsules3D(translations=[self.from_m], quaternions=[turn], **size, **style)
 
     def _turn(self) -> Float[np.ndarray, "3 3"]:
         """Turns the z axis into the direction of the line."""

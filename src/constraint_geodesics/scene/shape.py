@@ -1,6 +1,6 @@
 """What a shape of the workcell is for the planner, for PyBullet and for Rerun.
 
-A new kind is one file like those beside this one, and its name in shapes.py.
+A new kind is one more file in this folder, and its name in shapes.py.
 """
 
 from abc import ABC, abstractmethod
@@ -59,8 +59,8 @@ class Shape(ABC):
     def add_to(self, bullet: Any) -> int:
         """Make its body in a world, with `bullet`'s functions of PyBullet; the body's index."""
 
-    def drawn(self, rerun: Any, look: Mapping[str, Any]) -> Any:
-        """Its archetype of the module `rerun`, with the look that all shapes share; None if it is
+    def drawn(self, rerun: Any, style: Mapping[str, Any]) -> Any:
+        """Its archetype of the module `rerun`, in the style that all shapes share; None if it is
         drawn by its meshes.
         """
         return None

@@ -27,6 +27,6 @@ class Sphere(Shape):
         kind = bullet.GEOM_SPHERE
         return add_body(bullet, self.centre_m, shapeType=kind, radius=self.radius_m)
 
-    def drawn(self, rerun: Any, look: Mapping[str, Any]) -> Any:
+    def drawn(self, rerun: Any, style: Mapping[str, Any]) -> Any:
         """An ellipsoid of Rerun."""
-        return rerun.Ellipsoids3D(centers=[self.centre_m], radii=[self.radius_m], **look)
+        return rerun.Ellipsoids3D(centers=[self.centre_m], radii=[self.radius_m], **style)

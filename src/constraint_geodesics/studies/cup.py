@@ -142,16 +142,16 @@ def _follow(
     rest, moving = (int(np.ceil(s / settings.step_s)) for s in (settings.settle_s, t[-1]))
     for _ in range(rest):
         simulation.step(q[0], np.zeros_like(q[0]))
-    wanted = path(np.minimum(settings.step_s * np.arange(moving + rest + 1), t[-1]))
-    # the velocity that leads from one wanted position to the next one: 0 from the goal on
-    velocities = np.diff(wanted, axis=0) / settings.step_s
+    targets = path(np.minimum(settings.step_s * np.arange(moving + rest + 1), t[-1]))
+    # the velocity that leads from one target to the next one: 0 from the goal on
+    velocities = np.diff(targets, axis=0) / settings.step_s
     every = max(1, round(1.0 / (FRAME_RATE * settings.step_s)))
     frames, frame_times = [simulation.frame()], [0.0]
     error, tilt = 0.0, simulation.tilt()
     for k in range(moving + rest):
-        simulation.step(wanted[k], velocities[k])
+        simulation.step(targets[k], velocities[k])
         if k < moving:
-            error = max(error, float(np.abs(simulation.joints() - wanted[k + 1]).max()))
+            error = max(error, float(np.abs(simulation.joints() - targets[k + 1]).max()))
             tilt = max(tilt, simulation.tilt())
         if (k + 1) % every == 0 or k + 1 == moving + rest:
             frames.append(simulation.frame())
