@@ -17,7 +17,7 @@ from constraint_geodesics.geodesics.proposals import MeanPolicy
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.manifold import GeometryError
 from constraint_geodesics.learning.learned_manifold import JointManifold
-from constraint_geodesics.studies import policy_benchmark as bench
+from constraint_geodesics.studies import proposals as bench
 
 QUERIES, STEPS = 10, 3
 SMALL = bench.OptimumSettings(

@@ -540,7 +540,7 @@ class ProblemSet:
             same = replace(member, manifold=first.manifold, joints=first.joints) == first
             if not (same and member.retract and member.manifold.robot is first.manifold.robot):
                 raise GeometryError(
-                    "members of a set differ in more than constraint and data, or do not retract"
+                    "members of a problem set differ in more than constraint and data"
                 )
 
     @property
