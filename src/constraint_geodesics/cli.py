@@ -478,9 +478,7 @@ def _named(words: Sequence[str]) -> list[Path]:
 
 
 def _chosen(listed: "list[Listed]", wanted: "Filter") -> list[Path]:
-    """What is opened of the list: what was asked for, or what a person at the terminal chooses;
-    piped, nothing.
-    """
+    """What was asked for of the list, or what a person at the terminal chooses; piped, nothing."""
     from constraint_geodesics.recording.catalogue import as_table, by_words, one_of_each
 
     if wanted.one_problem:

@@ -18,16 +18,12 @@ from constraint_geodesics.recording.recording import LatentView, PathRecord, rec
 from constraint_geodesics.scene.world import Solid
 
 GRID_POINTS = 80
-"""At most so many points a side of a latent grid in a recording: finer ones are larger and show
-nothing more.
-"""
+"""At most so many points a side of a latent grid: finer ones are larger and show no more."""
 
 
 @dataclass(frozen=True)
 class RowRecorder:
-    """Records the paths of the first queries of one constraint, searched on one learned manifold or
-    shown on it.
-    """
+    """Records the first queries' paths of one constraint on one learned manifold."""
 
     folder: Path
     constraint: str
@@ -58,9 +54,7 @@ class RowRecorder:
         return file.as_posix()
 
     def _latent_view(self, joints: Float[np.ndarray, "T D"]) -> LatentView:
-        """The sub-manifold and the encoded path: the latent plane itself, or its first two
-        principal axes.
-        """
+        """The sub-manifold and the encoded path in the latent plane, or in two principal axes."""
         from sklearn.decomposition import PCA
 
         curve, submanifold = self.learned.encode(joints), self.submanifold

@@ -1,6 +1,4 @@
-"""The figures of a run's report with their titles and captions, from the stages' tables, metrics
-and data.
-"""
+"""The figures of a run's report with titles and captions, from its tables, metrics and data."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -40,9 +38,7 @@ CURVE_POINTS = 101
 
 
 class Drawn(NamedTuple):
-    """A figure of the report: its file's name, what it shows, how to read it, and what is said
-    where it isn't seen.
-    """
+    """A figure of the report: file's name, title, how to read it; alt: said where it isn't seen."""
 
     name: str
     title: str

@@ -1,6 +1,4 @@
-"""The tables of a run's report as texts: results beside the paper's, the stages' metrics,
-ablations, the data card.
-"""
+"""The tables of a run's page: results and the paper's, metrics, ablations, the data card."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
@@ -37,9 +35,7 @@ PUBLISHED = {
 
 
 def published_table(params: Params, layout: Layout, table: pd.DataFrame, constraint: str) -> Table:
-    """Table I of the paper beside its counterparts of this run; `×` is the average over the learned
-    geodesic's.
-    """
+    """Table I of the paper and this run's; `×` is the average over the learned geodesic's."""
     manifolds = [m for m, c in searched_items(params) if c == constraint]
     manifolds.sort(key=lambda name: params.manifolds[name].latent_dim)
     header = ["method", "shortest", "average ± std", "×", "time [s]"]
@@ -224,9 +220,7 @@ WITH_VARIANCE = {
 
 
 def ablation_tables(params: Params, layout: Layout) -> list[Table]:
-    """What each choice is worth: the reward, the family of curves, and the variance term of eq.
-    5.
-    """
+    """What each choice is worth: the reward, the family of curves, the variance term of eq. 5."""
     learned = {
         name: read_metrics(layout.report("ablate_manifold", name)) for name in params.manifolds
     }

@@ -234,9 +234,7 @@ def _by_planner(rows: pd.DataFrame, column: str) -> str:
 
 
 def _shortest_under(rows: pd.DataFrame) -> str:
-    """Under which constraints the learned geodesic is the shortest, in the mean over the common
-    queries.
-    """
+    """Where the learned geodesic is the shortest, in the mean over the common queries."""
     comparable = rows[~rows["planner"].isin(BESIDE)].dropna(subset=["latent_mean"])
     shortest = comparable.loc[comparable.groupby("constraint", sort=False)["latent_mean"].idxmin()]
     won = shortest.loc[shortest["planner"] == LEARNED, "constraint"].tolist()
@@ -291,9 +289,7 @@ def plus_minus(mean: float, deviation: float, number: Callable[[float], str]) ->
 
 
 def markdown_table(rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table, its header first; columns are aligned, so that it reads in a terminal
-    too.
-    """
+    """A Markdown table, its header first, aligned, so that it reads in a terminal too."""
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
 
     def line(cells: Sequence[str]) -> str:  # names to the left, figures to the right
