@@ -24,6 +24,7 @@ from constraint_geodesics.report import figures
 from constraint_geodesics.report.figures import LatentCurves
 from constraint_geodesics.report.results import (
     LEARNED,
+    metrics_of,
     read_metrics,
     read_paths,
     searched_items,
@@ -130,9 +131,7 @@ def _draw_ablation(params: Params, layout: Layout) -> list[Drawn]:
         ablated = read_metrics(layout.report("ablate_analytic", name))
         searched[name] = {"corrected_reward": own, **_ratios(ablated["policy_search"])}
         reached[name] = _ratios(ablated["gradient"])
-    learned = {
-        name: read_metrics(layout.report("ablate_manifold", name)) for name in params.manifolds
-    }
+    learned = metrics_of(layout, "ablate_manifold", params.manifolds)
     excess = "; ".join(
         f"{name}: {np.mean(ratios['corrected_reward']) - 1:.2%} against "
         f"{np.mean(ratios['printed_reward']) - 1:.2%}"

@@ -5,7 +5,7 @@ lies in a folder.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -111,6 +111,11 @@ def read_metrics(file: Path) -> dict[str, Any]:
     except json.JSONDecodeError as error:
         raise ReportError(f"{file}: not JSON: {error}") from None
     return content
+
+
+def metrics_of(layout: Layout, stage: str, names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """The metrics of some items of a stage, by their names."""
+    return {str(name): read_metrics(layout.report(stage, name)) for name in names}
 
 
 def result_table(layout: Layout) -> str:
