@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from constraint_geodesics.recording.catalogue import Filter, Listed
 
 NO_PATH = 3
+JSON = typer.Option(False, "--json", help="Print the answer as one JSON object.")
+OF_CONSTRAINT: dict[str, Any] = {"shell_complete": completion.listed_constraints}
 
 app = typer.Typer(
     help="Shortest robot paths that keep a task constraint.",
@@ -60,7 +62,7 @@ def package() -> None:
 @app.command("params")
 def check_params(
     file: Path = typer.Argument(Path("params.yaml"), help="The file to check."),
-    as_json: bool = typer.Option(False, "--json", help="Print the verdict as one JSON object."),
+    as_json: bool = JSON,
 ) -> None:
     """Check a params.yaml: one line naming the first bad entry, or "ok".  Exit code 0: good; 2:
     bad.
@@ -77,9 +79,7 @@ def check_params(
 
 
 @app.command("doctor")
-def look_for_trouble(
-    as_json: bool = typer.Option(False, "--json", help="Print the findings as one JSON object."),
-) -> None:
+def look_for_trouble(as_json: bool = JSON) -> None:
     """Look for what is wrong with this checkout and its environment, and say the mend.  Exit code
     1: a problem.
     """
@@ -91,7 +91,7 @@ def look_for_trouble(
 @app.command("constraints")
 def list_constraints(
     planner: str | None = typer.Option(None, help="Where the planner comes from, as for `plan`."),
-    as_json: bool = typer.Option(False, "--json", help="One JSON object."),
+    as_json: bool = JSON,
 ) -> None:
     """List the constraints that `plan` knows by name."""
     from constraint_geodesics.bundle import open_bundle
@@ -242,21 +242,13 @@ def _joints(text: str, option: str) -> list[float]:
 def bench(
     queries: int = typer.Option(1, help="Queries of each constraint and scene.", min=1),
     seeds: int = typer.Option(1, help="Seeds of each planner that chance plays a part in.", min=1),
-    constraint: list[str] | None = typer.Option(
-        None,
-        help="One of params.yaml's; by default all.",
-        shell_complete=completion.listed_constraints,
-    ),
+    constraint: list[str] | None = typer.Option(None, help="By default all.", **OF_CONSTRAINT),
     planner: list[str] | None = typer.Option(
-        None,
-        help="One of params.yaml's bench.planners; by default all.",
-        shell_complete=completion.benchmarked_planners,
+        None, help="By default all.", shell_complete=completion.benchmarked_planners
     ),
-    longest: float = typer.Option(
-        2.0, help="Leave out planners that are given more seconds a query."
-    ),
+    longest: float = typer.Option(2.0, help="Leave out planners with more seconds a query."),
     out: Path = typer.Option(Path(".geodesics/bench"), help="Folder of rows, table and summary."),
-    as_json: bool = typer.Option(False, "--json", help="Print the summary as one JSON object."),
+    as_json: bool = JSON,
 ) -> None:
     """Hold planners against each other on a few of the benchmark's queries; what is done is not
     done again.
@@ -292,11 +284,7 @@ def bench(
 
 
 @app.command("results")
-def show_results(
-    as_json: bool = typer.Option(
-        False, "--json", help="Print the table's rows as one JSON object."
-    ),
-) -> None:
+def show_results(as_json: bool = JSON) -> None:
     """Print the committed result table and how to look further."""
     table = Layout().root / "reports" / ("table.csv" if as_json else "table.md")
     if not table.is_file():
@@ -321,31 +309,17 @@ def replay(
         help="Files to open, or their numbers in the list; none lists them.",
         shell_complete=completion.recordings,
     ),
-    constraint: str | None = typer.Option(
-        None, help="Only of this constraint.", shell_complete=completion.listed_constraints
-    ),
+    constraint: str | None = typer.Option(None, help="Only of this constraint.", **OF_CONSTRAINT),
     query: int | None = typer.Option(None, help="Only of this query.", min=0),
-    planner: list[str] | None = typer.Option(
-        None, help="Only of this planner; may be given several times."
-    ),
+    planner: list[str] | None = typer.Option(None, help="Only of this planner; repeatable."),
     scene: str | None = typer.Option(None, help="Only in this scene of the benchmark."),
-    manifold: str | None = typer.Option(
-        None, help="Only of paths searched on this learned manifold."
-    ),
-    seed: list[int] | None = typer.Option(
-        None, help="Only of this seed; may be given several times."
-    ),
-    apart: bool = typer.Option(
-        False, "--side-by-side", help="A view for each recording, instead of one over the other."
-    ),
-    web: bool = typer.Option(
-        False, "--web", help="Open in a browser on this machine instead of a window."
-    ),
+    manifold: str | None = typer.Option(None, help="Only of paths on this learned manifold."),
+    seed: list[int] | None = typer.Option(None, help="Only of this seed; repeatable."),
+    apart: bool = typer.Option(False, "--side-by-side", help="Each recording in its own view."),
+    web: bool = typer.Option(False, "--web", help="Open in a local browser, not a window."),
     web_port: int = typer.Option(9090, help="Port of the page on 127.0.0.1.", min=1, max=65535),
-    save: Path | None = typer.Option(
-        None, help="Write what would be opened as one file, to hand on."
-    ),
-    as_json: bool = typer.Option(False, "--json", help="Print the list as one JSON object."),
+    save: Path | None = typer.Option(None, help="Write what would be opened as one file."),
+    as_json: bool = JSON,
 ) -> None:
     """Replay recorded paths in Rerun, several at once over each other; without any, list the
     recordings.
@@ -416,9 +390,7 @@ def _named(words: Sequence[str]) -> list[Path]:
 
 
 def _chosen(listed: "list[Listed]", wanted: "Filter") -> list[Path]:
-    """What is opened of the list: what was asked for, or what a person at the terminal chooses;
-    piped, nothing.
-    """
+    """What was asked for of the list, or what a person at the terminal chooses; piped, nothing."""
     from constraint_geodesics.recording.catalogue import as_table, by_words, one_of_each
 
     if wanted.one_problem:
@@ -440,7 +412,7 @@ def _chosen(listed: "list[Listed]", wanted: "Filter") -> list[Path]:
 @app.command("ui")
 def ui(
     port: int = typer.Option(5000, help="Port on 127.0.0.1.", min=1, max=65535),
-    as_json: bool = typer.Option(False, "--json", help="Print the address as one JSON object."),
+    as_json: bool = JSON,
 ) -> None:
     """Open MLflow's dashboard for this checkout, on this machine only; it runs until it is
     stopped.

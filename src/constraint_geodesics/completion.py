@@ -1,6 +1,4 @@
-"""What the shell proposes when Tab is pressed: names read from small files, without loading
-anything heavy.
-"""
+"""What the shell proposes when Tab is pressed, read from small files: nothing heavy is loaded."""
 
 import json
 import os
@@ -18,9 +16,7 @@ PACKAGED = Path(__file__).parent / "pretrained" / "planner.json"
 
 
 def planned_constraints(context: Any, parameter: Any, incomplete: str) -> list[Any]:
-    """Constraints that the planner knows by name: that of --planner, the pipeline's, or the
-    package's.
-    """
+    """Constraints that the planner knows: of --planner, the pipeline, or the package."""
     del parameter
     named = Path(str(context.params.get("planner") or "")) / "planner.json"
     card = next((file for file in (named, PIPELINE, PACKAGED) if file.is_file()), None)
@@ -70,9 +66,7 @@ def _items(names: Mapping[str, str], incomplete: str) -> list[CompletionItem]:
 
 
 def _typed(name: str) -> str:
-    """As it must stand on bash's line, which takes a proposal as it is; other shells quote it
-    themselves.
-    """
+    """As bash takes it, which quotes no proposal; other shells quote it themselves."""
     if os.environ.get("_GEODESICS_COMPLETE") != "complete_bash" or _inside_quotes():
         return name
     return re.sub(r"([^\w@%+=:,./-])", r"\\\1", name)
@@ -90,9 +84,7 @@ def _json(file: Path | None) -> Any:
 
 
 def _params() -> Any:
-    """params.yaml as it stands: a file with a mistake in it still has names to propose, if it is
-    YAML.
-    """
+    """params.yaml as it stands: one with a mistake in it still has names to propose."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 

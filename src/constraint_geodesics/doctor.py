@@ -57,9 +57,7 @@ COLOURS = {"ok": "\033[32m", "note": "\033[33m", "problem": "\033[31m"}
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check says.  A note is worth knowing and breaks nothing; only a problem makes the
-    exit code 1.
-    """
+    """One check's answer.  A note breaks nothing; only a problem makes the exit code 1."""
 
     check: str
     status: Status
@@ -133,9 +131,7 @@ def as_json(findings: Sequence[Finding]) -> str:
 
 
 def as_text(findings: Sequence[Finding], colours: Mapping[str, str] | None = None) -> str:
-    """One line a finding, the mend below it.  colours: a terminal's code for each status; by
-    default none.
-    """
+    """One line a finding, the mend below it.  colours: a terminal's code for each status."""
     width = 1 + max((len(finding.check) for finding in findings), default=0)
     lines = []
     for finding in findings:
@@ -290,9 +286,7 @@ def _same(version: str, wanted: str) -> bool:
 
 
 def check_torch(root: Path, here: Surroundings) -> Answers:
-    """Networks are trained on the processor, so that a build for a graphics card only takes
-    gigabytes.
-    """
+    """Networks are trained on the processor: a build for a graphics card only takes gigabytes."""
     version = here.installed.get("torch")
     if version is None:
         yield _note("not installed")
@@ -357,9 +351,7 @@ def _installed_from(here: Surroundings) -> Path | None:
 
 
 def _of_scripts(root: Path, here: Surroundings) -> Iterator[Answer]:
-    """The programs of an environment name their Python by its full path, which does not move with
-    them.
-    """
+    """The programs of an environment name their Python by its full path."""
     own = (root / ".venv").resolve()
     for prefix in dict.fromkeys((own, here.prefix.resolve())):
         if not (prefix / "pyvenv.cfg").is_file():
@@ -398,9 +390,7 @@ def _interpreter(script: Path) -> Path | None:
 
 
 def check_git(root: Path, here: Surroundings) -> Answers:
-    """DVC refuses to run outside of a git repository, and a run names the commit it was made
-    from.
-    """
+    """DVC refuses to run outside of a git repository, and a run names its commit."""
     if not _is_checkout(root):
         return ""
     git = shutil.which("git", path=here.environ.get("PATH"))
@@ -441,9 +431,7 @@ def check_disk(root: Path, here: Surroundings, least: int = LEAST_FREE) -> Answe
 
 
 def check_robot(root: Path, here: Surroundings) -> Answers:
-    """The URDFs that params.yaml and the planner's files name, found as the planner finds them, and
-    their meshes.
-    """
+    """The URDFs that params.yaml and the planner's files name, and their meshes."""
     data, counted = _on_path(here, "pybullet_data"), []
     pinned = _locked(root).get("pybullet")
     reinstall = "python -m pip install --force-reinstall --no-deps pybullet"
@@ -584,9 +572,7 @@ def _other_viewer(here: Surroundings, installed: str) -> Iterator[Answer]:
 
 
 def check_mlflow(root: Path, here: Surroundings) -> Answers:
-    """The address of the store, the schema of its database, and runs in a folder that the dashboard
-    does not show.
-    """
+    """The store's address, its database's schema, and runs in a folder that is not shown."""
     uri = here.environ.get("MLFLOW_TRACKING_URI") or "sqlite:///mlflow.db"
     files_allowed = here.environ.get("MLFLOW_ALLOW_FILE_STORE", "").lower() in ("true", "1")
     wrong, file = _wrong_address(uri, files_allowed), None
@@ -697,9 +683,7 @@ def _schemas(folder: Path) -> tuple[set[str], set[str]]:
 
 
 def check_pipeline(root: Path, here: Surroundings, longest_s: float = LONGEST_STATUS_S) -> Answers:
-    """What `dvc status` says: stages out of date, and those whose outputs are merely not here, as
-    in a fresh clone.
-    """
+    """Stages out of date, and those whose outputs are merely not here, as in a fresh clone."""
     if not (root / "dvc.yaml").is_file():
         return ""
     unseen = "the stages were not looked at"
@@ -729,9 +713,7 @@ def check_pipeline(root: Path, here: Surroundings, longest_s: float = LONGEST_ST
 
 
 def _of_stages(answer: Mapping[str, Sequence[Any]]) -> Iterator[Answer]:
-    """answer: for each stage that is not up to date what changed, as `dvc status --json` prints
-    it.
-    """
+    """answer: what changed of each stage that is not up to date (`dvc status --json`)."""
     outs = {name: _changes(entries, "changed outs") for name, entries in answer.items()}
     everything = {path: how for own in outs.values() for path, how in own.items()}
     absent = {path: how for path, how in everything.items() if how in ("deleted", "not in cache")}

@@ -36,9 +36,7 @@ class Listed:
     """Its place in the whole list, from 1."""
     constraint: str
     scene: str
-    """What stands round the robot, in the benchmark of all planners; its queries are others than
-    those without.
-    """
+    """What stands round the robot in the benchmark; its queries differ from those without."""
     planner: str
     """Or what was executed."""
     query: int | None
@@ -102,9 +100,7 @@ def catalogue(root: Path, read: Read) -> list[Listed]:
 
 
 def read_entry(file: Path) -> Listed:
-    """What a recording says of itself; a file that is no recording of one path says so instead of a
-    planner.
-    """
+    """What a recording says of itself; one that is not of one path says so as its planner."""
     import numpy as np
 
     from constraint_geodesics.recording.recording import RecordingError, read_recording
@@ -132,9 +128,7 @@ def _rows(layout: Layout) -> Iterator[Listed]:
 
 
 def _first_to_see(table: Path) -> tuple[bool, bool, str]:
-    """Before the paper's latent plane, whose paths do not keep the constraint, comes the manifold
-    that people use.
-    """
+    """The manifold that people use comes before the paper's plane, which keeps no constraint."""
     return table.name != "planner-level_cup.csv", not table.name.startswith("planner-"), table.name
 
 
@@ -207,9 +201,7 @@ def one_of_each(entries: Sequence[Listed], wanted: Filter) -> list[Listed]:
 
 
 def by_words(entries: Sequence[Listed], words: Sequence[str]) -> list[Listed]:
-    """The recordings of some numbers, as the list has them.  Raises CatalogueError for what is no
-    number of it.
-    """
+    """The recordings of some numbers.  Raises CatalogueError for what is no number of the list."""
     numbered = {str(entry.number): entry for entry in entries}
     for word in words:
         if word not in numbered:

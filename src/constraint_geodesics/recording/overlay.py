@@ -150,9 +150,7 @@ def overlaid(sources: Sequence[Opened]) -> Composed:
 
 
 def side_by_side(sources: Sequence[Opened]) -> Composed:
-    """Paths or executed paths, each in a view of its own.  Raises RecordingError for paths among
-    executed ones.
-    """
+    """Paths, or executed ones, each in its own view.  Raises RecordingError for a mix of both."""
     _of_one_kind(sources)
     parts = _parts(sources)
     own = [chunk for part in parts for chunk in _in_space(part, 1.0)]
@@ -230,9 +228,7 @@ def _parts(sources: Sequence[Opened]) -> list[_Part]:
 
 
 def labels_of(abouts: Sequence[About]) -> list[str]:
-    """The planner of each, with constraint, scene and query where they differ, and the seed where
-    that alone does.
-    """
+    """The planner of each; constraint, scene and query where they differ; else the seed."""
     labels = [about.planner or "path" for about in abouts]
     for what, words in (("constraint", "{}"), ("scene", "{}"), ("query", "query {}")):
         values = [getattr(about, what) for about in abouts]
@@ -288,9 +284,7 @@ def _in_space(part: _Part, opacity: float) -> Iterator[Chunk]:
 
 
 def _name(part: _Part, trace: Chunk) -> Any:
-    """The part's words on its trace, a place along it for each part, so that those of equal paths
-    do not meet.
-    """
+    """The part's name on its trace, at its own place, so that those of equal paths do not meet."""
     points = component(trace, "LineStrips3D:strips")[0][0]
     at, unseen = points[round(part.place * (len(points) - 1))], rr.Radius.ui_points(0.0)
     return rr.Points3D([at], colors=[part.colour], radii=[unseen], labels=[part.label])
@@ -392,9 +386,7 @@ def _series_chunks(parts: Sequence[_Part], series: Sequence[dict[str, _Lines]]) 
 def _own_lines(
     entity: str, lines: _Lines, label: str
 ) -> Iterator[tuple[str, list[str], np.ndarray]]:
-    """Where the lines of one recording go, what they are called, and their values without the
-    limits.
-    """
+    """Of one recording: where lines go, their names, and their values without the limits."""
     if entity == "joints":
         for k, joint in enumerate(lines.names):
             yield f"joint/{joint}", [label], lines.values[:, k : k + 1]
@@ -485,9 +477,7 @@ def _reach(parts: Sequence[_Part]) -> float:
 
 
 def _latent(parts: Sequence[_Part]) -> tuple[list[Chunk], Any]:
-    """The first sub-manifold that is shown, the curves of all recordings that show the same one,
-    and the view.
-    """
+    """The first sub-manifold shown, all curves on it, and the view."""
     of = {part.entity: _latent_chunks(part.source) for part in parts}
     shown = [part for part in parts if "submanifold" in of[part.entity]]
     if not shown:

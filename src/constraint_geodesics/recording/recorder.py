@@ -18,9 +18,7 @@ from constraint_geodesics.scene.shape import Shape
 
 PRINCIPAL = ("first principal axis", "second principal axis")
 GRID_POINTS = 80
-"""At most so many points a side of a latent grid in a recording: finer ones are larger and show
-nothing more.
-"""
+"""At most so many points a side of a latent grid: finer ones are larger and show no more."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +45,7 @@ class RowRecorder:
             record_path(file, path, self.manifold, self.workcell, frames=self.frames)
 
     def _latent_view(self, joints: Float[np.ndarray, "T D"]) -> LatentView:
-        """The sub-manifold and the encoded path: the latent plane itself, or its first two
-        principal axes.
-        """
+        """The sub-manifold and the encoded path in the latent plane, or in two principal axes."""
         curve, submanifold = self.learned.encode(joints), self.submanifold
         if isinstance(submanifold, GridSubmanifold):
             stride = math.ceil(len(submanifold.first_axis) / GRID_POINTS)

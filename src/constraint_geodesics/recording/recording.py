@@ -202,9 +202,7 @@ def text_chunks(text: str) -> list[Chunk]:
 
 
 def digest(sampled: Frames) -> str:
-    """Of the joints: recordings of equal paths have equal ids, and the viewer takes no two others
-    for one.
-    """
+    """Of the joints: equal paths have equal ids, and the viewer takes no others for one."""
     return hashlib.sha256(np.ascontiguousarray(sampled.joints).tobytes()).hexdigest()[:8]
 
 
@@ -217,9 +215,7 @@ def about_chunk(about: About) -> Chunk:
 def write_recording(
     file: Path, recording_id: str, name: str, chunks: Sequence[Chunk], blueprint: Any = None
 ) -> None:
-    """Write chunks, and a blueprint where there is one, as one recording; without a name it is a
-    part of another.
-    """
+    """Write chunks and a blueprint as one recording; without a name it is a part of another."""
     file.parent.mkdir(parents=True, exist_ok=True)
     # the properties would hold the time of writing
     stream = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
@@ -290,9 +286,7 @@ def same_recordings(a: Path, b: Path) -> bool:
 
 
 def sample(path: PathRecord, manifold: ConstraintManifold, frames: int) -> Frames:
-    """The path at points of equal joint arc length.  Raises RecordingError if it is not one of the
-    robot.
-    """
+    """The path at points of equal joint length.  Raises RecordingError if it is not the robot's."""
     joints = np.asarray(path.joints, dtype=float)
     name, dof, shape = path.name, manifold.robot.dof, joints.shape
     if joints.ndim != 2 or len(joints) < 2 or shape[1] != dof:
@@ -427,9 +421,7 @@ def _ends(points: np.ndarray) -> tuple[tuple[str, np.ndarray, tuple[int, int, in
 
 
 def _residuals(manifold: ConstraintManifold, joints: np.ndarray) -> list[_Series]:
-    """Held positions each by itself [mm]; held angles that share one tolerance together, as the
-    constraint does.
-    """
+    """Held positions each by itself [mm]; held angles of one tolerance together."""
     residual, tolerance = manifold.residual(joints), manifold.tolerance
     series = [
         _Series(AXES[i], "mm", 1e3 * abs(residual[:, i]), 1e3 * tolerance[i])
@@ -467,9 +459,7 @@ def _series_chunks(series: Sequence[_Series], sampled: Frames) -> Iterator[Chunk
 
 
 def joint_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
-    """Joint positions as series, [rad or m] with the limits beside them, and as shares of each
-    joint's range.
-    """
+    """Joint positions [rad or m] with their limits, and as shares of each joint's range."""
     own, names = colours(np.arange(robot.dof)), list(robot.joint_names)
     yield static("joints", rr.SeriesLines(names=names, colors=own))
     yield static("joints", rr.AnyValues(lower=robot.lower.tolist(), upper=robot.upper.tolist()))
@@ -572,9 +562,7 @@ def time_panel(**how: Any) -> Any:
 
 
 def arranged(scene: Any, right: Any, time: Any) -> Any:
-    """The blueprint of a recording: the scene with the status below it, the other panels to its
-    right.
-    """
+    """A blueprint: the scene, the status below it, the other panels to its right."""
     left = rrb.Vertical(scene, status_panel(), row_shares=[3.0, 1.0])
     return blueprint(rrb.Horizontal(left, right, column_shares=[3.0, 2.0]), time)
 

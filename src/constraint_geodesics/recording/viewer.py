@@ -1,6 +1,4 @@
-"""Rerun's viewer: recordings shown in a window or in a browser on this machine, or put together in
-one file.
-"""
+"""Rerun's viewer: recordings shown in a window or a local browser, or put together in one file."""
 
 import contextlib
 import os

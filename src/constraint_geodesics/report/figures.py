@@ -38,9 +38,7 @@ from constraint_geodesics.palette import VERMILION as VERMILION
 from constraint_geodesics.recording.png import save_png as save_png
 
 COMPONENTS = (SKY, PURPLE, BLUE, YELLOW, GREEN)
-"""Colours of a sub-manifold's components, the largest first; the smaller ones behind them share
-one.
-"""
+"""Colours of a sub-manifold's components, the largest first; the smaller ones share REST."""
 REST = "#6B6B6B"
 NEAR = LinearSegmentedColormap.from_list("near", ["#9AA3AB", "#FFFFFF"])
 REFERENCE: dict[str, Any] = {"color": BLACK, "lw": 0.8, "ls": ":"}
@@ -48,14 +46,10 @@ REFERENCE: dict[str, Any] = {"color": BLACK, "lw": 0.8, "ls": ":"}
 SHARE = PercentFormatter(1.0, decimals=0)
 
 ELEVATION, TUBE_ANGLE, HALF_WIDTH = np.pi / 6, np.pi / 6, np.radians(4.0)
-"""Fig. 2: the level sets drawn on the sphere and the torus, and the tolerance they are held within
-[rad].
-"""
+"""Fig. 2: the level sets on the sphere and the torus, held within a tolerance [rad]."""
 
 VIEW = (np.radians(24.0), np.radians(-58.0))
-"""Elevation and azimuth that Fig. 2's surfaces are seen from: both circles of the torus must show
-[rad].
-"""
+"""Elevation and azimuth of Fig. 2 [rad]: both circles of the torus must show."""
 
 RAYS, RAY_REACH, RAY_STEPS = 64, 4.0, 65
 """Directions, reach in data radii and points of the rays that a metric is followed along."""
@@ -107,9 +101,7 @@ class LatentCurves(NamedTuple):
 
 
 def analytic_submanifolds() -> Figure:
-    """Fig. 2: the sphere with one level set of its elevation, the torus with one of the angle
-    around its tube.
-    """
+    """Fig. 2: the sphere with a level set of elevation, the torus with one of the tube's angle."""
     sphere, torus = Sphere(), Torus()
     around, along = np.linspace(-np.pi, np.pi, 121), np.linspace(-np.pi / 2, np.pi / 2, 61)
     figure = Figure(figsize=(7.6, 5.6), layout="constrained")
@@ -123,9 +115,7 @@ def analytic_submanifolds() -> Figure:
 
 
 def plane_search(sampled: Float[np.ndarray, "n T 2"], learned: Float[np.ndarray, "T 2"]) -> Figure:
-    """Fig. 3: curves met by policy search in the plane, the learned one, and the line it should
-    find.
-    """
+    """Fig. 3: curves met by policy search in the plane, the learned one, and the exact line."""
     figure, axes = _single(6.0, 4.2)
     _strips(axes, sampled, colors=GREY, linewidths=0.6, alpha=0.4, label="sampled paths")
     ends = learned[[0, -1]]
@@ -183,9 +173,7 @@ def submanifolds_in_plane(
 
 
 def geodesics_in_plane(panels: Mapping[str, tuple[GridSubmanifold, LatentCurves]]) -> Figure:
-    """Fig. 4c: the geodesic that each seed found for one query, and the straight line, on the
-    sub-manifold.
-    """
+    """Fig. 4c: the geodesic of each seed for one query, and the straight line."""
     figure, grid = _panels(len(panels), (4.6, 4.6), columns=len(panels))
     straight, learned = PLANNERS["straight_latent_line"], PLANNERS["learned_geodesic"]
     for axes, (name, (plane, curves)) in zip(grid, panels.items(), strict=True):
@@ -229,9 +217,7 @@ def components_in_principal_axes(
 
 
 class MetricFigures(NamedTuple):
-    """Of a metric M = JμᵀJμ + JσᵀJσ at points (*batch): √det M, tr M, and the part of tr M that σ
-    adds.
-    """
+    """Of M = JμᵀJμ + JσᵀJσ at points (*batch): √det M, tr M, and the part of tr M from σ."""
 
     volume: Float[np.ndarray, "*batch"]
     trace: Float[np.ndarray, "*batch"]
@@ -266,9 +252,7 @@ class MetricGrowth(NamedTuple):
 
 
 def follow_rays(chart: LearnedManifold, data: Float[np.ndarray, "n N"]) -> MetricGrowth:
-    """The metric from the middle of the encoded training configurations `data` to far beyond
-    them.
-    """
+    """The metric from the middle of the encoded configurations `data` to far beyond them."""
     centre = data.mean(axis=0)
     radius = np.quantile(np.linalg.norm(data - centre, axis=1), 0.95)
     directions = np.random.default_rng(0).normal(size=(RAYS, chart.dim))

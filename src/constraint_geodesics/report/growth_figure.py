@@ -1,6 +1,4 @@
-"""How cost grows: a figure with a panel an axis, in log-log, with the exponents in its legends, and
-a table of the exponents.
-"""
+"""How cost grows: a figure with a log-log panel an axis, and a table of the exponents."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,9 +15,7 @@ from constraint_geodesics.report.results import fixed, markdown_table
 
 COLUMNS = 3
 FAMILIES = (("planner", ORANGE), ("band and trees", ORANGE), ("straight", GREEN), ("BiRRT", BLUE))
-"""How the names of a family begin, and its colour, as in the benchmark's figures; others take the
-next of OTHERS.
-"""
+"""How a family's names begin, and its colour; others take the next of OTHERS."""
 OTHERS = (VERMILION, PURPLE, BLACK)
 DASHES = ("-", "--", ":", "-.")
 """Tell members of one family apart."""

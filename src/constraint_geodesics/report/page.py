@@ -112,9 +112,7 @@ class Picture(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A part of a page: its anchor and title, what comes first, its figures, and tables, some of
-    them folded.
-    """
+    """A part of a page: anchor, title, text, figures, and tables, some of them folded."""
 
     name: str
     title: str

@@ -1,6 +1,4 @@
-"""The figures of a run's report with their titles and captions, from the stages' tables, metrics
-and data.
-"""
+"""The figures of a run's report with titles and captions, from its tables, metrics and data."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -26,6 +24,7 @@ from constraint_geodesics.report import figures
 from constraint_geodesics.report.figures import LatentCurves
 from constraint_geodesics.report.results import (
     LEARNED,
+    metrics_of,
     read_metrics,
     read_paths,
     searched_items,
@@ -41,9 +40,7 @@ CURVE_POINTS = 101
 
 
 class Drawn(NamedTuple):
-    """A figure of the report: its file's name, what it shows, how to read it, and what is said
-    where it isn't seen.
-    """
+    """A figure of the report: file's name, title, how to read it; alt: said where it isn't seen."""
 
     name: str
     title: str
@@ -137,9 +134,7 @@ def _draw_ablation(params: Params, layout: Layout) -> list[Drawn]:
         ablated = read_metrics(layout.report("ablate_analytic", name))
         searched[name] = {"corrected_reward": own, **_ratios(ablated["policy_search"])}
         reached[name] = _ratios(ablated["gradient"])
-    learned = {
-        name: read_metrics(layout.report("ablate_manifold", name)) for name in params.manifolds
-    }
+    learned = metrics_of(layout, "ablate_manifold", params.manifolds)
     excess = "; ".join(
         f"{name}: {np.mean(ratios['corrected_reward']) - 1:.2%} against "
         f"{np.mean(ratios['printed_reward']) - 1:.2%}"

@@ -33,7 +33,7 @@ from constraint_geodesics.report.results import (
     compare_planners,
     findings,
     geometry_table,
-    read_metrics,
+    metrics_of,
     result_table,
     studies_at_hand,
 )
@@ -81,9 +81,7 @@ def save_figure(layout: Layout, entry: Drawn) -> Picture:
 
 def page_content(params: Params, layout: Layout, table: pd.DataFrame) -> dict[str, Any]:
     """What the page says besides its figures."""
-    metrics = {
-        name: read_metrics(layout.report("train_manifold", name)) for name in params.manifolds
-    }
+    metrics = metrics_of(layout, "train_manifold", params.manifolds)
     compared = params.geodesics.illustrated_constraints[:1]
     studies = studies_at_hand(params, layout)
     plans = plan_blocks(params, layout) if "plans" in studies else []

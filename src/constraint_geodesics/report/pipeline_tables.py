@@ -1,6 +1,4 @@
-"""The tables of a run's report as texts: results beside the paper's, the stages' metrics,
-ablations, the data card.
-"""
+"""The tables of a run's page: results and the paper's, metrics, ablations, the data card."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
@@ -18,6 +16,7 @@ from constraint_geodesics.report.results import (
     COUNTED,
     LEARNED,
     fixed,
+    metrics_of,
     plus_minus,
     read_comparison,
     read_metrics,
@@ -38,9 +37,7 @@ PUBLISHED = {
 
 
 def published_table(params: Params, layout: Layout, table: pd.DataFrame, constraint: str) -> Table:
-    """Table I of the paper beside its counterparts of this run; `×` is the average over the learned
-    geodesic's.
-    """
+    """Table I of the paper and this run's; `×` is the average over the learned geodesic's."""
     manifolds = [m for m, c in searched_items(params) if c == constraint]
     manifolds.sort(key=lambda name: params.manifolds[name].latent_dim)
     header = ["method", "shortest", "average ± std", "×", "time [s]"]
@@ -143,10 +140,7 @@ def metric_tables(
 ) -> list[Table]:
     """The other stages' metrics, one row an item."""
     extracted = product(params.manifolds, params.constraints)
-    analytic = {
-        str(name): read_metrics(layout.report("train_analytic", name))
-        for name in params.geodesics.analytic
-    }
+    analytic = metrics_of(layout, "train_analytic", params.geodesics.analytic)
     known = "Policy search where the answer is known (length over exact distance, a seed each)"
     named: tuple[tuple[str, str, Mapping[str, Mapping[str, Any]]], ...] = (
         ("train_manifold", "Learned manifolds, on held-out configurations", manifolds),
@@ -226,12 +220,8 @@ WITH_VARIANCE = {
 
 
 def ablation_tables(params: Params, layout: Layout) -> list[Table]:
-    """What each choice is worth: the reward, the family of curves, and the variance term of eq.
-    5.
-    """
-    learned = {
-        name: read_metrics(layout.report("ablate_manifold", name)) for name in params.manifolds
-    }
+    """What each choice is worth: the reward, the family of curves, the variance term of eq. 5."""
+    learned = metrics_of(layout, "ablate_manifold", params.manifolds)
     searched = [_searched_table(params, layout)] if params.geodesics.analytic else []
     return [*searched, _variance_table(learned), _families_table(learned)]
 
@@ -316,7 +306,7 @@ def data_card_table(params: Params, layout: Layout) -> Table:
         "workcell_collision": "touch the workcell",
         "free": "touch nothing",
     }
-    cards = {name: read_metrics(layout.report("label_joints", name)) for name in params.constraints}
+    cards = metrics_of(layout, "label_joints", params.constraints)
     rows = []
     for name, card in cards.items():
         counts = [f"{card[key]:,}" for key in ("rows", "drawn")]

@@ -5,7 +5,7 @@ lies in a folder.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -111,6 +111,11 @@ def read_metrics(file: Path) -> dict[str, Any]:
     except json.JSONDecodeError as error:
         raise ReportError(f"{file}: not JSON: {error}") from None
     return content
+
+
+def metrics_of(layout: Layout, stage: str, names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """The metrics of some items of a stage, by their names."""
+    return {str(name): read_metrics(layout.report(stage, name)) for name in names}
 
 
 def result_table(layout: Layout) -> str:
@@ -252,9 +257,7 @@ def _by_planner(rows: pd.DataFrame, column: str) -> str:
 
 
 def _shortest_under(rows: pd.DataFrame) -> str:
-    """Under which constraints the learned geodesic is the shortest, in the mean over the common
-    queries.
-    """
+    """Where the learned geodesic is the shortest, in the mean over the common queries."""
     comparable = rows[~rows["planner"].isin(BESIDE)].dropna(subset=["latent_mean"])
     shortest = comparable.loc[comparable.groupby("constraint", sort=False)["latent_mean"].idxmin()]
     won = shortest.loc[shortest["planner"] == LEARNED, "constraint"].tolist()
@@ -309,9 +312,7 @@ def plus_minus(mean: float, deviation: float, number: Callable[[float], str]) ->
 
 
 def markdown_table(rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table, its header first; columns are aligned, so that it reads in a terminal
-    too.
-    """
+    """A Markdown table, its header first, aligned, so that it reads in a terminal too."""
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
 
     def line(cells: Sequence[str]) -> str:  # names to the left, figures to the right
