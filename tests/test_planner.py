@@ -529,9 +529,9 @@ def test_a_constraint_never_seen_gets_its_graph_when_it_is_needed(small) -> None
         assert world.free(nodes).all()
     small.prepare(never)
     assert small.nodes(never) is nodes, "kept"
-    paths = [small.plan(nodes[k], nodes[k + 1], never, parts=ONLY_GRAPH) for k in range(16)]
+    paths = [small.plan(nodes[k], nodes[k + 1], never, parts=ONLY_GRAPH) for k in range(40)]
     found = [path for path in paths if path.status == "solved"]
-    assert len(found) >= 4
+    assert len(found) >= 10
     for path in found:
         assert path.source == "graph"
         assert path.violation_bound_rad <= 1e-4
