@@ -41,11 +41,11 @@ def manifold_of(planner: Planner, name: str) -> ConstraintManifold:
 
 @cache
 def nodes_of(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes of a graph, on the constraint to rounding, free and within the limits, and their
-    components.
+    """Configurations on the constraint to rounding, free and within the limits, and their
+    components; none is a node of the planner's own roadmap.
     """
     planner = packaged_planner()
-    roadmap = planner.bundle.roadmaps[name]
+    roadmap = packaged_learned().submanifolds[name]
     joints = retract(manifold_of(planner, name), roadmap.joints[:300]).joints
     with planner.scene.world() as world:
         kept = world.free(joints) & (planner.scene.robot.limit_distance(joints) > 0.01)
