@@ -19,7 +19,6 @@ import numpy as np
 import pandas as pd
 import torch
 from jaxtyping import Float, Int
-from scipy.stats import linregress
 
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
@@ -259,9 +258,9 @@ def _line(x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"]) -> tuple[float, 
     """Slope of a least-squares line, its standard error, and exp of the intercept."""
     if len(np.unique(x)) < 2:
         return np.nan, np.nan, np.nan
-    found = linregress(x, y)
-    error = float(found.stderr) if len(x) > 2 else np.nan
-    return float(found.slope), error, float(np.exp(found.intercept))
+    slope, intercept = np.polyfit(x, y, 1)
+    error = np.sqrt(np.polyfit(x, y, 1, cov=True)[1][0, 0]) if len(x) > 2 else np.nan
+    return float(slope), float(error), float(np.exp(intercept))
 
 
 def epoch_seconds(
