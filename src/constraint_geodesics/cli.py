@@ -268,13 +268,13 @@ def check(
 
 KERNELS = (
     "robot/kernels",
-    "robot/clearance",
+    "scene/clearance",
     "constraints/kernels",
     "certification/kernels",
     "geometry/timing",
-    "geodesics/band_kernels",
+    "search/band_kernels",
 )
-"""Modules that numba compiles before the first path; their code is kept beside them, until they
+"""Modules that numba compiles before the first path; their code is kept next to them, until they
 change.
 """
 
