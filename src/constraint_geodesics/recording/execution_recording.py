@@ -18,29 +18,8 @@ from rerun.chunk import Chunk
 from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.palette import BLUE, SKY, VERMILION, planner_colour
-from constraint_geodesics.recording.recording import (
-    About,
-    Frames,
-    RecordingError,
-    about_chunk,
-    arranged,
-    colours,
-    digest,
-    joint_chunks,
-    joint_panel,
-    moving,
-    rgb,
-    scalars,
-    scene_chunks,
-    scene_panel,
-    series_view,
-    space_view,
-    static,
-    text_chunks,
-    time_panel,
-    tool_chunks,
-    write_recording,
-)
+from constraint_geodesics.recording import recording
+from constraint_geodesics.recording.recording import About, Frames, RecordingError, moving, static
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.studies.cup import CupSettings, Execution
@@ -50,7 +29,7 @@ TIME = "time"
 
 _EYE_M = (0.25, -0.25, 0.15)
 """From where the cup is looked at, seen from its centre."""
-_CUP, _TILT, _KEPT = (*rgb(SKY), 60), rgb(VERMILION), rgb(BLUE)
+_CUP, _TILT, _KEPT = (*recording.rgb(SKY), 60), recording.rgb(VERMILION), recording.rgb(BLUE)
 
 
 @dataclass(frozen=True)
@@ -90,18 +69,20 @@ def record_execution(
     time = rr.TimeColumn(TIME, duration=execution.times)
     frames = Frames(execution.joints, robot.forward(execution.joints)[0], None, time)
     chunks = [
-        *scene_chunks(robot, workcell, frames, meshes=meshes),
-        *tool_chunks(frames, rgb(planner_colour(record.kind))),
+        *recording.scene_chunks(robot, workcell, frames, meshes=meshes),
+        *recording.tool_chunks(frames, recording.rgb(planner_colour(record.kind))),
         *_cup_chunks(execution, cup, time),
         *_sphere_chunks(execution, cup, time),
         *_series_chunks(execution, cup, time),
-        *joint_chunks(robot, frames),
-        about_chunk(About(record.kind, record.constraint, query=record.query, executed=True)),
-        *text_chunks(_status(record)),
+        *recording.joint_chunks(robot, frames),
+        recording.about_chunk(
+            About(record.kind, record.constraint, query=record.query, executed=True)
+        ),
+        *recording.text_chunks(_status(record)),
     ]
     name = f"{record.constraint}, query {record.query}: {record.kind}, executed"
-    own = f"{record.constraint}-{record.name}-executed-{digest(frames)}"
-    write_recording(file, own, name, chunks, _blueprint(frames, execution.spheres))
+    own = f"{record.constraint}-{record.name}-executed-{recording.digest(frames)}"
+    recording.write_recording(file, own, name, chunks, _blueprint(frames, execution.spheres))
 
 
 def record_executions(
@@ -171,7 +152,7 @@ def _cup_chunks(execution: Execution, cup: CupSettings, time: rr.TimeColumn) -> 
 
 
 def _sphere_chunks(execution: Execution, cup: CupSettings, time: rr.TimeColumn) -> Iterator[Chunk]:
-    own = colours(np.arange(execution.spheres))
+    own = recording.colours(np.arange(execution.spheres))
     yield static("spheres", rr.Points3D.from_fields(colors=own, radii=[cup.sphere_radius_m]))
     columns = rr.Points3D.columns(positions=execution.sphere_positions.reshape(-1, 3))
     yield moving("spheres", columns.partition([execution.spheres] * len(execution.times)), time)
@@ -183,7 +164,7 @@ def _series_chunks(execution: Execution, cup: CupSettings, time: rr.TimeColumn) 
         ("cup_spheres", "spheres", _KEPT, in_cup(execution, cup)),
     ):
         yield static(entity, rr.SeriesLines(names=[name], colors=[colour], widths=[2.0]))
-        yield scalars(entity, values, time)
+        yield recording.scalars(entity, values, time)
 
 
 def _status(record: ExecutionRecord) -> str:
@@ -202,19 +183,23 @@ def _blueprint(frames: Frames, spheres: int) -> Any:
     # it follows the cup but does not turn with it; the arm is left out, it would often hide the cup
     follow = rrb.SpatialInformation(target_frame="tf#/cup")
     shown = ("workcell", "cup", "spheres")
-    cup = space_view("Cup", shown, _EYE_M, (0.0, 0.0, 0.0), spatial_information=follow)
-    right = rrb.Vertical(cup, *cup_panels(spheres), joint_panel(), row_shares=[2.5, 1.0, 1.0, 1.5])
-    return arranged(scene_panel(frames, "cup", "spheres"), right, execution_time())
+    cup = recording.space_view("Cup", shown, _EYE_M, (0.0, 0.0, 0.0), spatial_information=follow)
+    right = rrb.Vertical(
+        cup, *cup_panels(spheres), recording.joint_panel(), row_shares=[2.5, 1.0, 1.0, 1.5]
+    )
+    return recording.arranged(
+        recording.scene_panel(frames, "cup", "spheres"), right, execution_time()
+    )
 
 
 def cup_panels(spheres: float) -> list[Any]:
     """The cup's tilt, and how many of its spheres are still in it."""
     return [
-        series_view("cup_tilt", "Tilt of the cup [deg]", (0.0, 180.0)),
-        series_view("cup_spheres", "Spheres in the cup", (0.0, 1.1 * spheres)),
+        recording.series_view("cup_tilt", "Tilt of the cup [deg]", (0.0, 180.0)),
+        recording.series_view("cup_spheres", "Spheres in the cup", (0.0, 1.1 * spheres)),
     ]
 
 
 def execution_time() -> Any:
     """The time panel of executions: they play as fast as they were executed."""
-    return time_panel(timeline=TIME, playback_speed=1.0)
+    return recording.time_panel(timeline=TIME, playback_speed=1.0)

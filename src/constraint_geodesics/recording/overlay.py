@@ -21,31 +21,9 @@ from jaxtyping import Float
 from rerun.chunk import Chunk
 
 from constraint_geodesics.palette import planner_colour
+from constraint_geodesics.recording import recording
 from constraint_geodesics.recording.execution_recording import TIME, cup_panels, execution_time
-from constraint_geodesics.recording.recording import (
-    LIMIT,
-    ROOT_FRAME,
-    About,
-    RecordingError,
-    about_of,
-    arranged,
-    blueprint,
-    component,
-    has,
-    latent_view_of,
-    mesh_chunks,
-    path_time,
-    range_panel,
-    read_chunks,
-    residual_panel,
-    rgb,
-    scalars,
-    scene_view,
-    static,
-    status_panel,
-    text_chunks,
-    violation_panel,
-)
+from constraint_geodesics.recording.recording import About, RecordingError, static
 from constraint_geodesics.scene.urdf import find_urdf
 
 OTHERS_OPACITY = 0.45
@@ -106,9 +84,9 @@ def opened(file: Path) -> Opened:
     Raises RecordingError if it is not a recording or a mesh is missing, and RobotError if a URDF
     is.
     """
-    stored, chunks, _ = read_chunks(file)
+    stored, chunks, _ = recording.read_chunks(file)
     added = _missing_meshes(chunks)
-    about = about_of(stored.recording_id, chunks)
+    about = recording.about_of(stored.recording_id, chunks)
     return Opened(file, stored.recording_id, about, (*chunks, *added), tuple(added))
 
 
@@ -117,10 +95,12 @@ def _missing_meshes(chunks: Sequence[Chunk]) -> list[Chunk]:
     added = []
     for chunk in chunks:
         entity = chunk.entity_path
-        if has(chunk, "urdf") and not any(path.startswith(f"{entity}/") for path in drawn):
+        if recording.has(chunk, "urdf") and not any(
+            path.startswith(f"{entity}/") for path in drawn
+        ):
             row = chunk.to_record_batch().to_pylist()[0]
             urdf, prefix = find_urdf(row["urdf"][0]), row.get("frame_prefix", [None])[0]
-            added += mesh_chunks(urdf, entity, prefix)
+            added += recording.mesh_chunks(urdf, entity, prefix)
     return added
 
 
@@ -185,7 +165,7 @@ def _surroundings(source: Opened) -> dict[tuple[str, ...], Any]:
     bodies = [chunk for chunk in source.chunks if _is_surroundings(chunk)]
     found = {}
     for chunk in bodies:
-        if not has(chunk, "Asset3D:", "urdf"):
+        if not recording.has(chunk, "Asset3D:", "urdf"):
             names = _components(chunk)
             rows = chunk.to_record_batch().select(names).to_pylist()
             found[chunk.entity_path, *names] = rows
@@ -209,7 +189,7 @@ def _ends_once(chunks: Sequence[Chunk]) -> list[Chunk]:
     kept, seen = [], []
     for chunk in chunks:
         marks = chunk.entity_path.endswith(("/tool/start", "/tool/goal"))
-        row = component(chunk, "Points3D:positions") if marks else None
+        row = recording.component(chunk, "Points3D:positions") if marks else None
         if row is None or row not in seen:
             kept.append(chunk)
             seen += [] if row is None else [row]
@@ -257,7 +237,7 @@ def shades(colours: Sequence[str]) -> list[Colour]:
     found = []
     for colour in colours:
         white = 1.0 - 0.6 ** seen[colour]
-        red, green, blue = (round(value + white * (255 - value)) for value in rgb(colour))
+        red, green, blue = (round(value + white * (255 - value)) for value in recording.rgb(colour))
         found.append((red, green, blue))
         seen[colour] += 1
     return found
@@ -270,7 +250,7 @@ def _in_space(part: _Part, opacity: float) -> Iterator[Chunk]:
         if path.split("/")[1] not in _IN_SPACE:
             continue
         moved = _with_frames(chunk, f"{part.entity}/").with_entity_path(f"/{part.entity}{path}")
-        if has(chunk, "Asset3D:blob") and path.startswith("/robot/"):
+        if recording.has(chunk, "Asset3D:blob") and path.startswith("/robot/"):
             factor = (*part.colour, round(255 * opacity))
             own = rr.Asset3D.from_fields(albedo_factor=factor)
             yield from _changed(moved, "Asset3D:albedo_factor", own)
@@ -285,7 +265,7 @@ def _in_space(part: _Part, opacity: float) -> Iterator[Chunk]:
 
 def _name(part: _Part, trace: Chunk) -> Any:
     """The part's name on its trace, at its own place, so that those of equal paths do not meet."""
-    points = component(trace, "LineStrips3D:strips")[0][0]
+    points = recording.component(trace, "LineStrips3D:strips")[0][0]
     at, unseen = points[round(part.place * (len(points) - 1))], rr.Radius.ui_points(0.0)
     return rr.Points3D([at], colors=[part.colour], radii=[unseen], labels=[part.label])
 
@@ -296,7 +276,10 @@ def _with_frames(chunk: Chunk, prefix: str) -> Chunk:
     for name in ("CoordinateFrame:frame", "Transform3D:child_frame", "Transform3D:parent_frame"):
         if name in batch.schema.names:
             rows = [
-                [frame if frame.startswith(ROOT_FRAME) else prefix + frame for frame in row]
+                [
+                    frame if frame.startswith(recording.ROOT_FRAME) else prefix + frame
+                    for frame in row
+                ]
                 for row in batch.column(name).to_pylist()
             ]
             at = batch.schema.get_field_index(name)
@@ -325,12 +308,12 @@ def _composed(parts: Sequence[_Part], in_space: Sequence[Chunk], *, apart: bool)
     latent, latent_view = _latent(parts)
     panels = ([] if latent_view is None else [latent_view]) + _panels(series)
     texts = [
-        component(chunk, "TextDocument:text")[0][0]
+        recording.component(chunk, "TextDocument:text")[0][0]
         for part in parts
         for chunk in part.source.chunks
         if chunk.entity_path == "/status"
     ]
-    own = [*_series_chunks(parts, series), *latent, *text_chunks("\n\n".join(texts))]
+    own = [*_series_chunks(parts, series), *latent, *recording.text_chunks("\n\n".join(texts))]
     ids = " ".join([part.source.recording_id for part in parts] + [str(apart)])
     name = f"{', '.join(part.label for part in parts)}: {parts[0].source.about.constraint}"
     return Composed(
@@ -346,10 +329,10 @@ def _series_of(chunks: Sequence[Chunk]) -> dict[str, _Lines]:
     for chunk in chunks:
         # Rerun escapes spaces and the like
         entity = re.sub(r"\\(.)", r"\1", chunk.entity_path.strip("/"))
-        if has(chunk, "SeriesLines:names"):
-            names[entity] = component(chunk, "SeriesLines:names")[0]
-        elif has(chunk, "Scalars:scalars"):
-            rows = np.array(component(chunk, "Scalars:scalars"), dtype=float)
+        if recording.has(chunk, "SeriesLines:names"):
+            names[entity] = recording.component(chunk, "SeriesLines:names")[0]
+        elif recording.has(chunk, "Scalars:scalars"):
+            rows = np.array(recording.component(chunk, "Scalars:scalars"), dtype=float)
             values[entity] = (rows, _time(chunk))
     found = names.keys() & values.keys()
     return {entity: _Lines(names[entity], *values[entity]) for entity in found}
@@ -357,7 +340,7 @@ def _series_of(chunks: Sequence[Chunk]) -> dict[str, _Lines]:
 
 def _time(chunk: Chunk) -> rr.TimeColumn:
     (timeline,) = chunk.timeline_names
-    times = component(chunk, timeline)
+    times = recording.component(chunk, timeline)
     how = {"duration": times} if timeline == TIME else {"sequence": times}
     return rr.TimeColumn(timeline, **how)
 
@@ -380,7 +363,7 @@ def _series_chunks(parts: Sequence[_Part], series: Sequence[dict[str, _Lines]]) 
                     level = np.full((len(lines.values), 1), value)
                     limits[shown] = _Lines([f"{name}{what}"], level, lines.time)
     for shown, lines in limits.items():
-        yield from _lines(shown, LIMIT, lines, width=1.0)
+        yield from _lines(shown, recording.LIMIT, lines, width=1.0)
 
 
 def _own_lines(
@@ -403,7 +386,7 @@ def _limits(
     """The limits that belong to some lines: where each goes, what it is called, and its value."""
     if entity == "joints":
         for chunk in chunks:
-            if chunk.entity_path == "/joints" and has(chunk, "lower"):
+            if chunk.entity_path == "/joints" and recording.has(chunk, "lower"):
                 row = chunk.to_record_batch().to_pylist()[0]
                 for side in ("lower", "upper"):
                     for joint, value in zip(lines.names, row[side], strict=True):
@@ -420,7 +403,7 @@ def _lines(entity: str, colour: Colour, lines: _Lines, width: float = 2.0) -> It
     entity = str(rr.new_entity_path(entity.split("/")))
     style = {"colors": [colour] * count, "widths": [width] * count}
     yield static(entity, rr.SeriesLines(names=list(lines.names), **style))
-    yield scalars(entity, lines.values, lines.time)
+    yield recording.scalars(entity, lines.values, lines.time)
 
 
 def _panels(series: Sequence[dict[str, _Lines]]) -> list[Any]:
@@ -435,40 +418,42 @@ def _panels(series: Sequence[dict[str, _Lines]]) -> list[Any]:
         return max((float(lines.values.max()) for lines in own), default=None)
 
     tops = {unit: top(f"constraint/{unit}/") for unit in ("deg", "mm")}
-    panels = [residual_panel(unit, most) for unit, most in tops.items() if most is not None]
-    panels += [violation_panel(legend=not panels)] if "violation" in found else []
+    panels = [
+        recording.residual_panel(unit, most) for unit, most in tops.items() if most is not None
+    ]
+    panels += [recording.violation_panel(legend=not panels)] if "violation" in found else []
     if (spheres := top("cup_spheres")) is not None:
         panels += cup_panels(spheres)
     joints = sorted({joint for lines in found["joints"] for joint in lines.names})
     single = [
         rrb.TimeSeriesView(origin=f"joint/{joint}", name=f"{joint} [rad or m]") for joint in joints
     ]
-    together = [range_panel(legend=False)] if "joint_range" in found else []
+    together = [recording.range_panel(legend=False)] if "joint_range" in found else []
     return [*panels, rrb.Tabs(*together, *single, active_tab=0)]
 
 
 def _over(parts: Sequence[_Part], panels: Sequence[Any]) -> Any:
     entities = ["workcell", "transforms", *(part.entity for part in parts)]
     shares = [2.0 if isinstance(panel, rrb.Spatial2DView) else 1.0 for panel in panels[:-1]] + [1.3]
-    scene = scene_view("Robots", entities, _reach(parts))
-    return arranged(scene, rrb.Vertical(*panels, row_shares=shares), _clock(parts))
+    scene = recording.scene_view("Robots", entities, _reach(parts))
+    return recording.arranged(scene, rrb.Vertical(*panels, row_shares=shares), _clock(parts))
 
 
 def _side_by_side(parts: Sequence[_Part], panels: Sequence[Any]) -> Any:
     reach = _reach(parts)
-    scenes = rrb.Grid(*(scene_view(part.label, [part.entity], reach) for part in parts))
-    below = rrb.Horizontal(status_panel(), *panels)
-    return blueprint(rrb.Vertical(scenes, below, row_shares=[3.0, 1.5]), _clock(parts))
+    scenes = rrb.Grid(*(recording.scene_view(part.label, [part.entity], reach) for part in parts))
+    below = rrb.Horizontal(recording.status_panel(), *panels)
+    return recording.blueprint(rrb.Vertical(scenes, below, row_shares=[3.0, 1.5]), _clock(parts))
 
 
 def _clock(parts: Sequence[_Part]) -> Any:
-    return execution_time() if parts[0].source.about.executed else path_time()
+    return execution_time() if parts[0].source.about.executed else recording.path_time()
 
 
 def _reach(parts: Sequence[_Part]) -> float:
     """The farthest that any of the tools gets from the base [m]."""
     traces = [
-        component(chunk, "LineStrips3D:strips")[0][0]
+        recording.component(chunk, "LineStrips3D:strips")[0][0]
         for part in parts
         for chunk in part.source.chunks
         if chunk.entity_path == "/tool/trace"
@@ -490,10 +475,10 @@ def _latent(parts: Sequence[_Part]) -> tuple[list[Chunk], Any]:
         for name in ("curve", "position", *(("start", "goal") if k == 0 else ())):
             for chunk in of[part.entity][name]:
                 chunks += _in_latent(chunk, name, part)
-    strips = component(axes, "LineStrips2D:strips")[0]
+    strips = recording.component(axes, "LineStrips2D:strips")[0]
     corners = np.array(strips[0] + strips[1]) * [1.0, -1.0]  # the plane's second axis points down
-    names = component(axes, "LineStrips2D:labels")[0]
-    return chunks, latent_view_of(names, corners.min(axis=0), corners.max(axis=0))
+    names = recording.component(axes, "LineStrips2D:labels")[0]
+    return chunks, recording.latent_view_of(names, corners.min(axis=0), corners.max(axis=0))
 
 
 def _latent_chunks(source: Opened) -> dict[str, list[Chunk]]:

@@ -129,7 +129,7 @@ def plane_search(sampled: Float[np.ndarray, "n T 2"], learned: Float[np.ndarray,
 
 
 def latent_metric(
-    chart: LearnedManifold, data: Float[np.ndarray, "n 2"], points: int = 140
+    learned: LearnedManifold, data: Float[np.ndarray, "n 2"], points: int = 140
 ) -> Figure:
     """Fig. 4a: volume √det M of the metric over the latent plane (log colours), and the encoded
     data.
@@ -141,7 +141,7 @@ def latent_metric(
     margin = 0.2 * (high - low)
     first, second = np.linspace(low - margin, high + margin, points, axis=1)
     grid = np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1)
-    volume = metric_figures(chart, grid).volume
+    volume = metric_figures(learned, grid).volume
     figure, axes = _single(6.4, 4.8)
     norm = LogNorm(*np.quantile(volume, [0.005, 0.995]))
     image = axes.pcolormesh(first, second, volume.T, norm=norm, cmap="viridis", rasterized=True)
@@ -225,13 +225,15 @@ class MetricFigures(NamedTuple):
 
 
 def metric_figures(
-    chart: LearnedManifold, z: Float[np.ndarray, "*batch N"], piece: int = 2048
+    learned: LearnedManifold, z: Float[np.ndarray, "*batch N"], piece: int = 2048
 ) -> MetricFigures:
     """The metric of a learned manifold in figures [rad² for the traces, rad^N for the volume]."""
     parts = []
-    for points in chart.tensor(z).reshape(-1, chart.dim).split(piece):
-        eigenvalues = torch.linalg.eigvalsh(chart.metric(points).double()).clamp_min(0)
-        deviation = pullback_metric(chart.vae.deviation, points).double().diagonal(dim1=-2, dim2=-1)
+    for points in learned.tensor(z).reshape(-1, learned.dim).split(piece):
+        eigenvalues = torch.linalg.eigvalsh(learned.metric(points).double()).clamp_min(0)
+        deviation = (
+            pullback_metric(learned.vae.deviation, points).double().diagonal(dim1=-2, dim2=-1)
+        )
         own = (eigenvalues.prod(-1).sqrt(), eigenvalues.sum(-1), deviation.sum(-1))
         parts.append(torch.stack(own))
     return MetricFigures(*torch.cat(parts, dim=-1).numpy().reshape(3, *z.shape[:-1]))
@@ -251,16 +253,16 @@ class MetricGrowth(NamedTuple):
     largest_on_data: float
 
 
-def follow_rays(chart: LearnedManifold, data: Float[np.ndarray, "n N"]) -> MetricGrowth:
+def follow_rays(learned: LearnedManifold, data: Float[np.ndarray, "n N"]) -> MetricGrowth:
     """The metric from the middle of the encoded configurations `data` to far beyond them."""
     centre = data.mean(axis=0)
     radius = np.quantile(np.linalg.norm(data - centre, axis=1), 0.95)
-    directions = np.random.default_rng(0).normal(size=(RAYS, chart.dim))
+    directions = np.random.default_rng(0).normal(size=(RAYS, learned.dim))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     distance = np.linspace(0.0, RAY_REACH, RAY_STEPS)
-    along = metric_figures(chart, centre + radius * distance[:, None, None] * directions)
-    largest = float(metric_figures(chart, data[:2000]).trace.max())
-    return MetricGrowth(chart.dim, distance, along.trace, along.deviation_trace, largest)
+    along = metric_figures(learned, centre + radius * distance[:, None, None] * directions)
+    largest = float(metric_figures(learned, data[:2000]).trace.max())
+    return MetricGrowth(learned.dim, distance, along.trace, along.deviation_trace, largest)
 
 
 def metric_growth(growths: Mapping[str, MetricGrowth]) -> Figure:

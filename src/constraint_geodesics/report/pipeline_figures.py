@@ -197,19 +197,14 @@ def _draw_plane(
         "the straight line. The ends are encoded configurations that keep the constraint exactly; "
         "where they lie off the coloured components, the plane does not represent them well enough."
     )
-    drawn = (
-        figures.latent_metric(manifold, data),
-        figures.submanifolds_in_plane(planes, angles_only),
-    )
+    volume = figures.latent_metric(manifold, data)
+    components = figures.submanifolds_in_plane(planes, angles_only)
+    geodesics = figures.geodesics_in_plane(curves)
+    titles = (f"metric of the manifold {name}", "sub-manifolds of the same plane")
     return [
-        Drawn("fig4a_latent_metric", f"Fig. 4a: metric of the manifold {name}", metric, drawn[0]),
-        Drawn("fig4b_submanifolds", "Fig. 4b: sub-manifolds of the same plane", kept, drawn[1]),
-        Drawn(
-            "fig4c_geodesics",
-            "Fig. 4c: learned geodesics in the plane",
-            found,
-            figures.geodesics_in_plane(curves),
-        ),
+        Drawn("fig4a_latent_metric", f"Fig. 4a: {titles[0]}", metric, volume),
+        Drawn("fig4b_submanifolds", f"Fig. 4b: {titles[1]}", kept, components),
+        Drawn("fig4c_geodesics", "Fig. 4c: learned geodesics in the plane", found, geodesics),
     ]
 
 

@@ -9,24 +9,10 @@ import pandas as pd
 
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.report import figures
+from constraint_geodesics.report import figures, pipeline_tables, plan_report
 from constraint_geodesics.report.figures import PLANNERS
 from constraint_geodesics.report.page import Picture, write_page
 from constraint_geodesics.report.pipeline_figures import Drawn, draw_data_cards, draw_figures
-from constraint_geodesics.report.pipeline_tables import (
-    ablation_tables,
-    data_card_table,
-    metric_tables,
-    published_table,
-    result_tables,
-)
-from constraint_geodesics.report.plan_report import (
-    execution_block,
-    plan_blocks,
-    plans_markdown,
-    policies_markdown,
-    policy_blocks,
-)
 from constraint_geodesics.report.results import (
     LEARNED,
     ReportError,
@@ -61,9 +47,9 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
     if "geometry" in studies:
         (reports / "geometry.md").write_text(geometry_table(layout))
     if "plans" in studies:
-        (reports / "plans.md").write_text(plans_markdown(params, layout))
+        (reports / "plans.md").write_text(plan_report.plans_markdown(params, layout))
     if "policies" in studies:
-        (reports / "policies.md").write_text(policies_markdown(params, layout))
+        (reports / "policies.md").write_text(plan_report.policies_markdown(params, layout))
     pictures = [save_figure(layout, entry) for entry in drawn]
     described = [save_figure(layout, entry) for entry in cards]
     ablated = [picture for picture in pictures if picture.name == ABLATION]
@@ -84,16 +70,20 @@ def page_content(params: Params, layout: Layout, table: pd.DataFrame) -> dict[st
     metrics = metrics_of(layout, "train_manifold", params.manifolds)
     compared = params.geodesics.illustrated_constraints[:1]
     studies = studies_at_hand(params, layout)
-    plans = plan_blocks(params, layout) if "plans" in studies else []
+    plans = plan_report.plan_blocks(params, layout) if "plans" in studies else []
     return {
         "params": params,
         "learned": PLANNERS[LEARNED].label,
         "findings": findings(params, table, metrics),
-        "published": [published_table(params, layout, table, name) for name in compared],
-        "plans": [*plans, execution_block(params, layout)],
-        "proposals": policy_blocks(params, layout) if "policies" in studies else [],
-        "results": result_tables(params, layout, table),
-        "ablations": ablation_tables(params, layout) if "ablations" in studies else [],
-        "metrics": metric_tables(params, layout, metrics),
-        "data": data_card_table(params, layout),
+        "published": [
+            pipeline_tables.published_table(params, layout, table, name) for name in compared
+        ],
+        "plans": [*plans, plan_report.execution_block(params, layout)],
+        "proposals": plan_report.policy_blocks(params, layout) if "policies" in studies else [],
+        "results": pipeline_tables.result_tables(params, layout, table),
+        "ablations": (
+            pipeline_tables.ablation_tables(params, layout) if "ablations" in studies else []
+        ),
+        "metrics": pipeline_tables.metric_tables(params, layout, metrics),
+        "data": pipeline_tables.data_card_table(params, layout),
     }

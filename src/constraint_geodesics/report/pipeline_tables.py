@@ -265,12 +265,12 @@ def _variance_table(learned: Mapping[str, Mapping[str, Any]]) -> Table:
         "collision_free": "geodesics free of collision",
         "collision_free_points": "points free of it",
         "length_rad": "joint length [rad]",
-        "deviation_rad": "σ on the way [rad]",
+        "deviation_rad": "σ along the path [rad]",
     }
     rows = [
-        [f"{manifold}, {told}", *(_metric(found[variant].get(key)) for key in columns)]
+        [f"{manifold}, {label}", *(_metric(found[variant].get(key)) for key in columns)]
         for manifold, found in learned.items()
-        for variant, told in WITH_VARIANCE.items()
+        for variant, label in WITH_VARIANCE.items()
     ]
     note = (
         "between configurations whose straight latent line collides; a dash where no such line was "
