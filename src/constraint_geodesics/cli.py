@@ -64,11 +64,14 @@ def check_params(
     file: Path = typer.Argument(Path("params.yaml"), help="The file to check."),
     as_json: bool = JSON,
 ) -> None:
-    """Check a params.yaml: one line naming the first bad entry, or "ok".  Exit code 0: good; 2:
-    bad.
+    """Check a params.yaml and the files it names: one line with the first bad entry, or "ok".
+
+    Exit code 0: good; 2: bad.
     """
+    from constraint_geodesics.gate import check_params as check
+
     try:
-        load_params(file)
+        check(load_params(file))
     except ParamsError as error:
         if not as_json:
             raise

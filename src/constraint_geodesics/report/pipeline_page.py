@@ -2,12 +2,14 @@
 (reports/index.html).
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report import figures, pipeline_tables, plan_report
 from constraint_geodesics.report.figures import PLANNERS
@@ -50,8 +52,8 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
         (reports / "plans.md").write_text(plan_report.plans_markdown(params, layout))
     if "policies" in studies:
         (reports / "policies.md").write_text(plan_report.policies_markdown(params, layout))
-    pictures = [save_figure(layout, entry) for entry in drawn]
-    described = [save_figure(layout, entry) for entry in cards]
+    saved = parallel_map(partial(save_figure, layout), [*drawn, *cards], params.compute)
+    pictures, described = saved[: len(drawn)], saved[len(drawn) :]
     ablated = [picture for picture in pictures if picture.name == ABLATION]
     others = [picture for picture in pictures if picture.name != ABLATION]
     write_page(layout, "index", drawn=others, ablated=ablated, cards=described, **content)
