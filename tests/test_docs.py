@@ -133,7 +133,7 @@ def test_the_other_code_runs(page, monkeypatch, tmp_path) -> None:
     if "models:/" in PAGES[page]:  # what a run of the pipeline leaves in the registry
         with tracked_stage(Work("build_planner", "planner"), "built", tmp_path) as stage:
             example = {"start": [0.0] * 6, "goal": [0.1] * 6, "constraint": "free"}
-            register_planner(stage, PACKAGED, PACKAGE / "served_model.py", example)
+            register_planner(stage, PACKAGED, PACKAGE / "tracking" / "served_model.py", example)
     run(page, monkeypatch, tmp_path)
 
 

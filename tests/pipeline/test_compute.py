@@ -282,7 +282,7 @@ def test_waiting_is_seen_on_a_terminal_alone(capfd: pytest.CaptureFixture[str]) 
 STAGE = """
 import numpy as np, torch
 from threadpoolctl import threadpool_info
-from constraint_geodesics import cli
+from constraint_geodesics.pipeline import stage
 
 def main(params, layout):
     values = np.random.default_rng(0).normal(size=(700, 700))
@@ -291,8 +291,8 @@ def main(params, layout):
     print(repr([float(value) for value in sums]))
     print(torch.get_num_threads(), {pool["num_threads"] for pool in threadpool_info()})
 
-cli.note_stage_time = lambda *_: None
-cli.run_stage(main, [])
+stage.note_stage_time = lambda *_: None
+stage.run_stage(main, [])
 """
 
 

@@ -58,7 +58,7 @@ def committed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
     stages = yaml.safe_load((folder / "dvc.yaml").read_text())["stages"]
     (folder / "dvc.yaml").write_text(
-        yaml.safe_dump({"stages": {"train_analytic": stages["train_analytic"]}})
+        yaml.safe_dump({"stages": {n: stages[n] for n in ("digest_code", "train_analytic")}})
     )
     for name in ("dvc.yaml", "dvc.lock"):
         (folder / "stages" / name).unlink(missing_ok=True)

@@ -23,15 +23,24 @@ from tests.pipeline import smoke
 
 pytestmark = [pytest.mark.xdist_group("pipeline"), pytest.mark.timeout(600)]
 
-SHARED = {
-    "train_policies@planner",
-    "build_planner",
-    "build_learned",
-    "benchmark_plans",
-    "execute_paths",
-    "benchmark_policies",
-}
-"""What is made from all constraints together, and what is measured with it."""
+SHARED = {"train_policies@planner", "build_planner", "build_learned", "record_paths", "report"}
+"""What is made from all constraints together."""
+STUDIES = """
+import importlib, sys
+sys.path.insert(0, "stages")
+from constraint_geodesics.params import load_params
+from constraint_geodesics.pipeline.layout import Layout
+for name, *items in (
+    ("ablate_analytic", "plane"),
+    ("ablate_manifold", "paper"),
+    ("ablate_manifold", "planner"),
+    ("benchmark_geometry", "planner", "level_cup"),
+    ("benchmark_policies", "planner"),
+    ("report",),
+):
+    importlib.import_module(name).main(load_params(), Layout(), *items)
+"""
+"""Studies of stages/dvc.yaml in one process: each for itself would import the same for seconds."""
 BENCHMARK = "stages/dvc.yaml:report_benchmark"
 LEARNED = "data/recordings/train_geodesics/planner-level_cup/query0-learned_geodesic-seed0.rrd"
 
@@ -222,8 +231,7 @@ def test_a_tolerance_reruns_its_constraint_only(finished: Path) -> None:
         "train_geodesics@planner-level_cup",
         "train_paper_geodesics@paper-level_cup",
         "benchmark_planners@level_cup",
-        "benchmark_geometry",
-        "report",
+        "execute_paths",
         *SHARED,
     }
 
@@ -245,20 +253,32 @@ def test_a_new_constraint_reruns_what_is_its_own_or_shared(finished: Path) -> No
         "extract_submanifold@planner-upright",
         "train_geodesics@planner-upright",
         "benchmark_planners@upright",
-        "report",
-        "train_policies@planner",
-        "build_planner",
-        "build_learned",
+        *SHARED,
     }
 
 
-def test_a_comment_in_the_report_retrains_nothing(finished: Path) -> None:
-    file = finished / "stages" / "report.py"
-    kept = file.read_text()
-    file.write_text(kept + "# a comment\n")
-    changed = stages_to_run(finished)
-    file.write_text(kept)
-    assert changed == {"report"}
+def test_a_colour_retrains_nothing_and_a_comment_runs_nothing(finished: Path) -> None:
+    file = finished / "src" / "constraint_geodesics" / "palette.py"
+    kept, stages = file.read_text(), []
+    for text in (kept + "# a comment\n", kept.replace('"#0072B2"', '"#0072B3"', 1), kept):
+        file.write_text(text)
+        assert stages_to_run(finished) in ({"digest_code"}, set())
+        assert smoke.dvc(finished, "repro", "digest_code").returncode == 0
+        stages.append(stages_to_run(finished))
+    assert stages == [set(), {"record_paths", "report"}, set()]
+
+
+def test_the_studies_of_make_bench_run_and_the_report_shows_them(finished: Path) -> None:
+    reports = finished / "reports"
+    page, lock = (reports / "index.html").read_text(), (finished / "dvc.lock").read_text()
+    assert not (reports / "geometry.md").exists(), "the pipeline needs none of them"
+    run = {"cwd": finished, "env": smoke.environment(finished), "check": True}
+    subprocess.run([sys.executable, "-c", STUDIES], capture_output=True, **run)
+    for name in ("geometry.md", "policies.md", "figures/ablation.png", "figures/length_rules.png"):
+        assert (reports / name).stat().st_size > 100, name
+    assert len((reports / "index.html").read_text()) > len(page)
+    assert (finished / "dvc.lock").read_text() == lock
+    assert smoke.dvc(finished, "repro", "--single-item", "--force", "report").returncode == 0
 
 
 def test_the_benchmark_has_a_row_for_every_planner_and_says_where_it_is_from(
