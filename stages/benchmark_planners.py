@@ -8,6 +8,7 @@ from constraint_geodesics.benchmark.planner_benchmark import (
     run_planner,
 )
 from constraint_geodesics.cli import run_stage
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import read_queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import load_submanifold
@@ -26,7 +27,7 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     """Write data/benchmark/<constraint>/, its recordings, rows and figures."""
     source, settings = layout.queries(constraint), params.benchmark
     scene = Scene.from_params(params)
-    manifold = scene.manifold(params.constraints[constraint])
+    manifold = constraint_manifold(scene.robot, params.constraints[constraint])
     charts = {name: LearnedManifold.load(layout.manifold(name)) for name in params.manifolds}
     queries, shown = read_queries(source), params.geodesics.searched[0]
     about = subject_of(params, constraint=constraint)

@@ -3,8 +3,8 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from constraint_geodesics.constraints.pose import Constraint as Constraint
-    from constraint_geodesics.constraints.pose import Pose as Pose
+    from constraint_geodesics.constraints.constraint import Constraint as Constraint
+    from constraint_geodesics.constraints.constraint import Pose as Pose
     from constraint_geodesics.planner import Path as Path
     from constraint_geodesics.planner import Planner as Planner
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
@@ -30,6 +30,7 @@ from constraint_geodesics.params import (
 from constraint_geodesics.search.roadmap import Roadmap
 
 FORMAT = 1
+_CONSTRAINT: TypeAdapter[ConstraintParams] = TypeAdapter(ConstraintParams)
 CARD, MANIFOLD, POLICIES, ROADMAPS = (
     "planner.json",
     "manifold.safetensors",
@@ -142,7 +143,7 @@ def read_bundle(folder: Path) -> Bundle:
         return Bundle(
             RobotParams.model_validate(card["robot"]),
             WorkcellParams.model_validate(card["workcell"]),
-            {name: ConstraintParams.model_validate(c) for name, c in card["constraints"].items()},
+            {name: _CONSTRAINT.validate_python(c) for name, c in card["constraints"].items()},
             PlannerParams.model_validate(card["planner"]),
             GeodesicParams.model_validate(card["policy"]),
             JudgeParams.model_validate(card["judge"]),

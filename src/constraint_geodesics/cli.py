@@ -174,7 +174,7 @@ def list_constraints(
         )
         return
     for name, constraint in constraints.items():
-        print(f"{name:20s} {' '.join(map(str, constraint.axes))}  {constraint.description}")
+        print(f"{name:20s} {constraint.summary}  {constraint.description}")
 
 
 @app.command("plan", context_settings={"allow_extra_args": False})

@@ -18,15 +18,22 @@ from jaxtyping import Float
 
 from constraint_geodesics.bundle import Bundle, open_bundle
 from constraint_geodesics.certification.certifier import Certificate, Certifier, Limits
-from constraint_geodesics.constraints.pose import AXES, Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintManifold,
+    Pose,
+    constraint_from,
+    constraint_from_json,
+)
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.learning.inference import FrozenManifold
 from constraint_geodesics.params import JudgeParams, PlannerParams
 from constraint_geodesics.problem import ends_refused
+from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.clearance import clearance_model
-from constraint_geodesics.scene.scene import Scene, constraint_from, robot_from, workcell_from
+from constraint_geodesics.scene.scene import Scene, robot_from, workcell_from
 from constraint_geodesics.search.band import BandSettings, project
 from constraint_geodesics.search.candidates import (
     ALL_PARTS,
@@ -40,6 +47,7 @@ from constraint_geodesics.search.candidates import (
     rows_of,
 )
 from constraint_geodesics.search.roadmap import Joined, Roadmap, build_roadmap, join
+from constraint_geodesics.search.space import Space
 
 Status = Literal[
     "solved",
@@ -101,7 +109,7 @@ class Path:
     constraint_name: str
     scene: Scene = field(repr=False)
     certificate: Certificate | None = field(default=None, repr=False)
-    _space: tuple | None = field(default=None, repr=False)
+    _space: Space | None = field(default=None, repr=False)
 
     def at(self, s: float | Sequence[float] | Float[np.ndarray, "n"]) -> Float[np.ndarray, "*n D"]:
         """Configurations [rad] at shares s in [0, 1] of the way, each on the constraint: points of
@@ -224,7 +232,8 @@ class Planner:
         self.bundle = bundle
         self.scene = Scene(robot_from(bundle.robot), workcell_from(bundle.workcell))
         self.constraints = {
-            name: constraint_from(params) for name, params in bundle.constraints.items()
+            name: constraint_from(params, self.scene.robot)
+            for name, params in bundle.constraints.items()
         }
         self.chart = FrozenManifold(bundle.manifold)
         settings, judge = bundle.planner, bundle.judge
@@ -245,7 +254,7 @@ class Planner:
             # the nodes are written in single precision, which may lie beyond a limit
             inside = np.clip(roadmap.joints, self.scene.robot.lower, self.scene.robot.upper)
             inside.setflags(write=False)
-            self._roadmaps[_key(self.constraints[name])] = replace(roadmap, joints=inside)
+            self._roadmaps[self.constraints[name].key] = replace(roadmap, joints=inside)
         self._supplied = frozenset(self._roadmaps)
 
     @classmethod
@@ -305,7 +314,7 @@ class Planner:
         """
         self._require_open()
         meant, name = self._named(constraint)
-        if meant.reference is None and not meant.is_free:
+        if not meant.is_placed:
             raise PlannerError(f"{name} has no reference pose: use constraint.relative_to(pose)")
         roadmap = self._task(meant).roadmap()
         return np.empty((0, self.scene.robot.dof)) if roadmap is None else roadmap.joints
@@ -422,8 +431,7 @@ class Planner:
 
     def _named(self, constraint: str | Constraint) -> tuple[Constraint, str]:
         if isinstance(constraint, Constraint):
-            axes = " ".join(axis for axis, held in zip(AXES, constraint.axes, strict=True) if held)
-            return constraint, f"the constraint on {axes}" if axes else "no constraint"
+            return constraint, constraint.label
         if not isinstance(constraint, str) or constraint not in self.constraints:
             raise PlannerError(
                 f"there is no constraint {constraint!r}: must be one of "
@@ -432,18 +440,18 @@ class Planner:
         return self.constraints[constraint], constraint
 
     def _held_at(self, constraint: Constraint, start: Float[np.ndarray, "D"]) -> Constraint:
-        if constraint.reference is not None or constraint.is_free:
+        if constraint.is_placed:
             return constraint
         position, rotation = self.scene.robot.forward(start)
         return constraint.relative_to(Pose(position, rotation))
 
     def _task(self, constraint: Constraint) -> Task:
-        key = _key(constraint)
+        key = constraint.key
         if key not in self._tasks:
             if len(self._tasks) >= KEPT_TASKS + len(
                 self.constraints
             ):  # the oldest one that has no name goes
-                named = {_key(own) for own in self.constraints.values()}
+                named = {own.key for own in self.constraints.values()}
                 oldest = next(other for other in self._tasks if other not in named)
                 del self._tasks[oldest]
                 self._roadmaps.pop(oldest, None)
@@ -481,7 +489,7 @@ class Planner:
         robot, kept, found = self.scene.robot, [np.empty((0, self.scene.robot.dof))], 0
         for _ in range(_ROUNDS):
             drawn = self.chart.decode(self.chart.sample(2 * count, rng))
-            share = rng.uniform(size=len(drawn)) ** (1.0 / max(sum(manifold.constraint.axes), 1))
+            share = rng.uniform(size=len(drawn)) ** (1.0 / max(manifold.rows.held.sum(), 1))
             result = retract(manifold, drawn, Retraction(), band=share)
             good = result.joints[result.converged & (robot.limit_distance(result.joints) >= 0.0)][
                 : count - found
@@ -504,7 +512,7 @@ class Planner:
         status = ends_refused(task.manifold, start, goal)
         if status in ("start_violates", "goal_violates"):
             end, q = ("start", start) if status == "start_violates" else ("goal", goal)
-            return status, f"the {end} violates {name} by {_amount(task.manifold, q)}"
+            return status, f"the {end} violates {name} by {task.manifold.amount(q)}"
         if status == "out_of_limits":
             for end, q in (("start", start), ("goal", goal)):
                 for joint, value, low, high in zip(
@@ -717,12 +725,12 @@ def check_path(
     """
     bundle, _ = open_bundle(source)
     scene = Scene(robot_from(bundle.robot), workcell_from(bundle.workcell))
-    joints, times, own = read_path(FilePath(file), scene.robot.joint_names)
+    joints, times, own = read_path(FilePath(file), scene.robot.joint_names, scene.robot)
     if constraint is not None:
         if constraint not in bundle.constraints:
             known = ", ".join(bundle.constraints)
             raise PlannerError(f"there is no constraint {constraint!r}: must be one of {known}")
-        own = constraint_from(bundle.constraints[constraint])
+        own = constraint_from(bundle.constraints[constraint], scene.robot)
     if own is None:
         raise PlannerError(f"{file} names no constraint: say which with --constraint")
     with Certifier(scene, limits_of(bundle.planner, bundle.judge, scene.robot.dof)) as certifier:
@@ -739,18 +747,7 @@ def write_path(
     """Write a path as CSV, its constraint in a comment line before the header; numbers to the last
     bit.
     """
-    pose = constraint.reference
-    reference = (
-        None
-        if pose is None
-        else {"position_m": pose.position.tolist(), "rotation": pose.rotation.tolist()}
-    )
-    about = {
-        "axes": list(constraint.axes),
-        "tolerance": list(constraint.tolerance),
-        "reference": reference,
-    }
-    lines = [f"# constraint: {json.dumps(about)}", ",".join(("time_s", *names))]
+    lines = [f"# constraint: {json.dumps(constraint.to_json())}", ",".join(("time_s", *names))]
     lines += [
         ",".join(repr(float(x)) for x in (t, *row)) for t, row in zip(times, joints, strict=True)
     ]
@@ -759,11 +756,11 @@ def write_path(
 
 
 def read_path(
-    file: FilePath, names: Sequence[str] | None = None
+    file: FilePath, names: Sequence[str] | None = None, robot: SerialRobot | None = None
 ) -> tuple[Float[np.ndarray, "T D"], Float[np.ndarray, "T"] | None, Constraint | None]:
     """A path from CSV: rows of joints [rad] under their names, with a column time_s and a
     constraint's comment line if there are any.  names: of the joints, which the columns must have
-    in this order.
+    in this order.  robot: for the kinds of constraints that need one.
     Raises PlannerError naming the file and the line that can't be read.
     """
     try:
@@ -776,7 +773,7 @@ def read_path(
     constraint = None
     for number, line in lines:
         if line.startswith("# constraint: "):
-            constraint = _constraint_of(file, number, line.removeprefix("# constraint: "))
+            constraint = _constraint_of(file, number, line.removeprefix("# constraint: "), robot)
     table = [(number, line.split(",")) for number, line in lines if not line.startswith("#")]
     if len(table) < 2:
         raise PlannerError(f"{file}: a header line and at least one row are needed")
@@ -815,35 +812,11 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _constraint_of(file: FilePath, number: int, text: str) -> Constraint:
+def _constraint_of(file: FilePath, number: int, text: str, robot: SerialRobot | None) -> Constraint:
     try:
-        about = json.loads(text)
-        pose = about["reference"]
-        reference = (
-            None
-            if pose is None
-            else Pose(np.array(pose["position_m"], float), np.array(pose["rotation"], float))
-        )
-        return Constraint(tuple(about["axes"]), tuple(about["tolerance"]), reference)
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        return constraint_from_json(json.loads(text), robot)
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise PlannerError(f"{file}, line {number}: not a constraint: {error}") from None
-
-
-def _key(constraint: Constraint) -> tuple:
-    """The same for constraints that allow the same configurations."""
-    pose = constraint.reference
-    where = () if pose is None else (pose.position.tobytes(), pose.rotation.tobytes())
-    return (constraint.axes, constraint.tolerance, *where)
-
-
-def _amount(manifold: ConstraintManifold, q: Float[np.ndarray, "D"]) -> str:
-    """Excess of one configuration in the units people use."""
-    excess = manifold.inclusion(q)
-    metres, angle = float(excess[:3].max()), float(np.linalg.norm(excess[3:]))
-    parts = [f"{1e3 * metres:.3g} mm"] * (metres > 0.0) + [f"{np.degrees(angle):.3g}°"] * (
-        angle > 0.0
-    )
-    return " and ".join(parts)
 
 
 def _listed(q: Float[np.ndarray, "D"]) -> str:

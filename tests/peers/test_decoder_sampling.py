@@ -5,7 +5,7 @@ import pytest
 from tests.planner_fixtures import NAMES, assert_sound, manifold_of, packaged_planner, problems
 
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.params import BenchmarkParams
 from constraint_geodesics.peers.decoder_sampling import BATCH, DecoderSampling, decoded_samples
 from constraint_geodesics.peers.ompl import SamplingPlanner, birrt_with_sampler

@@ -7,7 +7,7 @@ import torch
 from tests.planner_fixtures import manifold_of, nodes_of, packaged_planner, pairs_of
 
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.length import estimate_length

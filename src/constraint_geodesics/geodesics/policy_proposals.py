@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.geodesics.episodes import episode_settings
 from constraint_geodesics.geodesics.problem import LearnedProblem
 from constraint_geodesics.geodesics.proposals import MeanPolicy, propose

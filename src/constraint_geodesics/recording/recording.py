@@ -28,7 +28,7 @@ from rerun.urdf import UrdfTree
 
 from constraint_geodesics import palette
 from constraint_geodesics.certification.certifier import Limits
-from constraint_geodesics.constraints.pose import AXES, ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold, Series
 from constraint_geodesics.robot.kinematics import SerialRobot, rotation_from_rpy
 from constraint_geodesics.scene.world import Box, Solid, Sphere, data_path
 
@@ -158,16 +158,6 @@ class Frames:
     time: rr.TimeColumn
 
 
-@dataclass(frozen=True)
-class _Series:
-    """One quantity that the constraint bounds, and its limit."""
-
-    name: str
-    unit: str
-    values: Float[np.ndarray, "frames"]
-    limit: float
-
-
 def record_path(
     file: Path,
     path: PathRecord,
@@ -198,7 +188,7 @@ def record_frames(
 ) -> None:
     """Write the recording of a path that is sampled already."""
     series = [
-        *_residuals(manifold, sampled.joints),
+        *manifold.constraint.series(manifold.residual(sampled.joints)),
         *_violations(manifold, sampled.joints, path.tolerance),
     ]
     robot = manifold.robot
@@ -489,38 +479,17 @@ def tool_chunks(sampled: Frames, colour: tuple[int, int, int]) -> Iterator[Chunk
     yield moving("tool/position", rr.Points3D.columns(positions=tool), sampled.time)
 
 
-def _residuals(manifold: ConstraintManifold, joints: np.ndarray) -> list[_Series]:
-    """Held positions each by itself [mm]; held angles that share one tolerance together, as the
-    constraint does.
-    """
-    residual, tolerance = manifold.residual(joints), manifold.tolerance
-    series = [
-        _Series(AXES[i], "mm", 1e3 * abs(residual[:, i]), 1e3 * tolerance[i])
-        for i in range(3)
-        if manifold.held[i]
-    ]
-    angles = [i for i in range(3, 6) if manifold.held[i]]
-    together = len({tolerance[i] for i in angles}) == 1
-    for group in [angles] if together else [[i] for i in angles]:
-        name = "tilt" if len(group) == 2 else " ".join(AXES[i] for i in group)
-        size = np.degrees(np.linalg.norm(residual[:, group], axis=1))
-        series.append(_Series(name, "deg", size, math.degrees(tolerance[group[0]])))
-    return series
-
-
-def _violations(
-    manifold: ConstraintManifold, joints: np.ndarray, tolerance: float
-) -> list[_Series]:
+def _violations(manifold: ConstraintManifold, joints: np.ndarray, tolerance: float) -> list[Series]:
     """What is beyond the constraint's own tolerance, as a power of ten: the judge's limit is far
     below a pixel else.
     """
-    if not any(manifold.held):
+    if manifold.constraint.is_free:
         return []
     values = np.log10(np.maximum(manifold.violation(joints), LOWEST_VIOLATION))
-    return [_Series("violation", "log10 rad or m", values, math.log10(tolerance))]
+    return [Series("violation", "log10 rad or m", values, math.log10(tolerance))]
 
 
-def _series_chunks(series: Sequence[_Series], sampled: Frames) -> Iterator[Chunk]:
+def _series_chunks(series: Sequence[Series], sampled: Frames) -> Iterator[Chunk]:
     for one in series:
         entity = one.name if one.name == "violation" else _entity("constraint", one.unit, one.name)
         names = [one.name, f"limit of {one.name}"]  # the panel says the unit
@@ -632,7 +601,7 @@ def colours(values: np.ndarray) -> np.ndarray:
     return np.asarray(matplotlib.colormaps["cividis_r"](scaled, bytes=True))[:, :3]
 
 
-def _blueprint(path: PathRecord, sampled: Frames, series: Sequence[_Series]) -> Any:
+def _blueprint(path: PathRecord, sampled: Frames, series: Sequence[Series]) -> Any:
     right: list[Any] = [] if path.latent is None else [_latent_panel(path.latent)]
     right += [
         _residual_panel(unit, series)
@@ -693,7 +662,7 @@ def scene_view(name: str, entities: Sequence[str], reach_m: float) -> Any:
     )
 
 
-def _residual_panel(unit: str, series: Sequence[_Series]) -> Any:
+def _residual_panel(unit: str, series: Sequence[Series]) -> Any:
     shown = [one for one in series if one.unit == unit]
     return residual_panel(unit, max(max(one.limit, float(one.values.max())) for one in shown))
 

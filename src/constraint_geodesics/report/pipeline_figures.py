@@ -198,7 +198,7 @@ def _draw_plane(
     names = params.geodesics.illustrated_constraints
     loaded = {name: load_submanifold(layout.submanifold(manifold, name)) for name in names}
     planes = {name: plane for name, plane in loaded.items() if isinstance(plane, GridSubmanifold)}
-    angles_only = {name: not any(params.constraints[name].axes[:3]) for name in planes}
+    angles_only = {name: not params.constraints[name].may_hold_positions for name in planes}
     curves = {
         name: (plane, latent_curves(params, layout, chart, manifold, name))
         for name, plane in planes.items()

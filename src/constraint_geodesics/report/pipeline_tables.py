@@ -104,7 +104,7 @@ def result_blocks(params: Params, layout: Layout, table: pd.DataFrame) -> list[B
     """The whole result table, one block a manifold and constraint."""
     blocks = []
     for (manifold, constraint), rows in table.groupby(["manifold", "constraint"], sort=False):
-        positions = any(params.constraints[str(constraint)].axes[:3])
+        positions = params.constraints[str(constraint)].may_hold_positions
         header = [*COLUMNS[1:], *(["worst [mm]"] if positions else []), "not connected", "refused"]
         cells = [
             [

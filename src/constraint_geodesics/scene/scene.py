@@ -1,12 +1,9 @@
-"""What params.yaml names, as objects: the robot, the fixed bodies around it, and the constraint
-manifolds.
-"""
+"""What params.yaml names, as objects: the robot and the fixed bodies around it."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
-from constraint_geodesics.params import ConstraintParams, Params, RobotParams, WorkcellParams
+from constraint_geodesics.params import Params, RobotParams, WorkcellParams
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, load_robot
 from constraint_geodesics.scene.world import Body, Box, Solid, Sphere, World, data_path
 
@@ -26,10 +23,6 @@ class Scene:
     def world(self) -> World:
         """A fresh PyBullet world; close it, or use it as a context manager."""
         return World(self.robot, self.workcell)
-
-    def manifold(self, constraint: ConstraintParams) -> ConstraintManifold:
-        """The constraint manifold of this scene's robot."""
-        return ConstraintManifold(self.robot, constraint_from(constraint))
 
 
 def find_urdf(name: str) -> Path:
@@ -61,10 +54,3 @@ def workcell_from(params: WorkcellParams) -> tuple[Solid, ...]:
         for name, ball in params.spheres.items()
     ]
     return (*boxes, *spheres, *bodies)
-
-
-def constraint_from(params: ConstraintParams) -> Constraint:
-    """The constraint that one entry of params.yaml describes."""
-    pose = params.reference
-    reference = None if pose is None else Pose.from_rpy(pose.position_m, pose.rpy_rad)
-    return Constraint(params.axes, params.tolerance, reference)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.geodesics.episodes import episode_settings
 from constraint_geodesics.geodesics.problem import LearnedProblem
 from constraint_geodesics.geodesics.proposals import MeanPolicy
