@@ -4,6 +4,7 @@ import json
 import sys
 from dataclasses import replace
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.geodesics.policy_search import load_policy
 from constraint_geodesics.geodesics.problem import ChartProblem, Samples
 from constraint_geodesics.learning.dataset import read_joints
@@ -11,7 +12,7 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
-from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.scene import robot_from
 from constraint_geodesics.studies.geodesic_search import geodesic_problem, write_table
 from constraint_geodesics.studies.geometry import GeometryBenchmark, policy_search_figures
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
@@ -23,7 +24,8 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     """Write reports/geometry.json and reports/benchmark_geometry/quadrature.csv."""
     sources = [layout.joints("free"), layout.joints(constraint)]
     chart, settings = LearnedManifold.load(layout.manifold(manifold)), params.geodesics
-    constrained = Scene.from_params(params).manifold(params.constraints[constraint])
+    robot = robot_from(params.robot)
+    constrained = constraint_manifold(robot, params.constraints[constraint])
     searched = geodesic_problem(
         params, chart, constrained, read_joints(sources[1]).free_joints, manifold
     )

@@ -7,6 +7,7 @@ from constraint_geodesics.benchmark.planner_benchmark import (
     planner_figures,
     run_planner,
 )
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import read_queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
@@ -25,7 +26,7 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     """Write data/benchmark/<constraint>/, its rows and figures."""
     source, settings = layout.queries(constraint), params.benchmark
     scene = Scene.from_params(params)
-    manifold = scene.manifold(params.constraints[constraint])
+    manifold = constraint_manifold(scene.robot, params.constraints[constraint])
     charts = {name: LearnedManifold.load(layout.manifold(name)) for name in params.manifolds}
     queries = read_queries(source)
     about = subject_of(params, constraint=constraint)

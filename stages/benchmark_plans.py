@@ -14,14 +14,13 @@ from constraint_geodesics.benchmark.plan_benchmark import (
     save_arrays,
 )
 from constraint_geodesics.bundle import read_bundle
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold, constraint_from
 from constraint_geodesics.learning.dataset import draw_queries, write_queries
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.planner import Planner
-from constraint_geodesics.scene.scene import constraint_from
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "benchmark_plans"
@@ -42,7 +41,7 @@ def main(params: Params, layout: Layout) -> None:
         Planner(read_bundle(layout.planner), "the pipeline's outputs") as planner,
     ):
         for name in names:
-            constraint = constraint_from(described[name])
+            constraint = constraint_from(described[name], planner.scene.robot)
             manifold = ConstraintManifold(planner.scene.robot, constraint)
             queries = draw_queries(planner.scene, manifold, name, settings.queries, settings.seed)
             write_queries(queries, layout.plans / f"{name}.csv")

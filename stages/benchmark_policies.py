@@ -6,6 +6,7 @@ import sys
 
 import pandas as pd
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
@@ -33,7 +34,7 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
         PolicyTask(
             name,
             scene,
-            scene.manifold(constraint),
+            constraint_manifold(scene.robot, constraint),
             chart,
             params.policy_settings(),
             layout.policies(manifold),

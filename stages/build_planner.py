@@ -7,10 +7,11 @@ import numpy as np
 
 import constraint_geodesics
 from constraint_geodesics.bundle import Bundle
+from constraint_geodesics.constraints.constraint import constraint_from
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
-from constraint_geodesics.scene.scene import Scene, constraint_from
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search.preparation import named_roadmaps
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 from constraint_geodesics.tracking.registry import register_planner
@@ -21,8 +22,9 @@ CODE = Path(constraint_geodesics.__file__).parent / "tracking" / "served_model.p
 
 def planner_files(params: Params) -> Bundle:
     """Everything the planner is made of; nothing in it is trained."""
-    constraints = {name: constraint_from(c) for name, c in params.constraints.items()}
-    roadmaps = named_roadmaps(Scene.from_params(params), constraints, params.planner)
+    scene = Scene.from_params(params)
+    constraints = {n: constraint_from(c, scene.robot) for n, c in params.constraints.items()}
+    roadmaps = named_roadmaps(scene, constraints, params.planner)
     return Bundle(
         params.robot, params.workcell, params.constraints, params.planner, params.judge, roadmaps
     )

@@ -9,6 +9,7 @@ from constraint_geodesics.benchmark.judge import judge_limits
 from constraint_geodesics.benchmark.queries import draw_cases
 from constraint_geodesics.benchmark.runner import write_cases
 from constraint_geodesics.certification.certifier import Certifier
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.peers.registry import PeerBuilder
 from constraint_geodesics.pipeline.layout import Layout
@@ -23,7 +24,7 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     planners.
     """
     settings, scene = params.bench, Scene.from_params(params)
-    manifold = scene.manifold(params.constraints[constraint])
+    manifold = constraint_manifold(scene.robot, params.constraints[constraint])
     with (
         PeerBuilder(params, layout.root)(settings.placed_by, scene, constraint, manifold) as (
             planners,

@@ -6,6 +6,7 @@ import sys
 from functools import partial
 
 from constraint_geodesics.bundle import read_bundle
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
@@ -30,7 +31,7 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     """
     scene, settings = Scene.from_params(params), params.execution
     manifold, cup = (
-        scene.manifold(params.constraints[constraint]),
+        constraint_manifold(scene.robot, params.constraints[constraint]),
         CupSettings(spheres=settings.spheres),
     )
     about = subject_of(params, constraint=constraint)

@@ -4,6 +4,7 @@ as it is.
 
 import sys
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import (
@@ -26,7 +27,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     item = f"{manifold}-{constraint}"
     sources = [layout.joints("free"), layout.joints(constraint)]
     scene = Scene.from_params(params)
-    constrained = scene.manifold(params.constraints[constraint])
+    constrained = constraint_manifold(scene.robot, params.constraints[constraint])
     about = subject_of(params, constraint=constraint, manifold=manifold)
     with (
         tracked_stage(

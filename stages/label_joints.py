@@ -4,6 +4,7 @@ queries.
 
 import sys
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import (
     ShardTask,
     data_card,
@@ -27,7 +28,7 @@ STAGE = "label_joints"
 def main(params: Params, layout: Layout, constraint: str) -> None:
     """Write data/joints/<constraint>/ and its data card."""
     scene = Scene.from_params(params)
-    manifold = scene.manifold(params.constraints[constraint])
+    manifold = constraint_manifold(scene.robot, params.constraints[constraint])
     labels = params.labels
     rows = labels.free_rows if constraint == "free" else labels.constrained_rows
     settings, about = (

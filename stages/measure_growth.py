@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from constraint_geodesics.benchmark.runner import write_table
 from constraint_geodesics.bundle import read_bundle
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.params import Params
 from constraint_geodesics.peers.registry import PeerBuilder
@@ -54,7 +55,7 @@ def main(params: Params, layout: Layout) -> None:
         GrowthSizes(),
         Scene.from_params(params),
     )
-    manifold = scene.manifold(params.constraints[CONSTRAINT])
+    manifold = constraint_manifold(scene.robot, params.constraints[CONSTRAINT])
     with (
         Planner(read_bundle(layout.planner), str(layout.planner)) as planner,
         PeerBuilder(params, layout.root)(PEERS, scene, CONSTRAINT, manifold) as (peers, _),

@@ -36,6 +36,7 @@ def main(params: Params, layout: Layout) -> None:
 
 def record_table(table: Table) -> None:
     """Record the paths that one table names."""
+    from constraint_geodesics.constraints.constraint import constraint_manifold
     from constraint_geodesics.learning.learned_manifold import LearnedManifold
     from constraint_geodesics.learning.submanifold import load_submanifold
     from constraint_geodesics.pipeline.paths import read_paths
@@ -53,7 +54,7 @@ def record_table(table: Table) -> None:
     rows, scene = named_rows(file), Scene.from_params(params)
     recorder = RowRecorder(
         constraint,
-        scene.manifold(params.constraints[constraint]),
+        constraint_manifold(scene.robot, params.constraints[constraint]),
         scene.workcell,
         LearnedManifold.load(layout.manifold(manifold)),
         load_submanifold(layout.submanifold(manifold, constraint)),

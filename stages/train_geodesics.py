@@ -5,6 +5,7 @@ geodesics with each.
 import shutil
 import sys
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import read_joints, read_queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import load_submanifold
@@ -37,7 +38,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         [layout.joints(constraint), layout.queries(constraint)],
     )
     scene = Scene.from_params(params)
-    constrained = scene.manifold(params.constraints[constraint])
+    constrained = constraint_manifold(scene.robot, params.constraints[constraint])
     chart = LearnedManifold.load(layout.manifold(manifold))
     problem = geodesic_problem(
         params, chart, constrained, read_joints(sources[0]).free_joints, manifold

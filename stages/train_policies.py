@@ -3,6 +3,7 @@
 import shutil
 import sys
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.geodesics.policy_search import save_policy
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
@@ -27,7 +28,8 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
     scene, settings = Scene.from_params(params), params.policy_settings()
     sources = [layout.joints(name) for name in params.constraints]
     manifolds = {
-        name: scene.manifold(constraint) for name, constraint in params.constraints.items()
+        name: constraint_manifold(scene.robot, constraint)
+        for name, constraint in params.constraints.items()
     }
     joints = {name: read_joints(layout.joints(name)).free_joints for name in params.constraints}
     problem = shared_problem(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.training import TrainingRun, train_manifold
@@ -73,7 +74,7 @@ class Trained:
 @pytest.fixture(scope="session")
 def trained(scene: Scene, params: Params, tmp_path_factory: pytest.TempPathFactory) -> Trained:
     frame = draw_shard(
-        ShardTask(scene, scene.manifold(params.constraints["free"]), 4000, (1,))
+        ShardTask(scene, constraint_manifold(scene.robot, params.constraints["free"]), 4000, (1,))
     ).frame
     joints = joints_of(frame)[free_rows(frame)]
     small = params.manifolds["planner"].model_copy(

@@ -9,7 +9,7 @@ import numpy as np
 from constraint_geodesics import bundle
 from constraint_geodesics.bundle import Bundle, read_bundle
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.geodesics.learned_method import FOLDER, LearnedFiles, read_learned
 from constraint_geodesics.planner import Planner

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.goal import ConfigurationGoal, Goal, as_goal
 from constraint_geodesics.problem import PlannerError
 from tests.planner_fixtures import packaged_planner, pairs_of

@@ -17,7 +17,7 @@ import pytest
 
 from constraint_geodesics import Constraint, Planner, Pose, Trajectory, bundle
 from constraint_geodesics.certification.certifier import Certifier, Limits
-from constraint_geodesics.constraints.pose import ConstraintError, ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintError, ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.planner import PlannerError, check_trajectory
 from constraint_geodesics.recording.recording import read_recording

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 from constraint_geodesics.kernel_digest import LOCATORS
 
 if TYPE_CHECKING:
-    from constraint_geodesics.constraints.pose import Constraint as Constraint
-    from constraint_geodesics.constraints.pose import Pose as Pose
+    from constraint_geodesics.constraints.constraint import Constraint as Constraint
+    from constraint_geodesics.constraints.constraint import Pose as Pose
     from constraint_geodesics.planner import Planner as Planner
     from constraint_geodesics.trajectory import Trajectory as Trajectory
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
@@ -29,6 +29,7 @@ from constraint_geodesics.plugs import MLFLOW, plug
 from constraint_geodesics.search.roadmap import Roadmap
 
 FORMAT = 2
+_CONSTRAINT: TypeAdapter[ConstraintParams] = TypeAdapter(ConstraintParams)
 CARD, ROADMAPS = "planner.json", "roadmaps.safetensors"
 PIPELINE = Path("data/planner")
 """Where the pipeline leaves the planner's files, in a checkout."""
@@ -156,7 +157,7 @@ def read_bundle(folder: Path) -> Bundle:
         return Bundle(
             RobotParams.model_validate(card["robot"]),
             WorkcellParams.model_validate(card["workcell"]),
-            {name: ConstraintParams.model_validate(c) for name, c in card["constraints"].items()},
+            {name: _CONSTRAINT.validate_python(c) for name, c in card["constraints"].items()},
             PlannerParams.model_validate(card["planner"]),
             JudgeParams.model_validate(card["judge"]),
             roadmaps,

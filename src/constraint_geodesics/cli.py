@@ -104,7 +104,7 @@ def list_constraints(
         print(json.dumps({name: own.model_dump(mode="json") for name, own in constraints.items()}))
         return
     for name, constraint in constraints.items():
-        print(f"{name:20s} {' '.join(map(str, constraint.axes))}  {constraint.description}")
+        print(f"{name:20s} {constraint.summary}  {constraint.description}")
 
 
 @app.command("plan", context_settings={"allow_extra_args": False})

@@ -64,7 +64,7 @@ def _problems(params: Params) -> Iterator[str]:
     if not execution.least_tilt_rad < math.pi:
         yield f"execution.least_tilt_rad={execution.least_tilt_rad}: must be below π"
     carried = params.plans.constraint
-    if not all(params.constraints[carried].axes[3:5]):
+    if not params.constraints[carried].keeps_upright:
         yield (
             f"plans.constraint={carried!r}: must hold roll and pitch, or the cup that the stage "
             f"execute_paths carries need not stay upright"

@@ -14,7 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.problem import PlannerError
 
 ArrayLike = Float[np.ndarray, "D"] | Sequence[float]

@@ -4,7 +4,15 @@ import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
@@ -107,16 +115,37 @@ class PoseParams(_Record):
     rpy_rad: Vector3
 
 
-class ConstraintParams(_Record):
+class PoseConstraintParams(_Record):
     """The constraint vector C of eq. 6 with tolerances and reference."""
 
+    kind: Literal["pose"] = "pose"
     description: str
     axes: tuple[Bit, Bit, Bit, Bit, Bit, Bit]
     tolerance: tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative]
     reference: PoseParams | None
 
+    @property
+    def is_free(self) -> bool:
+        """Whether no axis is held."""
+        return not any(self.axes)
+
+    @property
+    def may_hold_positions(self) -> bool:
+        """Whether something measured in metres is held."""
+        return any(self.axes[:3])
+
+    @property
+    def keeps_upright(self) -> bool:
+        """Whether both tilts are held."""
+        return all(self.axes[3:5])
+
+    @property
+    def summary(self) -> str:
+        """In a few characters."""
+        return " ".join(map(str, self.axes))
+
     @model_validator(mode="after")
-    def _meant(self) -> "ConstraintParams":
+    def _consistent(self) -> "PoseConstraintParams":
         for i, (held, tolerance) in enumerate(zip(self.axes, self.tolerance, strict=True)):
             if tolerance and not held:
                 raise ValueError(f"tolerance[{i}]={tolerance}: must be 0 where the axis is free")
@@ -125,6 +154,50 @@ class ConstraintParams(_Record):
                 "reference=null: a pose is needed to sample configurations that hold an axis"
             )
         return self
+
+
+class FunctionsConstraintParams(_Record):
+    """A constraint given by two functions, which a factory makes: `module:function`, called with
+    the robot and the arguments.
+    """
+
+    kind: Literal["functions"]
+    description: str
+    factory: Annotated[str, Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
+    arguments: dict[str, Any] = {}
+
+    @property
+    def is_free(self) -> bool:
+        """It holds something."""
+        return False
+
+    @property
+    def may_hold_positions(self) -> bool:
+        """Only the factory knows."""
+        return True
+
+    @property
+    def keeps_upright(self) -> bool:
+        """Only the factory knows."""
+        return False
+
+    @property
+    def summary(self) -> str:
+        """In a few characters."""
+        return self.factory
+
+
+def _kind(entry: Any) -> str:
+    kind = entry.get("kind", "pose") if isinstance(entry, dict) else entry.kind
+    return f"<{kind}>"
+
+
+ConstraintParams = Annotated[
+    Annotated[PoseConstraintParams, Tag("<pose>")]
+    | Annotated[FunctionsConstraintParams, Tag("<functions>")],
+    Discriminator(_kind),
+]
+"""An entry of `constraints`, by its `kind`, which is "pose" unless it is named."""
 
 
 class ManifoldParams(_Record):
@@ -387,7 +460,7 @@ class Params(_Record):
 
     @model_validator(mode="after")
     def _names_exist(self) -> "Params":
-        if "free" not in self.constraints or any(self.constraints["free"].axes):
+        if "free" not in self.constraints or not self.constraints["free"].is_free:
             raise ValueError(
                 "constraints.free: must be there with all axes 0, the manifolds are trained on it"
             )
@@ -441,7 +514,7 @@ def _yaml(text: str) -> Any:
 def _one_line(error: ValidationError) -> str:
     first = error.errors()[0]
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-    where = ".".join(str(part) for part in first["loc"])
+    where = ".".join(str(part) for part in first["loc"] if not str(part).startswith("<"))
     message = first["msg"].removeprefix("Value error, ")
     if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         return f"{where}={first['input']!r}: there is no such parameter{more}"

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from constraint_geodesics.bundle import Bundle, open_bundle
 from constraint_geodesics.certification.certifier import Certificate, Certifier, Limits
-from constraint_geodesics.constraints.pose import AXES, Constraint, Pose
+from constraint_geodesics.constraints.constraint import Constraint, Pose, constraint_from
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.goal import ArrayLike, Goal, as_goal, checked_configuration
@@ -24,7 +24,7 @@ from constraint_geodesics.methods import Method, SearchMethod, open_method
 from constraint_geodesics.params import JudgeParams, PlannerParams
 from constraint_geodesics.problem import PlannerError as PlannerError
 from constraint_geodesics.problem import Status
-from constraint_geodesics.scene.scene import Scene, constraint_from, robot_from, workcell_from
+from constraint_geodesics.scene.scene import Scene, robot_from, workcell_from
 from constraint_geodesics.search.candidates import ALL_PARTS, Answer, Candidate, Parts, rows_of
 from constraint_geodesics.search.explanations import not_connected, refused_ends
 from constraint_geodesics.search.preparation import Preparation, Query
@@ -57,7 +57,9 @@ class Planner:
         self._closed = False
         self.source, self.bundle = source, bundle
         self.scene = Scene(robot_from(bundle.robot), workcell_from(bundle.workcell))
-        self.constraints = {name: constraint_from(c) for name, c in bundle.constraints.items()}
+        self.constraints = {
+            name: constraint_from(c, self.scene.robot) for name, c in bundle.constraints.items()
+        }
         self.method: Method = method or SearchMethod()
         dof, settings = self.scene.robot.dof, bundle.planner
         self._acceleration = np.full(dof, settings.acceleration_rad_s2)
@@ -118,7 +120,7 @@ class Planner:
         """
         self._require_open()
         given, name = self._named(constraint)
-        if given.reference is None and not given.is_free:
+        if not given.is_placed:
             raise PlannerError(f"{name} has no reference pose: use constraint.relative_to(pose)")
         roadmap = self._preparation.task(given).roadmap()
         return np.empty((0, self.scene.robot.dof)) if roadmap is None else roadmap.joints
@@ -185,15 +187,14 @@ class Planner:
 
     def _named(self, constraint: str | Constraint) -> tuple[Constraint, str]:
         if isinstance(constraint, Constraint):
-            axes = " ".join(axis for axis, held in zip(AXES, constraint.axes, strict=True) if held)
-            return constraint, f"the constraint on {axes}" if axes else "no constraint"
+            return constraint, constraint.label
         if not isinstance(constraint, str) or constraint not in self.constraints:
             known = ", ".join(self.constraints)
             raise PlannerError(f"there is no constraint {constraint!r}: must be one of {known}")
         return self.constraints[constraint], constraint
 
     def _held_at(self, constraint: Constraint, start: Float[np.ndarray, "D"]) -> Constraint:
-        if constraint.reference is not None or constraint.is_free:
+        if constraint.is_placed:
             return constraint
         return constraint.relative_to(Pose(*self.scene.robot.forward(start)))
 
@@ -320,12 +321,12 @@ def check_trajectory(
     """
     bundle, _ = open_bundle(source)
     scene = Scene(robot_from(bundle.robot), workcell_from(bundle.workcell))
-    joints, times, own = read_trajectory(Path(file), scene.robot.joint_names)
+    joints, times, own = read_trajectory(Path(file), scene.robot.joint_names, scene.robot)
     if constraint is not None:
         if constraint not in bundle.constraints:
             known = ", ".join(bundle.constraints)
             raise PlannerError(f"there is no constraint {constraint!r}: must be one of {known}")
-        own = constraint_from(bundle.constraints[constraint])
+        own = constraint_from(bundle.constraints[constraint], scene.robot)
     if own is None:
         raise PlannerError(f"{file} names no constraint: say which with --constraint")
     with Certifier(scene, limits_of(bundle.planner, bundle.judge, scene.robot.dof)) as certifier:

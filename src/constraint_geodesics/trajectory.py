@@ -12,11 +12,16 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.certification.certifier import Certificate
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintManifold,
+    constraint_from_json,
+)
 from constraint_geodesics.problem import PlannerError, Status
-from constraint_geodesics.scene.clearance import no_clearance
+from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.search.band import BandSpace, project, step_lengths
+from constraint_geodesics.search.band import project, step_lengths
+from constraint_geodesics.search.space import space_of
 
 CONSTRAINT_LINE = "# constraint: "
 """What the comment line of a trajectory's CSV begins with."""
@@ -139,9 +144,7 @@ class Trajectory:
         )
         between = ~np.isin(at, along)
         moved = points[between]
-        robot = self.scene.robot
-        manifold = ConstraintManifold(robot, self.constraint)
-        project(BandSpace(manifold, no_clearance(robot.dof), 0.0).arrays, moved)
+        project(space_of(ConstraintManifold(self.scene.robot, self.constraint)), moved)
         points[between] = moved
         points[shares == 0.0], points[shares == 1.0] = self.joints[0], self.joints[-1]
         return points[0] if np.ndim(s) == 0 else points
@@ -227,7 +230,7 @@ def write_trajectory(
     """Write waypoints and times as CSV, the constraint in a comment line before the header; numbers
     to the last bit.
     """
-    lines = [f"{CONSTRAINT_LINE}{json.dumps(_described(constraint))}", ",".join(("time_s", *names))]
+    lines = [f"{CONSTRAINT_LINE}{json.dumps(constraint.to_json())}", ",".join(("time_s", *names))]
     for t, row in zip(times, joints, strict=True):
         lines.append(",".join(repr(float(x)) for x in (t, *row)))
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -235,11 +238,11 @@ def write_trajectory(
 
 
 def read_trajectory(
-    file: Path, names: Sequence[str] | None = None
+    file: Path, names: Sequence[str] | None = None, robot: SerialRobot | None = None
 ) -> tuple[Float[np.ndarray, "T D"], Float[np.ndarray, "T"] | None, Constraint | None]:
     """Waypoints from CSV: lines of joints [rad] under their names, with a column time_s and a
     constraint's comment line if there are any.  names: of the joints, which the columns must have
-    in this order.
+    in this order.  robot: for the kinds of constraints that need one.
 
     Raises PlannerError naming the file and the line that can't be read.
     """
@@ -251,7 +254,7 @@ def read_trajectory(
     constraint, table = None, []
     for number, line in lines:
         if line.startswith(CONSTRAINT_LINE):
-            constraint = _constraint_of(file, number, line.removeprefix(CONSTRAINT_LINE))
+            constraint = _constraint_of(file, number, line.removeprefix(CONSTRAINT_LINE), robot)
         elif line and not line.startswith("#"):
             table.append((number, line.split(",")))
     if len(table) < 2:
@@ -291,23 +294,8 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _described(constraint: Constraint) -> dict[str, Any]:
-    pose = constraint.reference
-    where = pose and {"position_m": pose.position.tolist(), "rotation": pose.rotation.tolist()}
-    return {
-        "axes": list(constraint.axes),
-        "tolerance": list(constraint.tolerance),
-        "reference": where,
-    }
-
-
-def _constraint_of(file: Path, number: int, text: str) -> Constraint:
+def _constraint_of(file: Path, number: int, text: str, robot: SerialRobot | None) -> Constraint:
     try:
-        about = json.loads(text)
-        pose = about["reference"]
-        reference = pose and Pose(
-            np.array(pose["position_m"], float), np.array(pose["rotation"], float)
-        )
-        return Constraint(tuple(about["axes"]), tuple(about["tolerance"]), reference)
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        return constraint_from_json(json.loads(text), robot)
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise PlannerError(f"{file}, line {number}: not a constraint: {error}") from None

@@ -18,6 +18,7 @@ from constraint_geodesics.benchmark.judge import (
     polyline_length,
 )
 from constraint_geodesics.certification.certifier import Certifier
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.vae import JointVae
@@ -36,7 +37,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def cup(scene):
-    return scene.manifold(PARAMS.constraints["level_cup"])
+    return constraint_manifold(scene.robot, PARAMS.constraints["level_cup"])
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +158,7 @@ def test_every_rule_refuses_what_it_is_for(scene, cup, certifier, start):
 
 
 def test_a_path_into_the_table_collides(scene, world, certifier):
-    free = scene.manifold(PARAMS.constraints["free"])
+    free = constraint_manifold(scene.robot, PARAMS.constraints["free"])
     poses = scene.robot.sample(200, np.random.default_rng(1))
     poses = poses[scene.robot.limit_distance(poses) > 0.1]
     touching = poses[~world.free(poses)][0]
@@ -177,7 +178,7 @@ def test_violation_between_two_points_is_seen(cup, certifier, start):
 
 
 def test_the_angle_of_a_cone_is_measured_as_a_whole(scene, cup, certifier):
-    relaxed = scene.manifold(PARAMS.constraints["level_cup_relaxed"])
+    relaxed = constraint_manifold(scene.robot, PARAMS.constraints["level_cup_relaxed"])
     q = scene.robot.sample(50, np.random.default_rng(2))
     tilt = np.linalg.norm(cup.residual(q)[:, 3:], axis=-1)
     tolerance = PARAMS.constraints["level_cup_relaxed"].tolerance[3]
@@ -189,7 +190,9 @@ def test_the_angle_of_a_cone_is_measured_as_a_whole(scene, cup, certifier):
             excess, abs=1e-6
         )
     assert (
-        judged(q[:2], scene.manifold(PARAMS.constraints["free"]), certifier).max_violation_rad
+        judged(
+            q[:2], constraint_manifold(scene.robot, PARAMS.constraints["free"]), certifier
+        ).max_violation_rad
         == 0.0
     )
 

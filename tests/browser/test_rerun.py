@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.palette import GOAL as GOAL_COLOUR
 from constraint_geodesics.palette import START as START_COLOUR
 from constraint_geodesics.palette import planner_colour
@@ -46,7 +47,7 @@ def recordings(
     for planner, joints in (("learned_geodesic", straight), ("birrt", bent)):
         path = PathRecord(planner, "free", 0, 0, joints, f"**{planner}**", meshes=False)
         files.append(folder / f"{planner}.rrd")
-        constrained = scene.manifold(params.constraints["free"])
+        constrained = constraint_manifold(scene.robot, params.constraints["free"])
         record_path(files[-1], path, constrained, scene.workcell, frames=60)  # as the stages do
     return files
 

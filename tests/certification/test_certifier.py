@@ -13,7 +13,12 @@ import pytest
 
 import constraint_geodesics.certification as package
 from constraint_geodesics.certification.certifier import CertificationError, Certifier, Limits
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintManifold,
+    Pose,
+    constraint_manifold,
+)
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.learning.lift import as_executed, densify
 from constraint_geodesics.params import Params
@@ -116,7 +121,7 @@ def certifier(scene: Scene):
 @pytest.fixture(scope="module")
 def good(scene: Scene, params: Params) -> Question:
     """A path that keeps the cup level, between drawn ends, slow and smooth in time."""
-    manifold = scene.manifold(params.constraints["level_cup"])
+    manifold = constraint_manifold(scene.robot, params.constraints["level_cup"])
     drawn = retract(manifold, scene.robot.sample(80, np.random.default_rng(0)))
     ends = drawn.joints[drawn.converged & (scene.robot.limit_distance(drawn.joints) > 0.05)]
     with scene.world() as world:
@@ -147,7 +152,7 @@ def excesses(manifold: ConstraintManifold, q: np.ndarray) -> tuple[np.ndarray, n
     the positions [m].
     """
     excess = manifold.inclusion(q)
-    shared = len(set(manifold.tolerance[3:][manifold.held[3:]])) == 1
+    shared = len(set(manifold.rows.tolerance[3:][manifold.rows.held[3:]])) == 1
     angles = np.linalg.norm(excess[:, 3:], axis=-1) if shared else excess[:, 3:].max(axis=-1)
     return angles, excess[:, :3].max(axis=-1)
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from constraint_geodesics.constraints.pose import (
+from constraint_geodesics.constraints.constraint import (
     Constraint,
     ConstraintError,
     ConstraintManifold,

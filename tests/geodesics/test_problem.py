@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.geodesics.problem import LearnedProblem, repeated
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
@@ -10,7 +11,7 @@ from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_ro
 
 @pytest.fixture(scope="module")
 def problem(scene, params, trained):
-    level = scene.manifold(params.constraints["level_cup"])
+    level = constraint_manifold(scene.robot, params.constraints["level_cup"])
     frame = draw_shard(ShardTask(scene, level, 4000, (1,))).frame
     joints = joints_of(frame)[free_rows(frame)]
     return LearnedProblem(trained.manifold, level, PinnedPolynomial(6, 3), joints, 16, True, 1.0)
@@ -63,7 +64,7 @@ def test_random_curves_find_a_way_where_the_straight_line_does_not(problem) -> N
 
 
 def test_the_fingerprint_knows_its_inputs(problem, scene, params) -> None:
-    relaxed = scene.manifold(params.constraints["level_cup_relaxed"])
+    relaxed = constraint_manifold(scene.robot, params.constraints["level_cup_relaxed"])
     other = LearnedProblem(problem.chart, relaxed, problem.curve, problem.joints, 16, True, 1.0)
     same = LearnedProblem(
         problem.chart, problem.manifold, problem.curve, problem.joints.copy(), 16, True, 1.0

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.geodesics.episodes import (
     EpisodeSettings,
     begin,
@@ -28,7 +29,7 @@ def ignore(step, figures) -> None:
 def problems(scene, params, trained):
     members = []
     for name in ("level_cup", "level_cup_relaxed", "free"):
-        manifold = scene.manifold(params.constraints[name])
+        manifold = constraint_manifold(scene.robot, params.constraints[name])
         frame = draw_shard(ShardTask(scene, manifold, 1000, (1,))).frame
         members.append(
             LearnedProblem(

@@ -1,27 +1,22 @@
 import numpy as np
 import pytest
 
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintManifold,
+    Pose,
+    constraint_manifold,
+)
 from constraint_geodesics.constraints.projection import retract
-from constraint_geodesics.geodesics.pull_kernels import tangential_pull
+from constraint_geodesics.geodesics.pull_kernels import Bounds, tangential_gradient
 
 TIMES = 0.5 - 0.5 * np.cos(np.pi * np.arange(13) / 12)
 
 
 def pulls_of(manifold, joints: np.ndarray) -> np.ndarray:
     robot, pulls = manifold.robot, np.empty_like(joints)
-    tangential_pull(
-        robot.chain.arrays,
-        manifold.held,
-        manifold.tolerance,
-        *manifold.reference_arrays,
-        robot.lower,
-        robot.upper,
-        1e-6,
-        TIMES,
-        joints,
-        pulls,
-    )
+    bounds = Bounds(robot.lower, robot.upper, 1e-6)
+    tangential_gradient(manifold.arrays, bounds, TIMES, joints, pulls)
     return pulls
 
 
@@ -45,7 +40,7 @@ def curves(manifold, count: int) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ["level_cup", "slide", "fixed_orientation", "tool_down", "free"])
 def test_the_pull_is_minus_the_gradient_on_the_tangent_space(scene, params, name) -> None:
-    manifold = scene.manifold(params.constraints[name])
+    manifold = constraint_manifold(scene.robot, params.constraints[name])
     joints = curves(manifold, 20)
     assert len(joints) >= 5
     pulls = pulls_of(manifold, joints)

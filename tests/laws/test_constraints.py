@@ -1,12 +1,30 @@
-"""What every constraint must satisfy, over all kinds of held axes and both robots."""
+"""What every constraint must satisfy, over all kinds, all held axes and both robots."""
+
+import json
+import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import njit
 
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.certification.certificate import Limits
+from constraint_geodesics.certification.certifier import Certifier
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintError,
+    ConstraintManifold,
+    Pose,
+    constraint_from,
+    constraint_from_json,
+)
+from constraint_geodesics.constraints.functions import FunctionsConstraint, RowBound, made_by
+from constraint_geodesics.constraints.kernels import curvature, linearise, scratch
 from constraint_geodesics.constraints.projection import Retraction, retract
+from constraint_geodesics.params import FunctionsConstraintParams
+from constraint_geodesics.scene.scene import Scene
 
 AXES = [
     (0, 0, 0, 0, 0, 0),
@@ -93,3 +111,239 @@ def test_a_tilt_is_measured_as_its_angle(xarm, tilt: float, heading: float) -> N
     # the axis that should be vertical is off by the tilt, wherever that tilt points
     np.testing.assert_allclose(np.linalg.norm(residual[3:5]), tilt, atol=1e-7)
     assert residual[5] == 0.0
+
+
+SPHERE = "constraint_geodesics.constraints.functions:tip_on_sphere"
+KINDS = ["held axes", "cone", "two tolerances", "sphere", "thick sphere", "coupling"]
+
+
+def coupled(q, out) -> None:
+    out[0] = np.sin(q[1]) + 0.5 * q[2]
+    out[1] = q[3] * q[4]
+
+
+def coupled_slopes(q, out) -> None:
+    out[:] = 0.0
+    out[0, 1], out[0, 2] = np.cos(q[1]), 0.5
+    out[1, 3], out[1, 4] = q[4], q[3]
+
+
+# |sin″| ≤ 1; (q₃ q₄)″ = 2 d₃ d₄ ≤ |d|²
+COUPLED = FunctionsConstraint(
+    coupled, coupled_slopes, (RowBound("first", "rad", 1.0, 0.1), RowBound("second", "m", 1.0))
+)
+
+
+def sphere(robot, tolerance: float = 0.0) -> FunctionsConstraint:
+    arguments = {"centre_m": [0.35, 0.0, 0.2], "radius_m": 0.25, "tolerance_m": tolerance}
+    return made_by(SPHERE, arguments, robot)
+
+
+def of_kind(name: str, robot) -> Constraint:
+    return {
+        "held axes": Constraint((0, 0, 1, 1, 1, 0), reference=REFERENCE),
+        "cone": Constraint((0, 0, 0, 1, 1, 0), (0, 0, 0, 0.2, 0.2, 0), REFERENCE),
+        "two tolerances": Constraint((0, 1, 0, 1, 0, 1), (0, 0.1, 0, 0.2, 0, 0.1), REFERENCE),
+        "sphere": sphere(robot),
+        "thick sphere": sphere(robot, 0.05),
+        "coupling": COUPLED,
+    }[name]
+
+
+@pytest.fixture(params=KINDS)
+def manifold(request: pytest.FixtureRequest, robot) -> ConstraintManifold:
+    return ConstraintManifold(robot, of_kind(request.param, robot))
+
+
+def test_shapes_units_and_words(manifold) -> None:
+    constraint, robot = manifold.constraint, manifold.robot
+    count = len(constraint.rows.held)
+    q = robot.sample(6, np.random.default_rng(0)).reshape(2, 3, -1)
+    residual, jacobian = manifold.linearise(q)
+    assert residual.shape == (2, 3, count)
+    assert jacobian.shape == (2, 3, count, robot.dof)
+    assert len(constraint.units) == count
+    assert set(constraint.units) <= {"m", "rad"}
+    assert constraint.codim == len(constraint.rows.exact)
+    assert isinstance(constraint, Constraint)
+    assert not constraint.is_free
+    assert constraint.is_placed
+    assert constraint.context.shape == (12,)
+    assert "constraint on" in constraint.label
+    drawn = constraint.series(residual.reshape(-1, count))
+    assert all(line.values.shape == (6,) and (line.values >= 0).all() for line in drawn)
+
+
+def test_the_slopes_are_the_residuals_of_every_kind(manifold) -> None:
+    q, step = manifold.robot.sample(40, np.random.default_rng(0)), 1e-6
+    q = q[np.abs(manifold.residual(q)).max(axis=-1) < 2.0]
+    jacobian = manifold.jacobian(q)
+    for joint in range(manifold.robot.dof):
+        shift = step * np.eye(manifold.robot.dof)[joint]
+        difference = (manifold.residual(q + shift) - manifold.residual(q - shift)) / (2 * step)
+        np.testing.assert_allclose(jacobian[..., joint], difference, atol=1e-6)
+
+
+def test_projection_ends_where_nothing_is_violated(manifold) -> None:
+    rows = manifold.constraint.rows
+    result = retract(manifold, manifold.robot.sample(200, np.random.default_rng(1)))
+    assert result.converged.mean() > 0.9
+    on = result.joints[result.converged]
+    residual, violation = manifold.residual(on), manifold.violation(on)
+    assert violation.max() <= 1e-9
+    np.testing.assert_array_equal(violation == 0.0, (manifold.inclusion(on) == 0.0).all(axis=1))
+    np.testing.assert_allclose(residual[:, rows.exact], 0.0, atol=1e-9)
+    for group in rows.loose_groups:
+        size = np.linalg.norm(residual[:, group], axis=1)
+        assert size.max() <= rows.tolerance[group[0]] + 1e-9
+    np.testing.assert_array_equal(retract(manifold, on, Retraction(accuracy=1e-8)).joints, on)
+
+
+@njit
+def closed_form(arrays, weights, q):
+    own = scratch(arrays.constraint, q.shape[0])
+    residual = np.zeros(weights.shape[0])
+    jacobian = np.zeros((weights.shape[0], q.shape[0]))
+    full = np.zeros((q.shape[0], q.shape[0]))
+    linearise(arrays, q, own, residual, jacobian)
+    return curvature(arrays, weights, own, full), full
+
+
+def test_the_closed_curvature_is_that_of_finite_differences(manifold) -> None:
+    """Where a kind knows Σ λ ∇²r in closed form: on the constraint, along its tangent space."""
+    rng, step, rows = np.random.default_rng(5), 1e-5, manifold.constraint.rows
+    result = retract(manifold, manifold.robot.sample(20, rng))
+    for q in result.joints[result.converged]:
+        weights = rng.normal(size=len(rows.held)) * rows.held
+        known, full = closed_form(manifold.arrays, weights, q)
+        if not known:
+            continue
+        slopes = manifold.jacobian(q)
+        basis = np.linalg.svd(slopes)[2][np.linalg.matrix_rank(slopes, 1e-6) :].T
+        moved = [
+            (manifold.jacobian(q + step * b) - manifold.jacobian(q - step * b)).T @ weights
+            for b in basis.T
+        ]
+        expected = np.array(moved) @ basis / (2.0 * step)
+        scale = max(1.0, np.abs(expected).max())
+        np.testing.assert_allclose(
+            basis.T @ full @ basis, 0.5 * (expected + expected.T), atol=1e-4 * scale
+        )
+
+
+@pytest.fixture(scope="module")
+def certifier(kuka_scene: Scene):
+    with Certifier(kuka_scene, Limits(max_step_rad=1.0)) as own:
+        yield own
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**31 - 1), step=st.floats(0.001, 0.3))
+def test_the_bound_between_waypoints_holds_at_every_sample(
+    kuka_scene, certifier, kind, seed, step
+) -> None:
+    robot, rng = kuka_scene.robot, np.random.default_rng(seed)
+    manifold = ConstraintManifold(robot, of_kind(kind, robot))
+    first = robot.sample(1, rng)[0]
+    steps = rng.normal(size=(3, robot.dof))
+    steps *= step / np.linalg.norm(steps, axis=1, keepdims=True)
+    path = np.concatenate([first[None], first + np.cumsum(steps, axis=0)])
+    found = certifier.certify(path, manifold.constraint, collisions=False)
+    t = np.linspace(0.0, 1.0, 50)[:, None, None]
+    between = (path[:-1] + t * (path[1:] - path[:-1])).reshape(-1, robot.dof)
+    sampled = manifold.violation(between).max()
+    assert found.violation_bound >= sampled - 1e-11
+    assert found.max_violation <= found.violation_bound + 1e-11
+    # the bound is sharp enough to be of use
+    assert found.violation_bound <= sampled + 0.05 * max(sampled, 1e-4) + 2e-4
+
+
+def test_a_sphere_s_bound_holds_the_second_derivative(robot) -> None:
+    constraint, rng, h = sphere(robot), np.random.default_rng(7), 1e-4
+    q, d = robot.sample(500, rng), rng.normal(size=(500, robot.dof))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    values = [constraint.values(q + k * h * d)[:, 0] for k in (-1, 0, 1)]
+    second = np.abs(values[0] - 2.0 * values[1] + values[2]) / h**2
+    bound = constraint.bounds[0].second_derivative
+    assert second.max() <= bound
+    assert second.max() > 0.02 * bound
+
+
+def test_json_pickle_and_key_keep_a_constraint(manifold) -> None:
+    constraint, robot = manifold.constraint, manifold.robot
+    again = pickle.loads(pickle.dumps(constraint))
+    assert again.key == constraint.key
+    hash(constraint.key)
+    if constraint is COUPLED:
+        with pytest.raises(ConstraintError, match="was not made by a factory"):
+            constraint.to_json()
+        return
+    read = constraint_from_json(json.loads(json.dumps(constraint.to_json())), robot)
+    assert read.key == constraint.key
+    q = robot.sample(5, np.random.default_rng(3))
+    np.testing.assert_array_equal(ConstraintManifold(robot, read).residual(q), manifold.residual(q))
+
+
+def test_looser_is_another_constraint(manifold) -> None:
+    loose = manifold.constraint.loosened({"m": 0.3, "rad": 0.3})
+    assert loose.key != manifold.constraint.key
+    held = loose.rows.held
+    assert (loose.rows.tolerance[held] >= manifold.constraint.rows.tolerance[held]).all()
+    assert (loose.rows.tolerance[held] >= 0.3).all()
+
+
+def test_only_marked_factories_are_called(kuka) -> None:
+    for factory in ("os:system", "nowhere.at_all:thing", "json:dumps", "no_colon"):
+        with pytest.raises(ConstraintError, match="factory"):
+            made_by(factory, {}, kuka)
+    with pytest.raises(ConstraintError, match="unexpected"):
+        made_by(SPHERE, {"centre": 1}, kuka)
+    with pytest.raises(ConstraintError, match="radius_m"):
+        made_by(SPHERE, {"centre_m": [0, 0, 0], "radius_m": -1.0}, kuka)
+    with pytest.raises(ConstraintError, match="no such kind"):
+        constraint_from_json({"kind": "kernels"}, kuka)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "words"),
+    [
+        ((), "one is needed"),
+        ((RowBound("", "m", 0.0),), "a name"),
+        ((RowBound("x", "mm", 0.0),), "m or rad"),
+        ((RowBound("x", "m", -1.0),), "second_derivative"),
+        ((RowBound("x", "m", 0.0, float("nan")),), "tolerance"),
+    ],
+)
+def test_a_row_that_makes_no_sense_is_refused(bounds, words) -> None:
+    with pytest.raises(ConstraintError, match=words):
+        FunctionsConstraint(coupled, coupled_slopes, bounds)
+
+
+def test_params_name_a_factory(kuka) -> None:
+    entry = FunctionsConstraintParams(
+        kind="functions",
+        description="wiping a bowl",
+        factory=SPHERE,
+        arguments={"centre_m": [0.35, 0.0, 0.2], "radius_m": 0.25},
+    )
+    assert constraint_from(entry, kuka).key == sphere(kuka).key
+
+
+FILES = {
+    "Pose": {"params.py", "constraints/constraint.py", "constraints/pose.py"},
+    "Functions": {"params.py", "constraints/functions.py"},
+}
+"""Where the class of a kind, its arrays and its record may be named."""
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_kind_is_named_in_its_own_files_alone(kind) -> None:
+    package = Path(__file__).parents[2] / "src" / "constraint_geodesics"
+    words = [f"{kind}Constraint", f"{kind.removesuffix('s')}Arrays", f"constraints.{kind.lower()} "]
+    named = {
+        str(file.relative_to(package))
+        for file in package.rglob("*.py")
+        if any(word in file.read_text() for word in words)
+    }
+    assert named <= FILES[kind] | {f"certification/{kind.lower()}.py"}

@@ -3,7 +3,12 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintManifold,
+    Pose,
+    constraint_manifold,
+)
 from constraint_geodesics.learning.dataset import (
     DatasetError,
     ShardTask,
@@ -28,7 +33,7 @@ def labelled(scene, manifold, params, workers, rows=600):
 
 
 def test_bytes_do_not_depend_on_the_number_of_workers(scene, params, tmp_path) -> None:
-    manifold = scene.manifold(params.constraints["level_cup"])
+    manifold = constraint_manifold(scene.robot, params.constraints["level_cup"])
     for workers in (1, 2):
         write_joints(
             labelled(scene, manifold, params, workers), tmp_path / f"{workers}.parquet", ABOUT
@@ -37,7 +42,7 @@ def test_bytes_do_not_depend_on_the_number_of_workers(scene, params, tmp_path) -
 
 
 def test_rows_are_what_pybullet_and_the_constraint_say(scene, params, tmp_path) -> None:
-    manifold = scene.manifold(params.constraints["level_cup_relaxed"])
+    manifold = constraint_manifold(scene.robot, params.constraints["level_cup_relaxed"])
     shards = labelled(scene, manifold, params, 1, rows=400)
     write_joints(shards, tmp_path / "joints.parquet", ABOUT)
     schema = pq.read_schema(tmp_path / "joints.parquet")
@@ -63,7 +68,7 @@ def test_rows_are_what_pybullet_and_the_constraint_say(scene, params, tmp_path) 
 
 
 def test_queries_are_usable_ends_unlike_the_data(scene, params, tmp_path) -> None:
-    manifold = scene.manifold(params.constraints["slide"])
+    manifold = constraint_manifold(scene.robot, params.constraints["slide"])
     queries = draw_queries(scene, manifold, "slide", 5, 7)
     assert len(queries) == 5
     ends = np.concatenate([queries.starts, queries.goals])
@@ -76,7 +81,7 @@ def test_queries_are_usable_ends_unlike_the_data(scene, params, tmp_path) -> Non
 
 
 def test_a_broken_table_is_named(scene, params, tmp_path) -> None:
-    manifold = scene.manifold(params.constraints["level_cup"])
+    manifold = constraint_manifold(scene.robot, params.constraints["level_cup"])
     file = tmp_path / "joints.parquet"
     write_joints(labelled(scene, manifold, params, 1, rows=50), file, ABOUT)
     frame = pd.read_parquet(file)

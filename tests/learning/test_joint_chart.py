@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.geodesics.problem import LearnedProblem
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.learned_manifold import JointManifold
@@ -14,7 +15,7 @@ def chart(trained) -> JointManifold:
 
 @pytest.fixture(scope="module")
 def problem(scene, params, chart, trained) -> LearnedProblem:
-    free = scene.manifold(params.constraints["free"])
+    free = constraint_manifold(scene.robot, params.constraints["free"])
     return LearnedProblem(chart, free, PinnedPolynomial(6, 3), trained.joints, 16, True, 1.0)
 
 

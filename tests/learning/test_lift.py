@@ -1,5 +1,6 @@
 import numpy as np
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.learning.lift import as_executed, densify, jump_excess
 
@@ -22,7 +23,7 @@ def test_a_jump_is_what_no_continuous_curve_needs() -> None:
 
 
 def test_executed_rows_are_on_the_constraint(scene, params) -> None:
-    manifold = scene.manifold(params.constraints["level_cup"])
+    manifold = constraint_manifold(scene.robot, params.constraints["level_cup"])
     q = retract(manifold, scene.robot.sample(200, np.random.default_rng(0))).joints
     pair = np.stack([q[0], q[0] + 0.05])
     pair[1] = retract(manifold, pair[1]).joints
@@ -34,7 +35,7 @@ def test_executed_rows_are_on_the_constraint(scene, params) -> None:
 
 def test_a_change_of_branch_stays_a_jump(scene, params) -> None:
     """Rows in between do not turn a leap between two branches of the constraint into a path."""
-    manifold = scene.manifold(params.constraints["fixed_orientation"])
+    manifold = constraint_manifold(scene.robot, params.constraints["fixed_orientation"])
     q = retract(manifold, scene.robot.sample(80, np.random.default_rng(0))).joints
     steps = [
         np.linalg.norm(np.diff(as_executed(manifold, np.stack(pair), 0.02), axis=0), axis=1).max()

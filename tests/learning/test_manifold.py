@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
 from constraint_geodesics.learning.learned_manifold import LearnedManifold, ManifoldFileError
 from constraint_geodesics.learning.submanifold import Surface, extract, submanifold_figures

@@ -3,6 +3,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
 from constraint_geodesics.learning.submanifold import (
     UNKNOWN,
@@ -56,7 +57,7 @@ def configurations(scene, manifold, count):
 
 
 def test_graph_edges_hold_and_components_are_answers(scene, params, tmp_path) -> None:
-    manifold = scene.manifold(params.constraints["tool_down"])
+    manifold = constraint_manifold(scene.robot, params.constraints["tool_down"])
     small = params.submanifold.model_copy(update={"nodes": 500})
     joints = configurations(scene, manifold, 1000)
     with scene.world() as world:
@@ -83,7 +84,7 @@ def test_graph_edges_hold_and_components_are_answers(scene, params, tmp_path) ->
 
 
 def test_a_plane_is_drawn_on_a_grid(scene, params) -> None:
-    manifold = scene.manifold(params.constraints["level_cup_relaxed"])
+    manifold = constraint_manifold(scene.robot, params.constraints["level_cup_relaxed"])
     joints = configurations(scene, manifold, 200)
     chart = PlaneChart(joints[0])
     small = params.submanifold.model_copy(update={"grid": 60})
@@ -97,7 +98,7 @@ def test_a_plane_is_drawn_on_a_grid(scene, params) -> None:
 
 
 def test_no_constraint_keeps_everything(scene, params) -> None:
-    manifold = scene.manifold(params.constraints["free"])
+    manifold = constraint_manifold(scene.robot, params.constraints["free"])
     joints = scene.robot.sample(50, np.random.default_rng(0))
     surface = Surface(PlaneChart(joints[0]), manifold, everywhere)
     found = extract(surface, joints, joints, params.submanifold)

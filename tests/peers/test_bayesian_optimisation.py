@@ -5,7 +5,7 @@ import pytest
 from tests.planner_fixtures import manifold_of, packaged_learned, packaged_planner, pairs_of
 
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.peers.bayesian_optimisation import BayesianPlanner

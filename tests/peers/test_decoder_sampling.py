@@ -12,7 +12,7 @@ from tests.planner_fixtures import (
 )
 
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.learning.inference import FrozenManifold
 from constraint_geodesics.params import BenchmarkParams
 from constraint_geodesics.peers.decoder_sampling import BATCH, DecoderSampling, decoded_samples

@@ -6,7 +6,7 @@ import pytest
 from tests.planner_fixtures import NAMES, assert_sound, manifold_of, packaged_planner, problems
 
 from constraint_geodesics.certification.certifier import Certifier, Limits
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.params import BenchmarkParams
 from constraint_geodesics.peers.elastic_band import (
     BandAfter,

@@ -6,7 +6,7 @@ import pytest
 from tests.planner_fixtures import manifold_of, packaged_learned, packaged_planner, pairs_of
 
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.peers.latent_geodesic import GradientGeodesic, StraightLatent, executable
 from constraint_geodesics.problem import PlanningProblem, Solution

@@ -13,7 +13,7 @@ from tests.planner_fixtures import (
 )
 
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.length import estimate_length

@@ -12,14 +12,13 @@ from tests.planner_fixtures import (
 )
 
 from constraint_geodesics.certification.certifier import Certifier, Limits
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.peers.elastic_band import StraightBand, task_of
 from constraint_geodesics.peers.trajectory_optimisation import (
     Course,
     Demand,
     TrajectoryOptimisation,
     demands_of,
-    groups_of,
 )
 from constraint_geodesics.problem import PathPlanner, PlanningProblem
 from constraint_geodesics.scene.box import Box
@@ -217,4 +216,4 @@ def test_demands_are_met_where_the_constraint_is(name: str, world: World) -> Non
         met &= (np.abs(values) < 1e-9).all(axis=1) if demand.equal else (values >= 0.0).all(axis=1)
     assert met[0]
     np.testing.assert_array_equal(met, manifold.violation(q) <= 1e-9)
-    assert sum(map(len, groups_of(manifold))) == np.count_nonzero(TOLERANCES[name])
+    assert sum(map(len, manifold.rows.loose_groups)) == np.count_nonzero(TOLERANCES[name])

@@ -15,6 +15,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import ShardTask, draw_shard, shard_tasks
 from constraint_geodesics.params import ComputeParams, Params
 from constraint_geodesics.pipeline import compute
@@ -126,7 +127,7 @@ def test_dask_loky_and_this_process_give_the_same_bits(dask: ComputeParams) -> N
 def test_a_stages_own_tasks_run_on_dask_as_on_loky(
     dask: ComputeParams, scene: Scene, params: Params
 ) -> None:
-    manifold = scene.manifold(params.constraints["level_cup"])
+    manifold = constraint_manifold(scene.robot, params.constraints["level_cup"])
     tasks = shard_tasks(ShardTask(scene, manifold, 200, (1,)), 100)
     for ours, theirs in zip(
         parallel_map(draw_shard, tasks, TWO), parallel_map(draw_shard, tasks, dask), strict=True

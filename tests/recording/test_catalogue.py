@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from tests.test_cli_plan import COMMAND, called, strict
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import in_checkout
 from constraint_geodesics.recording.catalogue import (
@@ -148,7 +149,8 @@ def test_files_that_no_table_names_speak_for_themselves(
     joints = np.linspace([0.0, -0.5, -1.0, 0.0, 0.5, 0.0], [0.3, -0.5, -1.0, 0.4, 0.5, 0.0], 5)
     record = PathRecord("prm", "free", 4, 2, joints, "text", scene="keep_out", meshes=False)
     file = Path("first_path/path.rrd")
-    record_path(file, record, scene.manifold(params.constraints["free"]), (), frames=5)
+    manifold = constraint_manifold(scene.robot, params.constraints["free"])
+    record_path(file, record, manifold, (), frames=5)
     Path("data/recordings/broken.rrd").write_bytes(b"RRF2")
     broken, own = catalogue(Path(), read_entry)[-2:]
     assert (own.planner, own.constraint, own.scene, own.query, own.seed) == (
@@ -335,7 +337,7 @@ def test_one_command_opens_the_learned_path_over_the_sampled_one(
 ) -> None:
     """As README has it, saved instead of shown."""
     joints = np.linspace([0.0, -0.5, -1.0, 0.0, 0.5, 0.0], [0.3, -0.5, -1.0, 0.4, 0.5, 0.0], 5)
-    manifold = scene.manifold(params.constraints["level_cup"])
+    manifold = constraint_manifold(scene.robot, params.constraints["level_cup"])
     for file, planner in ((LEARNED, "learned_geodesic"), (SAMPLED.format(0), "birrt")):
         record = PathRecord(planner, "level_cup", 0, 0, joints, "text", meshes=False)
         record_path(Path(file), record, manifold, scene.workcell, frames=5)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.params import Params
@@ -36,7 +37,7 @@ AXIS = np.array([0.0, 1.0, 0.0])
 def record(scene: Scene, params: Params) -> ExecutionRecord:
     """A level cup turned over about the tool's axis."""
     near = np.array([-1.35, -0.47, -0.87, -2.28, 0.34, 0.74])
-    start = retract(scene.manifold(params.constraints["level_cup"]), near).joints
+    start = retract(constraint_manifold(scene.robot, params.constraints["level_cup"]), near).joints
     path = start + np.linspace(0.0, -2.6, 100)[:, None] * np.eye(6)[5]
     times = time_parametrisation(path, scene.robot.velocity, np.full(6, 4.0))
     execution = execute(scene, path, times, AXIS, CUP)

@@ -16,7 +16,7 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.recording.recording import (
     About,

@@ -16,6 +16,7 @@ from mlflow.utils.search_utils import SearchUtils
 from tests.benchmark.plan_fixtures import write_plan_reports
 from tests.report.pages import DASHBOARD, check_page
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import (
     ShardTask,
     data_card,
@@ -232,7 +233,7 @@ def run(tmp_path_factory):
     scene = Scene.from_params(params)
     rng = np.random.default_rng(0)
     for name in CONSTRAINTS:
-        manifold = scene.manifold(params.constraints[name])
+        manifold = constraint_manifold(scene.robot, params.constraints[name])
         shards = [
             draw_shard(task)
             for task in shard_tasks(ShardTask(scene, manifold, 120, seed_of(name, 1)), 120)
@@ -253,7 +254,7 @@ def run(tmp_path_factory):
                 free, own = (
                     read_joints(layout.joints(c)).free_joints for c in ("free", constraint)
                 )
-                constrained = scene.manifold(params.constraints[constraint])
+                constrained = constraint_manifold(scene.robot, params.constraints[constraint])
                 surface = Surface(chart, constrained, world.free)
                 found = extract(surface, free, own, params.submanifold)
                 save_submanifold(found, layout.submanifold(name, constraint))

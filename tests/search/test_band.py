@@ -9,13 +9,19 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintManifold,
+    Pose,
+    constraint_manifold,
+)
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.params import Params
 from constraint_geodesics.scene.clearance import ClearanceModel, clearance_model
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search import band_kernels
-from constraint_geodesics.search.band import BandCurve, BandSettings, BandSpace, project, relax
+from constraint_geodesics.search.band import BandCurve, BandSettings, project, relax
+from constraint_geodesics.search.space import project_each, space_of
 
 MARGIN = 0.006
 HOME = np.array([-1.35, -0.47, -0.87, -2.28, 0.34, 0.74])
@@ -39,10 +45,10 @@ class Spaces:
     model: ClearanceModel
 
     def clear(self, name: str) -> tuple:
-        return BandSpace(self.manifolds[name], self.model, MARGIN).arrays
+        return space_of(self.manifolds[name], self.model, MARGIN)
 
     def open(self, name: str) -> tuple:
-        return BandSpace(self.manifolds[name], self.model, MARGIN).without_boxes().arrays
+        return space_of(self.manifolds[name])
 
     def lines(
         self, name: str, segments: int, count: int, seed: int, spread: float = 1.0
@@ -74,7 +80,7 @@ class Spaces:
 def spaces(scene: Scene, params: Params) -> Spaces:
     robot = scene.robot
     reference = Pose(*robot.forward(HOME))
-    manifolds = {name: scene.manifold(params.constraints[name]) for name in NAMED}
+    manifolds = {name: constraint_manifold(scene.robot, params.constraints[name]) for name in NAMED}
     manifolds |= {
         name: ConstraintManifold(robot, constraint.relative_to(reference))
         for name, constraint in OWN.items()
@@ -114,7 +120,7 @@ def pulls(nodes: np.ndarray) -> np.ndarray:
 def projected(space: tuple, nodes: np.ndarray) -> tuple[np.ndarray, float]:
     """The band before any step is taken, and what its nodes leave of the violation."""
     band = relax(space, nodes, BandSettings(iterations=0))
-    return band.nodes, band_kernels.project_rows(space, band.nodes[1:-1].copy(), 0)
+    return band.nodes, project_each(space, band.nodes[1:-1].copy(), 0)
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -154,7 +160,7 @@ def test_no_tangential_pull_is_left(spaces, name) -> None:
             continue
         used += 1
         pull = pulls(band.nodes)
-        rows = manifold.jacobian(band.nodes[1:-1])[:, manifold.held]
+        rows = manifold.jacobian(band.nodes[1:-1])[:, manifold.rows.held]
         across = np.linalg.pinv(rows) @ rows @ pull[..., None]
         assert np.abs(pull - across[..., 0]).max() < 1e-4 * np.linalg.norm(nodes[-1] - nodes[0])
     assert used >= 15
@@ -170,7 +176,7 @@ def blocks(jacobians: np.ndarray) -> np.ndarray:
 
 def reference(manifold: ConstraintManifold, nodes: np.ndarray) -> np.ndarray:
     """The band of least energy by SLSQP on all nodes at once, from the same start."""
-    dof, held, tolerance = manifold.robot.dof, manifold.held, manifold.tolerance
+    dof, held, tolerance = manifold.robot.dof, manifold.rows.held, manifold.rows.tolerance
     exact, loose = held & (tolerance == 0.0), held & (tolerance > 0.0)
     is_cone = loose[3:].any() and len(set(tolerance[3:][held[3:]])) == 1
     entries = loose & ~np.array([False] * 3 + [is_cone] * 3)
@@ -260,10 +266,9 @@ def test_the_reduced_hessian_is_that_of_the_lagrangian(spaces, name) -> None:
     """
     manifold = spaces.manifolds[name]
     robot, rng = manifold.robot, np.random.default_rng(4)
-    far_away = (np.stack([robot.lower - 100.0, robot.upper + 100.0]),)
-    chain, held, tolerance, position, rotation, _, boxes, _ = spaces.open(name)
-    space = (chain, held, tolerance, position, rotation, *far_away, boxes, 0.0)
-    work = band_kernels.workspace(robot.dof)
+    far_away = np.stack([robot.lower - 100.0, robot.upper + 100.0])
+    space = spaces.open(name)._replace(limits=far_away)
+    work = band_kernels.new_work(space)
     curved = 0
     for start in retract(manifold, robot.sample(20, rng)).joints:
         rows_at, active = active_rows(manifold, start)
@@ -279,7 +284,7 @@ def test_the_reduced_hessian_is_that_of_the_lagrangian(spaces, name) -> None:
             np.zeros((robot.dof,) * 2),
             np.zeros(robot.dof),
         )
-        count = band_kernels._node(space, start, pull, basis, hessian, onto, work)
+        count = band_kernels.reduced(space, start, pull, basis, hessian, onto, work)
         assert count == robot.dof - len(rows)
         basis, hessian = basis[:, :count], hessian[:count, :count]
         np.testing.assert_allclose(basis.T @ basis, np.eye(count), atol=1e-9)
@@ -300,7 +305,7 @@ def test_the_reduced_hessian_is_that_of_the_lagrangian(spaces, name) -> None:
 
 def active_rows(manifold: ConstraintManifold, q: np.ndarray):
     """Rows ∂c/∂q that hold at q as a function of the joints, and which of them are inequalities."""
-    residual, held, tolerance = manifold.residual(q), manifold.held, manifold.tolerance
+    residual, held, tolerance = manifold.residual(q), manifold.rows.held, manifold.rows.tolerance
     is_cone = (
         held[3:].any()
         and len(set(tolerance[3:][held[3:]])) == 1

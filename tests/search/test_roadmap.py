@@ -10,14 +10,14 @@ import pytest
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold, constraint_manifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.geometry.graph import components, nearest_neighbour_edges
 from constraint_geodesics.params import Params
 from constraint_geodesics.scene.clearance import ClearanceModel, clearance_model
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere
-from constraint_geodesics.search.band import BandSpace, project
+from constraint_geodesics.search.band import project
 from constraint_geodesics.search.roadmap import (
     JOINED,
     NEAREST,
@@ -29,6 +29,7 @@ from constraint_geodesics.search.roadmap import (
     resample,
     shortest_way,
 )
+from constraint_geodesics.search.space import space_of
 
 MARGIN = 0.006
 
@@ -178,12 +179,12 @@ class Made:
 
 @pytest.fixture(scope="module")
 def made(scene: Scene, params: Params) -> Made:
-    manifold = scene.manifold(params.constraints["level_cup"])
+    manifold = constraint_manifold(scene.robot, params.constraints["level_cup"])
     robot, model = scene.robot, clearance_model(scene.robot, scene.workcell)
     drawn = retract(manifold, robot.sample(1500, np.random.default_rng(3)))
     nodes = drawn.joints[drawn.converged & (robot.limit_distance(drawn.joints) >= 0.0)]
     nodes = nodes[model.clearance(robot, nodes) > MARGIN][:400]
-    space = BandSpace(manifold, model, MARGIN).arrays
+    space = space_of(manifold, model, MARGIN)
     return Made(manifold, model, space, build_roadmap(space, nodes, 10))
 
 
@@ -290,7 +291,7 @@ def test_edges_that_something_new_stands_on_are_left_out(made) -> None:
         model = clearance_model(robot, (ball,))
         if model.clearance(robot, np.stack([start, goal])).min() < 0.05:
             continue
-        space = BandSpace(made.manifold, model, MARGIN).arrays
+        space = space_of(made.manifold, model, MARGIN)
         after = shortest_way(roadmap, start, goal, at_start, at_goal, space)
         assert after is None or after.tobytes() != before.tobytes()
         changed += 1

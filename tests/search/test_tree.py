@@ -10,22 +10,23 @@ from tests.planner_fixtures import NAMES, manifold_of, packaged_planner, pairs_o
 
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.sphere import Sphere
-from constraint_geodesics.search.band import BandSpace, project
+from constraint_geodesics.search.band import project
 from constraint_geodesics.search.roadmap import edge_lengths
+from constraint_geodesics.search.space import Space, space_of
 from constraint_geodesics.search.tree import TreeSettings, tree_way
 
 MARGIN = 0.006
 
 
-def space_of(name: str, *more: Sphere) -> tuple:
+def scene_space(name: str, *more: Sphere) -> Space:
     scene = packaged_planner().scene
     model = clearance_model(scene.robot, (*scene.workcell, *more))
-    return BandSpace(manifold_of(packaged_planner(), name), model, MARGIN).arrays
+    return space_of(manifold_of(packaged_planner(), name), model, MARGIN)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_way_is_made_of_edges_that_hold(name) -> None:
-    space, manifold = space_of(name), manifold_of(packaged_planner(), name)
+    space, manifold = scene_space(name), manifold_of(packaged_planner(), name)
     found = 0
     for start, goal in pairs_of(name, 4, seed=3):
         corners = tree_way(space, start, goal, 0)
@@ -50,7 +51,7 @@ def test_a_way_is_made_of_edges_that_hold(name) -> None:
 
 
 def test_a_seed_decides_the_way() -> None:
-    space, bare, different = space_of("slide"), TreeSettings(shortcuts=0), 0
+    space, bare, different = scene_space("slide"), TreeSettings(shortcuts=0), 0
     for start, goal in pairs_of("slide", 6, seed=4):
         first, again, other = (tree_way(space, start, goal, seed, bare) for seed in (0, 0, 1))
         assert (first is None) == (again is None)
@@ -64,7 +65,7 @@ def test_a_seed_decides_the_way() -> None:
 
 
 def test_shortcuts_leave_corners_out_and_make_the_way_shorter() -> None:
-    space = space_of("level_cup")
+    space = scene_space("level_cup")
     shorter = 0
     for start, goal in pairs_of("level_cup", 5, seed=5):
         long, short = (tree_way(space, start, goal, 2, TreeSettings(shortcuts=n)) for n in (0, 60))
@@ -80,7 +81,7 @@ def test_shortcuts_leave_corners_out_and_make_the_way_shorter() -> None:
 def test_where_there_is_no_way_there_is_none() -> None:
     start, goal = pairs_of("level_cup", 1, seed=6)[0]
     x, y, z = map(float, packaged_planner().scene.robot.forward(goal)[0])
-    space = space_of("level_cup", Sphere("over the goal", (x, y, z), 0.15))
+    space = scene_space("level_cup", Sphere("over the goal", (x, y, z), 0.15))
     assert tree_way(space, start, goal, 0, TreeSettings(iterations=30)) is None
 
 
@@ -94,7 +95,7 @@ def test_a_sphere_is_gone_round() -> None:
         model = clearance_model(robot, (*planner.scene.workcell, ball))
         if model.clearance(robot, line[[0, -1]]).min() < 0.02:
             continue
-        way = tree_way(space_of("free", ball), start, goal, 0)
+        way = tree_way(scene_space("free", ball), start, goal, 0)
         assert way is not None
         assert model.clearance(robot, way[1:-1]).min() >= MARGIN - 1e-6
         assert len(way) > 2, "the straight line leads through the ball"
@@ -106,6 +107,6 @@ def test_settings_bound_the_work() -> None:
     start, goal = pairs_of("tool_down", 1, seed=8)[0]
     settings = TreeSettings()
     assert (
-        tree_way(space_of("tool_down"), start, goal, 0, replace(settings, nodes=2, iterations=1))
+        tree_way(scene_space("tool_down"), start, goal, 0, replace(settings, nodes=2, iterations=1))
         is None
     )

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.params import Params
@@ -22,7 +23,7 @@ QUICK = CupSettings(settle_s=0.25)
 def level(scene: Scene, params: Params) -> np.ndarray:
     """A configuration with the tool level, 0.4 m beside the base."""
     near = np.array([-1.35, -0.47, -0.87, -2.28, 0.34, 0.74])
-    return retract(scene.manifold(params.constraints["level_cup"]), near).joints
+    return retract(constraint_manifold(scene.robot, params.constraints["level_cup"]), near).joints
 
 
 def turned(start: np.ndarray, joint: int, angle: float, rows: int = 300) -> np.ndarray:

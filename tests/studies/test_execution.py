@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from constraint_geodesics.bundle import PACKAGED, read_bundle
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold, constraint_manifold
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.learning.dataset import Queries, draw_queries
 from constraint_geodesics.learning.lift import densify
@@ -47,7 +47,7 @@ def wanted(queries: int, least_tilt_rad: float) -> ExecutionParams:
 
 @pytest.fixture(scope="module")
 def manifold(scene: Scene, params: Params) -> ConstraintManifold:
-    return scene.manifold(params.constraints[LEVEL])
+    return constraint_manifold(scene.robot, params.constraints[LEVEL])
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +160,7 @@ def test_without_a_path_the_row_stays_and_the_line_is_judged(
 def test_constraints_that_let_the_cup_tip_are_refused(
     planner: Planner, scene: Scene, params: Params
 ) -> None:
-    free = scene.manifold(params.constraints["free"])
+    free = constraint_manifold(scene.robot, params.constraints["free"])
     with pytest.raises(
         ExecutionCheckError, match=r"axes = \(0, 0, 0, 0, 0, 0\): must hold roll and pitch"
     ):

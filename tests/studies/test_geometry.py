@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.graph_search import GraphSolver
 from constraint_geodesics.geodesics.problem import ChartBox, ChartProblem, LearnedProblem, Samples
@@ -28,7 +29,7 @@ from constraint_geodesics.studies.geometry import (
 
 @pytest.fixture(scope="module")
 def benchmark(scene, params, trained):
-    level = scene.manifold(params.constraints["level_cup"])
+    level = constraint_manifold(scene.robot, params.constraints["level_cup"])
     frame = draw_shard(ShardTask(scene, level, 1000, (1,))).frame
     curve = PinnedPolynomial(6, 3)
     plain = ChartProblem(trained.manifold, curve, Samples(trained.manifold.encode(trained.joints)))

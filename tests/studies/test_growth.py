@@ -17,6 +17,7 @@ from scipy.stats import linregress
 from tests.planner_fixtures import packaged_planner
 
 from constraint_geodesics.certification.certifier import Certifier, Limits
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import draw_queries
 from constraint_geodesics.peers.elastic_band import StraightBand
 from constraint_geodesics.peers.ompl import SamplingPlanner
@@ -321,7 +322,9 @@ def test_epochs_are_counted_without_what_surrounds_them(params, scene, tmp_path)
 
 @pytest.fixture(scope="module")
 def queries(params, scene):
-    return draw_queries(scene, scene.manifold(params.constraints[CONSTRAINT]), CONSTRAINT, 4, 3)
+    return draw_queries(
+        scene, constraint_manifold(scene.robot, params.constraints[CONSTRAINT]), CONSTRAINT, 4, 3
+    )
 
 
 def test_spheres_leave_room_around_both_ends(scene, queries):
@@ -343,7 +346,7 @@ def test_spheres_that_do_not_fit_are_an_error(scene, queries, monkeypatch):
 
 @pytest.fixture(scope="module")
 def problems(params, scene, queries):
-    manifold = scene.manifold(params.constraints[CONSTRAINT])
+    manifold = constraint_manifold(scene.robot, params.constraints[CONSTRAINT])
     with scene.world() as world:
         clearance = clearance_model(scene.robot, scene.workcell)
         pairs = zip(queries.starts, queries.goals, strict=True)

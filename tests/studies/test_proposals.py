@@ -9,7 +9,12 @@ import pandas as pd
 import pytest
 from scipy.optimize import minimize
 
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintManifold,
+    Pose,
+    constraint_manifold,
+)
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.geodesics.episodes import EpisodeSettings, observation_size
 from constraint_geodesics.geodesics.problem import LearnedProblem
@@ -36,7 +41,9 @@ def constrained(chart, manifold, trained) -> LearnedProblem:
 
 @pytest.fixture(scope="module")
 def level(scene, params, trained) -> LearnedProblem:
-    return constrained(trained.manifold, scene.manifold(params.constraints["level_cup"]), trained)
+    return constrained(
+        trained.manifold, constraint_manifold(scene.robot, params.constraints["level_cup"]), trained
+    )
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +137,8 @@ def test_without_policies_their_methods_are_left_out(problems, settings) -> None
 
 
 def test_the_optimum_without_constraint_is_the_straight_joint_line(scene, params, trained) -> None:
-    chart, free = JointManifold.of(trained.joints), scene.manifold(params.constraints["free"])
+    chart = JointManifold.of(trained.joints)
+    free = constraint_manifold(scene.robot, params.constraints["free"])
     problem = LearnedProblem(chart, free, PinnedPolynomial(6, 3), trained.joints, 16, True, 1.0)
     rng = np.random.default_rng(2)
     ends = problem.sample_ends(12, rng)

@@ -23,7 +23,7 @@ import yaml
 from mlflow import MlflowClient
 from mlflow.entities import Run
 
-from constraint_geodesics.params import ComputeParams, ConstraintParams, PoseParams, load_params
+from constraint_geodesics.params import ComputeParams, PoseConstraintParams, PoseParams, load_params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.tracking import experiment
 from constraint_geodesics.tracking.experiment import (
@@ -89,7 +89,7 @@ def work(task: tuple[ChildRun, int]) -> dict[str, float]:
 
 def test_a_stage_is_a_parent_its_seeds_are_children(root: Path) -> None:
     reference = PoseParams(position_m=(0.4, 0, 0.3), rpy_rad=(0, 0, 0))
-    held = ConstraintParams(
+    held = PoseConstraintParams(
         description="level", axes=(0, 0, 0, 1, 1, 0), tolerance=(0,) * 6, reference=reference
     )
     params = {

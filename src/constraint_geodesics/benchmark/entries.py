@@ -19,6 +19,7 @@ from constraint_geodesics.benchmark.runner import (
     run_block,
     table_of,
 )
+from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import ComputeParams, Params, PeerParams
 from constraint_geodesics.peers import registry
@@ -103,7 +104,7 @@ def blocks_of(params: Params, layout: Layout, folder: Path, recordings: Path) ->
                 if entries:
                     block = Block(
                         scene,
-                        scene.manifold(described),
+                        constraint_manifold(scene.robot, described),
                         charts,
                         chosen,
                         entries,

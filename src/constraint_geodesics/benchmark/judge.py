@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from constraint_geodesics.certification.certifier import Certifier, Limits
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.params import JudgeParams

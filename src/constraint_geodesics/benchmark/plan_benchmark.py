@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from constraint_geodesics.benchmark.judge import judge_limits
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.learning.dataset import Queries
 from constraint_geodesics.learning.lift import as_executed
 from constraint_geodesics.params import BenchmarkParams, JudgeParams, PlanBenchmarkParams
@@ -274,7 +274,11 @@ def _peers(
     """
     for name in names:
         yield PLANNERS[name].label, name, space
-        if name == "birrt" and not manifold.constraint.is_free and not manifold.tolerance.any():
+        if (
+            name == "birrt"
+            and not manifold.constraint.is_free
+            and not manifold.rows.tolerance.any()
+        ):
             yield TANGENT, name, "tangent_bundle"
 
 

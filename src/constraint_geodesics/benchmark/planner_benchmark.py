@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from constraint_geodesics.benchmark.judge import judge_limits, measure_path
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.learning.dataset import Queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import as_executed

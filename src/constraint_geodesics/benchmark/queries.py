@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.benchmark.runner import KEEP_OUT, TABLE, Case
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.learning.dataset import DatasetError, draw_queries
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere

@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from constraint_geodesics.benchmark.judge import PathMeasures, judge_limits, measure_path
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import JudgeParams
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution

@@ -1,60 +1,51 @@
-"""The constraint vector C of eq. 6 with tolerances and a reference pose, and its residual in joint
-space (eq. 7).
+"""Axes of the tool's pose held at a reference: the constraint vector C of eq. 6, and its residual
+in joint space (eq. 7).
+
+The orientation residual neither wraps nor locks.  With E = R R_refᵀ the rotation away from the
+reference: three held axes: the rotation vector of E; two held axes, axis k free: the swing that
+turns e_k back, i.e. the angle θ between R R_refᵀ e_k and e_k times its direction; one held axis k:
+the twist of E about e_k. The swing keeps its size up to θ = π, where the horizontal part of the
+axis alone would vanish upside down too.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
+from numba import njit
 
-from constraint_geodesics.constraints import kernels
-from constraint_geodesics.robot.kinematics import SerialRobot, rotation_from_rpy
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintError,
+    ConstraintManifold,
+    Pose,
+    Series,
+)
+from constraint_geodesics.constraints.kernels import COMPILE, Rows, register
+from constraint_geodesics.robot.kernels import Posture, geometric_jacobian, new_posture, pose_of
+from constraint_geodesics.robot.kinematics import SerialRobot
+
+__all__ = ["AXES", "Constraint", "ConstraintError", "ConstraintManifold", "Pose", "PoseConstraint"]
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+SEEN_TOLERANCE = 0.2
+"""Tolerance [rad or m] that a policy sees as 1."""
+_SMALL = 1e-9
 
 
-class ConstraintError(ValueError):
-    """A constraint that can't be meant; the message names the entry, its value and what is
-    allowed.
-    """
+class PoseArrays(NamedTuple):
+    """For the kernels: the six rows x y z roll pitch yaw [m, rad] and the reference pose."""
 
-
-@dataclass(frozen=True)
-class Pose:
-    """A tool pose in the base frame: position (3,) [m] and rotation (3, 3).
-
-    Raises ConstraintError if the numbers are not finite, too few or too many, or the rotation is
-    none.
-    """
-
+    rows: Rows
     position: Float[np.ndarray, "3"]
     rotation: Float[np.ndarray, "3 3"]
 
-    def __post_init__(self) -> None:
-        position, rotation = (
-            np.array(values, dtype=np.float64) for values in (self.position, self.rotation)
-        )
-        if position.shape != (3,) or not np.isfinite(position).all():
-            raise ConstraintError(f"position = {self.position}: must be 3 finite numbers [m]")
-        if rotation.shape != (3, 3) or not np.isfinite(rotation).all():
-            raise ConstraintError(f"rotation has shape {rotation.shape}: must be (3, 3), finite")
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0.0:
-            raise ConstraintError(
-                f"rotation = {rotation.tolist()}: must be orthonormal and right-handed"
-            )
-        object.__setattr__(self, "position", position)
-        object.__setattr__(self, "rotation", rotation)
-
-    @classmethod
-    def from_rpy(cls, position_m: Sequence[float], rpy_rad: Sequence[float]) -> Self:
-        """From a position [m] and roll, pitch, yaw [rad] about the fixed axes."""
-        return cls(np.asarray(position_m, float), rotation_from_rpy(np.asarray(rpy_rad, float)))
-
 
 @dataclass(frozen=True)
-class Constraint:
+class PoseConstraint(Constraint):
     """Which task axes x y z roll pitch yaw are held (eq. 6), how loosely, and relative to which
     pose.
 
@@ -65,6 +56,7 @@ class Constraint:
     tilt of at most 10°; unequal ones are bounded each by itself.
     """
 
+    kind: ClassVar[str] = "pose"
     axes: tuple[int, ...]
     tolerance: tuple[float, ...] = (0.0,) * 6
     reference: Pose | None = None
@@ -90,102 +82,359 @@ class Constraint:
         object.__setattr__(self, "tolerance", tuple(float(x) for x in self.tolerance))
 
     @property
-    def codim(self) -> int:
-        """Number of held axes that leave no freedom: the codimension of the constraint manifold."""
-        return sum(
-            1
-            for held, tolerance in zip(self.axes, self.tolerance, strict=True)
-            if held and tolerance == 0
+    def rows(self) -> Rows:
+        """The six axes; held angles that share one tolerance are bounded together."""
+        held, tolerance = np.array(self.axes, bool), np.array(self.tolerance)
+        together = held & (np.arange(6) >= 3)
+        if len(set(tolerance[together].tolist())) > 1:
+            together[:] = False
+        return Rows(held, tolerance, together)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Metres, then radians."""
+        return ("m",) * 3 + ("rad",) * 3
+
+    def arrays(self, robot: SerialRobot) -> PoseArrays:
+        """For the kernels."""
+        pose = self.reference or Pose(np.zeros(3), np.eye(3))
+        return PoseArrays(
+            self.rows, np.ascontiguousarray(pose.position), np.ascontiguousarray(pose.rotation)
         )
 
     @property
-    def is_free(self) -> bool:
-        """Whether no axis is held."""
-        return not any(self.axes)
+    def is_placed(self) -> bool:
+        """Whether it has a reference, or needs none."""
+        return self.reference is not None or self.is_free
 
-    def relative_to(self, pose: Pose) -> "Constraint":
+    def relative_to(self, pose: Pose) -> "PoseConstraint":
         """The same constraint held at `pose`."""
         return replace(self, reference=pose)
 
+    def loosened(self, least: Mapping[str, float]) -> "PoseConstraint":
+        """The same with every held axis loosened to the least of its unit."""
+        wider = zip(self.axes, self.tolerance, self.units, strict=True)
+        tolerance = tuple(max(own, least[unit]) if held else 0.0 for held, own, unit in wider)
+        return replace(self, tolerance=tolerance)
 
-@dataclass(frozen=True)
-class ConstraintManifold:
-    """The joint configurations of one robot that satisfy one constraint: {q : ι_C(q) = 0}, eqs.
-    7-8.
+    @property
+    def label(self) -> str:
+        """Its held axes."""
+        axes = " ".join(axis for axis, held in zip(AXES, self.axes, strict=True) if held)
+        return f"the constraint on {axes}" if axes else "no constraint"
 
-    Raises ConstraintError if an axis is held but the constraint has no reference yet.
+    @property
+    def context(self) -> Float[np.ndarray, "12"]:
+        """Which axes are held, and their tolerances over SEEN_TOLERANCE."""
+        return np.concatenate(
+            [np.array(self.axes, bool), np.array(self.tolerance) / SEEN_TOLERANCE]
+        )
+
+    @property
+    def level_axis(self) -> Float[np.ndarray, "3"] | None:
+        """What points up at the reference, where roll and pitch are held."""
+        if self.reference is None or not (self.axes[3] and self.axes[4]):
+            return None
+        return np.array(self.reference.rotation[2])
+
+    @property
+    def key(self) -> tuple:
+        """Axes, tolerances and reference, to the bit."""
+        pose = None if self.is_free else self.reference
+        where = () if pose is None else (pose.position.tobytes(), pose.rotation.tobytes())
+        return (self.kind, self.axes, self.tolerance, *where)
+
+    def series(self, residual: Float[np.ndarray, "n 6"]) -> list[Series]:
+        """Held positions each by itself [mm]; held angles that share one tolerance together
+        [deg].
+        """
+        rows = self.rows
+        found = [
+            Series(AXES[i], "mm", 1e3 * abs(residual[:, i]), 1e3 * self.tolerance[i])
+            for i in range(3)
+            if self.axes[i]
+        ]
+        angles = [i for i in range(3, 6) if self.axes[i]]
+        for group in [angles] if rows.together.any() else [[i] for i in angles]:
+            name = "tilt" if len(group) == 2 else " ".join(AXES[i] for i in group)
+            size = np.degrees(np.linalg.norm(residual[:, group], axis=1))
+            found.append(Series(name, "deg", size, math.degrees(self.tolerance[group[0]])))
+        return found
+
+    def to_json(self) -> dict[str, Any]:
+        """Axes, tolerance and reference; `kind` is left out, as in params.yaml."""
+        pose = self.reference
+        reference = (
+            None
+            if pose is None
+            else {"position_m": pose.position.tolist(), "rotation": pose.rotation.tolist()}
+        )
+        return {"axes": list(self.axes), "tolerance": list(self.tolerance), "reference": reference}
+
+    @classmethod
+    def from_json(cls, about: Mapping[str, Any], robot: SerialRobot | None) -> "PoseConstraint":
+        """What `to_json` wrote."""
+        pose = about["reference"]
+        reference = (
+            None
+            if pose is None
+            else Pose(np.array(pose["position_m"], float), np.array(pose["rotation"], float))
+        )
+        return cls(tuple(about["axes"]), tuple(about["tolerance"]), reference)
+
+    @classmethod
+    def from_params(cls, params: Any, robot: SerialRobot) -> "PoseConstraint":
+        """From axes, tolerance and reference."""
+        pose = params.reference
+        reference = None if pose is None else Pose.from_rpy(pose.position_m, pose.rpy_rad)
+        return cls(params.axes, params.tolerance, reference)
+
+
+KIND = PoseConstraint
+
+
+@njit(**COMPILE)
+def _quaternion(a, b):
+    """Unit quaternion (w ≥ 0, x, y, z) of the rotation E = A Bᵀ, by Shepperd's branch with the
+    largest component.
     """
+    e00 = a[0, 0] * b[0, 0] + a[0, 1] * b[0, 1] + a[0, 2] * b[0, 2]
+    e01 = a[0, 0] * b[1, 0] + a[0, 1] * b[1, 1] + a[0, 2] * b[1, 2]
+    e02 = a[0, 0] * b[2, 0] + a[0, 1] * b[2, 1] + a[0, 2] * b[2, 2]
+    e10 = a[1, 0] * b[0, 0] + a[1, 1] * b[0, 1] + a[1, 2] * b[0, 2]
+    e11 = a[1, 0] * b[1, 0] + a[1, 1] * b[1, 1] + a[1, 2] * b[1, 2]
+    e12 = a[1, 0] * b[2, 0] + a[1, 1] * b[2, 1] + a[1, 2] * b[2, 2]
+    e20 = a[2, 0] * b[0, 0] + a[2, 1] * b[0, 1] + a[2, 2] * b[0, 2]
+    e21 = a[2, 0] * b[1, 0] + a[2, 1] * b[1, 1] + a[2, 2] * b[1, 2]
+    e22 = a[2, 0] * b[2, 0] + a[2, 1] * b[2, 1] + a[2, 2] * b[2, 2]
+    trace = e00 + e11 + e22
+    if trace > 0.0:
+        s = 2.0 * np.sqrt(trace + 1.0)
+        w, x, y, z = 0.25 * s, (e21 - e12) / s, (e02 - e20) / s, (e10 - e01) / s
+    elif e00 >= e11 and e00 >= e22:
+        s = 2.0 * np.sqrt(1.0 + e00 - e11 - e22)
+        w, x, y, z = (e21 - e12) / s, 0.25 * s, (e01 + e10) / s, (e02 + e20) / s
+    elif e11 >= e22:
+        s = 2.0 * np.sqrt(1.0 + e11 - e00 - e22)
+        w, x, y, z = (e02 - e20) / s, (e01 + e10) / s, 0.25 * s, (e12 + e21) / s
+    else:
+        s = 2.0 * np.sqrt(1.0 + e22 - e00 - e11)
+        w, x, y, z = (e10 - e01) / s, (e02 + e20) / s, (e12 + e21) / s, 0.25 * s
+    if w < 0.0:
+        return -w, -x, -y, -z
+    return w, x, y, z
 
-    robot: SerialRobot
-    constraint: Constraint
 
-    def __post_init__(self) -> None:
-        if self.constraint.reference is None and not self.constraint.is_free:
-            raise ConstraintError(
-                "the constraint has no reference pose: use constraint.relative_to(start pose)"
+@njit(**COMPILE)
+def _swing(w, k, residual, linear):
+    """Swing from e_k to the unit vector w into residual[3:], and its derivative (3, 3) to ω, where
+    ẇ = ω × w.
+    """
+    i, j = (k + 1) % 3, (k + 2) % 3
+    # e_k × w has the components (−w_j, w_i) along (e_i, e_j)
+    si, sj, c = -w[j], w[i], w[k]
+    s = np.sqrt(si * si + sj * sj)
+    theta = np.arctan2(s, c)
+    if s > _SMALL:
+        g = theta / s
+        dg = (s - theta * c) / (s * s)
+    else:
+        # upside down the direction is lost: lean towards e_i, so that a step is still taken
+        g = 1.0 if c > 0.0 else np.pi / _SMALL
+        dg = 0.0
+        if c < 0.0:
+            si = _SMALL
+    residual[3 + i], residual[3 + j] = g * si, g * sj
+    for a in range(3):
+        # ω = e_a gives ẇ = e_a × w
+        w0 = 0.0 if a == 0 else (w[2] if a == 1 else -w[1])
+        w1 = -w[2] if a == 0 else (0.0 if a == 1 else w[0])
+        w2 = w[1] if a == 0 else (-w[0] if a == 1 else 0.0)
+        dw = (w0, w1, w2)
+        dsi, dsj, dc = -dw[j], dw[i], dw[k]
+        dtheta = (c * (si * dsi + sj * dsj) / s - s * dc) if s > _SMALL else 0.0
+        linear[k, a] = 0.0
+        linear[i, a] = g * dsi + dg * dtheta * si
+        linear[j, a] = g * dsj + dg * dtheta * sj
+
+
+@njit(**COMPILE)
+def _rotation_vector(quaternion, residual, linear):
+    """Rotation vector of a unit quaternion into residual[3:], and the inverse left Jacobian of
+    SO(3), its derivative to ω.
+    """
+    w, x, y, z = quaternion
+    n = np.sqrt(x * x + y * y + z * z)
+    theta = 2.0 * np.arctan2(n, w)
+    scale = theta / n if n > _SMALL else 2.0
+    r0, r1, r2 = x * scale, y * scale, z * scale
+    residual[3], residual[4], residual[5] = r0, r1, r2
+    if theta > 1e-4:
+        half = 0.5 * theta
+        b = (1.0 - half * np.cos(half) / np.sin(half)) / (theta * theta)
+    else:
+        b = 1.0 / 12.0
+    rest = 1.0 - b * (r0 * r0 + r1 * r1 + r2 * r2)
+    linear[0, 0], linear[0, 1], linear[0, 2] = (
+        rest + b * r0 * r0,
+        b * r0 * r1 + 0.5 * r2,
+        b * r0 * r2 - 0.5 * r1,
+    )
+    linear[1, 0], linear[1, 1], linear[1, 2] = (
+        b * r1 * r0 - 0.5 * r2,
+        rest + b * r1 * r1,
+        b * r1 * r2 + 0.5 * r0,
+    )
+    linear[2, 0], linear[2, 1], linear[2, 2] = (
+        b * r2 * r0 + 0.5 * r1,
+        b * r2 * r1 - 0.5 * r0,
+        rest + b * r2 * r2,
+    )
+
+
+@njit(**COMPILE)
+def _twist(quaternion, k, residual, linear):
+    """Twist about e_k into residual[3 + k], and its derivative to ω into row k of `linear`."""
+    w, i, j = quaternion[0], (k + 1) % 3, (k + 2) % 3
+    vk, vi, vj = quaternion[1 + k], quaternion[1 + i], quaternion[1 + j]
+    residual[3 + k] = 2.0 * np.arctan2(vk, w)
+    square = max(w * w + vk * vk, _SMALL)
+    # q̇ = ½ ω ⊗ q, so ẇ = −½ ω·v and v̇_k = ½ (w ω_k + (ω × v)_k) with (ω × v)_k = ω_i v_j − ω_j
+    # v_i
+    linear[k, k] = (w * w + vk * vk) / square
+    linear[k, i] = (w * vj + vk * vi) / square
+    linear[k, j] = (-w * vi + vk * vj) / square
+
+
+@njit(**COMPILE)
+def _residual(constraint, position, rotation, residual, linear):
+    """Residual (6,) [m, rad] of one tool pose, and the (3, 3) matrix that turns ω into its
+    orientation part.
+
+    Entries of axes that are not held are zero.
+    """
+    held, reference = constraint.rows.held, constraint.rotation
+    for i in range(3):
+        residual[i] = position[i] - constraint.position[i] if held[i] else 0.0
+        residual[3 + i] = 0.0
+    linear[:, :] = 0.0
+    count = 0
+    for i in range(3):
+        count += held[3 + i]
+    if count == 0:
+        return
+    if count == 2:
+        free = 0
+        for i in range(3):
+            if not held[3 + i]:
+                free = i
+        v0, v1, v2 = reference[free, 0], reference[free, 1], reference[free, 2]
+        w = (
+            rotation[0, 0] * v0 + rotation[0, 1] * v1 + rotation[0, 2] * v2,
+            rotation[1, 0] * v0 + rotation[1, 1] * v1 + rotation[1, 2] * v2,
+            rotation[2, 0] * v0 + rotation[2, 1] * v1 + rotation[2, 2] * v2,
+        )
+        _swing(w, free, residual, linear)
+        return
+    quaternion = _quaternion(rotation, reference)
+    if count == 3:
+        _rotation_vector(quaternion, residual, linear)
+        return
+    axis = 0
+    for i in range(3):
+        if held[3 + i]:
+            axis = i
+    _twist(quaternion, axis, residual, linear)
+
+
+class _Scratch(NamedTuple):
+    """The arm's posture, ω to orientation residual (3, 3), geometric Jacobian (6, D)."""
+
+    posture: Posture
+    linear: np.ndarray
+    geometric: np.ndarray
+
+
+@njit(**COMPILE)
+def _new_scratch(constraint, dof):
+    return _Scratch(new_posture(dof), np.empty((3, 3)), np.empty((6, dof)))
+
+
+@njit(**COMPILE)
+def _linearise(manifold, q, own, residual, jacobian):
+    constraint, geometric, linear = manifold.constraint, own.geometric, own.linear
+    pose_of(manifold.chain, q, own.posture)
+    _residual(constraint, own.posture.position, own.posture.rotation, residual, linear)
+    geometric_jacobian(manifold.chain.prismatic, own.posture, geometric)
+    for i in range(6):
+        if not constraint.rows.held[i]:
+            continue
+        for d in range(q.shape[0]):
+            value = 0.0
+            if i < 3:
+                value = geometric[i, d]
+            else:
+                for a in range(3):
+                    value += linear[i - 3, a] * geometric[3 + a, d]
+            jacobian[i, d] = value
+
+
+@njit(**COMPILE)
+def _curvature(manifold, weights, own, full):
+    """Σ λ_j ∇²r_j into `full` (D, D), for positions, and two or three angles held exactly, without
+    prismatic joints.  With the joints' axes a and origins o in the base frame, i ≤ j: ∂²p/∂q_i∂q_j
+    = a_i × (a_j × (p − o_j)); of a rotation vector ½ a_i × a_j; of the swing e_k × (a_i × (a_j ×
+    e_k)).
+    """
+    held, tolerance = manifold.constraint.rows.held, manifold.constraint.rows.tolerance
+    angles, exact = 0, True
+    for i in range(3, 6):
+        if held[i]:
+            angles += 1
+            exact = exact and tolerance[i] == 0.0
+    if (weights[3] != 0.0 or weights[4] != 0.0 or weights[5] != 0.0) and (angles < 2 or not exact):
+        return False
+    if manifold.chain.prismatic.any():
+        return False
+    position, joint_origins, joint_axes = (
+        own.posture.position,
+        own.posture.origins,
+        own.posture.axes,
+    )
+    l0, l1, l2 = weights[3], weights[4], weights[5]
+    free = -1
+    for i in range(3, 6):
+        if not held[i]:
+            free = i - 3
+    w0, w1, w2 = 1.0 * (free == 0), 1.0 * (free == 1), 1.0 * (free == 2)
+    # λ·(e_k × v) = (λ × e_k)·v
+    c0, c1, c2 = l1 * w2 - l2 * w1, l2 * w0 - l0 * w2, l0 * w1 - l1 * w0
+    for j in range(full.shape[0]):
+        b0, b1, b2 = joint_axes[j, 0], joint_axes[j, 1], joint_axes[j, 2]
+        x, y, z = (
+            position[0] - joint_origins[j, 0],
+            position[1] - joint_origins[j, 1],
+            position[2] - joint_origins[j, 2],
+        )
+        p0, p1, p2 = b1 * z - b2 * y, b2 * x - b0 * z, b0 * y - b1 * x
+        s0, s1, s2 = b1 * w2 - b2 * w1, b2 * w0 - b0 * w2, b0 * w1 - b1 * w0
+        for i in range(j + 1):
+            a0, a1, a2 = joint_axes[i, 0], joint_axes[i, 1], joint_axes[i, 2]
+            value = (
+                weights[0] * (a1 * p2 - a2 * p1)
+                + weights[1] * (a2 * p0 - a0 * p2)
+                + weights[2] * (a0 * p1 - a1 * p0)
             )
+            if angles > 0 and free >= 0:
+                value += (
+                    c0 * (a1 * s2 - a2 * s1) + c1 * (a2 * s0 - a0 * s2) + c2 * (a0 * s1 - a1 * s0)
+                )
+            elif angles > 0 and i < j:
+                value += 0.5 * (
+                    l0 * (a1 * b2 - a2 * b1) + l1 * (a2 * b0 - a0 * b2) + l2 * (a0 * b1 - a1 * b0)
+                )
+            full[i, j] = full[j, i] = value
+    return True
 
-    @property
-    def codim(self) -> int:
-        """Codimension in joint space."""
-        return self.constraint.codim
 
-    @property
-    def held(self) -> Bool[np.ndarray, "6"]:
-        """Which of the six task axes are held."""
-        return np.array(self.constraint.axes, dtype=bool)
-
-    @property
-    def tolerance(self) -> Float[np.ndarray, "6"]:
-        """Half-widths [m, m, m, rad, rad, rad]."""
-        return np.array(self.constraint.tolerance)
-
-    def residual(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch 6"]:
-        """C ⊙ x of eq. 7 [m, rad], relative to the reference; zero on free axes, tolerance not yet
-        taken off.
-        """
-        return self.linearise(q)[0]
-
-    def jacobian(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch 6 D"]:
-        """Derivative of the residual to the joints; zero rows on free axes."""
-        return self.linearise(q)[1]
-
-    def linearise(
-        self, q: Float[np.ndarray, "*batch D"]
-    ) -> tuple[Float[np.ndarray, "*batch 6"], Float[np.ndarray, "*batch 6 D"]]:
-        """Residual and Jacobian from one pass over the kinematics."""
-        flat = np.ascontiguousarray(q, dtype=np.float64).reshape(-1, self.robot.dof)
-        residuals, jacobians = np.empty((len(flat), 6)), np.empty((len(flat), 6, self.robot.dof))
-        kernels.residual_batch(
-            self.robot.chain.arrays, self.held, *self.reference_arrays, flat, residuals, jacobians
-        )
-        batch = q.shape[:-1]
-        return residuals.reshape(*batch, 6), jacobians.reshape(*batch, 6, self.robot.dof)
-
-    def inclusion(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch 6"]:
-        """Inclusion map ι_C of eqs. 7-8 [m, rad]: max(|C ⊙ x| − tolerance, 0), zero exactly where
-        satisfied.
-        """
-        return self._excess(q)[0]
-
-    def violation(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch"]:
-        """Largest excess over the tolerance [rad, or m for a held position]; 0 where the constraint
-        holds.
-        """
-        return self._excess(q)[1]
-
-    def _excess(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        residuals = self.residual(q).reshape(-1, 6)
-        excesses, worst = np.empty_like(residuals), np.empty(len(residuals))
-        kernels.excess_batch(self.held, self.tolerance, residuals, excesses, worst)
-        return np.abs(excesses).reshape(*q.shape[:-1], 6), worst.reshape(q.shape[:-1])
-
-    @property
-    def reference_arrays(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-        """Reference position and rotation as the kernels take them."""
-        pose = self.constraint.reference
-        if pose is None:
-            return np.zeros(3), np.eye(3)
-        return np.ascontiguousarray(pose.position, float), np.ascontiguousarray(
-            pose.rotation, float
-        )
+register(PoseArrays, _new_scratch, _linearise, _curvature)

@@ -1,19 +1,31 @@
-"""Retraction of joint configurations onto a constraint manifold by Gauss-Newton on the true
+"""Projection of joint configurations onto a constraint manifold: Gauss-Newton on the true
 kinematics.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numba import njit
 
-from constraint_geodesics.constraints import kernels
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
+from constraint_geodesics.constraints.kernels import (
+    COMPILE,
+    Rows,
+    backward,
+    cholesky,
+    excess_of,
+    forward,
+    linearise,
+    scratch,
+)
 
 
-@dataclass(frozen=True)
-class Retraction:
-    """Settings of the retraction: wanted accuracy [rad or m], steps at most, longest step [rad]."""
+class Retraction(NamedTuple):
+    """Settings of the projection: accuracy asked for [rad or m], steps at most, longest step
+    [rad].
+    """
 
     accuracy: float = 1e-9
     iterations: int = 50
@@ -44,20 +56,83 @@ def retract(
     """
     settings = settings or Retraction()
     joints = np.array(q, dtype=np.float64).reshape(-1, q.shape[-1])
-    share = np.ones(len(joints)) if band is None else np.asarray(band, float).reshape(-1)
+    shares = np.ones(len(joints)) if band is None else np.asarray(band, float).reshape(-1)
     worst = np.empty(len(joints))
-    kernels.retract_batch(
-        manifold.robot.chain.arrays,
-        manifold.held,
-        share[:, None] * manifold.tolerance,
-        *manifold.reference_arrays,
-        joints,
-        settings.accuracy,
-        settings.iterations,
-        settings.largest_step,
-        worst,
-    )
+    retract_batch(manifold.arrays, shares, joints, settings, worst)
     batch = q.shape[:-1]
     return Retracted(
         joints.reshape(q.shape), worst.reshape(batch), (worst <= settings.accuracy).reshape(batch)
     )
+
+
+@njit(**COMPILE)
+def normal_matrix(rows, size, normal):
+    """Lower half of J Jᵀ of the leading `size` rows of J (m, D); returns its trace."""
+    trace = 0.0
+    for i in range(size):
+        for j in range(i + 1):
+            value = 0.0
+            for d in range(rows.shape[1]):
+                value += rows[i, d] * rows[j, d]
+            normal[i, j] = value
+        trace += normal[i, i]
+    return trace
+
+
+@njit(**COMPILE)
+def solve_normal(normal, size, right, smallest_pivot):
+    """(J Jᵀ)⁻¹ right into `right` (m,): the weights of J's rows in the shortest step with J step =
+    right; False where J Jᵀ, of `normal_matrix` and overwritten, is singular.
+    """
+    if not cholesky(normal, size, smallest_pivot):
+        return False
+    forward(normal, size, right)
+    backward(normal, size, right)
+    return True
+
+
+@njit(**COMPILE)
+def retract_batch(manifold, shares, q, settings, worst):
+    """Gauss-Newton onto the constraint, in place: q ← q − Jᵀ(JJᵀ)⁻¹ ι(q) until |ι| ≤ accuracy, for
+    q (B, D).
+
+    shares (B,): of the tolerance, that each configuration may use.  A step is never longer than
+    `largest_step` [rad], so that a point far away walks to its own branch instead of jumping to
+    another.  worst (B,) gets the remaining excess.
+    """
+    bounds = manifold.constraint.rows
+    count, dof = bounds.held.shape[0], q.shape[1]
+    own = scratch(manifold.constraint, dof)
+    residual, excess, right = np.empty(count), np.empty(count), np.empty(count)
+    active = np.empty(count, dtype=np.bool_)
+    jacobian, rows = np.empty((count, dof)), np.empty((count, dof))
+    normal, step = np.empty((count, count)), np.empty(dof)
+    residual[:] = 0.0
+    for b in range(q.shape[0]):
+        narrow = Rows(bounds.held, shares[b] * bounds.tolerance, bounds.together)
+        for iteration in range(settings.iterations + 1):
+            linearise(manifold, q[b], own, residual, jacobian)
+            worst[b] = excess_of(narrow, residual, excess, active)
+            if not worst[b] > settings.accuracy or iteration == settings.iterations:
+                break
+            size = 0
+            for i in range(count):
+                if active[i]:
+                    rows[size] = jacobian[i]
+                    right[size] = excess[i]
+                    size += 1
+            trace = normal_matrix(rows, size, normal)
+            for i in range(size):
+                normal[i, i] += 1e-10 * trace + 1e-300
+            if not solve_normal(normal, size, right, 0.0):
+                break
+            length = 0.0
+            for d in range(dof):
+                step[d] = 0.0
+                for i in range(size):
+                    step[d] += rows[i, d] * right[i]
+                length += step[d] * step[d]
+            length = np.sqrt(length)
+            scale = 1.0 if length <= settings.largest_step else settings.largest_step / length
+            for d in range(dof):
+                q[b, d] -= scale * step[d]

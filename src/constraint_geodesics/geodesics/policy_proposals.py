@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.geodesics.episodes import episode_settings
 from constraint_geodesics.geodesics.problem import Ends, LearnedProblem

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction
-from constraint_geodesics.geodesics.pull_kernels import tangential_pull
+from constraint_geodesics.geodesics.pull_kernels import Bounds, tangential_gradient
 from constraint_geodesics.geometry.curves import CurveFamily, Curves, PinnedPolynomial
 from constraint_geodesics.geometry.length import Collocation, Quadrature, estimate_length
 from constraint_geodesics.geometry.manifold import (
@@ -55,8 +55,6 @@ largest.
 """
 LONGEST_DESCENT = 0.5
 """Longest step of the descent, in units of the ends' distance: at a jump the pull has no scale."""
-SEEN_TOLERANCE = 0.2
-"""Tolerance [rad or m] that a policy sees as 1."""
 
 
 @dataclass(frozen=True)
@@ -343,11 +341,12 @@ class LearnedProblem:
         """Costs, descent and features; both describe the constraint by what it does to the curve.
 
         descent: K⁻¹ ∫ (J̄⁺ P q̈) b_k dt in the chart, with P the projector on the tangent space of
-        the constraint (`tangential_pull`), J̄ the decoder's mean Jacobian and K_jk = ∫ ḃ_j ḃ_k dt.
+        the constraint (`tangential_gradient`), J̄ the decoder's mean Jacobian and K_jk =
+        ∫ ḃ_j ḃ_k dt.
         features: whether the curve is not feasible; jumps, and what lies outside the limits, as the
         coefficients that would follow them (2 p); their sizes and what the retraction left (3);
         configurations at SHOWN_NODES inner times [π rad]; the constraint's axes (6) and tolerances
-        (6) [SEEN_TOLERANCE].
+        (6) [`pose.SEEN_TOLERANCE`].
         Where curves are not retracted there are costs alone: what counts there is the whole
         embedding.
         """
@@ -391,17 +390,9 @@ class LearnedProblem:
     def _pulls(self, joints: Paths) -> Paths:
         manifold, robot = self.manifold, self.manifold.robot
         pulls = np.empty_like(joints)
-        tangential_pull(
-            robot.chain.arrays,
-            manifold.held,
-            manifold.tolerance,
-            *manifold.reference_arrays,
-            robot.lower,
-            robot.upper,
-            2 * self.retraction.accuracy,
-            _rule(self.degree).times.numpy(),
-            joints,
-            pulls,
+        bounds = Bounds(robot.lower, robot.upper, 2 * self.retraction.accuracy)
+        tangential_gradient(
+            manifold.arrays, bounds, _rule(self.degree).times.numpy(), joints, pulls
         )
         return pulls
 
@@ -466,7 +457,7 @@ class LearnedProblem:
 
     @cached_property
     def _constraint(self) -> Float[np.ndarray, "12"]:
-        return np.concatenate([self.manifold.held, self.manifold.tolerance / SEEN_TOLERANCE])
+        return self.manifold.constraint.context
 
     def latent_points(
         self, phi: Phi, ends: Ends, t: Float[np.ndarray, "T"]
@@ -520,7 +511,7 @@ class LearnedProblem:
         settings = (self.curve, self.degree, self.retract, self.inclusion_weight, self.retraction)
         chain = self.manifold.robot.chain.arrays
         return str(
-            joblib.hash((weights, chain, vars(self.manifold.constraint), self.joints, settings))
+            joblib.hash((weights, chain, self.manifold.constraint.key, self.joints, settings))
         )
 
 

@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Bool, Float
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.scene.scene import Scene
 
@@ -102,7 +102,7 @@ def draw_shard(task: ShardTask) -> Shard:
     count = drawn = not_converged = outside = 0
     while count < task.rows:
         candidates = robot.sample(max(task.rows - count, 64), rng)
-        share = rng.uniform(size=len(candidates)) ** (1.0 / max(sum(manifold.constraint.axes), 1))
+        share = rng.uniform(size=len(candidates)) ** (1.0 / max(manifold.rows.held.sum(), 1))
         result = retract(manifold, candidates, Retraction(), band=share)
         inside = robot.limit_distance(result.joints) >= 0
         good = result.joints[result.converged & inside]

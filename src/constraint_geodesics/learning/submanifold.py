@@ -6,13 +6,13 @@ edges were checked.  The learned manifold is used as it is, never retrained.
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.geometry.graph import (
     components,
@@ -153,16 +153,8 @@ def within_resolution(
     manifold: ConstraintManifold, params: SubmanifoldParams
 ) -> ConstraintManifold:
     """The same constraint with every held axis loosened to the grid's resolution at least."""
-    axes, resolution = (
-        manifold.constraint.axes,
-        (params.resolution_m,) * 3 + (params.resolution_rad,) * 3,
-    )
-    tolerance = tuple(
-        max(own, least) if held else 0.0
-        for held, own, least in zip(axes, manifold.constraint.tolerance, resolution, strict=True)
-    )
-    loose: Constraint = replace(manifold.constraint, tolerance=tolerance)
-    return ConstraintManifold(manifold.robot, loose)
+    least = {"m": params.resolution_m, "rad": params.resolution_rad}
+    return ConstraintManifold(manifold.robot, manifold.constraint.loosened(least))
 
 
 def submanifold_figures(

@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.learning.lift import Chart
 from constraint_geodesics.params import BenchmarkParams
@@ -102,7 +102,7 @@ def decoded_samples(
     """Endless configurations [rad] on the constraint and within the limits, or merely decoded where
     none is found.
     """
-    axes = max(sum(manifold.constraint.axes), 1)
+    axes = max(manifold.rows.held.sum(), 1)
     while True:
         drawn = chart.decode(chart.sample(BATCH, rng))
         share = rng.uniform(size=BATCH) ** (

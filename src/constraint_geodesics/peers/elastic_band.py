@@ -14,12 +14,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.problem import SATISFIED, PathPlanner, PlanningProblem, Solution, refusal
 from constraint_geodesics.scene.clearance import no_clearance
-from constraint_geodesics.search.band import BandSettings, BandSpace, project, step_lengths
+from constraint_geodesics.search.band import BandSettings, project, step_lengths
 from constraint_geodesics.search.candidates import (
     HALVINGS,
     LONGEST_ROW_STEP,
@@ -31,6 +31,7 @@ from constraint_geodesics.search.candidates import (
     rows_of,
 )
 from constraint_geodesics.search.roadmap import resample
+from constraint_geodesics.search.space import space_of
 
 ROW_SPACING = 0.04
 """Distance of the rows [rad] that are drawn along a given path, before they are halved where that
@@ -245,7 +246,7 @@ def _projected(
     either.
     """
     moved = np.ascontiguousarray(points)
-    project(BandSpace(manifold, no_clearance(manifold.robot.dof), 0.0).arrays, moved)
+    project(space_of(manifold), moved)
     return moved
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import optimize
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, repeated
 from constraint_geodesics.geometry.curves import CurveFamily, PinnedPolynomial, PinnedSpline

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from constraint_geodesics.constraints.pose import Constraint
+from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.geodesics.graph_search import KNIGHT
 from constraint_geodesics.geodesics.problem import Ends, LearnedProblem
@@ -397,15 +397,7 @@ def fitted(learned: LearnedProblem, corners: Float[np.ndarray, "k N"]) -> Float[
 
 def same_constraint(first: Constraint, second: Constraint) -> bool:
     """Whether two constraints hold the same axes, as tightly, at the same pose."""
-    if (first.axes, first.tolerance) != (second.axes, second.tolerance):
-        return False
-    if first.is_free:
-        return True
-    if first.reference is None or second.reference is None:
-        return False
-    return np.array_equal(first.reference.position, second.reference.position) and np.array_equal(
-        first.reference.rotation, second.reference.rotation
-    )
+    return first.is_placed and second.is_placed and first.key == second.key
 
 
 def _links(

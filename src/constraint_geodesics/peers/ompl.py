@@ -20,8 +20,8 @@ from jaxtyping import Float
 from ompl import base, geometric, util
 
 from constraint_geodesics.constraints import kernels
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
-from constraint_geodesics.constraints.projection import Retraction, retract
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
+from constraint_geodesics.constraints.projection import Retraction, retract, retract_batch
 from constraint_geodesics.learning.lift import as_executed
 from constraint_geodesics.params import BenchmarkParams
 from constraint_geodesics.problem import SATISFIED, PlanningProblem, Solution, refusal
@@ -90,7 +90,7 @@ class SamplingPlanner:
                 f"{manifold.codim} rows are held by {manifold.robot.dof} joints: isolated "
                 f"points are no space"
             )
-        if manifold.tolerance.any() and self.settings.space != "projected":
+        if manifold.rows.tolerance.any() and self.settings.space != "projected":
             return (
                 f"a tolerance has no tangent spaces, which the {self.settings.space} space "
                 f"is made of"
@@ -157,44 +157,29 @@ class _Single:
     """
 
     def __init__(self, manifold: ConstraintManifold) -> None:
-        self._about = (manifold.robot.chain.arrays, manifold.held, *manifold.reference_arrays)
-        self._tolerance = manifold.tolerance[None]
-        self._q = np.empty((1, manifold.robot.dof))
-        self._residual, self._jacobian = np.empty((1, 6)), np.empty((1, 6, manifold.robot.dof))
-        self._excess, self._worst = np.empty((1, 6)), np.empty(1)
+        count, dof = len(manifold.rows.held), manifold.robot.dof
+        self._manifold, self._rows, self._q = manifold.arrays, manifold.rows, np.empty((1, dof))
+        self._residual, self._jacobian = np.empty((1, count)), np.empty((1, count, dof))
+        self._excess, self._worst, self._all = np.empty((1, count)), np.empty(1), np.ones(1)
         self._settings = Retraction()
 
-    def linearise(self, x: np.ndarray) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6 D"]]:
+    def linearise(self, x: np.ndarray) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m D"]]:
         """Residual and Jacobian, until the next call."""
         self._q[0] = x
-        kernels.residual_batch(*self._about, self._q, self._residual, self._jacobian)
+        kernels.residual_batch(self._manifold, self._q, self._residual, self._jacobian)
         return self._residual[0], self._jacobian[0]
 
     def violation(self, x: np.ndarray) -> float:
         """Excess over the tolerance [rad or m]."""
         self.linearise(x)
-        kernels.excess_batch(
-            self._about[1], self._tolerance[0], self._residual, self._excess, self._worst
-        )
+        kernels.excess_batch(self._rows, self._residual, self._excess, self._worst)
         return float(self._worst[0])
 
     def retract(self, x: np.ndarray) -> Float[np.ndarray, "D"] | None:
-        """The configuration on the constraint, or None; as `retraction.retract`."""
+        """The configuration on the constraint, or None; as `projection.retract`."""
         joints = np.array(x, np.float64)[None]
-        chain, held, *reference = self._about
-        own = self._settings
-        kernels.retract_batch(
-            chain,
-            held,
-            self._tolerance,
-            *reference,
-            joints,
-            own.accuracy,
-            own.iterations,
-            own.largest_step,
-            self._worst,
-        )
-        return joints[0] if self._worst[0] <= own.accuracy else None
+        retract_batch(self._manifold, self._all, joints, self._settings, self._worst)
+        return joints[0] if self._worst[0] <= self._settings.accuracy else None
 
 
 class _HeldAxes(base.Constraint):
@@ -213,7 +198,7 @@ class _HeldAxes(base.Constraint):
         self._single = _Single(manifold)
         self._sampler = sampler
         self._samples = False
-        self._exact = np.flatnonzero(manifold.held & (manifold.tolerance == 0.0))
+        self._exact = manifold.rows.exact
         self._step = step
         self._last = np.full(manifold.robot.dof, np.inf)
 

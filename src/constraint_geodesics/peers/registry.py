@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.bundle import Bundle, read_bundle
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.learning.inference import FrozenManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import (

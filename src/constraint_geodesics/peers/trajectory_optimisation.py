@@ -22,7 +22,7 @@ from jaxtyping import Float
 from numba import njit
 from scipy.optimize import BFGS, NonlinearConstraint, OptimizeResult, minimize
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.peers.elastic_band import (
     Configurations,
@@ -256,10 +256,9 @@ def demands_of(task: Task, beyond: np.ndarray, near: bool) -> list[Demand]:
 
 
 def _axes(manifold: ConstraintManifold) -> list[Demand]:
-    """The constraint: one demand for the axes held exactly, one for those with a tolerance."""
-    exact = np.flatnonzero(manifold.held & (manifold.tolerance == 0.0))
-    groups = groups_of(manifold)
-    tolerances = np.array([manifold.tolerance[group[0]] for group in groups])
+    """The constraint: one demand for the rows held exactly, one for those with a tolerance."""
+    exact, groups = manifold.rows.exact, manifold.rows.loose_groups
+    tolerances = np.array([manifold.rows.tolerance[group[0]] for group in groups])
 
     def equal(q: Nodes) -> tuple[np.ndarray, np.ndarray]:
         residual, jacobian = manifold.linearise(q)
@@ -281,19 +280,6 @@ def _axes(manifold: ConstraintManifold) -> list[Demand]:
     return [Demand(True, False, equal)] * bool(len(exact)) + [Demand(False, False, within)] * bool(
         groups
     )
-
-
-def groups_of(manifold: ConstraintManifold) -> list[list[int]]:
-    """Axes with a tolerance that are bounded together: all held angles if they share one, else each
-    by itself.
-    """
-    loose = np.flatnonzero(manifold.held & (manifold.tolerance > 0.0)).tolist()
-    angles = np.flatnonzero(manifold.held[3:]) + 3
-    together = len(angles) > 0 and len(np.unique(manifold.tolerance[angles])) == 1
-    if not together:
-        return [[axis] for axis in loose]
-    cone = [axis for axis in loose if axis >= 3]
-    return [[axis] for axis in loose if axis < 3] + [cone] * bool(cone)
 
 
 def _beyond(manifold: ConstraintManifold, nodes: Nodes) -> np.ndarray:

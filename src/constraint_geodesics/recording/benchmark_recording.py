@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.recording.recorder import status_text
 from constraint_geodesics.recording.recording import PathRecord, record_path
 from constraint_geodesics.scene.scene import Scene

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.certification.certifier import Limits
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import GridSubmanifold, Submanifold
 from constraint_geodesics.recording.recording import LatentView, PathRecord, record_path

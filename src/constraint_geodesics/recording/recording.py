@@ -28,7 +28,7 @@ from rerun.urdf import UrdfTree
 
 from constraint_geodesics import palette
 from constraint_geodesics.certification.certifier import Limits
-from constraint_geodesics.constraints.pose import AXES, ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold, Series
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.urdf import urdf_name
@@ -155,16 +155,6 @@ class Frames:
     time: rr.TimeColumn
 
 
-@dataclass(frozen=True)
-class _Series:
-    """One quantity that the constraint bounds, and its limit."""
-
-    name: str
-    unit: str
-    values: Float[np.ndarray, "frames"]
-    limit: float
-
-
 def record_path(
     file: Path,
     path: PathRecord,
@@ -179,8 +169,10 @@ def record_path(
     written is missing.
     """
     robot, sampled = manifold.robot, sample(path, manifold, frames)
-    residuals = _residuals(manifold, sampled.joints)
-    series = [*residuals, *_violations(manifold, sampled.joints, path.tolerance)]
+    series = [
+        *manifold.constraint.series(manifold.residual(sampled.joints)),
+        *_violations(manifold, sampled.joints, path.tolerance),
+    ]
     chunks = [
         *scene_chunks(robot, workcell, sampled, meshes=path.meshes),
         *tool_chunks(sampled, rgb(palette.planner_colour(path.planner))),
@@ -420,36 +412,17 @@ def _ends(points: np.ndarray) -> tuple[tuple[str, np.ndarray, tuple[int, int, in
     return ("start", points[0], _START), ("goal", points[-1], _GOAL)
 
 
-def _residuals(manifold: ConstraintManifold, joints: np.ndarray) -> list[_Series]:
-    """Held positions each by itself [mm]; held angles of one tolerance together."""
-    residual, tolerance = manifold.residual(joints), manifold.tolerance
-    series = [
-        _Series(AXES[i], "mm", 1e3 * abs(residual[:, i]), 1e3 * tolerance[i])
-        for i in range(3)
-        if manifold.held[i]
-    ]
-    angles = [i for i in range(3, 6) if manifold.held[i]]
-    together = len({tolerance[i] for i in angles}) == 1
-    for group in [angles] if together else [[i] for i in angles]:
-        name = "tilt" if len(group) == 2 else " ".join(AXES[i] for i in group)
-        size = np.degrees(np.linalg.norm(residual[:, group], axis=1))
-        series.append(_Series(name, "deg", size, math.degrees(tolerance[group[0]])))
-    return series
-
-
-def _violations(
-    manifold: ConstraintManifold, joints: np.ndarray, tolerance: float
-) -> list[_Series]:
+def _violations(manifold: ConstraintManifold, joints: np.ndarray, tolerance: float) -> list[Series]:
     """What is beyond the constraint's own tolerance, as a power of ten: the judge's limit is far
     below a pixel else.
     """
-    if not any(manifold.held):
+    if manifold.constraint.is_free:
         return []
     values = np.log10(np.maximum(manifold.violation(joints), LOWEST_VIOLATION))
-    return [_Series("violation", "log10 rad or m", values, math.log10(tolerance))]
+    return [Series("violation", "log10 rad or m", values, math.log10(tolerance))]
 
 
-def _series_chunks(series: Sequence[_Series], sampled: Frames) -> Iterator[Chunk]:
+def _series_chunks(series: Sequence[Series], sampled: Frames) -> Iterator[Chunk]:
     for one in series:
         entity = one.name if one.name == "violation" else _entity("constraint", one.unit, one.name)
         names = [one.name, f"limit of {one.name}"]  # the panel says the unit
@@ -536,7 +509,7 @@ def component(chunk: Chunk, name: str) -> list[Any]:
     return list(chunk.to_record_batch().column(name).to_pylist())
 
 
-def _blueprint(path: PathRecord, sampled: Frames, series: Sequence[_Series]) -> Any:
+def _blueprint(path: PathRecord, sampled: Frames, series: Sequence[Series]) -> Any:
     right: list[Any] = []
     if path.latent is not None:
         right.append(latent_view_of(path.latent.axis_names, *_latent_bounds(path.latent)))

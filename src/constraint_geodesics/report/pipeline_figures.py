@@ -176,7 +176,7 @@ def _draw_plane(
     names = params.geodesics.illustrated_constraints
     loaded = {own: load_submanifold(layout.submanifold(name, own)) for own in names}
     planes = {own: plane for own, plane in loaded.items() if isinstance(plane, GridSubmanifold)}
-    angles_only = {own: not any(params.constraints[own].axes[:3]) for own in planes}
+    angles_only = {own: not params.constraints[own].may_hold_positions for own in planes}
     curves = {
         own: (plane, latent_curves(params, layout, manifold, name, own))
         for own, plane in planes.items()

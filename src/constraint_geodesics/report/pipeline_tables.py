@@ -92,7 +92,7 @@ def result_tables(params: Params, layout: Layout, table: pd.DataFrame) -> list[T
     for (manifold, constraint), rows in table.groupby(["manifold", "constraint"], sort=False):
         own = params.constraints[str(constraint)]
         # positions only where the constraint holds one
-        more = {"worst [mm]": "violation_max_mm"} if any(own.axes[:3]) else {}
+        more = {"worst [mm]": "violation_max_mm"} if own.may_hold_positions else {}
         shares = {"not connected": "not_connected", "refused": "refused"}
         header = [*COLUMNS[1:], *more, *shares]
         cells = []

@@ -7,6 +7,8 @@ previous joint's frame to this joint's frame at zero, `axes` (D, 3) the joint ax
 `prismatic` (D,) bool, `tool` (4, 4) from the last joint's frame to the tool.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -92,15 +94,33 @@ def joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes
     return p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22
 
 
-@njit(**_COMPILE)
-def pose_of(origins, axes, prismatic, base, tool, q, position, rotation, joint_origins, joint_axes):
-    """Tool pose in the base frame, with every joint's origin [m] and axis in the base frame; writes
-    its outputs.
+class Posture(NamedTuple):
+    """Where an arm is, in the base frame: the tool's position (3,) [m] and rotation (3, 3), each
+    joint's origin [m] and axis (D, 3).
     """
-    frame = frame_of(base)
+
+    position: np.ndarray
+    rotation: np.ndarray
+    origins: np.ndarray
+    axes: np.ndarray
+
+
+@njit(**_COMPILE)
+def new_posture(dof):
+    """Arrays that `pose_of` writes."""
+    return Posture(np.empty(3), np.empty((3, 3)), np.empty((dof, 3)), np.empty((dof, 3)))
+
+
+@njit(**_COMPILE)
+def pose_of(chain, q, posture):
+    """Write the posture of one configuration."""
+    frame = frame_of(chain.base)
     for j in range(q.shape[0]):
-        frame = joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes)
-    p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = moved_frame(frame, tool)
+        frame = joint_frame(
+            chain.origins, chain.axes, chain.prismatic, q, j, frame, posture.origins, posture.axes
+        )
+    p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = moved_frame(frame, chain.tool)
+    position, rotation = posture.position, posture.rotation
     position[0], position[1], position[2] = p0, p1, p2
     rotation[0, 0], rotation[0, 1], rotation[0, 2] = r00, r01, r02
     rotation[1, 0], rotation[1, 1], rotation[1, 2] = r10, r11, r12
@@ -108,39 +128,27 @@ def pose_of(origins, axes, prismatic, base, tool, q, position, rotation, joint_o
 
 
 @njit(**_COMPILE)
-def forward_batch(origins, axes, prismatic, base, tool, q, positions, rotations):
+def forward_batch(chain, q, positions, rotations):
     """Tool poses of q (B, D) into positions (B, 3) and rotations (B, 3, 3)."""
-    joint_origins = np.empty((q.shape[1], 3))
-    joint_axes = np.empty((q.shape[1], 3))
+    own = new_posture(q.shape[1])
     for b in range(q.shape[0]):
-        pose_of(
-            origins,
-            axes,
-            prismatic,
-            base,
-            tool,
-            q[b],
-            positions[b],
-            rotations[b],
-            joint_origins,
-            joint_axes,
-        )
+        pose_of(chain, q[b], Posture(positions[b], rotations[b], own.origins, own.axes))
 
 
 @njit(**_COMPILE)
-def geometric_jacobian(prismatic, position, joint_origins, joint_axes, jacobian):
-    """Geometric Jacobian (6, D) of one pose in the base frame: linear rows [m], then angular rows
-    [rad].
+def geometric_jacobian(prismatic, posture, jacobian):
+    """Geometric Jacobian (6, D) of one posture in the base frame: linear rows [m], then angular
+    rows [rad].
     """
-    for j in range(joint_axes.shape[0]):
-        a0, a1, a2 = joint_axes[j, 0], joint_axes[j, 1], joint_axes[j, 2]
+    for j in range(posture.axes.shape[0]):
+        a0, a1, a2 = posture.axes[j, 0], posture.axes[j, 1], posture.axes[j, 2]
         if prismatic[j]:
             jacobian[0, j], jacobian[1, j], jacobian[2, j] = a0, a1, a2
             jacobian[3, j] = jacobian[4, j] = jacobian[5, j] = 0.0
             continue
-        d0 = position[0] - joint_origins[j, 0]
-        d1 = position[1] - joint_origins[j, 1]
-        d2 = position[2] - joint_origins[j, 2]
+        d0 = posture.position[0] - posture.origins[j, 0]
+        d1 = posture.position[1] - posture.origins[j, 1]
+        d2 = posture.position[2] - posture.origins[j, 2]
         jacobian[0, j] = a1 * d2 - a2 * d1
         jacobian[1, j] = a2 * d0 - a0 * d2
         jacobian[2, j] = a0 * d1 - a1 * d0
@@ -148,44 +156,21 @@ def geometric_jacobian(prismatic, position, joint_origins, joint_axes, jacobian)
 
 
 @njit(**_COMPILE)
-def jacobian_batch(origins, axes, prismatic, base, tool, q, jacobians):
+def jacobian_batch(chain, q, jacobians):
     """Geometric Jacobians of q (B, D) into jacobians (B, 6, D)."""
-    position = np.empty(3)
-    rotation = np.empty((3, 3))
-    joint_origins = np.empty((q.shape[1], 3))
-    joint_axes = np.empty((q.shape[1], 3))
+    posture = new_posture(q.shape[1])
     for b in range(q.shape[0]):
-        pose_of(
-            origins,
-            axes,
-            prismatic,
-            base,
-            tool,
-            q[b],
-            position,
-            rotation,
-            joint_origins,
-            joint_axes,
-        )
-        geometric_jacobian(prismatic, position, joint_origins, joint_axes, jacobians[b])
+        pose_of(chain, q[b], posture)
+        geometric_jacobian(chain.prismatic, posture, jacobians[b])
 
 
 @njit(**_COMPILE)
-def skeleton_batch(origins, axes, prismatic, base, tool, q, points):
+def skeleton_batch(chain, q, points):
     """Base, joint origins and tool of q (B, D) into points (B, D + 2, 3)."""
-    rotation = np.empty((3, 3))
-    joint_axes = np.empty((q.shape[1], 3))
+    dof = q.shape[1]
+    own = new_posture(dof)
     for b in range(q.shape[0]):
-        points[b, 0] = base[:3, 3]
+        points[b, 0] = chain.base[:3, 3]
         pose_of(
-            origins,
-            axes,
-            prismatic,
-            base,
-            tool,
-            q[b],
-            points[b, q.shape[1] + 1],
-            rotation,
-            points[b, 1:-1],
-            joint_axes,
+            chain, q[b], Posture(points[b, dof + 1], own.rotation, points[b, 1 : dof + 1], own.axes)
         )

@@ -98,14 +98,14 @@ class SerialRobot:
         """Tool position [m] and rotation in the base frame, of configurations q [rad]."""
         flat = self._flat(q)
         positions, rotations = np.empty((len(flat), 3)), np.empty((len(flat), 3, 3))
-        kernels.forward_batch(*self.chain.arrays, flat, positions, rotations)
+        kernels.forward_batch(self.chain.arrays, flat, positions, rotations)
         return positions.reshape(*q.shape[:-1], 3), rotations.reshape(*q.shape[:-1], 3, 3)
 
     def jacobian(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch 6 D"]:
         """Geometric Jacobian in the base frame: three linear rows [m/rad], three angular rows."""
         flat = self._flat(q)
         jacobians = np.empty((len(flat), 6, self.dof))
-        kernels.jacobian_batch(*self.chain.arrays, flat, jacobians)
+        kernels.jacobian_batch(self.chain.arrays, flat, jacobians)
         return jacobians.reshape(*q.shape[:-1], 6, self.dof)
 
     def skeleton(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch n 3"]:
@@ -114,7 +114,7 @@ class SerialRobot:
         """
         flat = self._flat(q)
         points = np.empty((len(flat), self.dof + 2, 3))
-        kernels.skeleton_batch(*self.chain.arrays, flat, points)
+        kernels.skeleton_batch(self.chain.arrays, flat, points)
         return points.reshape(*q.shape[:-1], self.dof + 2, 3)
 
     def limit_distance(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch"]:

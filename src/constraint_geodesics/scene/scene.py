@@ -1,11 +1,8 @@
-"""What params.yaml names, as objects: the robot, the shapes around it, and the constraint
-manifolds.
-"""
+"""What params.yaml names, as objects: the robot and the shapes around it."""
 
 from dataclasses import dataclass
 
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
-from constraint_geodesics.params import ConstraintParams, Params, RobotParams, WorkcellParams
+from constraint_geodesics.params import Params, RobotParams, WorkcellParams
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.urdf import find_urdf
@@ -28,10 +25,6 @@ class Scene:
         """A fresh PyBullet world; close it, or use it as a context manager."""
         return World(self.robot, self.workcell)
 
-    def manifold(self, constraint: ConstraintParams) -> ConstraintManifold:
-        """The constraint manifold of this scene's robot."""
-        return ConstraintManifold(self.robot, constraint_from(constraint))
-
 
 def robot_from(params: RobotParams) -> SerialRobot:
     """The robot that params.yaml names."""
@@ -41,10 +34,3 @@ def robot_from(params: RobotParams) -> SerialRobot:
 def workcell_from(params: WorkcellParams) -> tuple[Shape, ...]:
     """The shapes that params.yaml lists."""
     return tuple(params.shapes.values())
-
-
-def constraint_from(params: ConstraintParams) -> Constraint:
-    """The constraint that one entry of params.yaml describes."""
-    pose = params.reference
-    reference = None if pose is None else Pose.from_rpy(pose.position_m, pose.rpy_rad)
-    return Constraint(params.axes, params.tolerance, reference)

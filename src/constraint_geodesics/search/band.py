@@ -11,15 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.constraints import kernels
-from constraint_geodesics.constraints.pose import ConstraintManifold
-from constraint_geodesics.scene.clearance import ClearanceModel, clearance_batch, no_clearance
+from constraint_geodesics.constraints.kernels import ManifoldArrays
+from constraint_geodesics.constraints.projection import Retraction, retract_batch
+from constraint_geodesics.scene.clearance import clearance_batch
 from constraint_geodesics.search import band_kernels
+from constraint_geodesics.search.space import Space, project_each
 
 ACCURACY = 1e-9
 """Violation [rad or m] that is left on a point of a curve, at most."""
-_PROJECTIONS = 12
-_LONGEST_STEP = 0.6
+_PROJECTION = Retraction(ACCURACY, iterations=12, largest_step=0.6)
 _COINCIDENT = 1e-12
 _ZERO = np.zeros(1)
 
@@ -40,35 +40,6 @@ class BandSettings:
 
 
 @dataclass(frozen=True)
-class BandSpace:
-    """The configurations a band may use: on the constraint, within the joint limits, clear of
-    boxes.
-    """
-
-    manifold: ConstraintManifold
-    clearance: ClearanceModel
-    clearance_m: float
-
-    @property
-    def arrays(self) -> tuple:
-        """The kernels' arguments, in their order."""
-        robot = self.manifold.robot
-        return (
-            robot.chain.arrays,
-            self.manifold.held,
-            self.manifold.tolerance,
-            *self.manifold.reference_arrays,
-            np.stack([robot.lower, robot.upper]),
-            self.clearance.arrays,
-            self.clearance_m,
-        )
-
-    def without_boxes(self) -> "BandSpace":
-        """The same with an empty workcell."""
-        return BandSpace(self.manifold, no_clearance(self.manifold.robot.dof), 0.0)
-
-
-@dataclass(frozen=True)
 class Band:
     """A relaxed band: nodes (n + 1, D) [rad], what is left of the violation, iterations, and
     whether it converged.
@@ -80,10 +51,8 @@ class Band:
     converged: bool
 
 
-def relax(space: tuple, nodes: Float[np.ndarray, "n D"], settings: BandSettings) -> Band:
-    """The shortest band near the given one, its ends fixed.  space: `BandSpace.arrays`, taken once
-    for many bands.
-    """
+def relax(space: Space, nodes: Float[np.ndarray, "n D"], settings: BandSettings) -> Band:
+    """The shortest band near the given one, its ends fixed."""
     moved = np.array(nodes, np.float64)
     left, iterations, converged = band_kernels.relax_band(
         space, moved, settings.iterations, settings.accuracy, settings.largest_step_rad
@@ -99,13 +68,13 @@ class BandCurve:
     Both ends are the band's, to the bit.
     """
 
-    space: tuple
+    space: Space
     nodes: Float[np.ndarray, "n D"]
     knots: Float[np.ndarray, "n"]
     moments: Float[np.ndarray, "n D"]
 
     @classmethod
-    def through(cls, space: tuple, nodes: Float[np.ndarray, "n D"]) -> "BandCurve | None":
+    def through(cls, space: Space, nodes: Float[np.ndarray, "n D"]) -> "BandCurve | None":
         """None where nodes coincide or are not finite, so that there is no curve."""
         steps = step_lengths(nodes)
         if not (np.isfinite(steps).all() and steps.min(initial=np.inf) > _COINCIDENT):
@@ -136,33 +105,22 @@ def step_lengths(points: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T-1"]:
     return np.sqrt(np.square(points[1:] - points[:-1]).sum(axis=1))
 
 
-def project(space: tuple, points: Float[np.ndarray, "n D"]) -> float:
+def project(space: Space, points: Float[np.ndarray, "n D"]) -> float:
     """Move points onto the space, in place; returns what is left of the violation [rad or m].
 
     The constraint alone is cheap; limits and boxes are taken together with it only where one of
     them is broken.
     """
-    chain, held, tolerance, position, rotation, limits, model, margin = space
     worst = np.empty(len(points))
-    kernels.retract_batch(
-        chain,
-        held,
-        np.broadcast_to(tolerance, (len(points), 6)),
-        position,
-        rotation,
-        points,
-        ACCURACY,
-        _PROJECTIONS,
-        _LONGEST_STEP,
-        worst,
-    )
-    beyond = ((points < limits[0]) | (points > limits[1])).any(axis=1)
-    if len(model[0]):
+    manifold = ManifoldArrays(space.chain, space.constraint)
+    retract_batch(manifold, np.ones(len(points)), points, _PROJECTION, worst)
+    beyond = ((points < space.limits[0]) | (points > space.limits[1])).any(axis=1)
+    if len(space.clearance.points):
         smallest = np.empty(len(points))
-        clearance_batch(chain, model, 2.0 * margin, points, smallest)
-        beyond |= smallest < margin
+        clearance_batch(space.chain, space.clearance, 2.0 * space.margin, points, smallest)
+        beyond |= smallest < space.margin
     if beyond.any():
-        rows = points[beyond]
-        worst[beyond] = band_kernels.project_rows(space, rows, _PROJECTIONS)
-        points[beyond] = rows
+        moved = points[beyond]
+        worst[beyond] = project_each(space, moved, _PROJECTION.iterations)
+        points[beyond] = moved
     return float(worst.max(initial=0.0))

@@ -15,11 +15,12 @@ from typing import Literal, Protocol
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.problem import Status
 from constraint_geodesics.scene.clearance import ClearanceModel, clearance_batch
-from constraint_geodesics.search.band import BandCurve, BandSettings, BandSpace, relax, step_lengths
+from constraint_geodesics.search.band import BandCurve, BandSettings, relax, step_lengths
 from constraint_geodesics.search.roadmap import Joined, Roadmap, join, resample, shortest_way
+from constraint_geodesics.search.space import Space, space_of
 from constraint_geodesics.search.tree import tree_way
 
 Source = Literal["straight", "policy", "graph", "tree", "bend"]
@@ -93,12 +94,12 @@ class Task:
     settings: BandSettings = field(default_factory=BandSettings)
 
     def __post_init__(self) -> None:
-        space = BandSpace(self.manifold, self.clearance, self.settings.clearance_m)
-        object.__setattr__(self, "clear", space.arrays)
-        object.__setattr__(self, "open", space.without_boxes().arrays)
+        margin = self.settings.clearance_m
+        object.__setattr__(self, "clear", space_of(self.manifold, self.clearance, margin))
+        object.__setattr__(self, "open", space_of(self.manifold))
 
-    clear: tuple = field(init=False, repr=False)
-    open: tuple = field(init=False, repr=False)
+    clear: Space = field(init=False, repr=False)
+    open: Space = field(init=False, repr=False)
 
 
 class Curve(Protocol):
@@ -322,7 +323,7 @@ def _relaxed(
 
 
 def _sound(
-    space: tuple, source: Source, nodes: Float[np.ndarray, "n D"], iterations: int
+    space: Space, source: Source, nodes: Float[np.ndarray, "n D"], iterations: int
 ) -> Candidate | None:
     """The curve through nodes if its points keep the constraint and the limits, without a jump."""
     curve = BandCurve.through(space, nodes)
@@ -342,7 +343,7 @@ def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
         return True
     smallest = np.empty(len(points))
     robot, margin = task.manifold.robot, task.settings.clearance_m
-    clearance_batch(robot.chain.arrays, task.clear[6], 2.0 * margin, points, smallest)
+    clearance_batch(robot.chain.arrays, task.clear.clearance, 2.0 * margin, points, smallest)
     # the ends are what they are; PyBullet has the last word on them
     return bool(smallest[1:-1].min(initial=np.inf) >= 0.5 * margin)
 

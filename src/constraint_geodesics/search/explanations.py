@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.problem import Status, ends_refused
 from constraint_geodesics.scene.world import World
@@ -22,7 +22,7 @@ def refused_ends(query: Query, world: World) -> tuple[Status, str] | None:
     status = ends_refused(manifold, query.start, query.goal)
     if status in ("start_violates", "goal_violates"):
         end = status.removesuffix("_violates")
-        return status, f"the {end} violates {query.name} by {_amount(manifold, ends[end])}"
+        return status, f"the {end} violates {query.name} by {manifold.amount(ends[end])}"
     if status is not None:
         return status, next(line for end, q in ends.items() if (line := _limit(manifold, end, q)))
     for end, q in ends.items():
@@ -72,14 +72,6 @@ def _same_pose(query: Query, seeds: Float[np.ndarray, "n D"]) -> Float[np.ndarra
 
 def _component(query: Query, roadmap: Roadmap, q: Float[np.ndarray, "D"]) -> set[int]:
     return join(roadmap, query.task.clear, q).components(roadmap)
-
-
-def _amount(manifold: ConstraintManifold, q: Float[np.ndarray, "D"]) -> str:
-    """Excess of one configuration in the units people use."""
-    excess = manifold.inclusion(q)
-    metres, angle = float(excess[:3].max()), float(np.linalg.norm(excess[3:]))
-    parts = [f"{1e3 * metres:.3g} mm"] * (metres > 0.0)
-    return " and ".join([*parts, *[f"{np.degrees(angle):.3g}°"] * (angle > 0.0)])
 
 
 def _listed(q: Float[np.ndarray, "D"]) -> str:

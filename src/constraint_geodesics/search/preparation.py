@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, Int
 
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.geometry.graph import components
 from constraint_geodesics.params import PlannerParams
@@ -17,6 +17,7 @@ from constraint_geodesics.scene.world import World
 from constraint_geodesics.search.band import BandSettings, project
 from constraint_geodesics.search.candidates import ALL_PARTS, Parts, Task
 from constraint_geodesics.search.roadmap import EDGE_STEP, Roadmap, build_roadmap
+from constraint_geodesics.search.space import Space
 
 KEPT_TASKS = 64
 """Constraints without a name that are remembered, with their roadmaps."""
@@ -59,17 +60,17 @@ class Preparation:
         self, constraints: Mapping[str, Constraint], roadmaps: Mapping[str, Roadmap]
     ) -> None:
         """Constraints that are never forgotten, and the roadmaps that exist already."""
-        self._named = frozenset(_key(constraint) for constraint in constraints.values())
+        self._named = frozenset(constraint.key for constraint in constraints.values())
         for name, roadmap in roadmaps.items():
             # the nodes are written in single precision, which may lie beyond a limit
             inside = np.clip(roadmap.joints, self.scene.robot.lower, self.scene.robot.upper)
             inside.setflags(write=False)
-            self._roadmaps[_key(constraints[name])] = replace(roadmap, joints=inside)
+            self._roadmaps[constraints[name].key] = replace(roadmap, joints=inside)
         self._supplied = frozenset(self._roadmaps)
 
     def task(self, constraint: Constraint) -> Task:
         """The constraint, prepared; its roadmap is made when it is first asked for."""
-        key = _key(constraint)
+        key = constraint.key
         if key not in self._tasks:
             if len(self._tasks) >= KEPT_TASKS + len(self._named):
                 oldest = next(other for other in self._tasks if other not in self._named)
@@ -127,7 +128,7 @@ def checked_roadmap(
 
 
 def edge_points(
-    space: tuple, roadmap: Roadmap
+    space: Space, roadmap: Roadmap
 ) -> tuple[Float[np.ndarray, "m D"], Int[np.ndarray, "m"]]:
     """Points on the constraint between the ends of every edge, at most EDGE_STEP apart [rad], and
     the edge that each belongs to.
@@ -152,7 +153,7 @@ def free_configurations(
     kept, found = [np.empty((0, robot.dof))], 0
     for _ in range(_ROUNDS):
         drawn = draw(2 * count, rng)
-        share = rng.uniform(size=len(drawn)) ** (1.0 / max(sum(manifold.constraint.axes), 1))
+        share = rng.uniform(size=len(drawn)) ** (1.0 / max(manifold.rows.held.sum(), 1))
         result = retract(manifold, drawn, Retraction(), band=share)
         good = result.joints[result.converged & (robot.limit_distance(result.joints) >= 0.0)]
         good = good[: count - found]
@@ -172,10 +173,3 @@ def band_settings(settings: PlannerParams) -> BandSettings:
         settings.largest_step_rad,
         settings.clearance_m,
     )
-
-
-def _key(constraint: Constraint) -> tuple:
-    """The same for constraints that allow the same configurations."""
-    pose = constraint.reference
-    where = () if pose is None else (pose.position.tobytes(), pose.rotation.tobytes())
-    return (constraint.axes, constraint.tolerance, *where)

@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
+from constraint_geodesics.constraints.kernels import COMPILE
 from constraint_geodesics.geometry.graph import components, nearest_neighbour_edges
-from constraint_geodesics.search.band_kernels import project_node, workspace
+from constraint_geodesics.search.space import Space, project_node, workspace
 
-_COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 NEAREST = 32
 """Nodes that an end is tried to be joined to, the nearest first."""
 JOINED = 4
@@ -70,8 +70,8 @@ class Joined:
         return {int(roadmap.labels[node]) for node in self.nodes}
 
 
-def join(roadmap: Roadmap, space: tuple, q: Float[np.ndarray, "D"], tried: int = NEAREST) -> Joined:
-    """The edges from a configuration to the graph.  space: as `BandSpace.arrays`."""
+def join(roadmap: Roadmap, space: Space, q: Float[np.ndarray, "D"], tried: int = NEAREST) -> Joined:
+    """The edges from a configuration to the graph."""
     distances = np.linalg.norm(roadmap.joints - q, axis=1)
     count = min(tried, len(distances))
     nearest = np.argpartition(distances, count - 1)[:count]
@@ -88,12 +88,12 @@ def shortest_way(
     goal: Float[np.ndarray, "D"],
     at_start: Joined,
     at_goal: Joined,
-    space: tuple | None = None,
+    space: Space | None = None,
 ) -> Float[np.ndarray, "k D"] | None:
     """Corners of the shortest way over the graph, both ends included; None where the graph does not
     join them.
 
-    space: as `BandSpace.arrays`; the edges of a way that was found are looked at in it, since the
+    space: the edges of a way that was found are looked at in it, since the
     graph may be of a workcell with less in it.  Those that fail are left out, and the search is
     begun again [lazy shortest paths, Dellin and Srinivasa 2016].
     """
@@ -119,7 +119,7 @@ def shortest_way(
             return np.concatenate([start[None], roadmap.joints[nodes], goal[None]])
 
 
-def build_roadmap(space: tuple, joints: Float[np.ndarray, "n D"], neighbours: int) -> Roadmap:
+def build_roadmap(space: Space, joints: Float[np.ndarray, "n D"], neighbours: int) -> Roadmap:
     """A graph over configurations of the space, each joined to its nearest neighbours where the
     edge holds.
     """
@@ -143,7 +143,7 @@ def resample(corners: Float[np.ndarray, "k D"], count: int) -> Float[np.ndarray,
     return points
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def edge_length(space, first, second, work):
     """Length [rad] of the straight joint line between two configurations, projected; inf where it
     jumps.
@@ -173,12 +173,12 @@ def edge_length(space, first, second, work):
     return total
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def _edges(space, q, nodes, tried, lengths, enough):
     """Lengths of the edges from q to the nodes named by `tried`, until `enough` of them hold; inf
     for the others.
     """
-    work = workspace(q.shape[0])
+    work = workspace(space)
     lengths[:] = np.inf
     found = 0
     for k in range(tried.shape[0]):
@@ -189,22 +189,22 @@ def _edges(space, q, nodes, tried, lengths, enough):
                 return
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def edge_lengths(space, nodes, edges, lengths):
     """Lengths of many edges (m, 2) between nodes (n, D) into lengths (m,); inf where one does not
     hold.
     """
-    work = workspace(nodes.shape[1])
+    work = workspace(space)
     for k in range(edges.shape[0]):
         lengths[k] = edge_length(space, nodes[edges[k, 0]], nodes[edges[k, 1]], work)
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def _holds(space, joints, begins, leads, lengths, looked_at, way):
     """Whether all edges of a way hold in the space; those that do not become infinitely long, in
     either direction.
     """
-    work = workspace(joints.shape[1])
+    work = workspace(space)
     sound = True
     for k in range(way.shape[0] - 1):
         here, there = way[k], way[k + 1]
@@ -229,7 +229,7 @@ def _holds(space, joints, begins, leads, lengths, looked_at, way):
     return sound
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def _a_star(nodes, begins, leads, lengths, goal, sources, source_lengths, targets, target_lengths):
     """Nodes of the shortest way from the sources to the targets, with the lengths at either end;
     empty for none.

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
-from constraint_geodesics.search.band_kernels import project_node, workspace
+from constraint_geodesics.constraints.kernels import COMPILE
 from constraint_geodesics.search.roadmap import edge_length
+from constraint_geodesics.search.space import Space, project_node, workspace
 
-_COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 _PROJECTIONS = 12
 _LEFT = 1e-6
 """Violation [rad or m] of a node, at most."""
@@ -40,7 +40,7 @@ class TreeSettings:
 
 
 def tree_way(
-    space: tuple,
+    space: Space,
     start: Float[np.ndarray, "D"],
     goal: Float[np.ndarray, "D"],
     seed: int,
@@ -49,7 +49,6 @@ def tree_way(
     """Corners of a way from start to goal [rad], both included, or None where the trees did not
     meet.
 
-    space: as `BandSpace.arrays`.
     """
     settings = settings or TreeSettings()
     corners = _grown(
@@ -65,7 +64,7 @@ def tree_way(
     return corners if len(corners) else None
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def _nearest(nodes, count, q):
     best, smallest = 0, np.inf
     for n in range(count):
@@ -77,7 +76,7 @@ def _nearest(nodes, count, q):
     return best
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def _extended(space, nodes, parents, count, node, target, step, work, point):
     """Grow a tree from one of its nodes towards a configuration as far as it gets.
 
@@ -112,7 +111,7 @@ def _extended(space, nodes, parents, count, node, target, step, work, point):
     return count, node, False
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def _chain(nodes, parents, node):
     """The nodes from one of a tree's back to its root."""
     length, n = 0, node
@@ -127,10 +126,10 @@ def _chain(nodes, parents, node):
     return way
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def _grown(space, start, goal, seed, step, iterations, capacity, shortcuts):
     dof = start.shape[0]
-    limits, work, point, drawn = space[5], workspace(dof), np.empty(dof), np.empty(dof)
+    limits, work, point, drawn = space.limits, workspace(space), np.empty(dof), np.empty(dof)
     nodes, parents = np.empty((2, capacity, dof)), np.full((2, capacity), -1, dtype=np.int64)
     counts = np.ones(2, dtype=np.int64)
     nodes[0, 0], nodes[1, 0] = start, goal
@@ -165,7 +164,7 @@ def _grown(space, start, goal, seed, step, iterations, capacity, shortcuts):
     return np.empty((0, dof))
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def _shortened(space, way, shortcuts, work):
     """The way without the corners that random shortcuts leave out."""
     dof, count = way.shape[1], len(way)

@@ -15,7 +15,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from constraint_geodesics.benchmark.judge import polyline_length
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.learning.dataset import Queries, draw_queries
 from constraint_geodesics.learning.lift import densify
@@ -120,12 +120,12 @@ def cup_axis(manifold: ConstraintManifold) -> Float[np.ndarray, "3"]:
 
     Raises ExecutionCheckError if the constraint does not hold roll and pitch.
     """
-    if not manifold.held[3:5].all():
+    axis = manifold.constraint.level_axis
+    if axis is None:
         raise ExecutionCheckError(
-            f"axes = {manifold.constraint.axes}: must hold roll and pitch, or a cup need not "
-            f"stay upright"
+            f"{manifold.constraint.label}: must hold roll and pitch, or a cup need not stay upright"
         )
-    return np.array(manifold.reference_arrays[1][2])
+    return axis
 
 
 def line_tilts(manifold: ConstraintManifold, queries: Queries) -> Float[np.ndarray, "n"]:

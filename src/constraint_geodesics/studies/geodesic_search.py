@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 
 from constraint_geodesics.benchmark.judge import Free, judge_limits, measure_path
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.geodesics.episodes import begin, episode_settings
 from constraint_geodesics.geodesics.policy_search import (
     PolicySolver,

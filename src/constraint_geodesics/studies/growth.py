@@ -20,7 +20,12 @@ import pandas as pd
 import torch
 from jaxtyping import Float, Int
 
-from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintManifold,
+    Pose,
+    constraint_manifold,
+)
 from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
 from constraint_geodesics.geometry.length import Collocation, curve_length
 from constraint_geodesics.learning.dataset import Queries, draw_queries
@@ -36,9 +41,10 @@ from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.scene.world import World
-from constraint_geodesics.search.band import BandSettings, BandSpace
+from constraint_geodesics.search.band import BandSettings
 from constraint_geodesics.search.candidates import Answer, candidates
 from constraint_geodesics.search.roadmap import build_roadmap
+from constraint_geodesics.search.space import space_of
 from constraint_geodesics.studies.geometry import one_thread
 
 AXES = ("joints", "codimension", "obstacles", "queries", "latent dimension", "dataset rows")
@@ -154,7 +160,7 @@ class Subject:
     @property
     def manifold(self) -> ConstraintManifold:
         """That of `CONSTRAINT`."""
-        return self.scene.manifold(self.params.constraints[CONSTRAINT])
+        return constraint_manifold(self.scene.robot, self.params.constraints[CONSTRAINT])
 
     @property
     def learned(self) -> ManifoldParams:
@@ -438,9 +444,8 @@ def _roadmaps(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
     scene, manifold, settings = subject.scene, subject.manifold, subject.params.planner
     drawn = draw_queries(scene, manifold, CONSTRAINT, -(-max(sizes.nodes) // 2), sizes.seed)
     nodes = np.concatenate([drawn.starts, drawn.goals])
-    space = BandSpace(
-        manifold, clearance_model(scene.robot, scene.workcell), settings.clearance_m
-    ).arrays
+    clearance = clearance_model(scene.robot, scene.workcell)
+    space = space_of(manifold, clearance, settings.clearance_m)
     build_roadmap(space, nodes[: min(sizes.nodes)], settings.roadmap_neighbours)
     for _ in range(sizes.roadmap_repeats):
         for count in sizes.nodes:

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 
-from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.geodesics.episodes import EpisodeSettings, episode_settings
 from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, Phi, repeated

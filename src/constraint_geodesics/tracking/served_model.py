@@ -14,7 +14,7 @@ import mlflow
 import mlflow.pyfunc
 import pandas as pd
 
-from constraint_geodesics.constraints.pose import Constraint
+from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.pipeline.threads import one_thread
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.trajectory import Trajectory

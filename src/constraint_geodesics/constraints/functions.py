@@ -1,0 +1,325 @@
+"""A constraint given by two functions of the joints: a residual r(q) and its Jacobian.
+
+Both are written in plain Python that numba compiles, `residual(q, out)` with out (m,) and
+`jacobian(q, out)` with out (m, D).  The search is compiled once for all constraints of this kind:
+it takes the addresses of what is compiled here.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib import import_module
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from llvmlite import ir
+from numba import carray, cfunc, njit, types
+from numba.extending import intrinsic
+
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintError, Series
+from constraint_geodesics.constraints.kernels import COMPILE, Rows, register
+from constraint_geodesics.robot.kernels import new_posture, pose_of
+from constraint_geodesics.robot.kinematics import SerialRobot
+
+Writes = Callable[[np.ndarray, np.ndarray], None]
+
+
+class RowBound(NamedTuple):
+    """What is demanded of one row: |r| ≤ tolerance [unit], "m" or "rad".
+
+    second_derivative: K with |d²r(q + t d)/dt²| ≤ K |d|² for all q within the joint limits [unit
+    per rad²]; the certifier's proof between waypoints stands on it.
+    """
+
+    name: str
+    unit: str
+    second_derivative: float
+    tolerance: float = 0.0
+
+
+class Origin(NamedTuple):
+    """The factory `module:function` that made a constraint for a robot, its arguments as JSON."""
+
+    factory: str
+    arguments: str
+    robot: SerialRobot
+
+
+class FunctionArrays(NamedTuple):
+    """For the kernels: the rows, and the addresses of both functions."""
+
+    rows: Rows
+    residual: int
+    jacobian: int
+
+
+@dataclass(frozen=True, eq=False)
+class FunctionsConstraint(Constraint):
+    """Two functions of the joints and what is demanded of each row.
+
+    Raises ConstraintError for a row without a name, of another unit, or whose numbers are negative
+    or not finite.
+    """
+
+    kind: ClassVar[str] = "functions"
+    residual: Writes
+    jacobian: Writes
+    bounds: tuple[RowBound, ...]
+    origin: Origin | None = None
+
+    def __post_init__(self) -> None:
+        if not self.bounds:
+            raise ConstraintError("bounds = (): one is needed for each row of the residual")
+        for i, bound in enumerate(self.bounds):
+            if not bound.name or bound.unit not in ("m", "rad"):
+                raise ConstraintError(f"bounds[{i}] = {bound}: a name and m or rad are needed")
+            for name in ("tolerance", "second_derivative"):
+                value = getattr(bound, name)
+                if not (math.isfinite(value) and value >= 0.0):
+                    raise ConstraintError(
+                        f"bounds[{i}].{name} = {value}: must be finite and not negative"
+                    )
+
+    def __reduce__(self) -> Any:
+        if self.origin is None:
+            return FunctionsConstraint, (self.residual, self.jacobian, self.bounds)
+        return _made_again, (self.origin, self.bounds)
+
+    @property
+    def rows(self) -> Rows:
+        """Every row is held, each by itself."""
+        count = len(self.bounds)
+        tolerance = np.array([bound.tolerance for bound in self.bounds])
+        return Rows(np.ones(count, bool), tolerance, np.zeros(count, bool))
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """As the bounds say."""
+        return tuple(bound.unit for bound in self.bounds)
+
+    def arrays(self, robot: SerialRobot) -> FunctionArrays:
+        """For the kernels."""
+        compiled = _compiled(self.residual, self.jacobian, len(self.bounds))
+        return FunctionArrays(self.rows, compiled[0].address, compiled[1].address)
+
+    def values(self, q: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "n m"]:
+        """The residuals of configurations."""
+        address = _compiled(self.residual, self.jacobian, len(self.bounds))[0].address
+        out = np.empty((len(q), len(self.bounds)))
+        _values(address, np.ascontiguousarray(q, np.float64), out)
+        return out
+
+    def loosened(self, least: Mapping[str, float]) -> "FunctionsConstraint":
+        """The same with every tolerance at least that of its row's unit."""
+        return self._with([max(bound.tolerance, least[bound.unit]) for bound in self.bounds])
+
+    def _with(self, tolerances: Sequence[float]) -> "FunctionsConstraint":
+        pairs = zip(self.bounds, tolerances, strict=True)
+        return replace(self, bounds=tuple(b._replace(tolerance=float(t)) for b, t in pairs))
+
+    @property
+    def label(self) -> str:
+        """Its rows."""
+        return f"the constraint on {' and '.join(bound.name for bound in self.bounds)}"
+
+    @property
+    def key(self) -> tuple:
+        """Factory and arguments, or the functions; and the bounds."""
+        made = (self.residual, self.jacobian) if self.origin is None else self.origin[:2]
+        return (self.kind, *made, self.bounds)
+
+    def series(self, residual: Float[np.ndarray, "n m"]) -> list[Series]:
+        """Each row by itself, in mm or degrees."""
+        drawn = {"m": ("mm", 1e3), "rad": ("deg", 180.0 / math.pi)}
+        found = []
+        for bound, values in zip(self.bounds, residual.T, strict=True):
+            unit, scale = drawn[bound.unit]
+            found.append(Series(bound.name, unit, scale * abs(values), scale * bound.tolerance))
+        return found
+
+    def to_json(self) -> dict[str, Any]:
+        """Factory, arguments and tolerances; ConstraintError for functions without a factory."""
+        if self.origin is None:
+            raise ConstraintError(
+                f"{self.label} was not made by a factory, so that it can't be written: see "
+                f"constraints.functions.constraint_factory"
+            )
+        return {
+            "kind": self.kind,
+            "factory": self.origin.factory,
+            "arguments": json.loads(self.origin.arguments),
+            "tolerance": [bound.tolerance for bound in self.bounds],
+        }
+
+    @classmethod
+    def from_json(cls, about: Mapping[str, Any], robot: SerialRobot | None) -> Constraint:
+        """What `to_json` wrote, for a robot."""
+        if robot is None:
+            raise ConstraintError(f"{about['factory']} can't be called without a robot")
+        return made_by(about["factory"], about["arguments"], robot)._with(about["tolerance"])
+
+    @classmethod
+    def from_params(cls, params: Any, robot: SerialRobot) -> Constraint:
+        """What the entry's factory makes."""
+        return made_by(params.factory, params.arguments, robot)
+
+
+KIND = FunctionsConstraint
+
+
+def constraint_factory(
+    function: Callable[..., FunctionsConstraint],
+) -> Callable[..., FunctionsConstraint]:
+    """Mark a function (robot, **arguments) → FunctionsConstraint that files may name: no other is
+    called, whatever a file says.
+    """
+    function.__dict__["makes_constraints"] = True
+    return function
+
+
+def made_by(factory: str, arguments: Mapping[str, Any], robot: SerialRobot) -> FunctionsConstraint:
+    """The constraint that a factory `module:function` makes.
+
+    Raises ConstraintError if there is none, it is not marked, or the arguments are not its own.
+    """
+    module, _, name = factory.partition(":")
+    try:
+        function = getattr(import_module(module), name)
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
+        raise ConstraintError(f"factory = {factory!r}: can't be imported: {error}") from None
+    if not getattr(function, "makes_constraints", False):
+        raise ConstraintError(f"factory = {factory!r}: is no constraint_factory")
+    try:
+        made = function(robot, **arguments)
+    except TypeError as error:
+        raise ConstraintError(f"factory = {factory!r}: {error}") from None
+    return replace(made, origin=Origin(factory, json.dumps(arguments, sort_keys=True), robot))
+
+
+def _made_again(origin: Origin, bounds: tuple[RowBound, ...]) -> FunctionsConstraint:
+    made = made_by(origin.factory, json.loads(origin.arguments), origin.robot)
+    return replace(made, bounds=bounds)
+
+
+@intrinsic
+def _pointer(typing, address):
+    def generate(context, builder, signature, values):
+        return builder.inttoptr(values[0], ir.DoubleType().as_pointer())
+
+    return types.CPointer(types.float64)(types.intp), generate
+
+
+@intrinsic
+def _call(typing, address, q, out, dof):
+    """Call a function of `_compiled` by its address, with those of q and out."""
+
+    def generate(context, builder, signature, values):
+        word = ir.IntType(64)
+        function = ir.FunctionType(ir.VoidType(), [word, word, word]).as_pointer()
+        builder.call(builder.inttoptr(values[0], function), values[1:])
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, types.int64, types.int64), generate
+
+
+@cache
+def _compiled(residual: Writes, jacobian: Writes, count: int) -> tuple[Any, Any]:
+    """Both functions as C functions of the addresses of q and out and of D; kept, since the search
+    holds their addresses.
+    """
+    options = {key: value for key, value in COMPILE.items() if key != "cache"}
+    own_residual, own_jacobian = njit(**options)(residual), njit(**options)(jacobian)
+    signature = types.void(types.intp, types.intp, types.intp)
+
+    def write_residual(q, out, dof):
+        own_residual(carray(_pointer(q), (dof,)), carray(_pointer(out), (count,)))
+
+    def write_jacobian(q, out, dof):
+        own_jacobian(carray(_pointer(q), (dof,)), carray(_pointer(out), (count, dof)))
+
+    return cfunc(signature)(write_residual), cfunc(signature)(write_jacobian)
+
+
+@njit(**COMPILE)
+def _values(address, q, out):
+    for n in range(q.shape[0]):
+        _call(address, q[n].ctypes.data, out[n].ctypes.data, q.shape[1])
+
+
+@njit(**COMPILE)
+def _no_scratch(constraint, dof):
+    return dof
+
+
+@njit(**COMPILE)
+def _linearise(manifold, q, own, residual, jacobian):
+    about = manifold.constraint
+    _call(about.residual, q.ctypes.data, residual.ctypes.data, q.shape[0])
+    _call(about.jacobian, q.ctypes.data, jacobian.ctypes.data, q.shape[0])
+
+
+register(FunctionArrays, _no_scratch, _linearise)
+
+
+@constraint_factory
+def tip_on_sphere(
+    robot: SerialRobot, centre_m: Sequence[float], radius_m: float, tolerance_m: float = 0.0
+) -> FunctionsConstraint:
+    """The tool's tip keeps to the surface of a sphere, as when a bowl is wiped.
+
+    With v = p(q) − c: r = (|v|² − R²) / 2R, which is the distance to the surface to first order.
+    Along q + t d: r″ = (|v′|² + v·v″) / R.  Let g_j bound |∂p/∂q_j|: the length of the chain behind
+    joint j, or 1 for a prismatic one.  For i ≤ j ∂²p/∂q_i∂q_j = a_i × ∂p/∂q_j, or 0 for a prismatic
+    i, so that it is at most G_ij = g_j.  Hence |v′| ≤ |g||d| and |v″| ≤ λ_max(G) |d|², and with V,
+    the largest |v|, K = (|g|² + V λ_max(G)) / R.
+    """
+    centre, radius = np.array(centre_m, float), float(radius_m)
+    if centre.shape != (3,) or not np.isfinite(centre).all() or not 0.0 < radius < math.inf:
+        raise ConstraintError(
+            f"centre_m = {centre_m}, radius_m = {radius_m}: 3 finite numbers and a positive one"
+        )
+    chain = robot.chain.arrays
+    prismatic, dof = chain.prismatic, robot.dof
+
+    def residual(q: np.ndarray, out: np.ndarray) -> None:
+        posture = new_posture(dof)
+        pose_of(chain, q, posture)
+        v = posture.position - centre
+        out[0] = 0.5 * (v[0] * v[0] + v[1] * v[1] + v[2] * v[2] - radius * radius) / radius
+
+    def jacobian(q: np.ndarray, out: np.ndarray) -> None:
+        posture = new_posture(dof)
+        pose_of(chain, q, posture)
+        v = posture.position - centre
+        for j in range(dof):
+            a, arm = posture.axes[j], posture.position - posture.origins[j]
+            x, y, z = a[0], a[1], a[2]
+            if not prismatic[j]:
+                x, y, z = (
+                    a[1] * arm[2] - a[2] * arm[1],
+                    a[2] * arm[0] - a[0] * arm[2],
+                    a[0] * arm[1] - a[1] * arm[0],
+                )
+            out[0, j] = (v[0] * x + v[1] * y + v[2] * z) / radius
+
+    bound = _sphere_bound(robot, centre, radius)
+    row = RowBound("distance to the sphere", "m", bound, tolerance_m)
+    return FunctionsConstraint(residual, jacobian, (row,))
+
+
+def _sphere_bound(robot: SerialRobot, centre: np.ndarray, radius: float) -> float:
+    """K of `tip_on_sphere` [m/rad²]."""
+    chain = robot.chain.arrays
+    frames = np.concatenate([chain.origins[1:], chain.tool[None]])
+    strokes = chain.prismatic * np.maximum(abs(robot.lower), abs(robot.upper))
+    behind = np.cumsum((np.linalg.norm(frames[:, :3, 3], axis=1) + strokes)[::-1])[::-1]
+    g = np.where(chain.prismatic, 1.0, behind)
+    index = np.arange(robot.dof)
+    second = g[np.maximum(index[:, None], index)]
+    second[chain.prismatic[np.minimum(index[:, None], index)]] = 0.0
+    first = (chain.base @ chain.origins[0])[:3, 3]
+    farthest = np.linalg.norm(first - centre) + behind[0]
+    return float((g @ g + farthest * np.linalg.eigvalsh(second)[-1]) / radius)
