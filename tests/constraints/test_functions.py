@@ -1,0 +1,68 @@
+"""A constraint of two functions, from the planner to the recording."""
+
+import numpy as np
+import pytest
+
+from constraint_geodesics.constraints.constraint import ConstraintManifold
+from constraint_geodesics.constraints.functions import made_by
+from constraint_geodesics.constraints.projection import retract
+from constraint_geodesics.planner import check_path, read_path
+from tests.planner_fixtures import packaged_planner
+
+SPHERE = "constraint_geodesics.constraints.functions:tip_on_sphere"
+CENTRE, RADIUS = np.array([0.35, 0.0, 0.15]), 0.25
+
+
+@pytest.fixture(scope="module")
+def manifold() -> ConstraintManifold:
+    robot = packaged_planner().scene.robot
+    arguments = {"centre_m": CENTRE.tolist(), "radius_m": RADIUS}
+    return ConstraintManifold(robot, made_by(SPHERE, arguments, robot))
+
+
+@pytest.fixture(scope="module")
+def path(manifold):
+    """The first of a few queries that is solved."""
+    planner, robot = packaged_planner(), manifold.robot
+    found = retract(manifold, robot.sample(400, np.random.default_rng(0)))
+    inside = found.converged & (robot.limit_distance(found.joints) >= 0.05)
+    free = found.joints[inside]
+    with planner.scene.world() as world:
+        free = free[world.free(free)]
+    away = np.linalg.norm(free - free[0], axis=1)
+    near = free[np.argsort(away)[1:6]]
+    paths = [planner.plan(free[0], goal, manifold.constraint) for goal in near]
+    return next(path for path in paths if path.status == "solved")
+
+
+def test_it_is_planned_and_certified(path, manifold) -> None:
+    assert path.certificate.valid
+    assert 0.0 < path.certificate.violation_bound_m <= 1e-4
+    assert path.certificate.violation_bound_rad == 0.0
+    t = np.linspace(0.0, 1.0, 20)[:, None, None]
+    between = path.joints[:-1] + t * (path.joints[1:] - path.joints[:-1])
+    tips, _ = manifold.robot.forward(between)
+    assert np.abs(np.linalg.norm(tips - CENTRE, axis=-1) - RADIUS).max() < 1.1e-4
+
+
+def test_its_path_is_read_again(path, manifold, tmp_path) -> None:
+    file = tmp_path / "path.csv"
+    path.save(file)
+    joints, _, constraint = read_path(file, manifold.robot.joint_names, manifold.robot)
+    np.testing.assert_array_equal(joints, path.joints)
+    assert constraint.key == manifold.constraint.key
+    assert check_path(file).valid
+
+
+def test_its_path_is_recorded(path, tmp_path) -> None:
+    file = tmp_path / "path.rrd"
+    path.record(file)
+    assert b"distance to the sphere" in file.read_bytes()
+
+
+def test_an_end_off_the_sphere_is_named_in_millimetres(path, manifold) -> None:
+    lower = path.joints[0] - 0.02
+    answer = packaged_planner().plan(lower, path.joints[-1], manifold.constraint)
+    assert answer.status == "start_violates"
+    assert "distance to the sphere by" in answer.explanation
+    assert "mm" in answer.explanation
