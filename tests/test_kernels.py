@@ -17,7 +17,7 @@ OUTER = (
     "@njit(cache=True)\ndef outer(x):\n    return 10 * inner(x)\n"
 )
 ASK = (
-    "from constraint_geodesics.high.outer import outer; "
+    "import numba; from constraint_geodesics.high.outer import outer; "
     "print(outer(1), sum(outer.stats.cache_hits.values()))"
 )
 

@@ -1,6 +1,7 @@
 """Shortest robot paths that keep a task constraint, by policy search on one learned manifold."""
 
 import os
+import sys
 from typing import TYPE_CHECKING, Any
 
 from constraint_geodesics.kernel_digest import LOCATORS
@@ -11,7 +12,9 @@ if TYPE_CHECKING:
     from constraint_geodesics.planner import Path as Path
     from constraint_geodesics.planner import Planner as Planner
 
-os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", LOCATORS)  # numba reads it when it compiles
+os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", LOCATORS)
+if "numba" in sys.modules:  # it has read its settings already
+    sys.modules["numba"].config.CACHE_LOCATOR_CLASSES = os.environ["NUMBA_CACHE_LOCATOR_CLASSES"]
 
 __all__ = ["Constraint", "Path", "Planner", "Pose"]
 
