@@ -9,7 +9,13 @@ from pathlib import Path
 import pytest
 
 from constraint_geodesics import kernel_digest
-from constraint_geodesics.kernel_digest import PACKAGE, ROOMS, are_compiled, kernels_digest
+from constraint_geodesics.kernel_digest import (
+    PACKAGE,
+    ROOMS,
+    are_compiled,
+    folder_of,
+    kernels_digest,
+)
 
 INNER = "from numba import njit\n\n\n@njit(cache=True)\ndef inner(x):\n    return x + {}\n"
 OUTER = (
@@ -17,7 +23,7 @@ OUTER = (
     "@njit(cache=True)\ndef outer(x):\n    return 10 * inner(x)\n"
 )
 ASK = (
-    "from constraint_geodesics.high.outer import outer; "
+    "import numba; from constraint_geodesics.high.outer import outer; "
     "print(outer(1), sum(outer.stats.cache_hits.values()))"
 )
 
@@ -52,6 +58,7 @@ def test_a_changed_kernel_changes_its_callers_elsewhere(package: Path) -> None:
     assert answer(package) == (20, 1)
     (package / "low" / "inner.py").write_text(INNER.format(2))
     assert answer(package) == (30, 0), "no cache was deleted"
+    assert len(list((package / "high" / "__pycache__").glob("kernels-*"))) == 1
     (package / "unrelated.py").write_text("nothing = 'compiled here'\n")
     assert answer(package) == (30, 1)
 
@@ -71,8 +78,9 @@ def test_the_first_call_is_known_by_the_kernels_that_are_not_compiled(tmp_path: 
         cache.unlink()
     assert not are_compiled(tmp_path)
     for room in ROOMS:
-        cache = tmp_path / room / "__pycache__" / "kernels.some-1.py311.nbi"
-        cache.write_bytes(b"version" + kernels_digest(tmp_path) + b"overloads")
+        folder = tmp_path / room / "__pycache__" / folder_of(kernels_digest(tmp_path))
+        folder.mkdir()
+        (folder / "kernels.some-1.py311.nbi").touch()
     assert are_compiled(tmp_path)
     with (tmp_path / ROOMS[0] / "kernels.py").open("a") as file:
         file.write("# another kernel\n")

@@ -1,6 +1,7 @@
 """Shortest robot paths that keep a task constraint, by policy search on one learned manifold."""
 
 import os
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -12,13 +13,15 @@ if TYPE_CHECKING:
     from constraint_geodesics.planner import Planner as Planner
     from constraint_geodesics.trajectory import Trajectory as Trajectory
 
-os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", LOCATORS)  # numba reads it when it compiles
+os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", LOCATORS)
+if "numba" in sys.modules:  # it has read its settings already
+    sys.modules["numba"].config.CACHE_LOCATOR_CLASSES = os.environ["NUMBA_CACHE_LOCATOR_CLASSES"]
 
 __all__ = ["Constraint", "Planner", "Pose", "Trajectory"]
 _MODULES = {
-    "Constraint": "constraints.pose",
+    "Constraint": "constraints.constraint",
     "Planner": "planner",
-    "Pose": "constraints.pose",
+    "Pose": "constraints.constraint",
     "Trajectory": "trajectory",
 }
 

@@ -1,16 +1,17 @@
-"""Where numba keeps this package's compiled kernels: where it always does, but under a stamp of all
-kernel files, so that a kernel is compiled again when one that it calls has changed.
+"""Where numba keeps this package's compiled kernels: where it always does, but in a folder named by
+a digest of all kernel files, so that a kernel is compiled again when one that it calls has changed.
 
 `constraint_geodesics/__init__.py` names these classes to numba, before anything is compiled.
 """
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from numba.core import caching
 
-from constraint_geodesics.kernel_digest import PACKAGE, kernels_digest
+from constraint_geodesics.kernel_digest import FOLDER, PACKAGE, folder_of, kernels_digest
 
 
 class _Own:
@@ -21,6 +22,18 @@ class _Own:
         """The place of one function, or None: ask the next class."""
         inside = Path(py_file).resolve().is_relative_to(PACKAGE.resolve())
         return super().from_function(py_func, py_file) if inside else None  # type: ignore[misc]
+
+    def get_cache_path(self) -> str:
+        """The folder of the kernels as they are now."""
+        return str(Path(super().get_cache_path()) / folder_of(kernels_digest()))  # type: ignore[misc]
+
+    def ensure_cache_path(self) -> None:
+        """Make the folder; those of kernels that have changed since go."""
+        super().ensure_cache_path()  # type: ignore[misc]
+        own = Path(self.get_cache_path())
+        for other in own.parent.glob(f"{FOLDER}*"):
+            if other != own:
+                shutil.rmtree(other, ignore_errors=True)
 
     def get_source_stamp(self) -> bytes:
         """Of the sources that a function was compiled from."""

@@ -18,6 +18,8 @@ LOCATORS = ",".join(
     )
 )
 """What numba asks where a compiled function is kept: this package's own first, then numba's."""
+FOLDER = "kernels-"
+"""What the name of a folder with compiled kernels begins with."""
 ROOMS = ("certification", "constraints", "geometry", "robot", "scene", "search")
 """Rooms whose kernels are compiled before the first path is there."""
 
@@ -33,8 +35,12 @@ def kernels_digest(package: Path = PACKAGE) -> bytes:
     return digest.digest()
 
 
+def folder_of(digest: bytes) -> str:
+    """Name of the folder of what was compiled from these files."""
+    return f"{FOLDER}{digest.hex()[:12]}"
+
+
 def are_compiled(package: Path = PACKAGE) -> bool:
     """Whether what the planner needs has been compiled from the kernels as they are."""
-    stamp = kernels_digest(package)
-    caches = {room: (package / room / "__pycache__").glob("*.nbi") for room in ROOMS}
-    return all(any(stamp in file.read_bytes() for file in own) for own in caches.values())
+    folder = folder_of(kernels_digest(package))
+    return all(any((package / room / "__pycache__" / folder).glob("*.nbi")) for room in ROOMS)

@@ -262,7 +262,7 @@ def test_a_colour_retrains_nothing_and_a_comment_runs_nothing(finished: Path) ->
     kept, stages = file.read_text(), []
     for text in (kept + "# a comment\n", kept.replace('"#0072B2"', '"#0072B3"', 1), kept):
         file.write_text(text)
-        assert stages_to_run(finished) in ({"digest_code"}, set())
+        assert "digest_code" in stages_to_run(finished)
         assert smoke.dvc(finished, "repro", "digest_code").returncode == 0
         stages.append(stages_to_run(finished))
     assert stages == [set(), {"record_paths", "report"}, set()]
