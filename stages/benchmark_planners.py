@@ -1,22 +1,22 @@
-"""Stage: the sampling-based planners on the queries of one constraint."""
+"""Stage: some planners of the benchmark on the pipeline's queries of one constraint (Table I)."""
 
 import sys
+from typing import Any
 
-from constraint_geodesics.benchmark.planner_benchmark import (
-    PlannerTask,
-    planner_figures,
-    run_planner,
-)
+import pandas as pd
+
+from constraint_geodesics.benchmark.entries import Run, answered, with_planners
+from constraint_geodesics.benchmark.queries import TABLE, Query
+from constraint_geodesics.benchmark.recorder import PathKeeper
+from constraint_geodesics.benchmark.statistics import comparison_figures
 from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import read_queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import load_submanifold
 from constraint_geodesics.params import Params
-from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.recording.replay import record_rows, save_paths
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.studies.geodesic_search import write_table
 from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 
 STAGE = "benchmark_planners"
@@ -24,46 +24,51 @@ STAGE = "benchmark_planners"
 
 def main(params: Params, layout: Layout, constraint: str) -> None:
     """Write data/benchmark/<constraint>/, its recordings, rows and figures."""
-    source, settings = layout.queries(constraint), params.benchmark
-    scene = Scene.from_params(params)
-    manifold = scene.manifold(params.constraints[constraint])
-    charts = {name: LearnedManifold.load(layout.manifold(name)) for name in params.manifolds}
-    queries, shown = read_queries(source), params.geodesics.searched[0]
+    source, compared = layout.queries(constraint), params.benchmark.compared
+    scene, shown = Scene.from_params(params), params.geodesics.searched[0]
+    pairs, scratch = read_queries(source), layout.scratch(STAGE, constraint)
+    queries = [
+        Query(constraint, TABLE, number, start, goal)
+        for number, (start, goal) in enumerate(zip(pairs.starts, pairs.goals, strict=True))
+    ]
+    asked = {"queries": len(queries), "seeds": compared.seeds}
+    entries = {
+        name: params.benchmark.planners[name].model_copy(update=asked) for name in compared.planners
+    }
+    own, kept = with_planners(params, entries), PathKeeper(scratch / "paths")
     about = subject_of(params, constraint=constraint)
     with tracked_stage(
         STAGE,
         constraint,
-        settings,
+        compared,
         [source],
         experiment=params.tracking.experiment,
         root=layout.root,
         subject=about,
     ) as run:
-        tasks = [
-            PlannerTask(planner, seed, scene, manifold, charts, queries, settings, params.judge)
-            for planner in settings.planners
-            for seed in settings.seeds
-        ]
-        results = parallel_map(
-            run_planner, tasks, params.compute, description=f"planners {constraint}"
-        )
-        rows = [row for result in results for row in result.rows]
-        paths = [path for result in results for path in result.paths]
+        table = answered(Run(own, layout, queries, scratch, list(params.manifolds), kept))
+        rows: list[Any] = table.to_dict("records")
+        paths = [kept.path(row, scene.robot.dof) for row in rows]
+        # one planner of each kind stands next to the learned geodesics: its kind is its name there
+        rows = [row | {"planner": row["kind"]} for row in rows]
         save_paths(rows, paths, layout.benchmark(constraint))
         rows = record_rows(
             layout.recordings(STAGE, constraint),
             rows,
             paths,
             constraint,
-            charts[shown],
-            manifold,
+            LearnedManifold.load(layout.manifold(shown)),
+            scene.manifold(params.constraints[constraint]),
             load_submanifold(layout.submanifold(shown, constraint)),
             scene.workcell,
             params.recording,
         )
         run.recordings(rows)
-        write_table(rows, layout.report(STAGE, constraint, "csv"), constraint=constraint)
-        run.report(planner_figures(results), layout.report(STAGE, constraint))
+        file = layout.report(STAGE, constraint, "csv")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        table = pd.DataFrame(rows)
+        table.to_csv(file, index=False)
+        run.report(comparison_figures(table), layout.report(STAGE, constraint))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ CODE = Path(constraint_geodesics.__file__).parent / "tracking" / "served_model.p
 
 def main(params: Params, layout: Layout) -> None:
     """Write data/planner/ and src/constraint_geodesics/pretrained/, and register the planner."""
-    manifold, shown = params.geodesics.searched[0], params.plans.constraint
+    manifold, shown = params.geodesics.searched[0], params.studies.constraint
     sources = [layout.manifold(manifold), layout.policies(manifold), layout.queries(shown)]
     about = subject_of(params, manifold=manifold)
     with tracked_stage(

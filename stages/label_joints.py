@@ -43,9 +43,7 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     ) as run:
         tasks = shard_tasks(scene, manifold, constraint, rows, labels.shard_rows, labels.seed)
         shards = parallel_map(draw_shard, tasks, params.compute, description=f"label {constraint}")
-        queries = draw_queries(
-            scene, manifold, constraint, params.queries.count, params.queries.seed
-        )
+        queries = draw_queries(scene, manifold, constraint, labels.queries, labels.query_seed)
         card = {
             "constraint": constraint,
             "robot": scene.robot.name,

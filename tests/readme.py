@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BLOCKS = {
     "results": "table.md",
     "geometry": "geometry.md",
-    "plans": "plans.md",
+    "execution": "execution.md",
     "policies": "policies.md",
     "benchmark": "benchmark/drawn.md",
     "budgets": "benchmark/budgets.md",

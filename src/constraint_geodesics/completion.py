@@ -41,7 +41,7 @@ def benchmarked_planners(
 ) -> list[CompletionItem]:
     """Planners of the benchmark."""
     del context, parameter
-    planners = (_params().get("bench") or {}).get("planners") or {}
+    planners = (_params().get("benchmark") or {}).get("planners") or {}
     return _items(
         {name: str(entry.get("kind", "")) for name, entry in planners.items()}, incomplete
     )

@@ -4,9 +4,8 @@ import hashlib
 import platform
 import subprocess
 from datetime import UTC, datetime
+from importlib import metadata
 from pathlib import Path
-
-import torch
 
 
 def machine() -> dict[str, str]:
@@ -18,7 +17,7 @@ def machine() -> dict[str, str]:
     return {
         "processor": processor,
         "python": platform.python_version(),
-        "torch": torch.__version__,
+        "torch": metadata.version("torch"),
         "threads": "1",
     }
 

@@ -20,13 +20,6 @@ from constraint_geodesics.report.pipeline_tables import (
     published_block,
     result_blocks,
 )
-from constraint_geodesics.report.plan_report import (
-    execution_block,
-    plan_blocks,
-    plans_markdown,
-    policies_markdown,
-    policy_blocks,
-)
 from constraint_geodesics.report.results import (
     LEARNED,
     ReportError,
@@ -35,6 +28,12 @@ from constraint_geodesics.report.results import (
     geometry_table,
     read_metrics,
     result_table,
+)
+from constraint_geodesics.report.study_report import (
+    execution_block,
+    execution_markdown,
+    policies_markdown,
+    policy_blocks,
 )
 
 ABLATION = "ablation"
@@ -57,7 +56,7 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
     table.to_csv(reports / "table.csv", index=False, float_format="%.6g")
     (reports / "table.md").write_text(result_table(layout))
     (reports / "geometry.md").write_text(geometry_table(layout))
-    (reports / "plans.md").write_text(plans_markdown(params, layout))
+    (reports / "execution.md").write_text(execution_markdown(params, layout))
     (reports / "policies.md").write_text(policies_markdown(params, layout))
     pictures = [save_figure(layout, entry) for entry in drawn]
     described = [save_figure(layout, entry) for entry in cards]
@@ -88,7 +87,7 @@ def page_content(params: Params, layout: Layout, table: pd.DataFrame) -> dict[st
         "published": [
             published_block(params, layout, table, constraint) for constraint in compared
         ],
-        "plans": [*plan_blocks(params, layout), execution_block(params, layout)],
+        "executed": [execution_block(params, layout)],
         "proposals": policy_blocks(params, layout),
         "results": result_blocks(params, layout, table),
         "ablations": ablation_blocks(params, layout),

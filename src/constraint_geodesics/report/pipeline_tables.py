@@ -141,7 +141,8 @@ def _looks(
     )
     return [
         Look(
-            sampled if planner in params.benchmark.planners else searched, recorded.get(planner, ())
+            sampled if planner in params.benchmark.compared_kinds else searched,
+            recorded.get(planner, ()),
         )
         for planner in planners
     ]

@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 import pandera.pandas as pandera
 
+from constraint_geodesics.benchmark.statistics import APART, RANDOM, STRAIGHT, Counted, summarise
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.figures import PLANNERS
-from constraint_geodesics.report.statistics import BESIDE, RANDOM, STRAIGHT, Counted, summarise
 
 LEARNED = "learned_geodesic"
 TEXTS = ("reason", "recording")
@@ -85,7 +85,7 @@ def compare_planners(params: Params, layout: Layout) -> pd.DataFrame:
 def read_comparison(params: Params, layout: Layout, manifold: str, constraint: str) -> pd.DataFrame:
     """The rows of all planners under one constraint, sampled first, in the order they are shown."""
     sampled = read_paths(layout.report("benchmark_planners", constraint, "csv"), manifold)
-    sampled = sampled[sampled["planner"].isin(params.benchmark.planners)]
+    sampled = sampled[sampled["planner"].isin(params.benchmark.compared_kinds)]
     searched = read_paths(
         layout.report("train_geodesics", f"{manifold}-{constraint}", "csv"), manifold
     )
@@ -220,14 +220,14 @@ def findings(
         _told_of(params, str(name), rows, manifolds[str(name)])
         for name, rows in table.groupby("manifold", sort=False)
     ]
-    sampled = table[~table["planner"].isin([LEARNED, *BESIDE])].drop_duplicates(
+    sampled = table[~table["planner"].isin([LEARNED, *APART])].drop_duplicates(
         ["constraint", "planner"]
     )
     refused = ", ".join(
         f"{PLANNERS[str(name)].label} {_share(rows, 'refused')}"
         for name, rows in sampled.groupby("planner", sort=False)
     )
-    seeds, queries = len(params.geodesics.seeds), params.queries.count
+    seeds, queries = len(params.geodesics.seeds), params.labels.queries
     cautions = [
         f"This is {queries} queries a constraint and {seeds} policies each: enough to see "
         f"large differences, not small "
@@ -248,7 +248,7 @@ def _told_of(
         rows[rows["planner"] == name].set_index("constraint")
         for name in (LEARNED, STRAIGHT, RANDOM)
     )
-    sampled = rows[~rows["planner"].isin([LEARNED, *BESIDE])]
+    sampled = rows[~rows["planner"].isin([LEARNED, *APART])]
     how = (
         "curves retracted onto the constraint"
         if settings.retract
@@ -287,7 +287,7 @@ def _shortest_under(rows: pd.DataFrame) -> str:
     """Under which constraints the learned geodesic is the shortest, in the mean over the common
     queries.
     """
-    comparable = rows[~rows["planner"].isin(BESIDE)].dropna(subset=["latent_mean"])
+    comparable = rows[~rows["planner"].isin(APART)].dropna(subset=["latent_mean"])
     shortest = comparable.loc[comparable.groupby("constraint", sort=False)["latent_mean"].idxmin()]
     won = shortest.loc[shortest["planner"] == LEARNED, "constraint"].tolist()
     lost = [

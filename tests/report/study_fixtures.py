@@ -1,4 +1,4 @@
-"""Reports of the planner's stages, as those stages write them, from a few rows whose figures are
+"""Reports of the studies' stages, as those stages write them, from a few rows whose figures are
 known.
 """
 
@@ -7,42 +7,11 @@ import json
 import numpy as np
 import pandas as pd
 
-from constraint_geodesics.benchmark.plan_benchmark import BAND_AFTER, figures_of, plan_table
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.studies.execution import PLANNED, STRAIGHT
 from constraint_geodesics.studies.policy_benchmark import policy_table
 from constraint_geodesics.studies.policy_tasks import policy_figures
-
-LENGTHS = {"planner": (2.0, 4.0, 3.0), BAND_AFTER: (2.2, 4.0, np.nan), "BiRRT": (3.0, 8.0, np.nan)}
-"""Joint lengths of three queries; nan without a path."""
-
-
-def plan_rows(constraint: str) -> pd.DataFrame:
-    """Rows of `plan_rows`: BiRRT claims a path for the last query that is not valid."""
-    rows = []
-    for planner, lengths in LENGTHS.items():
-        for query, length in enumerate(lengths):
-            found = np.isfinite(length)
-            rows.append(
-                {
-                    "planner": planner,
-                    "constraint": constraint,
-                    "query": query,
-                    "seed": 0,
-                    "source": "straight" if planner == "planner" else "",
-                    "status": "solved" if found or planner == "BiRRT" else "not_found",
-                    "time_s": 0.005,
-                    "check_time_s": 0.001 if planner == "planner" else np.nan,
-                    "valid": found,
-                    "reason": "",
-                    "length_rad": length,
-                    "max_violation": 1e-5,
-                    "violation_bound": 8e-5,
-                    "best_known_rad": LENGTHS["planner"][query],
-                }
-            )
-    return pd.DataFrame(rows)
 
 
 def policy_rows() -> pd.DataFrame:
@@ -96,23 +65,14 @@ def execution_figures() -> dict:
     }
 
 
-def write_plan_reports(params: Params, layout: Layout) -> None:
-    """reports/benchmark_plans, benchmark_policies and execute_paths of this layout."""
-    names = [params.plans.constraint, *params.plans.unseen]
-    plans = {
-        "machine": {"processor": "a processor"},
-        "plans": figures_of(pd.concat([plan_table(plan_rows(name)) for name in names])),
-        "batch": {
-            name: {"size": 4, "per_second": 400.0, "checked_per_second": 300.0} for name in names
-        },
-    }
+def write_study_reports(params: Params, layout: Layout) -> None:
+    """reports/benchmark_policies and execute_paths of this layout."""
     policies = policy_figures(
-        policy_table(policy_rows()).assign(constraint=params.plans.constraint)
+        policy_table(policy_rows()).assign(constraint=params.studies.constraint)
     )
     for file, content in (
-        (layout.report("benchmark_plans", "plans"), plans),
         (layout.report("benchmark_policies", params.geodesics.searched[0]), policies),
-        (layout.report("execute_paths", params.plans.constraint), execution_figures()),
+        (layout.report("execute_paths", params.studies.constraint), execution_figures()),
     ):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(content))
@@ -123,12 +83,12 @@ def write_plan_reports(params: Params, layout: Layout) -> None:
             "status": "executed",
             "kept": kept,
             "spheres": 12,
-            "recording": f"data/recordings/execute_paths/{params.plans.constraint}/{k}.rrd"
+            "recording": f"data/recordings/execute_paths/{params.studies.constraint}/{k}.rrd"
             if k == 0
             else "",
         }
         for k, (kind, kept) in enumerate(((PLANNED, 12), (STRAIGHT, 3)))
     ]
     pd.DataFrame(executed).to_csv(
-        layout.report("execute_paths", params.plans.constraint, "csv"), index=False
+        layout.report("execute_paths", params.studies.constraint, "csv"), index=False
     )
