@@ -136,3 +136,17 @@ def test_an_unknown_constraint_is_named(tmp_path: Path) -> None:
     assert result.returncode == 2
     assert "level_cap" in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "change", ["benchmark.seeds=3", "benchmark.planners.PRM.queries=4", "studies.queries=9"]
+)
+def test_an_experiment_changes_one_line_of_the_benchmark(tmp_path: Path, change: str) -> None:
+    """DVC writes the whole file again; what it would wrap otherwise must stand as it writes it."""
+    before = (ROOT / "params.yaml").read_text()
+    file = tmp_path / "params.yaml"
+    file.write_text(before)
+    apply_overrides(file, [change])
+    old, new = (text[text.index("\nunseen:") :].splitlines() for text in (before, file.read_text()))
+    assert len(old) == len(new)
+    assert sum(a != b for a, b in zip(old, new, strict=True)) == 1
