@@ -1,6 +1,7 @@
 """Stage: some planners of the benchmark on the pipeline's queries of one constraint (Table I)."""
 
 import sys
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -22,15 +23,18 @@ from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
 STAGE = "benchmark_planners"
 
 
+def asked_of(file: Path, constraint: str) -> list[Query]:
+    """The pipeline's queries as the benchmark asks them."""
+    pairs = read_queries(file)
+    ends = enumerate(zip(pairs.starts, pairs.goals, strict=True))
+    return [Query(constraint, TABLE, number, start, goal) for number, (start, goal) in ends]
+
+
 def main(params: Params, layout: Layout, constraint: str) -> None:
     """Write data/benchmark/<constraint>/, its recordings, rows and figures."""
     source, compared = layout.queries(constraint), params.benchmark.compared
     scene, shown = Scene.from_params(params), params.geodesics.searched[0]
-    pairs, scratch = read_queries(source), layout.scratch(STAGE, constraint)
-    queries = [
-        Query(constraint, TABLE, number, start, goal)
-        for number, (start, goal) in enumerate(zip(pairs.starts, pairs.goals, strict=True))
-    ]
+    queries, scratch = asked_of(source, constraint), layout.scratch(STAGE, constraint)
     asked = {"queries": len(queries), "seeds": compared.seeds}
     entries = {
         name: params.benchmark.planners[name].model_copy(update=asked) for name in compared.planners

@@ -67,7 +67,7 @@ class Builder(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Answer:
     """A path that a planner found for a query, and what it is worth."""
 
@@ -205,21 +205,17 @@ def _answered(batch: QueryBatch, query: Query, jobs: Sequence[_Job]) -> Iterator
                 certifier,
                 batch.judge.spacing_rad,
             )
-            answer = Answer(
-                query=query,
-                planner=baseline.name,
-                seed=job.seed,
-                joints=found.joints,
-                measures=measures,
-                scene=scene,
-                manifold=manifold,
-            )
-            kept = batch.record is not None and len(found.joints) > 1
+            recording = ""
+            if batch.record is not None and len(found.joints) > 1:
+                answer = Answer(
+                    query, baseline.name, job.seed, found.joints, measures, scene, manifold
+                )
+                recording = batch.record(answer)
             prepared_s = clearance_s if baseline.uses_clearance else 0.0
             more = {
                 "peak_memory_mb": grown,
                 "scene_s": made_s.get(baseline.name, 0.0) + prepared_s,
-                "recording": batch.record(answer) if kept and batch.record else "",
+                "recording": recording,
             }
             yield _row(job, found, measures, more)
 
