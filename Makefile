@@ -7,7 +7,7 @@ CONSTRAINT ?=
 FIRST_START = 1.329923 -0.584036 -3.766650 -2.008429 0.728803 -2.581396
 FIRST_GOAL = 1.071549 -0.217480 -1.682647 -2.906655 -0.337949 1.348704
 
-.PHONY: help env plan repro smoke bench bench-quick draw-queries bench-geometry test lint format results readme \
+.PHONY: help env plan repro pretrained dag smoke bench bench-quick draw-queries bench-geometry test lint format results readme \
 	docs notebook plots experiments ui replay clean test-browser screenshots
 
 help:  ## list the targets
@@ -36,12 +36,19 @@ repro: env  ## run all stages that are out of date, then print the results
 	dvc repro
 	geodesics results
 
+pretrained: env  ## copy the planner that was built into the package, for those who install it
+	geodesics package
+
+dag: env  ## the pipeline as a graph, a node a stage
+	@python -m constraint_geodesics.pipeline.dag
+
 smoke: env  ## the same pipeline on small parameters, in a copy of this checkout
 	python tests/pipeline/smoke.py .geodesics/smoke
 
-bench: env  ## all planners on all queries (an hour or two; go on after an interruption by calling it again), tables, figures
+bench: env  ## all planners on all queries, and the studies (two hours; go on after an interruption by calling it again)
 	geodesics params
 	dvc repro stages/dvc.yaml
+	dvc repro --single-item --force report
 
 bench-quick: env  ## the same table on one query of each constraint and scene (minutes), after `make repro`
 	geodesics bench
@@ -51,7 +58,7 @@ draw-queries: env  ## draw the benchmark's queries of constraints that have none
 
 bench-geometry: env  ## time the geometry core again, after whatever it needs; writes reports/geometry.json
 	dvc repro label_joints train_manifold train_analytic
-	dvc repro --single-item --force benchmark_geometry
+	dvc repro --single-item --force stages/dvc.yaml:benchmark_geometry
 
 test: env  ## run the tests, the whole pipeline on small parameters among them
 	python -m pytest -n 2 --dist loadgroup

@@ -5,18 +5,13 @@ families.
 import shutil
 import sys
 
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.studies.ablation import (
-    by_variant,
-    family_ratios,
-    policy_variants,
-    variant_task,
-)
-from constraint_geodesics.studies.analytic_search import run_analytic
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.studies.ablation import by_variant, family_ratios, policy_variants
+from constraint_geodesics.studies.geodesic_search import AnalyticTask, run_analytic
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "ablate_analytic"
 
@@ -25,16 +20,16 @@ def main(params: Params, layout: Layout, analytic: str) -> None:
     """Write reports/ablate_analytic/<analytic>.json."""
     settings = params.geodesics.model_copy(update={"steps": params.geodesics.analytic_steps})
     with tracked_stage(
-        STAGE, analytic, settings, [], experiment=params.tracking.experiment, root=layout.root
+        Work(STAGE, analytic, settings.of_training("ablated_segments"), []),
+        params.tracking.experiment,
+        layout.root,
     ) as run:
-        cases = [
-            (variant, seed) for variant in policy_variants(settings) for seed in settings.seeds
-        ]
+        variants = policy_variants(settings)
+        cases = [(variant, seed) for variant in variants for seed in settings.seeds]
         tasks = [
-            variant_task(
+            AnalyticTask(
                 analytic,
-                variant,
-                settings,
+                *variants[variant],
                 seed,
                 layout.scratch(STAGE, f"{analytic}-{variant}-{seed}"),
                 run.child(f"{variant}, seed {seed}", {"variant": variant, "seed": seed}),

@@ -4,29 +4,25 @@ of its metric.
 
 import sys
 
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.ablation import LearnedAblation
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "ablate_manifold"
 
 
 def main(params: Params, layout: Layout, manifold: str) -> None:
     """Write reports/ablate_manifold/<manifold>.json."""
-    source = layout.joints("free")
+    source, own = layout.joints("free"), {"degree", "ablated_segments"}
+    about = params.geodesics.model_dump(include=own) | {"pairs": params.geometry.pairs}
     with (
         tracked_stage(
-            STAGE,
-            manifold,
-            params.geodesics,
-            [source],
-            experiment=params.tracking.experiment,
-            root=layout.root,
+            Work(STAGE, manifold, about, [source]), params.tracking.experiment, layout.root
         ) as run,
         Scene.from_params(params).world() as world,
     ):

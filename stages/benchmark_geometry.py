@@ -4,17 +4,17 @@ import json
 import sys
 from dataclasses import replace
 
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.geodesics.policy_search import load_policy
 from constraint_geodesics.geodesics.problem import ChartProblem, Samples
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.geodesic_search import geodesic_problem, write_table
 from constraint_geodesics.studies.geometry import GeometryBenchmark, policy_search_figures
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "benchmark_geometry"
 
@@ -33,7 +33,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     )
     names = [str(name) for name in settings.analytic]
     with tracked_stage(
-        STAGE, manifold, settings, sources, experiment=params.tracking.experiment, root=layout.root
+        Work(STAGE, manifold, params.geometry, sources), params.tracking.experiment, layout.root
     ) as run:
         benchmark = GeometryBenchmark(plain, retracted, settings, params.geometry)
         figures = benchmark.figures(

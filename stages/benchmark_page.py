@@ -4,9 +4,9 @@ it.
 
 import sys
 
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.benchmark_page import write_benchmark_page
 
 

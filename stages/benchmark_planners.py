@@ -10,15 +10,12 @@ from constraint_geodesics.benchmark.entries import Run, answered, with_planners
 from constraint_geodesics.benchmark.queries import TABLE, Query
 from constraint_geodesics.benchmark.recorder import PathKeeper
 from constraint_geodesics.benchmark.statistics import comparison_figures
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import read_queries
-from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.submanifold import load_submanifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.recording.replay import record_rows, save_paths
-from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
+from constraint_geodesics.pipeline.paths import named_recordings, save_paths
+from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "benchmark_planners"
 
@@ -31,42 +28,27 @@ def asked_of(file: Path, constraint: str) -> list[Query]:
 
 
 def main(params: Params, layout: Layout, constraint: str) -> None:
-    """Write data/benchmark/<constraint>/, its recordings, rows and figures."""
+    """Write data/benchmark/<constraint>/, its rows and figures."""
     source, compared = layout.queries(constraint), params.benchmark.compared
-    scene, shown = Scene.from_params(params), params.geodesics.searched[0]
     queries, scratch = asked_of(source, constraint), layout.scratch(STAGE, constraint)
     asked = {"queries": len(queries), "seeds": compared.seeds}
     entries = {
         name: params.benchmark.planners[name].model_copy(update=asked) for name in compared.planners
     }
+    dof = len(queries[0].start)
     own, kept = with_planners(params, entries), PathKeeper(scratch / "paths")
     about = subject_of(params, constraint=constraint)
     with tracked_stage(
-        STAGE,
-        constraint,
-        compared,
-        [source],
-        experiment=params.tracking.experiment,
-        root=layout.root,
-        subject=about,
+        Work(STAGE, constraint, compared, [source], about), params.tracking.experiment, layout.root
     ) as run:
         table = answered(Run(own, layout, queries, scratch, list(params.manifolds), kept))
         rows: list[Any] = table.to_dict("records")
-        paths = [kept.path(row, scene.robot.dof) for row in rows]
+        paths = [kept.path(row, dof) for row in rows]
         # one planner of each kind stands next to the learned geodesics: its kind is its name there
         rows = [row | {"planner": row["kind"]} for row in rows]
         save_paths(rows, paths, layout.benchmark(constraint))
-        rows = record_rows(
-            layout.recordings(STAGE, constraint),
-            rows,
-            paths,
-            constraint,
-            LearnedManifold.load(layout.manifold(shown)),
-            scene.manifold(params.constraints[constraint]),
-            load_submanifold(layout.submanifold(shown, constraint)),
-            scene.workcell,
-            params.recording,
-        )
+        folder = layout.recordings(STAGE, constraint)
+        rows = named_recordings(rows, paths, folder, params.recording.queries)
         run.recordings(rows)
         file = layout.report(STAGE, constraint, "csv")
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -6,15 +6,19 @@ import sys
 
 import pandas as pd
 
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.studies.policy_benchmark import policy_table
-from constraint_geodesics.studies.policy_tasks import PolicyTask, policy_figures, run_policies
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.studies.proposals import (
+    PolicyTask,
+    policy_figures,
+    policy_table,
+    run_policies,
+)
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "benchmark_policies"
 
@@ -40,12 +44,7 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
         for name, constraint in described.items()
     ]
     with tracked_stage(
-        STAGE,
-        manifold,
-        params.policies,
-        shared,
-        experiment=params.tracking.experiment,
-        root=layout.root,
+        Work(STAGE, manifold, params.policies, shared), params.tracking.experiment, layout.root
     ) as run:
         rows = parallel_map(
             run_policies, tasks, params.compute, description=f"policies' proposals {manifold}"

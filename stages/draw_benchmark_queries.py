@@ -16,10 +16,10 @@ from constraint_geodesics.benchmark.queries import (
     write_queries,
 )
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.params import Params
 from constraint_geodesics.peers.registry import BaselineBuilder
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.problem import PlanningProblem
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene

@@ -6,26 +6,27 @@ import sys
 from functools import partial
 
 from constraint_geodesics.bundle import read_bundle
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.planner import Planner
-from constraint_geodesics.recording.execution_recording import ExecutionRecord, record_executions
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.cup import CupSettings
 from constraint_geodesics.studies.execution import (
+    Carrying,
     execute_queries,
     execution_figures,
+    save_execution,
     tipping_queries,
 )
-from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
+from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "execute_paths"
 
 
 def main(params: Params, layout: Layout, constraint: str) -> None:
-    """Write reports/execute_paths/<constraint>.csv and .json, and recordings of the first
-    queries.
+    """Write reports/execute_paths/<constraint>.csv and .json, and the executions to
+    record.
     """
     scene, settings = Scene.from_params(params), params.execution
     manifold, cup = (
@@ -34,36 +35,23 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     )
     about = subject_of(params, constraint=constraint)
     with tracked_stage(
-        STAGE,
-        constraint,
-        settings,
-        [layout.planner],
-        experiment=params.tracking.experiment,
-        root=layout.root,
-        subject=about,
+        Work(STAGE, constraint, settings, [layout.planner], about),
+        params.tracking.experiment,
+        layout.root,
     ) as run:
-        found = tipping_queries(
-            scene, manifold, constraint, settings.queries, settings.least_tilt_rad, settings.seed
-        )
+        found = tipping_queries(scene, manifold, constraint, settings)
+        carrying = Carrying(constraint, scene, manifold, params.planner.acceleration_rad_s2, cup)
         with Planner(read_bundle(layout.planner), str(layout.planner)) as planner:
-            table, executed = execute_queries(
-                partial(planner.plan, constraint=constraint),
-                scene,
-                manifold,
-                constraint,
-                found.queries,
-                params.planner.acceleration_rad_s2,
-                cup,
-            )
-        records = [
-            None
-            if one.execution is None or one.query >= settings.recorded
-            else ExecutionRecord(one.kind, constraint, one.query, one.execution, cup)
-            for one in executed
-        ]
-        files = record_executions(
-            layout.recordings(STAGE, constraint), records, scene.robot, scene.workcell
-        )
+            plan = partial(planner.plan, constraint=constraint)
+            table, executed = execute_queries(plan, carrying, found.queries)
+        files = []
+        for one in executed:
+            name = f"query{one.query}-{one.kind.replace(' ', '-')}"
+            recorded = one.execution is not None and one.query < settings.recorded
+            if one.execution is not None and recorded:
+                save_execution(layout.executions(constraint) / f"{name}.npz", one.execution)
+            file = layout.recordings(STAGE, constraint) / f"{name}.rrd"
+            files.append(file.as_posix() if recorded else "")
         file = layout.report(STAGE, constraint, "csv")
         file.parent.mkdir(parents=True, exist_ok=True)
         table.assign(recording=files).to_csv(file, index=False)

@@ -4,14 +4,19 @@ as it is.
 
 import sys
 
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.submanifold import extract, save_submanifold, submanifold_figures
+from constraint_geodesics.learning.submanifold import (
+    Surface,
+    extract,
+    save_submanifold,
+    submanifold_figures,
+)
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
+from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "extract_submanifold"
 
@@ -25,23 +30,18 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     about = subject_of(params, constraint=constraint, manifold=manifold)
     with (
         tracked_stage(
-            STAGE,
-            item,
-            params.submanifold,
-            sources,
-            experiment=params.tracking.experiment,
-            root=layout.root,
-            subject=about,
+            Work(STAGE, item, params.submanifold, sources, about),
+            params.tracking.experiment,
+            layout.root,
         ) as run,
         scene.world() as world,
     ):
         chart = LearnedManifold.load(layout.manifold(manifold))
         free, on_constraint = (read_joints(source).free_joints for source in sources)
-        found = extract(chart, constrained, free, on_constraint, world.free, params.submanifold)
+        surface = Surface(chart, constrained, world.free)
+        found = extract(surface, free, on_constraint, params.submanifold)
         save_submanifold(found, layout.submanifold(manifold, constraint))
-        figures = submanifold_figures(
-            found, chart, constrained, free, on_constraint, params.submanifold
-        )
+        figures = submanifold_figures(found, surface, free, on_constraint, params.submanifold)
         run.report(figures, layout.report(STAGE, item))
 
 

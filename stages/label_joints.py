@@ -4,11 +4,12 @@ queries.
 
 import sys
 
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import (
+    ShardTask,
     data_card,
     draw_queries,
     draw_shard,
+    seed_of,
     shard_tasks,
     write_joints,
     write_queries,
@@ -16,8 +17,9 @@ from constraint_geodesics.learning.dataset import (
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
+from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "label_joints"
 
@@ -33,15 +35,11 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
         subject_of(params, constraint=constraint),
     )
     with tracked_stage(
-        STAGE,
-        constraint,
-        settings,
-        [],
-        experiment=params.tracking.experiment,
-        root=layout.root,
-        subject=about,
+        Work(STAGE, constraint, settings, [], about), params.tracking.experiment, layout.root
     ) as run:
-        tasks = shard_tasks(scene, manifold, constraint, rows, labels.shard_rows, labels.seed)
+        tasks = shard_tasks(
+            ShardTask(scene, manifold, rows, seed_of(constraint, labels.seed)), labels.shard_rows
+        )
         shards = parallel_map(draw_shard, tasks, params.compute, description=f"label {constraint}")
         queries = draw_queries(scene, manifold, constraint, labels.queries, labels.query_seed)
         card = {

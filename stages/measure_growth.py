@@ -10,17 +10,18 @@ from jaxtyping import Float
 
 from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.bundle import read_bundle
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.params import Params
 from constraint_geodesics.peers.registry import BaselineBuilder
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import run_header
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.report.figures import save_png
-from constraint_geodesics.report.growth_figure import growth_figure
+from constraint_geodesics.report.growth_figure import growth_figure, slopes_markdown
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
-from constraint_geodesics.scene.scene import Scene, find_urdf
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.urdf import find_urdf
 from constraint_geodesics.studies.growth import (
     CONSTRAINT,
     BandAndTrees,
@@ -28,7 +29,6 @@ from constraint_geodesics.studies.growth import (
     Subject,
     measure_growth,
     slopes,
-    slopes_markdown,
 )
 
 STAGE = "measure_growth"

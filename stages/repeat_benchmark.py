@@ -6,10 +6,10 @@ import sys
 from constraint_geodesics.benchmark.entries import answered, at_most, committed_run, with_planners
 from constraint_geodesics.benchmark.row import read_table
 from constraint_geodesics.benchmark.statistics import repeated
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.params import Params
 from constraint_geodesics.peers.registry import all_settings
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.benchmark_tables import repeated_markdown
 
 STAGE = "repeat_benchmark"

@@ -2,11 +2,11 @@
 
 import sys
 
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.pipeline_page import write_report
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "report"
 
@@ -17,7 +17,7 @@ def main(params: Params, layout: Layout) -> None:
         layout.report("benchmark_planners", constraint, "csv") for constraint in params.constraints
     ]
     with tracked_stage(
-        STAGE, STAGE, params.judge, sources, experiment=params.tracking.experiment, root=layout.root
+        Work(STAGE, STAGE, {}, sources), params.tracking.experiment, layout.root
     ) as run:
         for figure in write_report(params, layout):
             run.figure(figure)

@@ -15,12 +15,12 @@ from constraint_geodesics.benchmark.statistics import (
     break_even_table,
     ours_against_baselines,
 )
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.params import Params
 from constraint_geodesics.peers.baseline import BaselineSettings
 from constraint_geodesics.peers.planner import PlannerSettings
 from constraint_geodesics.peers.registry import all_settings, colours
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report import benchmark_figures as figures
 from constraint_geodesics.report import benchmark_tables as tables
 from constraint_geodesics.report.figures import save_png
@@ -94,11 +94,17 @@ def write_tables(
 
 def own_names(settings: Settings) -> tuple[dict[str, float], list[str]]:
     """The planner's names with the budget [s] of each, 0 for the first answer; and those of it
-    without some part, but for those that nothing learned is left of: they are baselines.
+    without some part, but for those that have no roadmap either: they are baselines, as are the
+    learned methods.
     """
-    own = {name: one for name, one in settings.items() if isinstance(one, PlannerSettings)}
+    own = {
+        name: one
+        for name, one in settings.items()
+        if isinstance(one, PlannerSettings) and one.method == "planner"
+    }
     ours = {name: one.given_s for name, one in own.items() if not one.switched_off}
-    return ours, [name for name, one in own.items() if name not in ours and one.trained]
+    bare = [name for name, one in own.items() if {"graph", "policy"} <= one.switched_off]
+    return ours, [name for name in own if name not in ours and name not in bare]
 
 
 def training_times(params: Params, layout: Layout, settings: Settings) -> dict[str, float]:

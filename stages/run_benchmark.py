@@ -4,10 +4,10 @@ import sys
 
 from constraint_geodesics.benchmark.entries import answered, committed_run
 from constraint_geodesics.benchmark.row import write_table
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import run_header
+from constraint_geodesics.pipeline.stage import run_stage
 
 
 def main(params: Params, layout: Layout) -> None:

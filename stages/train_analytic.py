@@ -5,19 +5,19 @@ import sys
 
 import numpy as np
 
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.geodesics.policy_search import save_policy
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.studies.analytic_search import (
+from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.studies.geodesic_search import (
     MANIFOLDS,
     AnalyticTask,
     curve_family,
     run_analytic,
+    write_table,
 )
-from constraint_geodesics.studies.geodesic_search import write_table
-from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
+from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "train_analytic"
 
@@ -27,13 +27,9 @@ def main(params: Params, layout: Layout, analytic: str) -> None:
     settings = params.geodesics.model_copy(update={"steps": params.geodesics.analytic_steps})
     about = subject_of(params, manifold=analytic, reward=settings.reward)
     with tracked_stage(
-        STAGE,
-        analytic,
-        settings,
-        [],
-        experiment=params.tracking.experiment,
-        root=layout.root,
-        subject=about,
+        Work(STAGE, analytic, settings.of_training(), [], about),
+        params.tracking.experiment,
+        layout.root,
     ) as run:
         tasks = [
             AnalyticTask(

@@ -5,14 +5,14 @@ geodesics with each.
 import shutil
 import sys
 
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import read_joints, read_queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import load_submanifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.recording.replay import record_rows
+from constraint_geodesics.pipeline.paths import named_recordings, save_paths
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.geodesic_search import (
     PLANNER,
@@ -25,13 +25,13 @@ from constraint_geodesics.studies.geodesic_search import (
     straight_rows,
     write_table,
 )
-from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
+from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "train_geodesics"
 
 
 def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None:
-    """Write data/geodesics/<manifold>-<constraint>/, its recordings, rows and figures."""
+    """Write data/geodesics/<manifold>-<constraint>/, its rows and figures."""
     item, sources = (
         f"{manifold}-{constraint}",
         [layout.joints(constraint), layout.queries(constraint)],
@@ -51,13 +51,9 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     settings = params.policy_settings(separate=True) if problem.retract else params.geodesics
     about = subject_of(params, constraint=constraint, manifold=manifold, reward=settings.reward)
     with tracked_stage(
-        STAGE,
-        item,
-        settings,
-        sources,
-        experiment=params.tracking.experiment,
-        root=layout.root,
-        subject=about,
+        Work(STAGE, item, settings.of_training("length_degree", "rollouts"), sources, about),
+        params.tracking.experiment,
+        layout.root,
     ) as run:
         tasks = [
             SeedTask(
@@ -79,21 +75,14 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         run.summarise(
             [result.figures() for result in results], [result.policy.curve for result in results]
         )
-        save_seeds(results, queries, layout, STAGE, manifold, constraint)
+        folder = layout.geodesics(manifold, constraint)
+        save_seeds(results, queries, folder, layout.report(STAGE, f"{item}-learning", "csv"))
         rows, paths = straight_rows(tasks[0])
         rows += [row for result in results for row in result.rows]
         paths += [path for result in results for path in result.paths]
-        rows = record_rows(
-            layout.recordings(STAGE, item),
-            rows,
-            paths,
-            constraint,
-            chart,
-            constrained,
-            submanifold,
-            scene.workcell,
-            params.recording,
-        )
+        save_paths(rows, paths, layout.geodesics(manifold, constraint))
+        folder = layout.recordings(STAGE, item)
+        rows = named_recordings(rows, paths, folder, params.recording.queries)
         run.recordings(rows, shown=PLANNER)
         write_table(
             rows, layout.report(STAGE, item, "csv"), manifold=manifold, constraint=constraint

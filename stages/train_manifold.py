@@ -4,13 +4,13 @@ import sys
 
 import pandas as pd
 
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.learning.dataset import read_joints
-from constraint_geodesics.learning.training import train_manifold
+from constraint_geodesics.learning.training import TrainingRun, train_manifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import robot_from
-from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
+from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "train_manifold"
 
@@ -20,21 +20,14 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
     source = layout.joints("free")
     settings, about = params.manifolds[manifold], subject_of(params, manifold=manifold)
     with tracked_stage(
-        STAGE,
-        manifold,
-        {},
-        [source],
-        experiment=params.tracking.experiment,
-        root=layout.root,
-        subject=about,
+        Work(STAGE, manifold, {}, [source], about), params.tracking.experiment, layout.root
     ) as run:
         joints = read_joints(source).free_joints
         trained = train_manifold(
             joints,
             robot_from(params.robot),
             settings,
-            layout.scratch(STAGE, manifold),
-            run.metric_logger(),
+            TrainingRun(layout.scratch(STAGE, manifold), run.metric_logger()),
         )
         trained.manifold.save(layout.manifold(manifold))
         run.report({"rows": len(joints), **trained.metrics}, layout.report(STAGE, manifold))

@@ -3,13 +3,13 @@
 import shutil
 import sys
 
-from constraint_geodesics.cli import run_stage
 from constraint_geodesics.geodesics.policy_search import save_policy
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.geodesic_search import (
     TrainingTask,
@@ -17,7 +17,7 @@ from constraint_geodesics.studies.geodesic_search import (
     train_seed,
     write_table,
 )
-from constraint_geodesics.tracking.experiment import subject_of, tracked_stage
+from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "train_policies"
 
@@ -35,13 +35,9 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
     )
     about = subject_of(params, manifold=manifold, reward=settings.reward)
     with tracked_stage(
-        STAGE,
-        manifold,
-        settings,
-        sources,
-        experiment=params.tracking.experiment,
-        root=layout.root,
-        subject=about,
+        Work(STAGE, manifold, settings.of_training("length_degree"), sources, about),
+        params.tracking.experiment,
+        layout.root,
     ) as run:
         tasks = [
             TrainingTask(

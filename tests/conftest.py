@@ -9,11 +9,12 @@ import torch
 
 from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.training import train_manifold
+from constraint_geodesics.learning.training import TrainingRun, train_manifold
 from constraint_geodesics.params import Params, load_params
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
+from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.world import Box, data_path
+from constraint_geodesics.scene.urdf import data_path
 from tests.kernels import compile_kernels
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -80,6 +81,6 @@ def trained(scene: Scene, params: Params, tmp_path_factory: pytest.TempPathFacto
     )
     folder = tmp_path_factory.mktemp("manifold")
     chart = train_manifold(
-        joints, scene.robot, small, folder, lambda *_: None, progress=False
+        joints, scene.robot, small, TrainingRun(folder, lambda *_: None, False)
     ).manifold
     return Trained(chart, joints)

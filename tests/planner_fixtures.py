@@ -11,6 +11,7 @@ from constraint_geodesics.bundle import Bundle, read_bundle
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
+from constraint_geodesics.geodesics.learned_method import FOLDER, LearnedFiles, read_learned
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.scene.clearance import clearance_model
@@ -29,17 +30,22 @@ def packaged_planner() -> Planner:
     return Planner.load(bundle.PACKAGED)
 
 
+@cache
+def packaged_learned() -> LearnedFiles:
+    return read_learned(bundle.PACKAGED / FOLDER)
+
+
 def manifold_of(planner: Planner, name: str) -> ConstraintManifold:
     return ConstraintManifold(planner.scene.robot, planner.constraints[name])
 
 
 @cache
 def nodes_of(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes of a graph, on the constraint to rounding, free and within the limits, and their
-    components.
+    """Configurations on the constraint to rounding, free and within the limits, and their
+    components; none is a node of the planner's own roadmap.
     """
     planner = packaged_planner()
-    roadmap = planner.bundle.roadmaps[name]
+    roadmap = packaged_learned().submanifolds[name]
     joints = retract(manifold_of(planner, name), roadmap.joints[:300]).joints
     with planner.scene.world() as world:
         kept = world.free(joints) & (planner.scene.robot.limit_distance(joints) > 0.01)

@@ -1,4 +1,4 @@
-"""README's and docs' tables and numbers from the reports: `python tests/readme.py` writes them,
+"""Tables and numbers of README and docs from the reports: `python tests/readme.py` writes them,
 tests compare.
 """
 
@@ -9,32 +9,69 @@ from collections import defaultdict
 from pathlib import Path
 from urllib.parse import unquote
 
+from constraint_geodesics.report.benchmark_tables import FEW
+
 ROOT = Path(__file__).resolve().parents[1]
+README, RESULTS, EXPERIMENTS = (
+    ROOT / name for name in ("README.md", "docs/results.md", "docs/experiments.md")
+)
 BLOCKS = {
     "results": "table.md",
     "geometry": "geometry.md",
-    "execution": "execution.md",
     "policies": "policies.md",
     "benchmark": "benchmark/drawn.md",
     "budgets": "benchmark/budgets.md",
     "table_i": "benchmark/table_i.md",
     "growth": "growth/growth.md",
 }
-"""What stands between <!-- name --> and <!-- /name -->: a file of reports/."""
+"""What stands between <!-- name --> and <!-- /name --> in docs/results.md: a file of reports/."""
 SHORTENED = ("budgets",)
 """Blocks that are their file's first paragraph."""
+SHOWN = (
+    *("planner", "straight + band", "trees + band", "SLSQP", "BiRRT + band", "BiRRT"),
+    *("RRT* 10 s", "latent graph"),
+)
+"""Rows of README's table."""
 QUOTED = re.compile(r"([\d.]+)([^\d<]{0,12})<!-- from (\S+) (\S+) ([\d.e-]+) (\d) -->")
 """A number with its source behind it: file, key (a blank is written %20), scale, digits."""
 
 
+def with_planners(text: str) -> str:
+    """README's text with its table of planners, from the benchmark's overview."""
+    with (ROOT / "reports" / "benchmark" / "overview.csv").open() as file:
+        found = {(row["planner"], row["scene"]): row for row in csv.DictReader(file)}
+    columns = ("solved", "length, p95", "median [ms]")
+    head = ("planner", *columns, *(f"sphere: {column}" for column in columns))
+    lines = [f"| {' | '.join(head)} |", f"|---|{'---:|' * 6}"]
+    for planner in SHOWN:
+        cells = [cell for scene in ("table", "keep_out") for cell in _cells(found[planner, scene])]
+        lines.append(f"| {' | '.join((planner, *cells))} |")
+    return replaced(text, "planners", "\n".join(lines))
+
+
+def _cells(row: dict[str, str]) -> tuple[str, str, str]:
+    """Share solved of the solvable, p95 of the length over the best known with failures as
+    infinite, and the median time of one figure of the benchmark's overview.
+    """
+    ratio, few = float(row["ratio_p95_all"]), int(row["rows"]) < FEW
+    length = "–" if few else "∞" if ratio == float("inf") else f"{ratio:.3f}"
+    milliseconds = 1e3 * float(row["time_median_s"])
+    time = f"{milliseconds:,.0f}" if milliseconds >= 100.0 else f"{milliseconds:.3g}"
+    return f"{float(row['success_of_solvable']):.0%}", length, time
+
+
+def replaced(text: str, name: str, content: str) -> str:
+    """The text with other content between a block's marks."""
+    begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
+    head, rest = text.split(begin)
+    return f"{head}{begin}\n{content}\n{end}{rest.split(end)[1]}"
+
+
 def filled(text: str) -> str:
-    """README's text with every block and every quoted number as the reports have it now."""
+    """The results' text with every block and every quoted number as the reports have it now."""
     for name, file in BLOCKS.items():
-        begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
-        head, rest = text.split(begin)
         content = (ROOT / "reports" / file).read_text().strip()
-        shown = content.split("\n\n")[0] if name in SHORTENED else content
-        text = f"{head}{begin}\n{shown}\n{end}{rest.split(end)[1]}"
+        text = replaced(text, name, content.split("\n\n")[0] if name in SHORTENED else content)
     return QUOTED.sub(_requoted, text)
 
 
@@ -50,7 +87,6 @@ def _requoted(found: re.Match[str]) -> str:
 TIMES = re.compile(r"<!-- stage_times -->.*?<!-- /stage_times -->", re.S)
 CONTINUED = "run_benchmark"
 """Its last run may have made few of its rows, so its time says nothing."""
-TIMES_PAGE = ROOT / "docs" / "experiments.md"
 
 
 def with_stage_times(text: str) -> str:
@@ -75,6 +111,9 @@ def _range(values: list[float]) -> str:
     return low if low == high else f"{low} to {high}"
 
 
+PAGES = {README: with_planners, RESULTS: filled, EXPERIMENTS: with_stage_times}
+"""What brings each page up to date."""
+
 if __name__ == "__main__":
-    TIMES_PAGE.write_text(with_stage_times(TIMES_PAGE.read_text()))
-    (ROOT / "README.md").write_text(filled((ROOT / "README.md").read_text()))
+    for page, written in PAGES.items():
+        page.write_text(written(page.read_text()))

@@ -13,7 +13,7 @@ from constraint_geodesics import bundle
 from constraint_geodesics.benchmark.queries import TABLE, Query, write_queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.pipeline.layout import Layout
-from tests.planner_fixtures import packaged_bundle, pairs_of
+from tests.planner_fixtures import packaged_learned, pairs_of
 from tests.test_cli_plan import called, strict
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -100,7 +100,7 @@ def test_the_benchmarks_summary_is_json(geodesics, tmp_path) -> None:
     shutil.copy(ROOT / "requirements.lock", tmp_path)
     layout = Layout(tmp_path)
     shutil.copytree(bundle.PACKAGED, layout.planner)
-    LearnedManifold.from_arrays(packaged_bundle().manifold).save(layout.manifold("planner"))
+    LearnedManifold.from_arrays(packaged_learned().manifold).save(layout.manifold("planner"))
     (start, goal), *_ = pairs_of("free", 1, seed=1)
     write_queries([Query("free", TABLE, 0, start, goal)], layout.benchmark_queries("free"))
     code, out, err = geodesics("bench", "--constraint", "free", "--json")

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from constraint_geodesics import bundle, cli
-from constraint_geodesics.planner import read_path
 from constraint_geodesics.recording.recording import read_recording
+from constraint_geodesics.trajectory import read_trajectory
 from tests.planner_fixtures import NAMES, nodes_of, packaged_bundle, packaged_planner, pairs_of
 
 COMMAND = str(Path(sys.executable).parent / "geodesics")
@@ -103,7 +103,7 @@ def test_a_path_is_planned_and_its_files_are_written(command, query, tmp_path) -
     assert out.startswith("solved: ")
     assert out.count("\n") == 1
     assert err.strip() == f"planner: {bundle.PACKAGED}"
-    joints, times, constraint = read_path(csv)
+    joints, times, constraint = read_trajectory(csv)
     own = packaged_planner().plan(*pairs_of("level_cup", 1, seed=1)[0], "level_cup")
     assert joints.tobytes() == own.joints.tobytes()
     assert times.tobytes() == own.times.tobytes()
@@ -413,6 +413,16 @@ def test_a_budget_is_used(command, query) -> None:
     )
     assert longer["planning_time_s"] >= 0.2
     assert longer["length_rad"] <= first["length_rad"]
+
+
+@pytest.mark.parametrize("method", ["planner", "learned", "learned+band"])
+def test_a_method_is_chosen_by_its_name_and_named_in_the_answer(command, query, method) -> None:
+    words = ("--start", query[0], "--goal", query[1], "--constraint", "level_cup", "--json")
+    code, out, _ = command("plan", *words, "--method", method)
+    assert (code, strict(out)["method"]) == (0, method)
+    code, out, err = command("plan", *words, "--method", "paper")
+    assert (code, out) == (2, "")
+    assert "no method 'paper'" in error_line(err)
 
 
 @pytest.mark.parametrize(

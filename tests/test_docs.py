@@ -30,9 +30,10 @@ from constraint_geodesics import cli
 from constraint_geodesics.bundle import PACKAGED
 from constraint_geodesics.params import load_params
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
 from constraint_geodesics.tracking.registry import register_planner
-from tests.readme import TIMES_PAGE, with_stage_times
+from tests.readme import EXPERIMENTS as TIMES_PAGE
+from tests.readme import with_stage_times
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "constraint_geodesics"
@@ -128,9 +129,7 @@ def test_the_extensions_work(monkeypatch, tmp_path) -> None:
 def test_the_other_code_runs(page, monkeypatch, tmp_path) -> None:
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     if "models:/" in PAGES[page]:  # what a run of the pipeline leaves in the registry
-        with tracked_stage(
-            "build_planner", "planner", {}, [], experiment="built", root=tmp_path
-        ) as stage:
+        with tracked_stage(Work("build_planner", "planner"), "built", tmp_path) as stage:
             example = {"start": [0.0] * 6, "goal": [0.1] * 6, "constraint": "free"}
             register_planner(stage, PACKAGED, PACKAGE / "served_model.py", example)
     run(page, monkeypatch, tmp_path)

@@ -11,7 +11,6 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-import time
 import venv
 from collections.abc import Mapping
 from contextlib import closing
@@ -25,13 +24,21 @@ from mlflow import MlflowClient
 from mlflow.exceptions import MlflowException
 
 from constraint_geodesics import bundle
-from constraint_geodesics.doctor.checkout import check_disk
-from constraint_geodesics.doctor.report import CHECKS, COLOURS, Finding, as_text, examine, exit_code
-from constraint_geodesics.doctor.runs import check_pipeline
-from constraint_geodesics.doctor.surroundings import Surroundings, numbers, versions_in
+from constraint_geodesics.doctor import (
+    CHECKS,
+    COLOURS,
+    Finding,
+    Surroundings,
+    as_text,
+    check_disk,
+    check_pipeline,
+    examine,
+    exit_code,
+    numbers,
+    versions_in,
+)
 from constraint_geodesics.robot.kinematics import RobotError
-from constraint_geodesics.scene.scene import find_urdf
-from constraint_geodesics.scene.world import data_path
+from constraint_geodesics.scene.urdf import data_path, find_urdf
 from tests.test_cli_plan import strict
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -122,9 +129,7 @@ def test_an_older_python_can_read_the_module() -> None:
     """All that is imported, which annotates with what that Python does not have but never evaluates
     it.
     """
-    files = list((PACKAGE / "doctor").glob("*.py"))
-    assert len(files) > 5
-    for file in (PACKAGE / "__init__.py", *files):
+    for file in (PACKAGE / "__init__.py", PACKAGE / "doctor.py"):
         tree = ast.parse(file.read_text(), feature_version=(3, 8))
         future = [
             node
@@ -197,10 +202,7 @@ def test_of_two_versions_the_one_that_python_finds_counts(tmp_path) -> None:
     (tmp_path / "first" / "scipy-1.17.1.dist-info").mkdir()  # broken: nothing in it
     folders = [str(tmp_path / "first"), str(tmp_path / "second")]
     assert versions_in(folders) == {"numpy": "2.4.6"}
-    ask = (
-        f"from constraint_geodesics.doctor.surroundings import versions_in; "
-        f"print(versions_in({folders}))"
-    )
+    ask = f"from constraint_geodesics.doctor import versions_in; print(versions_in({folders}))"
     environ = {
         **HERE.environ,
         "PYTHONPATH": str(SOURCES),
@@ -420,72 +422,6 @@ def test_meshes_missing_from_pybullets_own_are_installed_again(tmp_path) -> None
     assert found.mend == "python -m pip install --force-reinstall --no-deps pybullet==3.2.7"
     (site / "xarm" / "xarm6_robot.urdf").write_text("<robot><link")
     assert "not XML" in only(look("robot", tmp_path, here), "problem").message
-
-
-# Compiled kernels
-
-
-INNER = "from numba import njit\n\n\n@njit(cache=True)\ndef inner(x):\n    return x + {}\n"
-OUTER = (
-    "from numba import njit\n\nfrom constraint_geodesics.low.inner import inner\n\n\n"
-    "@njit(cache=True)\ndef outer(x):\n    return 10 * inner(x)\n"
-)
-
-
-def kernel_checkout(root: Path) -> Path:
-    package = checkout(root) / "src" / "constraint_geodesics"
-    (package / "__init__.py").write_text("")
-    for name, text in (
-        ("low/inner.py", INNER.format(1)),
-        ("high/outer.py", OUTER),
-        ("high/alone.py", INNER.format(0)),
-    ):
-        (package / name).parent.mkdir(exist_ok=True)
-        (package / name).write_text(text)
-    return package
-
-
-def test_a_stale_kernel_is_recognised_and_mended(tmp_path) -> None:
-    package = kernel_checkout(tmp_path)
-    environ = {**HERE.environ, "PYTHONPATH": str(package.parent)}
-    environ.pop("NUMBA_CACHE_DIR", None)
-    ask = "from constraint_geodesics.high.outer import outer; print(outer(1))"
-
-    def answer() -> str:
-        return run(sys.executable, "-c", ask, folder=tmp_path, environ=environ).stdout.strip()
-
-    assert answer() == "20"
-    assert only(look("kernels", tmp_path), "ok").message.startswith("4 files of compiled kernels")
-    (package / "low" / "inner.py").write_text(INNER.format(2))
-    assert answer() == "20", "numba's own check does not see it"
-    found = only(look("kernels", tmp_path), "problem")
-    assert (
-        found.message
-        == "2 of 4 files of compiled kernels are older than low/inner.py, which they call"
-    )
-    subprocess.run(found.mend, shell=True, check=True, cwd=tmp_path)
-    assert only(look("kernels", tmp_path), "ok")
-    assert answer() == "30"
-
-
-def test_caches_that_numba_drops_itself_are_well(tmp_path) -> None:
-    """Older than their own file, or than one that they do not call."""
-    package = kernel_checkout(tmp_path)
-    now = time.time()
-    for name in ("high/outer", "high/alone"):
-        source = package / f"{name}.py"
-        cache = source.parent / "__pycache__" / f"{source.stem}.{source.stem}-7.py311.1.nbc"
-        cache.parent.mkdir(exist_ok=True)
-        cache.write_bytes(b"")
-        os.utime(source, (now - 100, now - 100))
-        os.utime(cache, (now - 50, now - 50))
-    inner = package / "low" / "inner.py"
-    assert "1 of 2 " in only(look("kernels", tmp_path), "problem").message
-    os.utime(package / "high" / "outer.py", (now - 40, now - 40))
-    assert only(look("kernels", tmp_path), "ok")
-    os.utime(package / "high" / "outer.py", (now - 100, now - 100))
-    os.utime(inner, (now - 60, now - 60))
-    assert only(look("kernels", tmp_path), "ok")
 
 
 # Display and recordings

@@ -8,8 +8,14 @@ from typing import Any
 import pytest
 import yaml
 from dvc.utils.hydra import apply_overrides
+from dvc.utils.serialize import modify_yaml
 
-from constraint_geodesics.params import ParamsError, load_params
+from constraint_geodesics.gate import check_params
+from constraint_geodesics.params import ParamsError, WorkcellParams, load_params
+from constraint_geodesics.scene.body import Body
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.capsule import Capsule
+from constraint_geodesics.scene.sphere import Sphere
 
 ROOT = Path(__file__).resolve().parents[1]
 Change = Callable[[dict[str, Any]], Any]
@@ -23,6 +29,12 @@ def changed(tmp_path: Path, change: Change) -> Path:
     return file
 
 
+def shapes(raw: dict[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = raw["workcell"]["shapes"]
+    return found
+
+
+PIPE = {"kind": "capsule", "from_m": [0, 0, 1], "to_m": [1, 0, 1], "radius_m": 0.1}
 BAD: list[tuple[Change, tuple[str, ...]]] = [
     (lambda p: p.update(speed=1), ("speed=1", "no such parameter")),
     (lambda p: p["labels"].update(free_row=5), ("labels.free_row=5", "no such parameter")),
@@ -64,6 +76,13 @@ BAD: list[tuple[Change, tuple[str, ...]]] = [
     (lambda p: p["compute"].update(backend="dask"), ("compute", "dask_address")),
     (lambda p: p.pop("judge"), ("judge is missing",)),
     (lambda p: p["constraints"].pop("free"), ("constraints.free",)),
+    (lambda p: shapes(p)["table"].pop("kind"), ("workcell.shapes.table.kind is missing",)),
+    (lambda p: shapes(p)["table"].update(kind="cone"), ("workcell.shapes.table", "'capsule'")),
+    (lambda p: shapes(p)["table"].update(size_m=[1, 1, 0]), ("box.size_m.2=0", "greater than 0")),
+    (lambda p: shapes(p)["table"].update(centre_m=[0, 0, "1"]), ("box.centre_m.2='1'", "number")),
+    (lambda p: shapes(p)["table"].update(radius_m=1), ("box.radius_m=1", "no such parameter")),
+    (lambda p: shapes(p).update(pipe=PIPE | {"to_m": [0, 0]}), ("capsule.to_m.2 is missing",)),
+    (lambda p: shapes(p).update(pipe=PIPE | {"radius_m": -1}), ("capsule.radius_m=-1",)),
 ]
 
 
@@ -79,8 +98,79 @@ def test_a_bad_parameter_is_named_in_one_line(
         assert part in message
 
 
+BODY = {"urdf": "nowhere.urdf"}
+TABLE = {"centre_m": [0.0, 0.0, -1.0], "size_m": [1.0, 1.0, 0.1], "exempt_links": ["arm"]}
+REFUSED: list[tuple[Change, tuple[str, ...]]] = [
+    (lambda p: p["robot"].update(urdf="no/arm.urdf"), ("robot", "no/arm.urdf", "no such URDF")),
+    (lambda p: p["robot"].update(urdf="params.yaml"), ("robot.urdf", "params.yaml", "no URDF")),
+    (lambda p: p["robot"].update(tool_link="hand"), ("robot", "there is no link 'hand'")),
+    (lambda p: p["robot"].update(limits_rad={"elbow": [-1, 1]}), ("robot", "elbow", "joint6")),
+    (
+        lambda p: p["robot"].update(limits_rad={"joint1": [-9.0, 3.5]}),
+        ("robot", "joint1", "[-9.0, 3.5]", "within the URDF's"),
+    ),
+    (lambda p: p["workcell"].update(urdfs={"door": BODY}), ("workcell", "nowhere.urdf")),
+    (lambda p: p["workcell"].update(boxes={"table": TABLE}), ("workcell", "arm")),
+    (
+        lambda p: p["manifolds"]["paper"].update(latent_dim=7),
+        ("manifolds.paper.latent_dim=7", "at most 6"),
+    ),
+    (
+        lambda p: p["geodesics"].update(searched=["paper"]),
+        ("geodesics.searched='paper'", "retract must be true"),
+    ),
+    (
+        lambda p: p["policies"]["ppo"].update(batch_size=5000),
+        ("policies.ppo.batch_size=5000", "at most 2560"),
+    ),
+    (lambda p: p["execution"].update(least_tilt_rad=4.0), ("execution.least_tilt_rad=4.0", "π")),
+    (
+        lambda p: p["studies"].update(constraint="free"),
+        ("studies.constraint='free'", "roll and pitch"),
+    ),
+    (
+        lambda p: p["benchmark"]["planners"]["BiRRT"].update(kind="omple"),
+        ("benchmark.planners.BiRRT", "no kind 'omple'", "birrt"),
+    ),
+    (
+        lambda p: p["benchmark"].update(drawn=["BiRTT"]),
+        ("benchmark.drawn='BiRTT'", "must be one of"),
+    ),
+]
+
+
+@pytest.mark.parametrize(("change", "parts"), REFUSED)
+def test_the_gate_refuses_what_a_stage_would_fail_on(
+    tmp_path: Path, change: Change, parts: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = changed(tmp_path, change)
+    monkeypatch.chdir(tmp_path)
+    params = load_params(file)
+    with pytest.raises(ParamsError) as caught:
+        check_params(params)
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in parts:
+        assert part in message, message
+
+
+def test_an_experiment_changes_one_line(tmp_path: Path) -> None:
+    """DVC writes the file anew; it must be as DVC writes it."""
+    file = tmp_path / "params.yaml"
+    text = (ROOT / "params.yaml").read_text().partition("\nplans:")[0]
+    file.write_text(text)
+    with modify_yaml(str(file)) as params:
+        params["constraints"]["slide"]["tolerance"][2] = 0.01
+    before, after = text.splitlines(), file.read_text().splitlines()
+    assert len(before) == len(after)
+    differing = [line for line, old in zip(after, before, strict=True) if line != old]
+    assert differing == ["    tolerance: [0, 0, 0.01, 0, 0, 0]"]
+
+
 def test_the_committed_parameters_are_good() -> None:
-    assert load_params(ROOT / "params.yaml").constraints["level_cup"].axes == (0, 0, 0, 1, 1, 0)
+    params = load_params(ROOT / "params.yaml")
+    check_params(params)
+    assert params.constraints["level_cup"].axes == (0, 0, 0, 1, 1, 0)
 
 
 @pytest.mark.parametrize(
@@ -114,9 +204,7 @@ def test_what_is_no_yaml_is_said_in_one_line(tmp_path: Path, text: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "stage", ["label_joints.py level_cup", "train_geodesics.py planner level_cup", "report.py"]
-)
+@pytest.mark.parametrize("stage", ["label_joints.py level_cup", "digest_code.py"])
 def test_a_stage_stops_before_any_work(tmp_path: Path, stage: str) -> None:
     changed(tmp_path, lambda p: p["geodesics"]["ppo"].update(gamma=1.5))
     script, *names = stage.split()
@@ -138,15 +226,25 @@ def test_an_unknown_constraint_is_named(tmp_path: Path) -> None:
     assert result.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    "change", ["benchmark.seeds=3", "benchmark.planners.PRM.queries=4", "studies.queries=9"]
-)
-def test_an_experiment_changes_one_line_of_the_benchmark(tmp_path: Path, change: str) -> None:
-    """DVC writes the whole file again; what it would wrap otherwise must stand as it writes it."""
-    before = (ROOT / "params.yaml").read_text()
-    file = tmp_path / "params.yaml"
-    file.write_text(before)
-    apply_overrides(file, [change])
-    old, new = (text[text.index("\nunseen:") :].splitlines() for text in (before, file.read_text()))
-    assert len(old) == len(new)
-    assert sum(a != b for a, b in zip(old, new, strict=True)) == 1
+def test_shapes_of_every_kind_come_from_params_and_go_back(tmp_path: Path) -> None:
+    given = {
+        "pipe": PIPE | {"exempt_links": ["link1"]},
+        "lamp": {"kind": "sphere", "centre_m": [0.5, 0.0, 1], "radius_m": 0.1},
+        "tray": {"kind": "urdf", "urdf": "tray/traybox.urdf", "rpy_rad": [0, 0, 1.5]},
+    }
+    workcell = load_params(changed(tmp_path, lambda p: shapes(p).update(given))).workcell
+    assert set(workcell.shapes) == {"table", "pipe", "lamp", "tray"}
+    assert workcell.shapes["pipe"] == Capsule("pipe", (0, 0, 1), (1, 0, 1), 0.1, ("link1",))
+    assert workcell.shapes["tray"] == Body("tray", "tray/traybox.urdf", rpy_rad=(0, 0, 1.5))
+    assert WorkcellParams.model_validate(workcell.model_dump(mode="json")) == workcell
+    assert WorkcellParams().including(*workcell.shapes.values()) == workcell
+
+
+def test_files_that_list_boxes_spheres_and_urdfs_apart_are_read_as_well() -> None:
+    box = {"centre_m": [0.0, 0.0, 1.0], "size_m": [1.0, 1.0, 1.0]}
+    ball = {"centre_m": [0.0, 0.0, 1.0], "radius_m": 0.1}
+    listed = {"boxes": {"a": box}, "spheres": {"b": ball}, "urdfs": {"c": {"urdf": "c.urdf"}}}
+    shapes = WorkcellParams.model_validate(listed).shapes
+    assert shapes["a"] == Box("a", (0.0, 0.0, 1.0), (1.0, 1.0, 1.0))
+    assert shapes["b"] == Sphere("b", (0.0, 0.0, 1.0), 0.1)
+    assert shapes["c"] == Body("c", "c.urdf")

@@ -15,15 +15,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from constraint_geodesics import Constraint, Planner, Pose, bundle
+from constraint_geodesics import Constraint, Planner, Pose, Trajectory, bundle
 from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.pose import ConstraintError, ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
-from constraint_geodesics.params import SphereParams
-from constraint_geodesics.planner import Path as Solution
-from constraint_geodesics.planner import PlannerError, check_path, read_path
+from constraint_geodesics.planner import PlannerError, check_trajectory
 from constraint_geodesics.recording.recording import read_recording
+from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.candidates import Answer, Parts, Task, candidates, refined, rows_of
+from constraint_geodesics.trajectory import read_trajectory
 from tests.planner_fixtures import (
     NAMES,
     manifold_of,
@@ -39,7 +39,7 @@ OTHER_WAY_ROUND = np.array([0.0, 2.0, -0.2, 0.0, 0.3, 0.1])
 
 
 @cache
-def solved(name: str) -> tuple[Solution, ...]:
+def solved(name: str) -> tuple[Trajectory, ...]:
     """Paths of some queries of one constraint, those found over the graph among them."""
     planner = packaged_planner()
     paths = [planner.plan(*ends, name) for ends in pairs_of(name, 6, seed=1)]
@@ -372,7 +372,7 @@ def alternative(explanation: str) -> np.ndarray:
 @pytest.mark.parametrize("name", ["tool_down", "slide", "fixed_orientation"])
 def test_an_alternative_goal_is_named_and_can_be_reached(planner, name) -> None:
     robot, same_pose = planner.scene.robot, 0
-    for start, goal in pairs_of(name, 5, seed=11, joined=False):
+    for start, goal in pairs_of(name, 8, seed=11, joined=False):
         path = planner.plan(start, goal, name)
         if path.status != "not_connected":  # the graph may miss a way that the straight line finds
             assert path.status == "solved"
@@ -454,7 +454,7 @@ def test_a_goal_that_is_the_start_is_a_path_that_stands(planner, tmp_path, name)
         assert (np.diff(path.times) > 0.0).all()
         assert path.violation_bound_rad <= 1e-4
         path.save(tmp_path / "path.csv")
-        assert check_path(tmp_path / "path.csv", source=bundle.PACKAGED).valid
+        assert check_trajectory(tmp_path / "path.csv", source=bundle.PACKAGED).valid
 
 
 @pytest.mark.parametrize("distance", [1e-9, 1e-6, 1e-3])
@@ -529,9 +529,9 @@ def test_a_constraint_never_seen_gets_its_graph_when_it_is_needed(small) -> None
         assert world.free(nodes).all()
     small.prepare(never)
     assert small.nodes(never) is nodes, "kept"
-    paths = [small.plan(nodes[k], nodes[k + 1], never, parts=ONLY_GRAPH) for k in range(8)]
+    paths = [small.plan(nodes[k], nodes[k + 1], never, parts=ONLY_GRAPH) for k in range(40)]
     found = [path for path in paths if path.status == "solved"]
-    assert len(found) >= 4
+    assert len(found) >= 10
     for path in found:
         assert path.source == "graph"
         assert path.violation_bound_rad <= 1e-4
@@ -612,7 +612,7 @@ def test_a_saved_path_is_read_to_the_last_bit(tmp_path) -> None:
     for name in NAMES:
         path = solved(name)[0]
         path.save(tmp_path / "new" / f"{name}.csv")
-        joints, times, constraint = read_path(tmp_path / "new" / f"{name}.csv")
+        joints, times, constraint = read_trajectory(tmp_path / "new" / f"{name}.csv")
         assert joints.tobytes() == path.joints.tobytes()
         assert times.tobytes() == path.times.tobytes()
         assert (constraint.axes, constraint.tolerance) == (
@@ -636,17 +636,17 @@ def test_a_saved_path_is_certified_by_itself(planner, tmp_path) -> None:
     for name in ("level_cup", "level_cup_relaxed", "slide"):
         path = solved(name)[0]
         path.save(tmp_path / "path.csv")
-        certificate = check_path(tmp_path / "path.csv", source=bundle.PACKAGED)
+        certificate = check_trajectory(tmp_path / "path.csv", source=bundle.PACKAGED)
         assert certificate.valid
         assert certificate.length_rad == path.length_rad
         assert certificate.violation_bound == path.violation_bound_rad
-    assert check_path(tmp_path / "path.csv", "level_cup", bundle.PACKAGED).valid, (
+    assert check_trajectory(tmp_path / "path.csv", "level_cup", bundle.PACKAGED).valid, (
         "what slides is level"
     )
-    other = check_path(tmp_path / "path.csv", "tool_down", bundle.PACKAGED)
+    other = check_trajectory(tmp_path / "path.csv", "tool_down", bundle.PACKAGED)
     assert other.violation.kind == "constraint"
     with pytest.raises(PlannerError, match="there is no constraint 'cup'"):
-        check_path(tmp_path / "path.csv", "cup", bundle.PACKAGED)
+        check_trajectory(tmp_path / "path.csv", "cup", bundle.PACKAGED)
 
 
 def lines_of(tmp_path: Path) -> list[str]:
@@ -658,13 +658,13 @@ def test_a_path_of_somebody_else_may_lack_times_and_constraint(tmp_path) -> None
     path, lines = solved("level_cup")[0], lines_of(tmp_path)
     bare = tmp_path / "bare.csv"
     bare.write_text("\r\n".join(line.split(",", 1)[1] for line in lines[1:]) + "\r\n\r\n")
-    joints, times, constraint = read_path(bare)
+    joints, times, constraint = read_trajectory(bare)
     assert joints.tobytes() == path.joints.tobytes()
     assert times is None
     assert constraint is None
     with pytest.raises(PlannerError, match=r"bare\.csv names no constraint.*--constraint"):
-        check_path(bare, source=bundle.PACKAGED)
-    certificate = check_path(bare, "level_cup", bundle.PACKAGED)
+        check_trajectory(bare, source=bundle.PACKAGED)
+    certificate = check_trajectory(bare, "level_cup", bundle.PACKAGED)
     assert certificate.valid
     assert np.isnan(certificate.duration_s)
 
@@ -691,7 +691,7 @@ def test_a_corrupted_line_is_named(tmp_path, line, text, said) -> None:
     lines[line - 1] = text
     (tmp_path / "path.csv").write_text("\n".join(lines))
     with pytest.raises(PlannerError, match=rf"path\.csv, {said}") as error:
-        check_path(tmp_path / "path.csv", source=bundle.PACKAGED)
+        check_trajectory(tmp_path / "path.csv", source=bundle.PACKAGED)
     assert one_line(str(error.value))
 
 
@@ -701,7 +701,7 @@ def test_files_that_hold_no_path_are_refused(tmp_path) -> None:
     (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00\x00")
     for name in ("empty.csv", "header.csv", "bytes.csv", "nowhere.csv", "."):
         with pytest.raises(PlannerError, match=str(tmp_path)):
-            read_path(tmp_path / name)
+            read_trajectory(tmp_path / name)
 
 
 @pytest.mark.parametrize("change", ["reversed", "foreign", "none"])
@@ -717,7 +717,7 @@ def test_columns_are_the_joints_that_their_names_say(planner, tmp_path, change) 
     }
     (tmp_path / "path.csv").write_text("\n".join([about, *headers[change], *rows]))
     with pytest.raises(PlannerError):
-        read_path(tmp_path / "path.csv", planner.scene.robot.joint_names)
+        read_trajectory(tmp_path / "path.csv", planner.scene.robot.joint_names)
 
 
 def test_a_recording_holds_the_path(tmp_path) -> None:
@@ -817,7 +817,7 @@ def test_paths_are_equal_as_objects_only() -> None:
 
 
 def task_of(planner: Planner, name: str) -> Task:
-    return planner._task(planner.constraints[name])
+    return planner._preparation.task(planner.constraints[name])
 
 
 def test_rows_are_so_close_that_lines_between_them_keep_the_constraint(planner) -> None:
@@ -874,8 +874,7 @@ def around(planner: Planner, name: str, seed: int) -> tuple[Planner, np.ndarray,
             continue
         middle = free.at(0.5)
         x, y, z = map(float, planner.scene.robot.forward(middle)[0])
-        ball = SphereParams(centre_m=(x, y, z), radius_m=0.1)
-        workcell = planner.bundle.workcell.model_copy(update={"spheres": {"ball": ball}})
+        workcell = planner.bundle.workcell.including(Sphere("ball", (x, y, z), 0.1))
         other = Planner(replace(planner.bundle, workcell=workcell), "with a sphere")
         with other.scene.world() as world:
             if (

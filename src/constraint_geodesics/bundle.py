@@ -1,14 +1,13 @@
-"""The planner's files: networks, graphs and settings of one run, small enough to travel with the
-package.
+"""The planner's files: robot, workcell, constraints, settings and roadmaps, small enough to travel
+with the package; nothing in them is trained.
 
-A folder with planner.json (robot, workcell, constraints, settings, and the SHA-256 of every other
-file), manifold.safetensors, policies.safetensors and roadmaps.safetensors.  Nothing in it is code,
-nothing is unpickled.
+A folder with planner.json (the SHA-256 of every other file in it too) and roadmaps.safetensors.
+Nothing in it is code, nothing is unpickled.
 """
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,21 +20,16 @@ from safetensors.numpy import load, save
 from constraint_geodesics.geometry.graph import components
 from constraint_geodesics.params import (
     ConstraintParams,
-    GeodesicParams,
     JudgeParams,
     PlannerParams,
     RobotParams,
     WorkcellParams,
 )
+from constraint_geodesics.plugs import MLFLOW, plug
 from constraint_geodesics.search.roadmap import Roadmap
 
-FORMAT = 1
-CARD, MANIFOLD, POLICIES, ROADMAPS = (
-    "planner.json",
-    "manifold.safetensors",
-    "policies.safetensors",
-    "roadmaps.safetensors",
-)
+FORMAT = 2
+CARD, ROADMAPS = "planner.json", "roadmaps.safetensors"
 PIPELINE = Path("data/planner")
 """Where the pipeline leaves the planner's files, in a checkout."""
 PACKAGED = Path(__file__).parent / "pretrained"
@@ -48,59 +42,78 @@ class BundleError(ValueError):
 
 @dataclass(frozen=True)
 class Bundle:
-    """What a planner is made of: parameters, and the arrays of its networks; roadmaps by
-    constraint.
-    """
+    """What a planner is made of: parameters, and roadmaps by constraint."""
 
     robot: RobotParams
     workcell: WorkcellParams
     constraints: Mapping[str, ConstraintParams]
     planner: PlannerParams
-    policy: GeodesicParams
     judge: JudgeParams
-    manifold: Mapping[str, np.ndarray]
-    policies: Mapping[str, np.ndarray]
     roadmaps: Mapping[str, Roadmap]
 
     def write(self, folder: Path) -> None:
-        """Write all files; the card last, so that an interrupted write leaves no bundle that looks
-        whole.
-        """
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / CARD).unlink(missing_ok=True)
-        contents = {
-            MANIFOLD: save(dict(self.manifold)),
-            POLICIES: save(dict(self.policies)),
-            ROADMAPS: self._graphs(),
-        }
-        for name, content in contents.items():
-            (folder / name).write_bytes(content)
-        card: dict[str, Any] = {
-            "format": FORMAT,
+        """Write all files."""
+        card = {
             "robot": self.robot.model_dump(mode="json"),
             "workcell": self.workcell.model_dump(mode="json"),
             "constraints": {
                 name: c.model_dump(mode="json") for name, c in self.constraints.items()
             },
             "planner": self.planner.model_dump(mode="json"),
-            "policy": self.policy.model_dump(mode="json"),
             "judge": self.judge.model_dump(mode="json"),
-            "sha256": {
-                name: hashlib.sha256(content).hexdigest() for name, content in contents.items()
-            },
         }
-        card["sha256"][CARD] = card_digest(card)
-        (folder / CARD).write_text(json.dumps(card, indent=1) + "\n")
+        write_files(folder / CARD, FORMAT, card, {ROADMAPS: roadmap_arrays(self.roadmaps)})
 
-    def _graphs(self) -> bytes:
-        arrays: dict[str, np.ndarray] = {}
-        for name, roadmap in self.roadmaps.items():
-            arrays[f"{name}/joints"] = roadmap.joints.astype(np.float32)
-            arrays[f"{name}/edges"] = roadmap.edges.astype(
-                np.uint16 if len(roadmap.joints) < 2**16 else np.uint32
-            )
-            arrays[f"{name}/lengths"] = roadmap.lengths.astype(np.float32)
-        return save(arrays)
+
+def write_files(
+    card_file: Path,
+    version: int,
+    card: Mapping[str, Any],
+    arrays: Mapping[str, Mapping[str, np.ndarray]],
+) -> None:
+    """Write arrays as safetensors files and the card beside them with their checksums: the card
+    last, so that an interrupted write leaves nothing that looks whole.
+    """
+    folder = card_file.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    card_file.unlink(missing_ok=True)
+    whole: dict[str, Any] = {"format": version, **card, "sha256": {}}
+    for name, values in arrays.items():
+        content = save(dict(values))
+        (folder / name).write_bytes(content)
+        whole["sha256"][name] = hashlib.sha256(content).hexdigest()
+    whole["sha256"][card_file.name] = card_digest(whole)
+    card_file.write_text(json.dumps(whole, indent=1) + "\n")
+
+
+def read_files(
+    card_file: Path, version: int, names: Sequence[str]
+) -> tuple[dict[str, Any], dict[str, dict[str, np.ndarray]]]:
+    """The card and the arrays that `write_files` wrote.
+
+    Raises BundleError if a file is missing, altered (its checksum differs), or of another format.
+    """
+    card = _card(card_file, version)
+    return card, {
+        name: _arrays(card_file.parent / name, card["sha256"].get(name)) for name in names
+    }
+
+
+def roadmap_arrays(roadmaps: Mapping[str, Roadmap]) -> dict[str, np.ndarray]:
+    """Roadmaps as named arrays in single precision."""
+    arrays: dict[str, np.ndarray] = {}
+    for name, roadmap in roadmaps.items():
+        numbers = np.uint16 if len(roadmap.joints) < 2**16 else np.uint32
+        arrays[f"{name}/joints"] = roadmap.joints.astype(np.float32)
+        arrays[f"{name}/edges"] = roadmap.edges.astype(numbers)
+        arrays[f"{name}/lengths"] = roadmap.lengths.astype(np.float32)
+    return arrays
+
+
+def roadmaps_of(arrays: Mapping[str, np.ndarray]) -> dict[str, Roadmap]:
+    """What `roadmap_arrays` wrote."""
+    names = sorted({name.split("/")[0] for name in arrays})
+    return {name: _roadmap(arrays, name) for name in names}
 
 
 def open_bundle(source: str | Path | None = None) -> tuple[Bundle, str]:
@@ -110,16 +123,22 @@ def open_bundle(source: str | Path | None = None) -> tuple[Bundle, str]:
     Raises BundleError if the files are missing or altered, TrackingError if MLflow does not have
     them.
     """
-    if source is None:
-        if (PIPELINE / CARD).is_file():
-            return read_bundle(PIPELINE), f"the pipeline's outputs in {PIPELINE.resolve()}"
-        return read_bundle(PACKAGED), "the files that come with the package"
     if isinstance(source, str) and ":/" in source:
-        from constraint_geodesics.tracking.experiment import fetch_artifacts
-
-        with fetch_artifacts(source) as folder:
+        with plug(MLFLOW)(source) as folder:
             return read_bundle(folder), f"MLflow's {source}"
-    return read_bundle(Path(source)), str(source)
+    folder = bundle_folder(source)
+    if source is not None:
+        return read_bundle(folder), str(source)
+    if folder == PIPELINE:
+        return read_bundle(folder), f"the pipeline's outputs in {PIPELINE.resolve()}"
+    return read_bundle(folder), "the files that come with the package"
+
+
+def bundle_folder(source: str | Path | None) -> Path:
+    """The folder that a source names; None: the pipeline's in this checkout, else the package's."""
+    if source is not None:
+        return Path(source)
+    return PIPELINE if (PIPELINE / CARD).is_file() else PACKAGED
 
 
 def read_bundle(folder: Path) -> Bundle:
@@ -127,28 +146,20 @@ def read_bundle(folder: Path) -> Bundle:
 
     Raises BundleError if a file is missing, altered (its checksum differs), or of another format.
     """
-    card = _card(folder)
-    arrays = {
-        name: _arrays(folder / name, card["sha256"].get(name))
-        for name in (MANIFOLD, POLICIES, ROADMAPS)
-    }
+    card, arrays = read_files(folder / CARD, FORMAT, (ROADMAPS,))
     try:
-        alone = set(_named(arrays[ROADMAPS])) - set(card["constraints"])
+        roadmaps = roadmaps_of(arrays[ROADMAPS])
+        alone = sorted(set(roadmaps) - set(card["constraints"]))
         if alone:
-            raise BundleError(
-                f"{folder / ROADMAPS}: graphs of {sorted(alone)}, which are no constraints of "
-                f"{CARD}"
-            )
+            strays = f"roadmaps of {alone}, which are no constraints of {CARD}"
+            raise BundleError(f"{folder / ROADMAPS}: {strays}")
         return Bundle(
             RobotParams.model_validate(card["robot"]),
             WorkcellParams.model_validate(card["workcell"]),
             {name: ConstraintParams.model_validate(c) for name, c in card["constraints"].items()},
             PlannerParams.model_validate(card["planner"]),
-            GeodesicParams.model_validate(card["policy"]),
             JudgeParams.model_validate(card["judge"]),
-            arrays[MANIFOLD],
-            arrays[POLICIES],
-            {name: _roadmap(arrays[ROADMAPS], name) for name in _named(arrays[ROADMAPS])},
+            roadmaps,
         )
     except (AttributeError, KeyError, TypeError, ValidationError) as error:
         raise BundleError(
@@ -156,22 +167,18 @@ def read_bundle(folder: Path) -> Bundle:
         ) from None
 
 
-def _card(folder: Path) -> dict[str, Any]:
-    file = folder / CARD
+def _card(file: Path, version: int) -> dict[str, Any]:
     try:
         card = json.loads(file.read_text())
     except OSError:
-        raise BundleError(f"{folder}: there is no {CARD}: not a folder of a planner") from None
+        what = f"there is no {file.name}: not a folder of a planner"
+        raise BundleError(f"{file.parent}: {what}") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise BundleError(f"{file}: not JSON: {error}") from None
-    if (
-        not isinstance(card, dict)
-        or card.get("format") != FORMAT
-        or not isinstance(card.get("sha256"), dict)
-    ):
-        written = card.get("format") if isinstance(card, dict) else None
-        raise BundleError(f"{file}: format {written}: this version reads format {FORMAT}")
-    if card["sha256"].get(CARD) != card_digest(card):
+    written = card.get("format") if isinstance(card, dict) else None
+    if written != version or not isinstance(card.get("sha256"), dict):
+        raise BundleError(f"{file}: format {written}: this version reads format {version}")
+    if card["sha256"].get(file.name) != card_digest(card):
         raise BundleError(f"{file}: altered since it was written (its checksum differs)")
     return card
 
@@ -193,10 +200,6 @@ def _arrays(file: Path, wanted: str | None) -> dict[str, np.ndarray]:
         return load(content)
     except SafetensorError as error:
         raise BundleError(f"{file}: not safetensors: {error}") from None
-
-
-def _named(arrays: Mapping[str, np.ndarray]) -> list[str]:
-    return sorted({name.split("/")[0] for name in arrays})
 
 
 def _roadmap(arrays: Mapping[str, np.ndarray], name: str) -> Roadmap:

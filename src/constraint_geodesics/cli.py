@@ -1,30 +1,31 @@
-"""The command `geodesics`, and how a stage starts."""
+"""The command `geodesics`."""
 
-import inspect
 import json
 import math
 import os
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from constraint_geodesics import completion
-from constraint_geodesics.params import Params, ParamsError, load_params
+from constraint_geodesics.kernel_digest import are_compiled
+from constraint_geodesics.params import ParamsError, load_params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.progress import waiting
-from constraint_geodesics.pipeline.threads import ONE_THREAD, one_thread
+from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
+from constraint_geodesics.pipeline.threads import ONE_THREAD
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from constraint_geodesics.recording.catalogue import Entry, Wanted
+    from constraint_geodesics.recording.catalogue import Filter, Listed
 
-WRONG_USAGE = 2
 NO_PATH = 3
+JSON = typer.Option(False, "--json", help="Print the answer as one JSON object.")
+OF_CONSTRAINT: dict[str, Any] = {"shell_complete": completion.listed_constraints}
 
 app = typer.Typer(
     help="Shortest robot paths that keep a task constraint.",
@@ -43,135 +44,64 @@ def main() -> None:
     try:
         app()
     except (ValueError, OSError, RuntimeError) as error:
-        raise SystemExit(_complain(error)) from None
+        raise SystemExit(complain(error)) from None
 
 
-def run_stage(stage: Callable[..., None], arguments: Sequence[str]) -> None:
-    """Run one stage in this checkout: check params.yaml first, and report a bad input in one line.
+@app.command("package")
+def package() -> None:
+    """Copy the planner that the pipeline built into the package, for those who install it."""
+    import shutil
 
-    What runs in this process computes on one thread, libraries that are loaded already too, so that
-    results are those of `make`; more cores are used by `parallel_map`.
-    arguments: the names after (params, layout), as dvc.yaml passes them; each must be one that
-    params.yaml has.
-    """
-    began = time.perf_counter()
-    try:
-        params = load_params()
-        _check_names(params, stage, arguments)
-        with one_thread(), waiting(" ".join([Path(sys.argv[0]).stem, *arguments])):
-            stage(params, Layout(), *arguments)
-        note_stage_time(
-            Layout().stage_times, Path(sys.argv[0]).stem, arguments, time.perf_counter() - began
-        )
-    except (ValueError, OSError, RuntimeError) as error:
-        if os.environ.get("GEODESICS_TRACEBACK"):
-            raise
-        raise SystemExit(_complain(error)) from None
-
-
-def note_stage_time(file: Path, stage: str, names: Sequence[str], seconds: float) -> None:
-    """Keep how long the last finished run of each stage took, workers and all: what training costs
-    is read from it.
-    """
-    file.parent.mkdir(parents=True, exist_ok=True)
-    own = " ".join([stage, *names])
-    kept = (
-        dict(line.split(",") for line in file.read_text().splitlines()[1:])
-        if file.is_file()
-        else {}
-    )
-    kept[own] = f"{seconds:.1f}"
-    file.write_text(
-        "\n".join(["stage,seconds", *(f"{name},{kept[name]}" for name in sorted(kept))]) + "\n"
-    )
-
-
-def _check_names(params: Params, stage: Callable[..., None], arguments: Sequence[str]) -> None:
-    """Each argument must be a name of the kind that the stage's own parameter is called after."""
-    kinds = list(inspect.signature(stage).parameters)[2:]
-    if len(kinds) != len(arguments):
-        raise ParamsError(
-            f"this stage takes {len(kinds)} names ({', '.join(kinds)}), not {len(arguments)}"
-        )
-    names: dict[str, list[str]] = {
-        "constraint": list(params.constraints),
-        "manifold": list(params.manifolds),
-        "analytic": list(params.geodesics.analytic),
-    }
-    for kind, name in zip(kinds, arguments, strict=True):
-        if name not in names[kind]:
-            raise ParamsError(
-                f"params.yaml: there is no {kind} {name!r}: must be one of {names[kind]}"
-            )
-
-
-def _complain(error: Exception, code: int | None = None) -> int:
-    print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-    if code is not None:
-        return code
-    return WRONG_USAGE if isinstance(error, ParamsError) else 1
+    layout = Layout()
+    if not (layout.planner / "planner.json").is_file():
+        raise OSError(f"{layout.planner}: holds no planner; `dvc repro build_planner` makes it")
+    shutil.copytree(layout.planner, layout.pretrained, dirs_exist_ok=True)
+    print(f"{layout.planner} -> {layout.pretrained}")
 
 
 @app.command("params")
 def check_params(
-    file: Annotated[Path, typer.Argument(help="The file to check.")] = Path("params.yaml"),
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the verdict as one JSON object.")
-    ] = False,
+    file: Path = typer.Argument(Path("params.yaml"), help="The file to check."),
+    as_json: bool = JSON,
 ) -> None:
-    """Check a params.yaml: one line naming the first bad entry, or "ok".  Exit code 0: good; 2:
-    bad.
+    """Check a params.yaml and the files it names: one line with the first bad entry, or "ok".
+
+    Exit code 0: good; 2: bad.
     """
+    from constraint_geodesics.gate import check_params as check
+
     try:
-        load_params(file)
+        check(load_params(file))
     except ParamsError as error:
         if not as_json:
             raise
         print(json.dumps({"file": str(file), "valid": False, "error": str(error)}))
         raise SystemExit(WRONG_USAGE) from None
-    print(
-        json.dumps({"file": str(file), "valid": True, "error": None}) if as_json else f"{file}: ok"
-    )
+    verdict = {"file": str(file), "valid": True, "error": None}
+    print(json.dumps(verdict) if as_json else f"{file}: ok")
 
 
 @app.command("doctor")
-def look_for_trouble(
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the findings as one JSON object.")
-    ] = False,
-) -> None:
+def look_for_trouble(as_json: bool = JSON) -> None:
     """Look for what is wrong with this checkout and its environment, and say the mend.  Exit code
     1: a problem.
     """
-    from constraint_geodesics.doctor import report
+    from constraint_geodesics import doctor
 
-    findings = report.examine(Path())
-    print(
-        report.as_json(findings) if as_json else report.as_text(findings, report.terminal_colours())
-    )
-    raise SystemExit(report.exit_code(findings))
+    raise SystemExit(doctor.show(Path(), json_wanted=as_json))
 
 
 @app.command("constraints")
 def list_constraints(
-    planner: Annotated[
-        str | None, typer.Option(help="Where the planner comes from, as for `plan`.")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
+    planner: str | None = typer.Option(None, help="Where the planner comes from, as for `plan`."),
+    as_json: bool = JSON,
 ) -> None:
     """List the constraints that `plan` knows by name."""
     from constraint_geodesics.bundle import open_bundle
 
     constraints = open_bundle(planner)[0].constraints
     if as_json:
-        print(
-            json.dumps(
-                {
-                    name: constraint.model_dump(mode="json")
-                    for name, constraint in constraints.items()
-                }
-            )
-        )
+        print(json.dumps({name: own.model_dump(mode="json") for name, own in constraints.items()}))
         return
     for name, constraint in constraints.items():
         print(f"{name:20s} {' '.join(map(str, constraint.axes))}  {constraint.description}")
@@ -205,6 +135,15 @@ def plan(
             help="Look for shorter paths until so many seconds have passed; by default do not."
         ),
     ] = None,
+    method: Annotated[
+        str,
+        typer.Option(
+            help="planner: straight line, roadmap and trees, refined; nothing in it is learned.  "
+            "learned: trained policies on the learned manifold alone, as in the paper.  "
+            "learned+band: the same, refined by the planner's elastic band.",
+            shell_complete=completion.methods,
+        ),
+    ] = "planner",
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the answer as one JSON object.")
     ] = False,
@@ -217,11 +156,11 @@ def plan(
 
     try:
         first, last = _joints(start, "--start"), _joints(goal, "--goal")
-        with waiting(what_takes_time()), Planner.load(planner) as loaded:
+        with waiting(what_takes_time()), Planner.load(planner, method) as loaded:
             path = loaded.plan(first, last, constraint, budget_s=budget)
             source = loaded.source
     except (BundleError, PlannerError) as error:
-        raise SystemExit(_complain(error, WRONG_USAGE)) from None
+        raise SystemExit(complain(error, WRONG_USAGE)) from None
     print(f"planner: {source}", file=sys.stderr)
     if path.status == "solved":
         if out is not None:
@@ -257,13 +196,13 @@ def check(
     what it breaks.
     """
     from constraint_geodesics.bundle import BundleError
-    from constraint_geodesics.planner import PlannerError, check_path
+    from constraint_geodesics.planner import PlannerError, check_trajectory
 
     try:
         with waiting(what_takes_time()):
-            certificate = check_path(file, constraint, planner)
+            certificate = check_trajectory(file, constraint, planner)
     except (BundleError, PlannerError) as error:
-        raise SystemExit(_complain(error, WRONG_USAGE)) from None
+        raise SystemExit(complain(error, WRONG_USAGE)) from None
     broken = certificate.violation
     untimed = (
         " (no times: velocity and acceleration not looked at)"
@@ -284,27 +223,11 @@ def check(
     raise SystemExit(0 if broken is None else NO_PATH)
 
 
-KERNELS = (
-    "robot/kernels",
-    "robot/clearance",
-    "constraints/kernels",
-    "certification/kernels",
-    "geometry/timing",
-    "geodesics/band_kernels",
-)
-"""Modules that numba compiles before the first path; their code is kept beside them, until they
-change.
-"""
-
-
-def what_takes_time(package: Path = Path(__file__).parent) -> str:
+def what_takes_time() -> str:
     """What a planner's user waits for: the compiler where a kernel has no compiled code yet."""
-    for name in KERNELS:
-        source = package / f"{name}.py"
-        kept = (source.parent / "__pycache__").glob(f"{source.stem}.*.nbi")
-        if not any(cache.stat().st_mtime >= source.stat().st_mtime for cache in kept):
-            return "compiling the numerical kernels, once for this environment: a minute or two"
-    return "loading the planner"
+    if are_compiled():
+        return "loading the planner"
+    return "compiling the numerical kernels, once for this environment: a minute or two"
 
 
 def _joints(text: str, option: str) -> list[float]:
@@ -320,33 +243,15 @@ def _joints(text: str, option: str) -> list[float]:
 
 @app.command("bench")
 def bench(
-    queries: Annotated[int, typer.Option(help="Queries of each constraint and scene.", min=1)] = 1,
-    seeds: Annotated[
-        int, typer.Option(help="Seeds of each planner that chance plays a part in.", min=1)
-    ] = 1,
-    constraint: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="One of params.yaml's; by default all.",
-            shell_complete=completion.listed_constraints,
-        ),
-    ] = None,
-    planner: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="One of params.yaml's benchmark.planners; by default all.",
-            shell_complete=completion.benchmarked_planners,
-        ),
-    ] = None,
-    longest: Annotated[
-        float, typer.Option(help="Leave out planners that are given more seconds a query.")
-    ] = 2.0,
-    out: Annotated[Path, typer.Option(help="Folder of rows, table and summary.")] = Path(
-        ".geodesics/bench"
+    queries: int = typer.Option(1, help="Queries of each constraint and scene.", min=1),
+    seeds: int = typer.Option(1, help="Seeds of each planner that chance plays a part in.", min=1),
+    constraint: list[str] | None = typer.Option(None, help="By default all.", **OF_CONSTRAINT),
+    planner: list[str] | None = typer.Option(
+        None, help="By default all.", shell_complete=completion.benchmarked_planners
     ),
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the summary as one JSON object.")
-    ] = False,
+    longest: float = typer.Option(2.0, help="Leave out planners with more seconds a query."),
+    out: Path = typer.Option(Path(".geodesics/bench"), help="Folder of rows, table and summary."),
+    as_json: bool = JSON,
 ) -> None:
     """Hold planners against each other on a few of the benchmark's queries; what is done is not
     done again.
@@ -367,32 +272,20 @@ def bench(
     summary = benchmark_summary(all_constraints(table), next(iter(some.benchmark.planners)))
     text = overview_markdown(summary, asks_in_python(all_settings(some)))
     (out / "overview.md").write_text(text)
+    rows = out / "benchmark.csv"
     if as_json:
-        print(
-            json.dumps(
-                {
-                    "rows": str(out / "benchmark.csv"),
-                    "overview": _records(summary),
-                    "left_out": left_out,
-                }
-            )
-        )
+        answer = {"rows": str(rows), "overview": _records(summary), "left_out": left_out}
+        print(json.dumps(answer))
         return
     print(text)
     if left_out:
-        print(
-            f"left out, as they are given more than {longest:g} s a query (--longest): "
-            f"{', '.join(left_out)}"
-        )
-    print(f"rows: {out / 'benchmark.csv'}")
+        why = f"as they are given more than {longest:g} s a query (--longest)"
+        print(f"left out, {why}: {', '.join(left_out)}")
+    print(f"rows: {rows}")
 
 
 @app.command("results")
-def show_results(
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the table's rows as one JSON object.")
-    ] = False,
-) -> None:
+def show_results(as_json: bool = JSON) -> None:
     """Print the committed result table and how to look further."""
     table = Layout().root / "reports" / ("table.csv" if as_json else "table.md")
     if not table.is_file():
@@ -402,56 +295,32 @@ def show_results(
 
         print(json.dumps({"rows": _records(pd.read_csv(table, float_precision="round_trip"))}))
         return
-    recordings = recordings_of(Layout())
+    recordings = _recordings(Path())
     print(table.read_text().rstrip())
     print("\nOpen the runs in MLflow:    make ui")
     if recordings:
-        print(f"Replay a path in Rerun:     make replay FILE={recordings[0]}")
+        print(f"Replay a path in Rerun:     make replay FILE={recordings[0].file}")
     print("Read the report offline:    reports/index.html")
 
 
 @app.command("replay")
 def replay(
-    recordings: Annotated[
-        list[str] | None,
-        typer.Argument(
-            help="Files to open, or their numbers in the list; none lists them.",
-            shell_complete=completion.recordings,
-        ),
-    ] = None,
-    constraint: Annotated[
-        str | None,
-        typer.Option(help="Only of this constraint.", shell_complete=completion.listed_constraints),
-    ] = None,
-    query: Annotated[int | None, typer.Option(help="Only of this query.", min=0)] = None,
-    planner: Annotated[
-        list[str] | None, typer.Option(help="Only of this planner; may be given several times.")
-    ] = None,
-    scene: Annotated[str | None, typer.Option(help="Only in this scene of the benchmark.")] = None,
-    manifold: Annotated[
-        str | None, typer.Option(help="Only of paths searched on this learned manifold.")
-    ] = None,
-    seed: Annotated[
-        list[int] | None, typer.Option(help="Only of this seed; may be given several times.")
-    ] = None,
-    beside: Annotated[
-        bool,
-        typer.Option(
-            "--side-by-side", help="A view for each recording, instead of one over the other."
-        ),
-    ] = False,
-    web: Annotated[
-        bool, typer.Option("--web", help="Open in a browser on this machine instead of a window.")
-    ] = False,
-    web_port: Annotated[
-        int, typer.Option(help="Port of the page on 127.0.0.1.", min=1, max=65535)
-    ] = 9090,
-    save: Annotated[
-        Path | None, typer.Option(help="Write what would be opened as one file, to hand on.")
-    ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the list as one JSON object.")
-    ] = False,
+    recordings: list[str] | None = typer.Argument(
+        None,
+        help="Files to open, or their numbers in the list; none lists them.",
+        shell_complete=completion.recordings,
+    ),
+    constraint: str | None = typer.Option(None, help="Only of this constraint.", **OF_CONSTRAINT),
+    query: int | None = typer.Option(None, help="Only of this query.", min=0),
+    planner: list[str] | None = typer.Option(None, help="Only of this planner; repeatable."),
+    scene: str | None = typer.Option(None, help="Only in this scene of the benchmark."),
+    manifold: str | None = typer.Option(None, help="Only of paths on this learned manifold."),
+    seed: list[int] | None = typer.Option(None, help="Only of this seed; repeatable."),
+    apart: bool = typer.Option(False, "--side-by-side", help="Each recording in its own view."),
+    web: bool = typer.Option(False, "--web", help="Open in a local browser, not a window."),
+    web_port: int = typer.Option(9090, help="Port of the page on 127.0.0.1.", min=1, max=65535),
+    save: Path | None = typer.Option(None, help="Write what would be opened as one file."),
+    as_json: bool = JSON,
 ) -> None:
     """Replay recorded paths in Rerun, several at once over each other; without any, list the
     recordings.
@@ -459,64 +328,70 @@ def replay(
     With --constraint, --query and --planner what fits is opened; with fewer of them the list is
     narrowed.
     """
-    from constraint_geodesics.recording.catalogue import Wanted, as_records
+    from constraint_geodesics.recording.catalogue import Filter
 
-    wanted = Wanted(constraint, scene, query, tuple(planner or ()), tuple(seed or ()), manifold)
-    if recordings and (as_json or wanted != Wanted()):
-        words = (
-            "--json prints the list of recordings"
-            if as_json
-            else "--constraint, --query, ... choose from the list"
-        )
-        raise SystemExit(_complain(ValueError(f"{words}: give no file"), WRONG_USAGE))
-    if as_json:
-        print(json.dumps({"recordings": as_records(_listed(wanted))}))
-        return
-    files = _named(recordings) if recordings else _chosen(_listed(wanted), wanted)
+    wanted = Filter(constraint, scene, query, tuple(planner or ()), tuple(seed or ()), manifold)
+    files = _files(recordings or [], wanted, as_json)
     if not files:
         return
     from constraint_geodesics.recording.viewer import open_recordings, save_recordings
 
     if save is not None:
-        save_recordings(files, save, beside=beside)
+        save_recordings(files, save, apart=apart)
         print(f"{save}: open it with geodesics replay {save}")
         return
-    raise SystemExit(open_recordings(files, web=web, beside=beside, web_port=web_port))
+    raise SystemExit(open_recordings(files, web=web, apart=apart, web_port=web_port))
 
 
-def _listed(wanted: "Wanted") -> "list[Entry]":
+def _files(words: Sequence[str], wanted: "Filter", as_json: bool) -> list[Path]:
+    """What is opened; nothing where the list is printed."""
+    from constraint_geodesics.recording.catalogue import Filter, as_records
+
+    if words and (as_json or wanted != Filter()):
+        choosing = "--constraint, --query, ... choose from the list"
+        what = "--json prints the list of recordings" if as_json else choosing
+        raise SystemExit(complain(ValueError(f"{what}: give no file"), WRONG_USAGE))
+    if as_json:
+        print(json.dumps({"recordings": as_records(_listed(wanted))}))
+        return []
+    return _named(words) if words else _chosen(_listed(wanted), wanted)
+
+
+def _recordings(root: Path) -> "list[Listed]":
+    """All recordings of a checkout, learned paths that keep a cup level first."""
+    from constraint_geodesics.recording.catalogue import catalogue, read_entry
+
+    return catalogue(root, read_entry)
+
+
+def _listed(wanted: "Filter") -> "list[Listed]":
     """The recordings of this checkout that are as asked for."""
-    from constraint_geodesics.recording.catalogue import catalogue, narrowed, read_entry
+    from constraint_geodesics.recording.catalogue import narrowed
 
-    entries = catalogue(Path(), read_entry)
+    entries = _recordings(Path())
     if not entries:
-        raise FileNotFoundError(
-            "data/recordings: no recordings yet; run `make plan` for one, or `make repro` for all"
-        )
+        none = "data/recordings: no recordings yet"
+        raise FileNotFoundError(f"{none}; run `make plan` for one, or `make repro` for all")
     return narrowed(entries, wanted)
 
 
 def _named(words: Sequence[str]) -> list[Path]:
     """The files that some words name, by themselves or by their numbers in the list."""
-    from constraint_geodesics.recording.catalogue import Wanted, by_words
+    from constraint_geodesics.recording.catalogue import Filter, by_words
 
-    for word in words:
-        if not word.isdigit() and not Path(word).is_file():
-            raise FileNotFoundError(
-                f"{word}: no such recording; `geodesics replay` lists those there are"
-            )
-    numbers = [word for word in words if not Path(word).is_file()]
-    files = {
-        entry.number: Path(entry.file)
-        for entry in (by_words(_listed(Wanted()), numbers) if numbers else [])
-    }
-    return [Path(word) if Path(word).is_file() else files[int(word)] for word in words]
+    files = {word: Path(word) for word in words if Path(word).is_file()}
+    numbers = [word for word in words if word not in files]
+    if missing := next((word for word in numbers if not word.isdigit()), None):
+        none = f"{missing}: no such recording"
+        raise FileNotFoundError(f"{none}; `geodesics replay` lists those there are")
+    if numbers:
+        found = by_words(_listed(Filter()), numbers)
+        files |= {word: Path(entry.file) for word, entry in zip(numbers, found, strict=True)}
+    return [files[word] for word in words]
 
 
-def _chosen(listed: "list[Entry]", wanted: "Wanted") -> list[Path]:
-    """What is opened of the list: what was asked for, or what a person at the terminal chooses;
-    piped, nothing.
-    """
+def _chosen(listed: "list[Listed]", wanted: "Filter") -> list[Path]:
+    """What was asked for of the list, or what a person at the terminal chooses; piped, nothing."""
     from constraint_geodesics.recording.catalogue import as_table, by_words, one_of_each
 
     if wanted.one_problem:
@@ -537,21 +412,17 @@ def _chosen(listed: "list[Entry]", wanted: "Wanted") -> list[Path]:
 
 @app.command("ui")
 def ui(
-    port: Annotated[int, typer.Option(help="Port on 127.0.0.1.", min=1, max=65535)] = 5000,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the address as one JSON object.")
-    ] = False,
+    port: int = typer.Option(5000, help="Port on 127.0.0.1.", min=1, max=65535),
+    as_json: bool = JSON,
 ) -> None:
     """Open MLflow's dashboard for this checkout, on this machine only; it runs until it is
     stopped.
     """
-    from constraint_geodesics.tracking.experiment import ui_command
+    from constraint_geodesics.tracking.store import ui_command
 
     command, address = ui_command(Path().resolve(), port), f"http://127.0.0.1:{port}"
-    print(
-        json.dumps({"address": address}) if as_json else f"{address}  (stop with Ctrl-C)",
-        flush=True,
-    )
+    text = json.dumps({"address": address}) if as_json else f"{address}  (stop with Ctrl-C)"
+    print(text, flush=True)
     os.execvp(command[0], command)
 
 
@@ -559,13 +430,6 @@ def _records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
     """The rows of a table for JSON: what is not a finite number there is null."""
     records: list[dict[str, Any]] = json.loads(frame.to_json(orient="records", double_precision=15))
     return records
-
-
-def recordings_of(layout: Layout) -> list[Path]:
-    """All recordings of this checkout, learned paths that keep a cup level first."""
-    from constraint_geodesics.recording.catalogue import catalogue, read_entry
-
-    return [layout.root / entry.file for entry in catalogue(layout.root, read_entry)]
 
 
 if __name__ == "__main__":

@@ -1,6 +1,4 @@
-"""What the shell proposes when Tab is pressed: names read from small files, without loading
-anything heavy.
-"""
+"""What the shell proposes when Tab is pressed, read from small files: nothing heavy is loaded."""
 
 import json
 import os
@@ -9,52 +7,47 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from click import Context, Parameter
 from click.shell_completion import CompletionItem
+
+from constraint_geodesics.plugs import METHODS
 
 PIPELINE = Path("data") / "planner" / "planner.json"
 PACKAGED = Path(__file__).parent / "pretrained" / "planner.json"
 
 
-def planned_constraints(
-    context: Context, parameter: Parameter, incomplete: str
-) -> list[CompletionItem]:
-    """Constraints that the planner knows by name: that of --planner, the pipeline's, or the
-    package's.
-    """
+def planned_constraints(context: Any, parameter: Any, incomplete: str) -> list[Any]:
+    """Constraints that the planner knows: of --planner, the pipeline, or the package."""
     del parameter
     named = Path(str(context.params.get("planner") or "")) / "planner.json"
     card = next((file for file in (named, PIPELINE, PACKAGED) if file.is_file()), None)
     return _items(_described(_json(card).get("constraints")), incomplete)
 
 
-def listed_constraints(
-    context: Context, parameter: Parameter, incomplete: str
-) -> list[CompletionItem]:
+def listed_constraints(context: Any, parameter: Any, incomplete: str) -> list[Any]:
     """Constraints of params.yaml."""
     del context, parameter
     return _items(_described(_params().get("constraints")), incomplete)
 
 
-def benchmarked_planners(
-    context: Context, parameter: Parameter, incomplete: str
-) -> list[CompletionItem]:
+def benchmarked_planners(context: Any, parameter: Any, incomplete: str) -> list[Any]:
     """Planners of the benchmark."""
     del context, parameter
     planners = (_params().get("benchmark") or {}).get("planners") or {}
-    return _items(
-        {name: str(entry.get("kind", "")) for name, entry in planners.items()}, incomplete
-    )
+    kinds = {name: str(entry.get("kind", "")) for name, entry in planners.items()}
+    return _items(kinds, incomplete)
 
 
-def recordings(context: Context, parameter: Parameter, incomplete: str) -> list[CompletionItem]:
+def methods(context: Any, parameter: Any, incomplete: str) -> list[Any]:
+    """Methods of the planner."""
+    del context, parameter
+    return _items(dict.fromkeys(METHODS, ""), incomplete)
+
+
+def recordings(context: Any, parameter: Any, incomplete: str) -> list[Any]:
     """Recordings of this checkout, and those in the folder that the word names."""
     del context, parameter
-    made = [
-        str(file)
-        for folder in ("data/recordings", "first_path")
-        for file in sorted(Path(folder).rglob("*.rrd"))
-    ]
+    folders = ("data/recordings", "first_path")
+    made = [str(file) for folder in folders for file in sorted(Path(folder).rglob("*.rrd"))]
     folder = incomplete[: incomplete.rfind("/") + 1]
     near = [folder + file.name for file in sorted(Path(folder or ".").glob("*.rrd"))]
     return _items(dict.fromkeys([*made, *near], ""), incomplete)
@@ -73,9 +66,7 @@ def _items(names: Mapping[str, str], incomplete: str) -> list[CompletionItem]:
 
 
 def _typed(name: str) -> str:
-    """As it must stand on bash's line, which takes a proposal as it is; other shells quote it
-    themselves.
-    """
+    """As bash takes it, which quotes no proposal; other shells quote it themselves."""
     if os.environ.get("_GEODESICS_COMPLETE") != "complete_bash" or _inside_quotes():
         return name
     return re.sub(r"([^\w@%+=:,./-])", r"\\\1", name)
@@ -93,9 +84,7 @@ def _json(file: Path | None) -> Any:
 
 
 def _params() -> Any:
-    """params.yaml as it stands: a file with a mistake in it still has names to propose, if it is
-    YAML.
-    """
+    """params.yaml as it stands: one with a mistake in it still has names to propose."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 

@@ -7,6 +7,8 @@ from typing import NamedTuple
 BLACK, ORANGE, SKY, GREEN = "#222222", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILION, PURPLE, YELLOW = "#0072B2", "#D55E00", "#CC79A7", "#F0E442"
 GREY, LIGHT = "#606060", "#E4E4E4"
+SERIES = (SKY, ORANGE, PURPLE, BLUE, YELLOW, GREEN, VERMILION)
+"""Of things that are counted and have no colour of their own."""
 START, GOAL = GREEN, VERMILION
 """A path's ends."""
 

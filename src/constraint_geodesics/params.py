@@ -8,15 +8,19 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Share = Annotated[float, Field(gt=0, lt=1)]
-Count = Annotated[int, Field(ge=1)]
-Seed = Annotated[int, Field(ge=0, lt=2**31)]
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
-Vector3 = tuple[Finite, Finite, Finite]
-Bit = Literal[0, 1]
+from constraint_geodesics.fields import (
+    Bit,
+    Count,
+    Finite,
+    Name,
+    NonNegative,
+    Positive,
+    Seed,
+    Share,
+    Vector3,
+)
+from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.shapes import AnyShape
 
 
 class ParamsError(ValueError):
@@ -37,37 +41,33 @@ class RobotParams(_Record):
     limits_rad: dict[str, tuple[Finite, Finite]] = {}
 
 
-class BoxParams(_Record):
-    """A fixed box of the workcell."""
-
-    centre_m: Vector3
-    size_m: tuple[Positive, Positive, Positive]
-    exempt_links: tuple[str, ...] = ()
-
-
-class SphereParams(_Record):
-    """A fixed sphere of the workcell."""
-
-    centre_m: Vector3
-    radius_m: Positive
-    exempt_links: tuple[str, ...] = ()
-
-
-class BodyParams(_Record):
-    """A fixed body of the workcell read from a URDF."""
-
-    urdf: str
-    position_m: Vector3 = (0.0, 0.0, 0.0)
-    rpy_rad: Vector3 = (0.0, 0.0, 0.0)
-    exempt_links: tuple[str, ...] = ()
-
-
 class WorkcellParams(_Record):
-    """What surrounds the arm."""
+    """What surrounds the arm: shapes by name."""
 
-    boxes: dict[Name, BoxParams] = {}
-    spheres: dict[Name, SphereParams] = {}
-    urdfs: dict[Name, BodyParams] = {}
+    shapes: dict[Name, AnyShape] = {}
+
+    def including(self, *shapes: Shape) -> "WorkcellParams":
+        """The same workcell with more shapes, or others of the same names."""
+        more = {shape.name: shape for shape in shapes}
+        return self.model_copy(update={"shapes": {**self.shapes, **more}})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named(cls, raw: Any) -> Any:
+        """Each shape with its name; earlier files list boxes, spheres and urdfs apart."""
+        if not isinstance(raw, dict):
+            return raw
+        rest, found = dict(raw), dict(raw.get("shapes") or {})
+        for listed, kind in _LISTED_APART.items():
+            found |= {name: {"kind": kind, **one} for name, one in rest.pop(listed, {}).items()}
+        for name, shape in found.items():
+            if isinstance(shape, dict):  # lists become tuples here, as JSON's strict mode has them
+                given = {k: tuple(v) if isinstance(v, list) else v for k, v in shape.items()}
+                found[name] = given | {"name": name}
+        return rest | {"shapes": found}
+
+
+_LISTED_APART = {"boxes": "box", "spheres": "sphere", "urdfs": "urdf"}
 
 
 class ComputeParams(_Record):
@@ -219,6 +219,13 @@ class GeodesicParams(_Record):
     ppo: PpoParams
     rollouts: Count
     checkpoint_steps: Count
+
+    def of_training(self, *more: str) -> dict[str, Any]:
+        """What one policy is trained with, and what else is named; the rest says what is trained
+        besides.
+        """
+        own = {"seeds", "degree", "steps", "environments", "episode_steps", "reward", "ppo"}
+        return self.model_dump(mode="json", include=own | set(more))
 
 
 class GeometryParams(_Record):
@@ -446,8 +453,10 @@ def one_line(error: ValidationError) -> str:
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     where = ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "extra_forbidden":
+    if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         return f"{where}={first['input']!r}: there is no such parameter{more}"
+    if first["type"] == "union_tag_not_found":
+        return f"{where}.kind is missing{more}"
     if first["type"] == "missing":
         return f"{where} is missing{more}"
     if first["type"] == "value_error":

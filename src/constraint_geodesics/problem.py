@@ -1,5 +1,5 @@
-"""The seam of the planners: a problem between two configurations, the path as it is executed, and
-who plans it.
+"""The seam of the planners: a problem between two configurations, its solution and status, and who
+plans it.
 """
 
 from collections.abc import Callable
@@ -18,13 +18,23 @@ SATISFIED = 1e-4
 LIMIT_SLACK = 1e-9
 """How far beyond a limit an end may lie [rad], by rounding."""
 
-EndStatus = Literal["start_violates", "goal_violates", "out_of_limits"]
 Status = Literal[
-    EndStatus, "solved", "not_found", "not_connected", "in_collision", "not_applicable"
+    "solved",
+    "not_found",
+    "not_connected",
+    "start_violates",
+    "goal_violates",
+    "out_of_limits",
+    "in_collision",
+    "not_applicable",
 ]
-"""not_applicable: the planner cannot work on such a problem at all; `Solution.explanation` says
-why.
+"""How a query ended, for the planner and every baseline alike.  not_applicable: it cannot work on
+such a problem at all.  Where the status does not say it all, an explanation does.
 """
+
+
+class PlannerError(ValueError):
+    """A question that makes no sense; the message names the value and what is allowed."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +95,7 @@ def refusal(problem: PlanningProblem) -> Status | None:
 
 def ends_refused(
     manifold: ConstraintManifold, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]
-) -> EndStatus | None:
+) -> Status | None:
     """Why these can't be the ends of a path, collisions apart; None where they can."""
     ends = np.stack([start, goal])
     violation = manifold.violation(ends)

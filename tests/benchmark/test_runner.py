@@ -28,7 +28,7 @@ from constraint_geodesics.benchmark.runner import (
 from constraint_geodesics.params import load_params
 from constraint_geodesics.peers.straight_band import StraightBand
 from constraint_geodesics.problem import Solution
-from constraint_geodesics.scene.world import Sphere
+from constraint_geodesics.scene.sphere import Sphere
 
 PARAMS = load_params(Path(__file__).parents[2] / "params.yaml")
 ASKED = tuple(

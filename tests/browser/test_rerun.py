@@ -44,12 +44,10 @@ def recordings(
     bent = straight + np.sin(np.pi * t) * np.array([0.0, 0.5, -0.7, 0.0, 0.0, 0.0])
     files = []
     for planner, joints in (("learned_geodesic", straight), ("birrt", bent)):
-        path = PathRecord(planner, "free", 0, 0, joints, f"**{planner}**")
+        path = PathRecord(planner, "free", 0, 0, joints, f"**{planner}**", meshes=False)
         files.append(folder / f"{planner}.rrd")
         constrained = scene.manifold(params.constraints["free"])
-        record_path(
-            files[-1], path, constrained, scene.workcell, frames=60, meshes=False
-        )  # as the stages do
+        record_path(files[-1], path, constrained, scene.workcell, frames=60)  # as the stages do
     return files
 
 

@@ -14,7 +14,7 @@ from constraint_geodesics.geodesics.episodes import (
 )
 from constraint_geodesics.geodesics.problem import Ends
 from constraint_geodesics.geometry.curves import PinnedPolynomial
-from constraint_geodesics.studies.analytic_search import analytic_problem, curve_family
+from constraint_geodesics.studies.geodesic_search import analytic_problem, curve_family
 
 
 @pytest.fixture(scope="module")

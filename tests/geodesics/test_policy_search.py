@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from constraint_geodesics.geodesics.policy_search import (
+    PolicySolver,
     load_policy,
     save_policy,
-    search,
     train_policy,
 )
-from constraint_geodesics.studies.analytic_search import (
+from constraint_geodesics.studies.geodesic_search import (
     AnalyticTask,
     analytic_problem,
     curve_family,
@@ -103,7 +103,7 @@ def test_a_saved_policy_acts_the_same(small, tmp_path: Path) -> None:
     save_policy(policy, tmp_path, 0)
     ends = problem.sample_ends(1, np.random.default_rng(0))
     found, again = (
-        search(problem, actor, small, ends, 3, lambda phi: True)
+        PolicySolver(actor, small, 3).search(problem, ends, lambda phi: True)
         for actor in (policy.actor, load_policy(tmp_path, 0))
     )
     np.testing.assert_array_equal(found.phi, again.phi)
@@ -115,10 +115,9 @@ def test_what_the_exact_check_refuses_is_not_returned(small, tmp_path: Path) -> 
     problem = analytic_problem("sphere", curve_family(2, small))
     policy = train_policy(problem, small, 0, tmp_path, ignore)
     ends = problem.sample_ends(1, np.random.default_rng(0))
-    nothing = search(problem, policy.actor, small, ends, 3, lambda phi: False)
+    solver = PolicySolver(policy.actor, small, 3)
+    nothing = solver.search(problem, ends, lambda phi: False)
     assert nothing.status == "not_found"
-    best = search(problem, policy.actor, small, ends, 3, lambda phi: True)
-    second = search(
-        problem, policy.actor, small, ends, 3, lambda phi: not np.array_equal(phi, best.phi)
-    )
+    best = solver.search(problem, ends, lambda phi: True)
+    second = solver.search(problem, ends, lambda phi: not np.array_equal(phi, best.phi))
     assert second.length >= best.length

@@ -71,13 +71,13 @@ def test_a_set_measures_each_row_as_its_member_does(problems) -> None:
     rng = np.random.default_rng(0)
     ends = problems.sample_ends(60, rng)
     phi = problems.sample_curves(ends, rng)
-    whole, costs = problems.look(phi, ends), problems.evaluate(phi, ends)
+    whole, costs = problems.observed(phi, ends), problems.evaluate(phi, ends)
     np.testing.assert_array_equal(whole.costs.cost, costs.cost)
     for k, member in enumerate(problems.members):
         rows = np.flatnonzero(ends.member == k)
         assert len(rows) > 5
         assert member.manifold.violation(ends.q_start[rows]).max() < 1e-6
-        one = member.look(phi[rows], ends[rows])
+        one = member.observed(phi[rows], ends[rows])
         # batches of another size round differently in single precision, which a retraction may
         # magnify
         close = np.isclose(one.costs.cost, costs.cost[rows], rtol=1e-3)
@@ -99,11 +99,11 @@ def test_steps_along_the_descent_shorten_curves(problems) -> None:
     rng = np.random.default_rng(1)
     ends = problems.sample_ends(90, rng)
     phi = np.zeros((90, problems.curve.coefficients))
-    first = problems.look(phi, ends)
+    first = problems.observed(phi, ends)
     now = first
     for _ in range(6):
         phi = phi + 0.7 * now.descent
-        now = problems.look(phi, ends)
+        now = problems.observed(phi, ends)
     both = first.costs.feasible & now.costs.feasible & (ends.member < 2)
     assert both.sum() > 25
     ratio = now.costs.length[both] / first.costs.length[both]

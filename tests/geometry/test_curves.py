@@ -84,20 +84,6 @@ def test_families_keep_the_protocol(curve):
 
 
 @every_family
-def test_a_basis_that_is_kept_gives_the_same_curves(curve):
-    generator = torch.Generator().manual_seed(0)
-    phi, start, goal = (
-        torch.randn(5, n, generator=generator, dtype=torch.float64)
-        for n in (curve.coefficients, 2, 2)
-    )
-    kept = curve.from_basis(phi, start, goal, T, curve.basis(T), curve.basis_derivative(T))
-    for found, expected in zip(kept, curve.evaluate(phi, start, goal, T), strict=True):
-        assert torch.equal(found, expected)
-    with pytest.raises(CurveError, match=r"basis has shape \(3, \d\): must be \(11, \d\)"):
-        curve.from_basis(phi, start, goal, T, curve.basis(T[:3]), curve.basis_derivative(T))
-
-
-@every_family
 def test_curves_can_be_transformed_and_differentiated(curve):
     """Solvers map over curves and take second derivatives in φ."""
     ends = torch.zeros(4, 2, dtype=torch.float64)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from constraint_geodesics.geometry.analytic import Plane, Torus
-from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
 from constraint_geodesics.geometry.grid import WALL, GridError, GridManifold
 from constraint_geodesics.geometry.length import Quadrature, curve_energy, curve_length
 from constraint_geodesics.geometry.manifold import (
@@ -71,7 +71,7 @@ def test_a_constant_grid_is_the_scaled_plane():
     torch.testing.assert_close(constant().metric(z), 2.25 * Plane(2).metric(z), rtol=1e-15, atol=0)
     line, rule = PinnedPolynomial(2, 3), Quadrature.gauss_legendre(8)
     length = curve_length(
-        constant(), line, torch.zeros(4).double(), tensor([-1, 2]), tensor([0.5, 4]), rule
+        constant(), Curves(line, torch.zeros(4).double(), tensor([-1, 2]), tensor([0.5, 4])), rule
     )
     assert length.item() == pytest.approx(1.5 * 2.5, rel=1e-14)
 
@@ -166,7 +166,7 @@ def test_a_curve_relaxed_on_the_grid_goes_round_a_blocked_region():
     assert not grid.contains(curve.evaluate(phi, start, goal, times)[0]).all()
     for _ in range(200):
         search.zero_grad()
-        curve_energy(grid, curve, phi, start, goal, rule).backward()
+        curve_energy(grid, Curves(curve, phi, start, goal), rule).backward()
         search.step()
     assert grid.contains(curve.evaluate(phi, start, goal, times)[0]).all()
 
@@ -199,13 +199,16 @@ def test_distances_of_the_hyperbolic_half_plane_are_approached():
 
         def energy(grid=grid, phi=phi, search=search, rule=rule):
             search.zero_grad()
-            total = curve_energy(grid, curve, phi, a, b, rule).sum()
+            total = curve_energy(grid, Curves(curve, phi, a, b), rule).sum()
             total.backward()
             return total
 
         search.step(energy)
         errors.append(
-            (curve_length(grid, curve, phi.detach(), a, b, rule) / exact - 1).abs().max().item()
+            (curve_length(grid, Curves(curve, phi.detach(), a, b), rule) / exact - 1)
+            .abs()
+            .max()
+            .item()
         )
     assert errors[0] < 5e-3
     assert errors[1] < errors[0] / 8  # bilinear values are off by the square of the spacing
@@ -305,10 +308,7 @@ def test_points_that_have_no_metric_are_refused():
     with pytest.raises(NonFiniteError, match=r"goal\[0\] = nan"):
         curve_length(
             constant(),
-            PinnedPolynomial(2, 3),
-            torch.zeros(4),
-            tensor([0, 3]),
-            tensor([math.nan, 3]),
+            Curves(PinnedPolynomial(2, 3), torch.zeros(4), tensor([0, 3]), tensor([math.nan, 3])),
         )
     for function in (constant().metric, constant().contains):
         with pytest.raises(

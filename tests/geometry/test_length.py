@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
-from constraint_geodesics.geometry.curves import CurveError, PinnedPolynomial, PinnedSpline
+from constraint_geodesics.geometry.curves import CurveError, Curves, PinnedPolynomial, PinnedSpline
 from constraint_geodesics.geometry.grid import GridManifold
 from constraint_geodesics.geometry.length import (
     Collocation,
@@ -53,9 +53,9 @@ def test_gauss_legendre_is_exact_for_polynomials(count):
     ],
 )
 def test_known_lengths(manifold, start, goal, length):
-    found = curve_length(manifold, CUBIC, STRAIGHT, point(*start), point(*goal), RULE)
+    found = curve_length(manifold, Curves(CUBIC, STRAIGHT, point(*start), point(*goal)), RULE)
     assert found.item() == pytest.approx(length, rel=1e-14)
-    energy = curve_energy(manifold, CUBIC, STRAIGHT, point(*start), point(*goal), RULE)
+    energy = curve_energy(manifold, Curves(CUBIC, STRAIGHT, point(*start), point(*goal)), RULE)
     assert energy.item() == pytest.approx(length**2, rel=1e-13)  # these run at constant speed
     if hasattr(manifold, "distance") and length != 2 * math.cos(1):
         assert manifold.distance(point(*start), point(*goal)).item() == pytest.approx(
@@ -67,10 +67,7 @@ def test_length_of_a_parabola():
     # y = 4x(1 − x) for 0 ≤ x ≤ 1: L = √17/2 + asinh(4)/8
     length = curve_length(
         Plane(2),
-        PinnedPolynomial(2, 2),
-        point(0, 4),
-        point(0, 0),
-        point(1, 0),
+        Curves(PinnedPolynomial(2, 2), point(0, 4), point(0, 0), point(1, 0)),
         Quadrature.gauss_legendre(40),
     )
     assert length.item() == pytest.approx(math.sqrt(17) / 2 + math.asinh(4) / 8, rel=1e-10)
@@ -81,10 +78,7 @@ def test_error_where_a_curve_turns_back_falls_like_the_square_of_the_nodes(count
     # x = 0.6t + 2t(1 − t) rises to 0.845 and comes back to 0.6.
     length = curve_length(
         Plane(1),
-        PinnedPolynomial(1, 2),
-        point(2),
-        point(0),
-        point(0.6),
+        Curves(PinnedPolynomial(1, 2), point(2), point(0), point(0.6)),
         Quadrature.gauss_legendre(count),
     )
     assert abs(length.item() - (2 * 0.845 - 0.6)) < 2 / count**2
@@ -93,7 +87,7 @@ def test_error_where_a_curve_turns_back_falls_like_the_square_of_the_nodes(count
 def test_a_curve_that_stays_where_it_is_has_no_length_and_no_nan_gradient():
     phi = STRAIGHT.clone().requires_grad_()
     for measure in (curve_length, curve_energy):
-        value = measure(Sphere(), CUBIC, phi, point(0.1, 0.2), point(0.1, 0.2), RULE)
+        value = measure(Sphere(), Curves(CUBIC, phi, point(0.1, 0.2), point(0.1, 0.2)), RULE)
         (gradient,) = torch.autograd.grad(value, phi)
         assert value.item() == 0.0
         assert torch.equal(gradient, torch.zeros_like(phi))
@@ -103,9 +97,9 @@ def test_lengths_of_a_batch_are_those_of_its_members():
     generator = torch.Generator().manual_seed(0)
     phi = torch.randn(3, 4, generator=generator, dtype=torch.float64)
     goals = torch.rand(3, 2, generator=generator, dtype=torch.float64)
-    batch = curve_length(Sphere(), CUBIC, phi, point(0, 0), goals, RULE)
+    batch = curve_length(Sphere(), Curves(CUBIC, phi, point(0, 0), goals), RULE)
     single = [
-        curve_length(Sphere(), CUBIC, p, point(0, 0), g, RULE)
+        curve_length(Sphere(), Curves(CUBIC, p, point(0, 0), g), RULE)
         for p, g in zip(phi, goals, strict=True)
     ]
     torch.testing.assert_close(batch, torch.stack(single), rtol=1e-14, atol=0)
@@ -113,7 +107,7 @@ def test_lengths_of_a_batch_are_those_of_its_members():
 
 def test_single_precision_curves_are_measured_in_single_precision():
     ends = torch.tensor([[0.0, 0.0], [0.0, 1.0]])
-    length = curve_length(Sphere(), CUBIC, torch.zeros(4), *ends, RULE)
+    length = curve_length(Sphere(), Curves(CUBIC, torch.zeros(4), *ends), RULE)
     assert length.dtype == torch.float32
     assert length.item() == pytest.approx(1.0, rel=1e-6)
 
@@ -121,7 +115,7 @@ def test_single_precision_curves_are_measured_in_single_precision():
 def test_lengths_can_be_measured_without_a_graph():
     phi = STRAIGHT.clone().requires_grad_()
     with torch.no_grad():
-        length = curve_length(Sphere(), CUBIC, phi, point(0, 0), point(0, 1), RULE)
+        length = curve_length(Sphere(), Curves(CUBIC, phi, point(0, 0), point(0, 1)), RULE)
     assert not length.requires_grad
     assert length.item() == pytest.approx(1.0, rel=1e-14)
 
@@ -135,15 +129,15 @@ def test_gradient_descent_on_the_length_finds_the_great_circle():
 
     def energy() -> torch.Tensor:
         optimiser.zero_grad()
-        value = curve_energy(Sphere(), curve, phi, start, goal, RULE)
+        value = curve_energy(Sphere(), Curves(curve, phi, start, goal), RULE)
         value.backward()
         return value
 
     optimiser.step(energy)
     exact = Sphere().distance(start, goal).item()
-    assert curve_length(Sphere(), curve, phi.detach(), start, goal, RULE).item() == pytest.approx(
-        exact, rel=1e-3
-    )
+    assert curve_length(
+        Sphere(), Curves(curve, phi.detach(), start, goal), RULE
+    ).item() == pytest.approx(exact, rel=1e-3)
 
 
 def test_chord_length():
@@ -163,15 +157,17 @@ def test_bad_input_is_refused_by_name(measure):
     good, phi = point(0.1, 0.1), torch.zeros(2, 4)
     phi[1, 2] = math.nan
     with pytest.raises(NonFiniteError, match=r"phi\[1, 2\] = nan"):
-        measure(Sphere(), CUBIC, phi, good, good, RULE)
+        measure(Sphere(), Curves(CUBIC, phi, good, good), RULE)
     with pytest.raises(NonFiniteError, match=r"goal\[1\] = -inf"):
-        measure(Sphere(), CUBIC, STRAIGHT, good, point(0, -math.inf), RULE)
+        measure(Sphere(), Curves(CUBIC, STRAIGHT, good, point(0, -math.inf)), RULE)
     with pytest.raises(GeometryError, match="the curve has dim 3: must be that of the manifold, 2"):
         measure(
-            Sphere(), PinnedPolynomial(3, 3), torch.zeros(6), torch.zeros(3), torch.zeros(3), RULE
+            Sphere(),
+            Curves(PinnedPolynomial(3, 3), torch.zeros(6), torch.zeros(3), torch.zeros(3)),
+            RULE,
         )
     with pytest.raises(CurveError, match=r"phi has shape \(3,\)"):
-        measure(Sphere(), CUBIC, torch.zeros(3), good, good, RULE)
+        measure(Sphere(), Curves(CUBIC, torch.zeros(3), good, good), RULE)
     with pytest.raises(GeometryError, match="count = 0"):
         Quadrature.gauss_legendre(0)
 
@@ -208,8 +204,8 @@ def test_default_lengths_are_within_their_tolerance(tolerance):
     for manifold in (Sphere(), Torus(), Plane(2)):
         for curve in (PinnedPolynomial(2, 7), PinnedSpline(2, 4)):
             phi, start, goal = draw(400, curve.coefficients), draw(400, 2), draw(400, 2)
-            reference = curve_length(manifold, curve, phi, start, goal, exact)
-            found = estimate_length(manifold, curve, phi, start, goal, tolerance)
+            reference = curve_length(manifold, Curves(curve, phi, start, goal), exact)
+            found = estimate_length(manifold, Curves(curve, phi, start, goal), tolerance)
             error = (found.length - reference).abs() / reference
             resolved = found.error <= tolerance * found.length
             assert tolerance < 1e-3 or resolved.double().mean() > 0.95
@@ -232,7 +228,7 @@ def test_default_lengths_on_a_learned_manifold_are_within_a_thousandth(trained):
         with torch.no_grad():
             points, _ = curve.evaluate(phi, start, goal, t)
             reference = torch.stack([chord_length(exact.embed(one)) for one in points])
-            length = curve_length(trained.manifold, curve, phi, start, goal)
+            length = curve_length(trained.manifold, Curves(curve, phi, start, goal))
         error = ((length - reference).abs() / reference.clamp(min=1e-9)).max().item()
         assert error <= 1e-3, curve
 
@@ -242,7 +238,7 @@ def test_a_curve_that_no_rule_resolves_says_so():
     curve = PinnedPolynomial(1, 14)
     phi = torch.zeros(13, dtype=torch.float64)
     phi[-1] = 50.0
-    found = estimate_length(Plane(1), curve, phi, point(0), point(0.1), tolerance=1e-9)
+    found = estimate_length(Plane(1), Curves(curve, phi, point(0), point(0.1)), tolerance=1e-9)
     assert math.isfinite(found.length.item())
     assert found.error > 1e-9 * found.length
 
@@ -261,7 +257,7 @@ def test_lengths_on_a_grid_agree_with_those_of_the_manifold_it_samples():
     generator = torch.Generator().manual_seed(2)
     phi = 0.3 * torch.randn(20, 4, generator=generator, dtype=torch.float64)
     smooth, sampled = (
-        curve_length(manifold, CUBIC, phi, point(-0.9, -0.8), point(0.7, 0.9))
+        curve_length(manifold, Curves(CUBIC, phi, point(-0.9, -0.8), point(0.7, 0.9)))
         for manifold in (Mercator(), grid)
     )
     torch.testing.assert_close(sampled, smooth, rtol=1e-3, atol=0)
@@ -272,7 +268,7 @@ def test_energy_and_length_of_a_grid_have_derivatives():
     phi = STRAIGHT.clone().requires_grad_()
     for measure in (curve_length, curve_energy):
         (gradient,) = torch.autograd.grad(
-            measure(grid, CUBIC, phi, point(0.5, 0.5), point(0.5, 0.5)), phi
+            measure(grid, Curves(CUBIC, phi, point(0.5, 0.5), point(0.5, 0.5))), phi
         )
         assert torch.equal(gradient, torch.zeros_like(phi)), "standing still: no NaN"
 
@@ -284,7 +280,9 @@ def test_energy_and_length_of_a_grid_have_derivatives():
         (lambda: Collocation.chebyshev(4, (0.0, 0.5)), "must rise from 0 to 1"),
         (lambda: Quadrature.gauss_legendre(4, (0.0, 0.7, 0.3, 1.0)), "must rise from 0 to 1"),
         (
-            lambda: estimate_length(Plane(2), CUBIC, STRAIGHT, point(0, 0), point(1, 0), 0.0),
+            lambda: estimate_length(
+                Plane(2), Curves(CUBIC, STRAIGHT, point(0, 0), point(1, 0)), 0.0
+            ),
             "tolerance = 0.0",
         ),
     ],
@@ -296,4 +294,4 @@ def test_impossible_rules_are_refused(make, message):
 
 def test_no_curves_have_no_lengths():
     empty = torch.zeros(0, 4, dtype=torch.float64)
-    assert curve_length(Sphere(), CUBIC, empty, point(0, 0), point(0, 1)).shape == (0,)
+    assert curve_length(Sphere(), Curves(CUBIC, empty, point(0, 0), point(0, 1))).shape == (0,)

@@ -6,9 +6,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from constraint_geodesics.geometry.analytic import Sphere, Torus
+from constraint_geodesics.geometry.analytic import (
+    LevelCircle,
+    LevelSet,
+    LevelSetError,
+    Sphere,
+    Torus,
+)
 from constraint_geodesics.geometry.graph import OUTSIDE, components_on_grid
-from constraint_geodesics.geometry.level_sets import LevelCircle, LevelSet, LevelSetError
 from constraint_geodesics.geometry.manifold import (
     EmbeddedManifold,
     GeometryError,

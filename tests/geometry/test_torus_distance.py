@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.integrate import solve_ivp
 
 from constraint_geodesics.geometry.analytic import Torus
-from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
 from constraint_geodesics.geometry.length import Quadrature, curve_energy
 from constraint_geodesics.geometry.torus_distance import torus_distance
 
@@ -111,12 +111,12 @@ def relaxed_length(radii, a, b):
 
     def energy():
         search.zero_grad()
-        total = curve_energy(torus, curve, phi, start, goal, rule).sum()
+        total = curve_energy(torus, Curves(curve, phi, start, goal), rule).sum()
         total.backward()
         return total
 
     search.step(energy)
-    return curve_energy(torus, curve, phi.detach(), start, goal, rule).min().sqrt().item()
+    return curve_energy(torus, Curves(curve, phi.detach(), start, goal), rule).min().sqrt().item()
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
-from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
-from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.geometry.analytic import LevelSet, Plane, Sphere, Torus
+from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
 from constraint_geodesics.geometry.grid import GridManifold
 from constraint_geodesics.geometry.length import (
     Quadrature,
@@ -23,7 +23,6 @@ from constraint_geodesics.geometry.length import (
     curve_energy,
     curve_length,
 )
-from constraint_geodesics.geometry.level_sets import LevelSet
 from constraint_geodesics.geometry.manifold import (
     EmbeddedManifold,
     MeasuredManifold,
@@ -298,10 +297,10 @@ def test_length_is_that_of_the_metric(name, batch, data):
     curve, phi, start, goal = draw_curve(data, MEMBERS[name], batch)
     z, velocity = curve.evaluate(phi, start, goal, RULE.nodes)
     square = torch.einsum("...i,...ij,...j->...", velocity, manifold.metric(z), velocity)
-    length = curve_length(manifold, curve, phi, start, goal, RULE)
+    length = curve_length(manifold, Curves(curve, phi, start, goal), RULE)
     assert length.shape == batch
     torch.testing.assert_close(length, (square.sqrt() * RULE.weights).sum(-1), rtol=1e-12, atol=0)
-    energy = curve_energy(manifold, curve, phi, start, goal, RULE)
+    energy = curve_energy(manifold, Curves(curve, phi, start, goal), RULE)
     torch.testing.assert_close(energy, (square * RULE.weights).sum(-1), rtol=1e-12, atol=0)
 
 
@@ -311,11 +310,11 @@ def test_length_is_that_of_the_metric(name, batch, data):
 def test_length_is_invariant_under_reparametrisation(name, batch, data):
     manifold = MEMBERS[name].manifold
     curve, phi, start, goal = draw_curve(data, MEMBERS[name], batch)
-    length = curve_length(manifold, curve, phi, start, goal, RULE)
-    slower = curve_length(manifold, Reparametrised(curve), phi, start, goal, RULE)
+    length = curve_length(manifold, Curves(curve, phi, start, goal), RULE)
+    slower = curve_length(manifold, Curves(Reparametrised(curve), phi, start, goal), RULE)
     torch.testing.assert_close(slower, length, rtol=1e-7, atol=0)
     signs = (-1.0) ** torch.arange(curve.degree - 1).repeat(curve.dim)
-    backwards = curve_length(manifold, curve, signs * phi, goal, start, RULE)
+    backwards = curve_length(manifold, Curves(curve, signs * phi, goal, start), RULE)
     torch.testing.assert_close(backwards, length, rtol=1e-12, atol=0)
 
 
@@ -325,7 +324,7 @@ def test_length_is_invariant_under_reparametrisation(name, batch, data):
 def test_no_curve_is_shorter_than_the_distance(name, batch, data):
     manifold = MEMBERS[name].manifold
     curve, phi, start, goal = draw_curve(data, MEMBERS[name], batch)
-    length = curve_length(manifold, curve, phi, start, goal, RULE)
+    length = curve_length(manifold, Curves(curve, phi, start, goal), RULE)
     assert (length >= manifold.distance(start, goal) * (1 - 1e-9)).all()
 
 
@@ -335,7 +334,7 @@ def test_no_curve_is_shorter_than_the_distance(name, batch, data):
 def test_chords_are_never_longer_than_the_curve_and_approach_it(name, batch, data):
     manifold = MEMBERS[name].manifold
     curve, phi, start, goal = draw_curve(data, MEMBERS[name], batch)
-    length = curve_length(manifold, curve, phi, start, goal, RULE)
+    length = curve_length(manifold, Curves(curve, phi, start, goal), RULE)
     for chords, shortfall in ((8, None), (512, 1e-3)):
         t = torch.linspace(0, 1, chords + 1, dtype=torch.float64)
         chord = chord_length(manifold.embed(curve.evaluate(phi, start, goal, t)[0]))
@@ -352,8 +351,10 @@ def test_energy_is_at_least_the_square_of_the_length(name, batch, data):
     start, goal = draw_points(data, MEMBERS[name], batch), draw_points(data, MEMBERS[name], batch)
     curve = PinnedPolynomial(manifold.dim, 4)
     phi = data.draw(tensors((*batch, curve.coefficients), -5.0, 5.0))
-    length = curve_length(manifold, curve, phi, start, goal, RULE)
-    assert (curve_energy(manifold, curve, phi, start, goal, RULE) >= length**2 * (1 - 1e-12)).all()
+    length = curve_length(manifold, Curves(curve, phi, start, goal), RULE)
+    assert (
+        curve_energy(manifold, Curves(curve, phi, start, goal), RULE) >= length**2 * (1 - 1e-12)
+    ).all()
 
 
 @every_member
@@ -369,10 +370,11 @@ def test_gradients_of_length_and_energy_agree_with_finite_differences(name, batc
     for measure in (curve_length, curve_energy):
         moving = phi.clone().requires_grad_()
         (gradient,) = torch.autograd.grad(
-            measure(manifold, curve, moving, start, goal, rule).sum(), moving
+            measure(manifold, Curves(curve, moving, start, goal), rule).sum(), moving
         )
         ahead, behind = (
-            measure(manifold, curve, phi + s * step * direction, start, goal, rule) for s in (1, -1)
+            measure(manifold, Curves(curve, phi + s * step * direction, start, goal), rule)
+            for s in (1, -1)
         )
         slope = ((ahead - behind) / (2 * step)).sum()
         torch.testing.assert_close((gradient * direction).sum(), slope, rtol=1e-6, atol=1e-7)

@@ -19,10 +19,10 @@ from hypothesis import strategies as st
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.graph_search import CombinedSolver, GraphSolver
 from constraint_geodesics.geodesics.policy_search import Actor, PolicySolver
-from constraint_geodesics.geodesics.problem import Box, ChartProblem
+from constraint_geodesics.geodesics.problem import ChartBox, ChartProblem
 from constraint_geodesics.geodesics.solver import geodesics_between
 from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
-from constraint_geodesics.geometry.curves import PinnedPolynomial, PinnedSpline
+from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial, PinnedSpline
 from constraint_geodesics.geometry.grid import GridManifold
 from constraint_geodesics.geometry.length import curve_length
 from constraint_geodesics.geometry.manifold import (
@@ -31,30 +31,38 @@ from constraint_geodesics.geometry.manifold import (
     OutsideError,
     pullback_metric,
 )
-from constraint_geodesics.studies.analytic_search import AnalyticTask, curve_family, run_analytic
+from constraint_geodesics.studies.geodesic_search import AnalyticTask, curve_family, run_analytic
 
 SEED = 3
 CUBIC = PinnedPolynomial(2, 3)
 WHOLE = {
-    "plane": (Plane(), Box((-1.5, -1.5), (1.5, 1.5))),
-    "sphere": (Sphere(), Box((-1.5, -math.pi), (1.5, math.pi))),
-    "torus": (Torus(), Box((-math.pi, -math.pi), (math.pi, math.pi))),
+    "plane": (Plane(), ChartBox((-1.5, -1.5), (1.5, 1.5))),
+    "sphere": (Sphere(), ChartBox((-1.5, -math.pi), (1.5, math.pi))),
+    "torus": (Torus(), ChartBox((-math.pi, -math.pi), (math.pi, math.pi))),
 }
 REACHES = {
     # manifold, family, box of the ends in which the family reaches every geodesic within 1e-3
-    "plane, cubic": ("plane", CUBIC, Box((-1.5, -1.5), (1.5, 1.5))),
-    "sphere, cubic": ("sphere", CUBIC, Box((-0.7, -1.0), (0.7, 1.0))),
-    "sphere, degree 7": ("sphere", PinnedPolynomial(2, 7), Box((-0.9, -math.pi), (0.9, math.pi))),
-    "sphere, 8 segments": ("sphere", PinnedSpline(2, 8), Box((-1.0, -math.pi), (1.0, math.pi))),
+    "plane, cubic": ("plane", CUBIC, ChartBox((-1.5, -1.5), (1.5, 1.5))),
+    "sphere, cubic": ("sphere", CUBIC, ChartBox((-0.7, -1.0), (0.7, 1.0))),
+    "sphere, degree 7": (
+        "sphere",
+        PinnedPolynomial(2, 7),
+        ChartBox((-0.9, -math.pi), (0.9, math.pi)),
+    ),
+    "sphere, 8 segments": (
+        "sphere",
+        PinnedSpline(2, 8),
+        ChartBox((-1.0, -math.pi), (1.0, math.pi)),
+    ),
     "torus, degree 7": (
         "torus",
         PinnedPolynomial(2, 7),
-        Box((-math.pi, -math.pi), (math.pi, math.pi)),
+        ChartBox((-math.pi, -math.pi), (math.pi, math.pi)),
     ),
     "torus, 4 segments": (
         "torus",
         PinnedSpline(2, 4),
-        Box((-math.pi, -math.pi), (math.pi, math.pi)),
+        ChartBox((-math.pi, -math.pi), (math.pi, math.pi)),
     ),
 }
 
@@ -174,7 +182,7 @@ def test_policy_search_is_a_solver_like_the_others(params, tmp_path) -> None:
     task = AnalyticTask("torus", curve_family(2, small), small, 0, tmp_path, nullcontext(Quiet()))
     result = run_analytic(task)
     solver = PolicySolver(result.policy.actor, small)
-    problem = ChartProblem(Torus(), CUBIC, Box((-1.0, -1.0), (1.0, 1.0)))
+    problem = ChartProblem(Torus(), CUBIC, ChartBox((-1.0, -1.0), (1.0, 1.0)))
     ends = problem.sample_ends(4, np.random.default_rng(0))
     found = geodesics_between(solver, problem, ends.z_start, ends.z_goal)
     exact = distance(Torus(), ends.z_start, ends.z_goal)
@@ -228,7 +236,7 @@ def wall(gap: bool) -> GridManifold:
 
 def test_a_wall_is_walked_around() -> None:
     manifold, curve = wall(gap=True), PinnedSpline(2, 16)
-    problem = ChartProblem(manifold, curve, Box((-1.0, -1.0), (1.0, 1.0)))
+    problem = ChartProblem(manifold, curve, ChartBox((-1.0, -1.0), (1.0, 1.0)))
     start, goal = np.array([[0.5, -0.5]]), np.array([[0.5, 0.5]])
     graph = GraphSolver.over_grid(manifold, (-1.0, -1.0), (1.0, 1.0), (41, 41))
     (found,) = geodesics_between(CombinedSolver(graph), problem, start, goal)
@@ -244,7 +252,7 @@ def test_a_wall_is_walked_around() -> None:
 
 def test_what_a_wall_separates_is_not_connected() -> None:
     manifold = wall(gap=False)
-    problem = ChartProblem(manifold, PinnedSpline(2, 4), Box((-1.0, -1.0), (1.0, 1.0)))
+    problem = ChartProblem(manifold, PinnedSpline(2, 4), ChartBox((-1.0, -1.0), (1.0, 1.0)))
     graph = GraphSolver.over_grid(manifold, (-1.0, -1.0), (1.0, 1.0), (41, 41))
     start, goal = np.array([[0.5, -0.5], [0.5, -0.5]]), np.array([[0.5, 0.5], [-0.5, -0.5]])
     for solver in (graph, CombinedSolver(graph)):
@@ -261,7 +269,7 @@ def test_what_a_wall_separates_is_not_connected() -> None:
 
 def test_ends_in_a_blocked_cell_are_refused_with_their_place() -> None:
     manifold = wall(gap=True)
-    problem = ChartProblem(manifold, CUBIC, Box((-1.0, -1.0), (1.0, 1.0)))
+    problem = ChartProblem(manifold, CUBIC, ChartBox((-1.0, -1.0), (1.0, 1.0)))
     inside, blocked, beyond = (
         np.array([[0.5, -0.5]]),
         np.array([[0.5, 0.01]]),
@@ -302,7 +310,7 @@ class Holed:
 
 def test_what_a_graph_found_is_not_lost_to_a_descent_that_sees_no_border() -> None:
     manifold = Holed()
-    problem = ChartProblem(manifold, PinnedSpline(2, 8), Box((-1.5, -1.5), (1.5, 1.5)))
+    problem = ChartProblem(manifold, PinnedSpline(2, 8), ChartBox((-1.5, -1.5), (1.5, 1.5)))
     points = problem.domain.sample(2000, np.random.default_rng(0))
     graph = GraphSolver.over_points(manifold, points[np.linalg.norm(points, axis=1) > 0.5])
     ends = np.array([[-1.0, 0.05]]), np.array([[1.0, 0.05]])
@@ -345,7 +353,7 @@ class Disc:
 
 
 def test_a_metric_that_is_not_finite_gives_no_short_curves() -> None:
-    problem = ChartProblem(Disc(), CUBIC, Box((-1.0, -1.0), (1.0, 1.0)))
+    problem = ChartProblem(Disc(), CUBIC, ChartBox((-1.0, -1.0), (1.0, 1.0)))
     inside, outside = np.array([[0.1, 0.1]]), np.array([[2.0, 2.0]])
     with np.errstate(over="raise"):
         (lost,) = geodesics_between(GradientSolver(), problem, inside, outside)
@@ -356,15 +364,17 @@ def test_a_metric_that_is_not_finite_gives_no_short_curves() -> None:
     with pytest.raises(NonFiniteError, match="length"):
         curve_length(
             Disc(),
-            CUBIC,
-            torch.zeros(4, dtype=torch.float64),
-            *torch.tensor([[0.1, 0.1], [2.0, 2.0]]).double(),
+            Curves(
+                CUBIC,
+                torch.zeros(4, dtype=torch.float64),
+                *torch.tensor([[0.1, 0.1], [2.0, 2.0]]).double(),
+            ),
         )
 
 
 def test_a_graph_has_no_edges_where_the_metric_is_not_finite() -> None:
     graph = GraphSolver.over_grid(Disc(), (-1.2, -1.2), (1.2, 1.2), (25, 25))
-    problem = ChartProblem(Disc(), CUBIC, Box((-1.0, -1.0), (1.0, 1.0)))
+    problem = ChartProblem(Disc(), CUBIC, ChartBox((-1.0, -1.0), (1.0, 1.0)))
     start, goal = np.array([[0.1, 0.1], [0.1, 0.1]]), np.array([[-0.5, 0.4], [1.1, 1.1]])
     for solver in (graph, CombinedSolver(graph)):
         inside, outside = geodesics_between(solver, problem, start, goal)
@@ -384,7 +394,7 @@ def test_a_straight_line_over_a_hill_is_left() -> None:
         def metric(self, z):
             return pullback_metric(self.embed, z)
 
-    problem = ChartProblem(Hill(), PinnedSpline(2, 4), Box((-1.5, -1.5), (1.5, 1.5)))
+    problem = ChartProblem(Hill(), PinnedSpline(2, 4), ChartBox((-1.5, -1.5), (1.5, 1.5)))
     (found,) = geodesics_between(
         GradientSolver(starts=1), problem, np.array([[-1.0, 0.0]]), np.array([[1.0, 0.0]])
     )

@@ -6,11 +6,13 @@ import pytest
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.learning.dataset import (
     DatasetError,
+    ShardTask,
     data_card,
     draw_queries,
     draw_shard,
     read_joints,
     read_queries,
+    seed_of,
     shard_tasks,
     write_joints,
     write_queries,
@@ -21,7 +23,7 @@ ABOUT = {"seed": "1", "constraint": "level_cup"}
 
 
 def labelled(scene, manifold, params, workers, rows=600):
-    tasks = shard_tasks(scene, manifold, "level_cup", rows, 200, 1)
+    tasks = shard_tasks(ShardTask(scene, manifold, rows, seed_of("level_cup", 1)), 200)
     return parallel_map(draw_shard, tasks, params.compute.model_copy(update={"workers": workers}))
 
 
@@ -87,7 +89,7 @@ def test_a_broken_table_is_named(scene, params, tmp_path) -> None:
 def test_a_constraint_out_of_reach_is_said(scene) -> None:
     far = Constraint((1, 1, 1, 0, 0, 0), reference=Pose.from_rpy([9.0, 0.0, 0.0], [0.0, 0.0, 0.0]))
     manifold = ConstraintManifold(scene.robot, far)
-    (task,) = shard_tasks(scene, manifold, "far", 10, 10, 1)
+    (task,) = shard_tasks(ShardTask(scene, manifold, 10, (1,)), 10)
     with pytest.raises(DatasetError, match="satisfy the constraint"):
         draw_shard(task)
 
@@ -95,7 +97,7 @@ def test_a_constraint_out_of_reach_is_said(scene) -> None:
 def test_seven_joints_are_labelled_alike(kuka_scene) -> None:
     pose = Pose.from_rpy([0.4, 0.0, 0.4], [np.pi / 2, 0.0, 0.0])
     manifold = ConstraintManifold(kuka_scene.robot, Constraint((0, 0, 0, 1, 1, 0), reference=pose))
-    (task,) = shard_tasks(kuka_scene, manifold, "level_cup", 100, 100, 1)
+    (task,) = shard_tasks(ShardTask(kuka_scene, manifold, 100, (1,)), 100)
     frame = draw_shard(task).frame
     assert "joint_7" in frame
     assert frame["residual"].max() <= 1e-9

@@ -4,12 +4,12 @@ import torch
 
 from constraint_geodesics.geodesics.problem import LearnedProblem
 from constraint_geodesics.geometry.curves import PinnedPolynomial
-from constraint_geodesics.learning.joint_chart import JointChart
+from constraint_geodesics.learning.learned_manifold import JointManifold
 
 
 @pytest.fixture(scope="module")
-def chart(trained) -> JointChart:
-    return JointChart.of(trained.joints)
+def chart(trained) -> JointManifold:
+    return JointManifold.of(trained.joints)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_its_metric_is_one_everywhere_and_its_deviation_adds_nothing(chart, trai
 
 def test_a_straight_line_without_constraint_is_the_joint_line(problem) -> None:
     ends = problem.sample_ends(60, np.random.default_rng(0))
-    look = problem.look(np.zeros((60, problem.curve.coefficients)), ends)
+    look = problem.observed(np.zeros((60, problem.curve.coefficients)), ends)
     assert look.costs.feasible.all()
     np.testing.assert_allclose(
         look.costs.length, np.linalg.norm(ends.q_goal - ends.q_start, axis=1), rtol=1e-5
@@ -57,7 +57,7 @@ def test_one_step_of_the_descent_straightens_a_curve_without_constraint(problem)
     rng = np.random.default_rng(1)
     ends = problem.sample_ends(60, rng)
     phi = 0.05 * ends.distance[:, None] * rng.normal(size=(60, problem.curve.coefficients))
-    look = problem.look(phi, ends)
+    look = problem.observed(phi, ends)
     inside = look.costs.feasible
     assert inside.sum() > 20
     left = np.linalg.norm(phi + look.descent, axis=1) / np.linalg.norm(phi, axis=1)
@@ -72,14 +72,14 @@ def test_the_fingerprint_tells_charts_apart(problem, trained) -> None:
             chart, problem.manifold, problem.curve, problem.joints, problem.degree, True, 1.0
         ).fingerprint()
 
-    assert problem.fingerprint() == on(JointChart.of(trained.joints.copy()))
+    assert problem.fingerprint() == on(JointManifold.of(trained.joints.copy()))
     assert problem.fingerprint() not in (
         on(trained.manifold),
-        on(JointChart.of(trained.joints[:100])),
+        on(JointManifold.of(trained.joints[:100])),
     )
 
 
 @pytest.mark.parametrize("joints", [np.zeros((5, 6)), np.ones(6), np.full((3, 6), np.nan)])
 def test_joints_that_span_nothing_are_refused(joints) -> None:
     with pytest.raises(ValueError, match=r"joints has shape"):
-        JointChart.of(joints)
+        JointManifold.of(joints)

@@ -7,8 +7,8 @@ import torch
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
 from constraint_geodesics.learning.learned_manifold import LearnedManifold, ManifoldFileError
-from constraint_geodesics.learning.submanifold import extract, submanifold_figures
-from constraint_geodesics.learning.training import train_manifold
+from constraint_geodesics.learning.submanifold import Surface, extract, submanifold_figures
+from constraint_geodesics.learning.training import TrainingRun, train_manifold
 
 
 def free_joints(scene, count):
@@ -29,7 +29,7 @@ def train(scene, params, name, folder, rows=6000, **changes):
     )
     joints = free_joints(scene, rows)
     return joints, train_manifold(
-        joints, scene.robot, settings, folder, lambda step, figures: None, progress=False
+        joints, scene.robot, settings, TrainingRun(folder, lambda step, figures: None, False)
     )
 
 
@@ -117,7 +117,8 @@ def test_seven_joints_train_and_keep_a_constraint(kuka_scene, params, tmp_path) 
     on_level = joints_of(frame)[free_rows(frame)]
     small = params.submanifold.model_copy(update={"nodes": 300})
     with kuka_scene.world() as world:
-        found = extract(result.manifold, level, joints, on_level, world.free, small)
-    figures = submanifold_figures(found, result.manifold, level, joints, on_level, small)
+        surface = Surface(result.manifold, level, world.free)
+        found = extract(surface, joints, on_level, small)
+    figures = submanifold_figures(found, surface, joints, on_level, small)
     assert figures["largest_component_share"] > 0.5
     assert len(found.edges) > 100

@@ -8,6 +8,7 @@ from constraint_geodesics.learning.submanifold import (
     UNKNOWN,
     GraphSubmanifold,
     GridSubmanifold,
+    Surface,
     component_of,
     extract,
     load_submanifold,
@@ -45,6 +46,10 @@ class PlaneChart:
         return q
 
 
+def everywhere(q):
+    return np.ones(len(q), bool)
+
+
 def configurations(scene, manifold, count):
     frame = draw_shard(ShardTask(scene, manifold, count, (3,))).frame
     return joints_of(frame)[free_rows(frame)]
@@ -55,19 +60,15 @@ def test_graph_edges_hold_and_components_are_answers(scene, params, tmp_path) ->
     small = params.submanifold.model_copy(update={"nodes": 500})
     joints = configurations(scene, manifold, 1000)
     with scene.world() as world:
-        found = extract(JointChart(6), manifold, joints, joints, world.free, small)
+        surface = Surface(JointChart(6), manifold, world.free)
+        found = extract(surface, joints, joints, small)
         assert isinstance(found, GraphSubmanifold)
         sizes = np.bincount(found.labels)
         assert len(sizes) >= 2, "tool down falls into several sheets"
         assert (np.diff(sizes) <= 0).all()
         node = int(np.flatnonzero(found.labels == 1)[0])
-        assert (
-            component_of(found, JointChart(6), manifold, found.joints[node], world.free, small) == 1
-        )
-        assert (
-            component_of(found, JointChart(6), manifold, np.full(6, 50.0), world.free, small)
-            == UNKNOWN
-        )
+        assert component_of(found, surface, found.joints[node], small) == 1
+        assert component_of(found, surface, np.full(6, 50.0), small) == UNKNOWN
     direct = np.linalg.norm(
         found.joints[found.edges[:, 0]] - found.joints[found.edges[:, 1]], axis=1
     )
@@ -75,7 +76,7 @@ def test_graph_edges_hold_and_components_are_answers(scene, params, tmp_path) ->
     save_submanifold(found, tmp_path)
     again = load_submanifold(tmp_path)
     np.testing.assert_array_equal(again.labels, found.labels)
-    figures = submanifold_figures(found, JointChart(6), manifold, joints, joints, small)
+    figures = submanifold_figures(found, surface, joints, joints, small)
     assert figures["components"] == len(sizes)
     assert figures["decoded_violation_p95"] < 1e-8
     assert figures["share_inside"] == 1.0
@@ -86,7 +87,7 @@ def test_a_plane_is_drawn_on_a_grid(scene, params) -> None:
     joints = configurations(scene, manifold, 200)
     chart = PlaneChart(joints[0])
     small = params.submanifold.model_copy(update={"grid": 60})
-    found = extract(chart, manifold, joints, joints, lambda q: np.ones(len(q), bool), small)
+    found = extract(Surface(chart, manifold, everywhere), joints, joints, small)
     assert isinstance(found, GridSubmanifold)
     assert found.inclusion.shape == (60, 60)
     assert (found.labels >= 0).any()
@@ -98,13 +99,7 @@ def test_a_plane_is_drawn_on_a_grid(scene, params) -> None:
 def test_no_constraint_keeps_everything(scene, params) -> None:
     manifold = scene.manifold(params.constraints["free"])
     joints = scene.robot.sample(50, np.random.default_rng(0))
-    found = extract(
-        PlaneChart(joints[0]),
-        manifold,
-        joints,
-        joints,
-        lambda q: np.ones(len(q), bool),
-        params.submanifold,
-    )
+    surface = Surface(PlaneChart(joints[0]), manifold, everywhere)
+    found = extract(surface, joints, joints, params.submanifold)
     assert (found.labels == 0).all()
     assert found.inclusion.max() == pytest.approx(0.0)

@@ -2,7 +2,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from tests.planner_fixtures import manifold_of, packaged_planner, pairs_of
+from tests.planner_fixtures import manifold_of, packaged_learned, packaged_planner, pairs_of
 
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
@@ -36,7 +36,7 @@ def length(joints: np.ndarray) -> float:
 @pytest.mark.parametrize("name", ["free", "level_cup", "level_cup_relaxed", "slide"])
 def test_paths_keep_the_constraint_in_either_chart(world: World, name: str) -> None:
     planner = packaged_planner()
-    chart = LearnedManifold.from_arrays(planner.bundle.manifold)
+    chart = LearnedManifold.from_arrays(packaged_learned().manifold)
     asked, solved = problem(world, name, 1), 0
     with Certifier(planner.scene) as judge:
         for search in (

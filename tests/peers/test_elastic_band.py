@@ -14,9 +14,10 @@ from constraint_geodesics.peers.ompl_settings import OmplSettings
 from constraint_geodesics.peers.straight_band import StraightBand
 from constraint_geodesics.peers.wrappers import BandAfter, band_after
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
+from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.world import Box, World
+from constraint_geodesics.scene.world import World
 from constraint_geodesics.search.band import BandSettings
 
 BIRRT = SamplingPlanner("birrt", OmplSettings(budget_s=60.0, iterations=300))

@@ -3,7 +3,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from tests.planner_fixtures import manifold_of, packaged_planner, pairs_of
+from tests.planner_fixtures import manifold_of, packaged_learned, packaged_planner, pairs_of
 
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
@@ -13,8 +13,9 @@ from constraint_geodesics.peers.latent_geodesic import executable
 from constraint_geodesics.peers.straight_latent import StraightLatent
 from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.clearance import clearance_model
-from constraint_geodesics.scene.world import Box, World
+from constraint_geodesics.scene.world import World
 
 NAMES = ("free", "level_cup", "level_cup_relaxed", "slide", "fixed_orientation")
 
@@ -47,7 +48,7 @@ class Bench:
 def bench() -> Iterator[Bench]:
     planner = packaged_planner()
     with planner.scene.world() as world, Certifier(planner.scene) as judge:
-        yield Bench(LearnedManifold.from_arrays(planner.bundle.manifold), world, judge)
+        yield Bench(LearnedManifold.from_arrays(packaged_learned().manifold), world, judge)
 
 
 def length(path: Solution) -> float:

@@ -4,21 +4,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.planner_fixtures import manifold_of, nodes_of, packaged_planner, pairs_of
+from tests.planner_fixtures import (
+    manifold_of,
+    nodes_of,
+    packaged_learned,
+    packaged_planner,
+    pairs_of,
+)
 
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
-from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.length import estimate_length
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import (
     GraphSubmanifold,
     GridSubmanifold,
+    Surface,
     on_graph,
     on_grid,
 )
-from constraint_geodesics.learning.training import train_manifold
+from constraint_geodesics.learning.training import TrainingRun, train_manifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.peers.latent_geodesic import same_constraint, straight_lengths
 from constraint_geodesics.peers.latent_graph import LatentGraphSearch, LatentGraphSettings
@@ -42,7 +49,7 @@ def world() -> Iterator[World]:
 
 @pytest.fixture(scope="module")
 def chart() -> LearnedManifold:
-    return LearnedManifold.from_arrays(packaged_planner().bundle.manifold)
+    return LearnedManifold.from_arrays(packaged_learned().manifold)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +62,7 @@ def plane(
     joints = nodes_of("free")[0]
     folder = tmp_path_factory.mktemp("plane")
     return train_manifold(
-        joints, scene.robot, small, folder, lambda *_: None, progress=False
+        joints, scene.robot, small, TrainingRun(folder, lambda *_: None, False)
     ).manifold
 
 
@@ -66,7 +73,7 @@ def problem(world: World, name: str, seed: int) -> PlanningProblem:
 
 def graph_of(chart: LearnedManifold, name: str, world: World, params: Params) -> GraphSubmanifold:
     manifold, joints = manifold_of(packaged_planner(), name), nodes_of(name)[0]
-    return on_graph(chart, manifold, joints, world.free, params.submanifold)
+    return on_graph(Surface(chart, manifold, world.free), joints, params.submanifold)
 
 
 def grid_of(plane: LearnedManifold, name: str, params: Params, cells: int = 60) -> GridSubmanifold:
@@ -227,6 +234,6 @@ def test_chords_measure_what_the_metric_does(chart: LearnedManifold) -> None:
     last = first + 0.2 * (last - first)
     line, none = PinnedPolynomial(chart.dim, 1), torch.zeros(20, 0, dtype=torch.float64)
     expected = estimate_length(
-        chart, line, none, torch.from_numpy(first), torch.from_numpy(last)
+        chart, Curves(line, none, torch.from_numpy(first), torch.from_numpy(last))
     ).length
     np.testing.assert_allclose(straight_lengths(chart, first, last), expected.numpy(), rtol=5e-3)

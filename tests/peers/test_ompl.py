@@ -12,7 +12,9 @@ from constraint_geodesics.peers.ompl import SamplingPlanner, Search
 from constraint_geodesics.peers.ompl_settings import OmplSettings
 from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
-from constraint_geodesics.scene.world import Box, World, data_path
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.urdf import data_path
+from constraint_geodesics.scene.world import World
 
 PLANNERS: tuple[Search, ...] = ("prm", "rrt_star", "birrt")
 SETTINGS = OmplSettings(budget_s=60.0, range_rad=4.0)

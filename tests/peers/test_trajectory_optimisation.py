@@ -24,9 +24,10 @@ from constraint_geodesics.peers.trajectory_optimisation import (
     groups_of,
 )
 from constraint_geodesics.problem import PathPlanner, PlanningProblem
+from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.world import Box, World
+from constraint_geodesics.scene.world import World
 from constraint_geodesics.search.band import BandSettings
 
 SLSQP = TrajectoryOptimisation(TrajectoryOptimisationSettings(starts=6))

@@ -15,7 +15,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info
 
-from constraint_geodesics.learning.dataset import draw_shard, shard_tasks
+from constraint_geodesics.learning.dataset import ShardTask, draw_shard, shard_tasks
 from constraint_geodesics.params import ComputeParams, Params
 from constraint_geodesics.pipeline import compute
 from constraint_geodesics.pipeline.compute import ComputeError, parallel_map
@@ -127,7 +127,7 @@ def test_a_stages_own_tasks_run_on_dask_as_on_loky(
     dask: ComputeParams, scene: Scene, params: Params
 ) -> None:
     manifold = scene.manifold(params.constraints["level_cup"])
-    tasks = shard_tasks(scene, manifold, "level_cup", 200, 100, 1)
+    tasks = shard_tasks(ShardTask(scene, manifold, 200, (1,)), 100)
     for ours, theirs in zip(
         parallel_map(draw_shard, tasks, TWO), parallel_map(draw_shard, tasks, dask), strict=True
     ):

@@ -19,8 +19,8 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import in_checkout
 from constraint_geodesics.recording.catalogue import (
     CatalogueError,
-    Entry,
-    Wanted,
+    Filter,
+    Listed,
     as_table,
     by_words,
     catalogue,
@@ -118,7 +118,7 @@ def geodesics(
     return lambda *words: called(monkeypatch, capfd, words)
 
 
-def unread(file: Path) -> Entry:
+def unread(file: Path) -> Listed:
     raise AssertionError(f"{file} is named by a table")
 
 
@@ -146,11 +146,9 @@ def test_files_that_no_table_names_speak_for_themselves(
     checkout: Path, scene: Scene, params: Params
 ) -> None:
     joints = np.linspace([0.0, -0.5, -1.0, 0.0, 0.5, 0.0], [0.3, -0.5, -1.0, 0.4, 0.5, 0.0], 5)
-    record = PathRecord("prm", "free", 4, 2, joints, "text", scene="keep_out")
+    record = PathRecord("prm", "free", 4, 2, joints, "text", scene="keep_out", meshes=False)
     file = Path("first_path/path.rrd")
-    record_path(
-        file, record, scene.manifold(params.constraints["free"]), (), frames=5, meshes=False
-    )
+    record_path(file, record, scene.manifold(params.constraints["free"]), (), frames=5)
     Path("data/recordings/broken.rrd").write_bytes(b"RRF2")
     broken, own = catalogue(Path(), read_entry)[-2:]
     assert (own.planner, own.constraint, own.scene, own.query, own.seed) == (
@@ -171,16 +169,16 @@ def test_files_that_no_table_names_speak_for_themselves(
 
 def test_the_list_is_narrowed_and_says_what_there_is_instead(checkout: Path) -> None:
     entries = catalogue(Path(), unread)
-    assert [e.number for e in narrowed(entries, Wanted(planners=("BIRRT",)))] == [3, 4, 6]
-    assert [e.number for e in narrowed(entries, Wanted(planners=("birrt",), seeds=(1,)))] == [4]
-    assert [e.number for e in narrowed(entries, Wanted(scene="table", query=0))] == [5, 6]
+    assert [e.number for e in narrowed(entries, Filter(planners=("BIRRT",)))] == [3, 4, 6]
+    assert [e.number for e in narrowed(entries, Filter(planners=("birrt",), seeds=(1,)))] == [4]
+    assert [e.number for e in narrowed(entries, Filter(scene="table", query=0))] == [5, 6]
     for wanted, message in (
-        (Wanted(constraint="cup"), "constraint cup is as asked for: there is level_cup"),
+        (Filter(constraint="cup"), "constraint cup is as asked for: there is level_cup"),
         (
-            Wanted(planners=("birrt", "prm")),
+            Filter(planners=("birrt", "prm")),
             "planner prm .* there is birrt, learned_geodesic, planned_path, ",
         ),
-        (Wanted(query=3), "query 3 .* there is 0"),
+        (Filter(query=3), "query 3 .* there is 0"),
     ):
         with pytest.raises(CatalogueError, match=message):
             narrowed(entries, wanted)
@@ -200,7 +198,7 @@ def test_the_list_is_narrowed_and_says_what_there_is_instead(checkout: Path) -> 
     ],
 )
 def test_paths_that_are_opened_at_once_answer_one_query(checkout, planners, seeds, numbers) -> None:
-    wanted = Wanted("level_cup", None, 0, planners, seeds)
+    wanted = Filter("level_cup", None, 0, planners, seeds)
     chosen = one_of_each(narrowed(catalogue(Path(), unread), wanted), wanted)
     assert [entry.number for entry in chosen] == numbers
 
@@ -295,8 +293,8 @@ def test_at_a_terminal_the_command_asks(checkout: Path) -> None:
 
 def entry(
     number: int, planner: str, valid: bool, scene: str = "", query: int = 0, manifold: str = ""
-) -> Entry:
-    return Entry(number, "slide", scene, planner, query, 0, 4.5, valid, f"{number}.rrd", manifold)
+) -> Listed:
+    return Listed(number, "slide", scene, planner, query, 0, 4.5, valid, f"{number}.rrd", manifold)
 
 
 def test_a_path_that_the_judge_accepts_is_opened_before_one_that_it_does_not() -> None:
@@ -305,9 +303,9 @@ def test_a_path_that_the_judge_accepts_is_opened_before_one_that_it_does_not() -
         entry(1, "learned_geodesic", False, manifold="paper"),
         entry(2, "learned_geodesic", True),
     ]
-    wanted = Wanted("slide", None, 0, ("learned_geodesic", "birrt"))
+    wanted = Filter("slide", None, 0, ("learned_geodesic", "birrt"))
     assert [e.number for e in one_of_each([*learned, entry(3, "birrt", True)], wanted)] == [2, 3]
-    assert [e.number for e in narrowed(learned, Wanted(manifold="paper"))] == [1]
+    assert [e.number for e in narrowed(learned, Filter(manifold="paper"))] == [1]
 
 
 def test_a_planner_without_a_path_of_the_query_is_named() -> None:
@@ -317,7 +315,7 @@ def test_a_planner_without_a_path_of_the_query_is_named() -> None:
         entry(3, "planner", True, "table"),
     ]
     with pytest.raises(CatalogueError, match="planner has no path of the query"):
-        one_of_each(entries, Wanted("slide", None, 0, ("learned_geodesic", "birrt", "planner")))
+        one_of_each(entries, Filter("slide", None, 0, ("learned_geodesic", "birrt", "planner")))
 
 
 def test_the_manifold_that_people_use_comes_before_the_papers(checkout: Path) -> None:
@@ -339,8 +337,8 @@ def test_one_command_opens_the_learned_path_over_the_sampled_one(
     joints = np.linspace([0.0, -0.5, -1.0, 0.0, 0.5, 0.0], [0.3, -0.5, -1.0, 0.4, 0.5, 0.0], 5)
     manifold = scene.manifold(params.constraints["level_cup"])
     for file, planner in ((LEARNED, "learned_geodesic"), (SAMPLED.format(0), "birrt")):
-        record = PathRecord(planner, "level_cup", 0, 0, joints, "text")
-        record_path(Path(file), record, manifold, scene.workcell, frames=5, meshes=False)
+        record = PathRecord(planner, "level_cup", 0, 0, joints, "text", meshes=False)
+        record_path(Path(file), record, manifold, scene.workcell, frames=5)
     asked = (
         "--constraint",
         "level_cup",

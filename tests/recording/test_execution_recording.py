@@ -39,7 +39,7 @@ def record(scene: Scene, params: Params) -> ExecutionRecord:
     start = retract(scene.manifold(params.constraints["level_cup"]), near).joints
     path = start + np.linspace(0.0, -2.6, 100)[:, None] * np.eye(6)[5]
     times = time_parametrisation(path, scene.robot.velocity, np.full(6, 4.0))
-    execution = execute(scene.robot, scene.workcell, path, times, AXIS, CUP)
+    execution = execute(scene, path, times, AXIS, CUP)
     return ExecutionRecord("straight joint line", "level_cup", 2, execution, CUP)
 
 

@@ -32,12 +32,18 @@ from constraint_geodesics.recording.recording import (
 )
 from constraint_geodesics.recording.viewer import prepared, save_recordings
 from constraint_geodesics.robot.kinematics import load_robot
-from constraint_geodesics.scene.world import Body, Box, Solid, Sphere, data_path
+from constraint_geodesics.scene.body import Body
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.capsule import Capsule
+from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.scene.urdf import data_path
 
 FRAMES = 10
 TABLE = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1))
 TRAY = Body("tray", data_path() / "tray" / "traybox.urdf", (0.6, 0.3, 0.1), (0.1, -0.2, 0.5))
 BALL = Sphere("keep_out", (0.3, 0.3, 0.6), 0.1)
+PIPE = Capsule("pipe", (-0.4, 0.2, 0.5), (-0.4, 0.5, 0.8), 0.05)
 LEVEL = Constraint(
     (0, 0, 0, 1, 1, 0),
     (0, 0, 0, 0.1, 0.1, 0),
@@ -67,7 +73,7 @@ class Writer:
         constraint: str = "level_cup",
         seed: int = 0,
         meshes: bool = False,
-        bodies: tuple[Solid, ...] = (TABLE,),
+        bodies: tuple[Shape, ...] = (TABLE,),
         latent: bool = False,
         frames: int = FRAMES,
     ) -> Path:
@@ -79,10 +85,11 @@ class Writer:
             -1, 2
         )
         view = LatentView(grid, np.zeros(25, int), curve, ("z1", "z2")) if latent else None
-        record = PathRecord(planner, constraint, 0, seed, joints, f"text of {planner} {seed}", view)
+        text = f"text of {planner} {seed}"
+        record = PathRecord(planner, constraint, 0, seed, joints, text, view, meshes=meshes)
         self.written += 1
         file = self.folder / f"{self.written}.rrd"
-        record_path(file, record, self.manifold, bodies, frames=frames, meshes=meshes)
+        record_path(file, record, self.manifold, bodies, frames=frames)
         return file
 
 
@@ -92,9 +99,9 @@ def write(tmp_path: Path) -> Writer:
     return Writer(tmp_path / "written")
 
 
-def together(tmp_path: Path, *files: Path, beside: bool = False) -> Path:
+def together(tmp_path: Path, *files: Path, apart: bool = False) -> Path:
     (tmp_path / "opened").mkdir()
-    (file,) = prepared(files, tmp_path / "opened", beside=beside)
+    (file,) = prepared(files, tmp_path / "opened", apart=apart)
     return file
 
 
@@ -191,7 +198,7 @@ def test_every_series_has_one_line_a_planner(write: Writer, tmp_path: Path) -> N
 
 
 def test_what_is_shared_is_there_once(write: Writer, tmp_path: Path) -> None:
-    bodies = (TABLE, TRAY, BALL)
+    bodies = (TABLE, TRAY, BALL, PIPE)
     sources = [
         write(name, latent=True, bodies=bodies, meshes=name == "prm")
         for name in ("planner", "birrt", "prm")
@@ -200,6 +207,7 @@ def test_what_is_shared_is_there_once(write: Writer, tmp_path: Path) -> None:
     for shared in (
         "workcell/table",
         "workcell/keep_out",
+        "workcell/pipe",
         "latent/submanifold",
         "tool/start",
         "tool/goal",
@@ -218,7 +226,7 @@ def test_side_by_side_each_recording_has_its_own_surroundings(
         tmp_path,
         write("planner", bodies=(TABLE,)),
         write("birrt", bodies=(TABLE, BALL)),
-        beside=True,
+        apart=True,
     )
     found = entities(file)
     assert {
@@ -264,8 +272,8 @@ def test_one_recording_opens_as_it_is_with_the_meshes_it_names(
         write("planner", meshes=True, bodies=(TABLE, TRAY)),
         write("planner", bodies=(TABLE, TRAY)),
     )
-    assert prepared([whole], tmp_path, beside=False) == [whole]
-    (file,) = prepared([slim], tmp_path, beside=False)
+    assert prepared([whole], tmp_path, apart=False) == [whole]
+    (file,) = prepared([slim], tmp_path, apart=False)
     before, after = read_recording(whole), read_recording(file)
     assert after.meshes == before.meshes == 8
     assert set(after.entity_paths) == set(before.entity_paths)
@@ -277,7 +285,7 @@ def test_one_recording_opens_as_it_is_with_the_meshes_it_names(
 
 def test_paths_of_several_constraints_open_each_by_itself(write: Writer, tmp_path: Path) -> None:
     files = write("planner", constraint="slide"), write("birrt")
-    shown = prepared(files, tmp_path, beside=False)
+    shown = prepared(files, tmp_path, apart=False)
     assert [read_recording(file).meshes for file in shown] == [7, 7]
     with pytest.raises(RecordingError, match="several constraints can't be saved as one"):
         save_recordings(files, tmp_path / "out.rrd")
@@ -288,7 +296,7 @@ def test_what_can_not_be_laid_over_each_other_is_refused(write: Writer, tmp_path
     with pytest.raises(
         RecordingError, match=r"1\.rrd and .*2\.rrd have different bodies .*--side-by-side"
     ):
-        prepared([plain, other], tmp_path, beside=False)
+        prepared([plain, other], tmp_path, apart=False)
 
 
 def test_executed_paths_are_neither_laid_over_each_other_nor_mixed_with_paths(
@@ -327,9 +335,9 @@ def test_series_with_spaces_in_their_name_keep_it(write: Writer, tmp_path: Path)
 def test_a_saved_comparison_opens_again(write: Writer, tmp_path: Path) -> None:
     save_recordings([write("planner"), write("birrt", frames=15)], tmp_path / "sent" / "both.rrd")
     sent = tmp_path / "sent" / "both.rrd"
-    assert prepared([sent], tmp_path, beside=False) == [sent]
+    assert prepared([sent], tmp_path, apart=False) == [sent]
     with pytest.raises(
         RecordingError, match=r"both\.rrd: not a recording of one path: open it by itself"
     ):
-        prepared([sent, sent], tmp_path, beside=False)
+        prepared([sent, sent], tmp_path, apart=False)
     assert list(tmp_path.glob("*.rrd")) == []

@@ -30,7 +30,9 @@ from constraint_geodesics.recording.recording import (
 )
 from constraint_geodesics.recording.viewer import open_recordings
 from constraint_geodesics.robot.kinematics import load_robot, rotation_from_rpy
-from constraint_geodesics.scene.world import Body, Box, data_path
+from constraint_geodesics.scene.body import Body
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.urdf import data_path
 
 FRAMES = 25
 TABLE = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1))
@@ -165,10 +167,10 @@ def test_body_of_the_workcell_stands_at_its_pose(xarm, tmp_path):
     manifold, joints = xarm
     record_path(tmp_path / "path.rrd", path_of(joints), manifold, [TABLE, TRAY], frames=FRAMES)
     pose = pose_of_link(tmp_path / "path.rrd", "tray/base_link", 0)
-    np.testing.assert_allclose(pose[:3, 3], TRAY.position, atol=1e-6)
-    np.testing.assert_allclose(pose[:3, :3], rotation_from_rpy(np.array(TRAY.rpy)), atol=1e-6)
+    np.testing.assert_allclose(pose[:3, 3], TRAY.position_m, atol=1e-6)
+    np.testing.assert_allclose(pose[:3, :3], rotation_from_rpy(np.array(TRAY.rpy_rad)), atol=1e-6)
     np.testing.assert_allclose(
-        column(tmp_path / "path.rrd", "/workcell/table", "Boxes3D:centers"), [[TABLE.centre]]
+        column(tmp_path / "path.rrd", "/workcell/table", "Boxes3D:centers"), [[TABLE.centre_m]]
     )
     half = column(tmp_path / "path.rrd", "/workcell/table", "Boxes3D:half_sizes")
     np.testing.assert_allclose(half, [[[1.2, 1.2, 0.05]]])
@@ -269,7 +271,7 @@ def test_without_meshes_a_recording_is_small_and_names_the_urdfs(xarm, tmp_path)
     whole, slim = tmp_path / "whole.rrd", tmp_path / "slim.rrd"
     for file, meshes in ((whole, True), (slim, False)):
         record_path(
-            file, path_of(joints, latent=latent), manifold, [TABLE, TRAY], frames=100, meshes=meshes
+            file, path_of(joints, latent=latent, meshes=meshes), manifold, [TABLE, TRAY], frames=100
         )
     small, large = read_recording(slim), read_recording(whole)
     assert (small.meshes, large.meshes) == (0, 8)
@@ -284,7 +286,7 @@ def test_ids_tell_paths_apart_that_share_their_name(xarm, tmp_path):
     manifold, joints = xarm
     paths = {"one": joints, "same": joints.copy(), "other": joints[::-1]}
     for name, own in paths.items():
-        record_path(tmp_path / name, path_of(own), manifold, [], frames=FRAMES, meshes=False)
+        record_path(tmp_path / name, path_of(own, meshes=False), manifold, [], frames=FRAMES)
     one, same, other = (read_recording(tmp_path / name).recording_id for name in paths)
     assert one == same != other
 
@@ -451,7 +453,8 @@ def test_without_a_display_the_browser_is_named(xarm, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    record_path(tmp_path / "path.rrd", path_of(xarm[1]), xarm[0], [], frames=FRAMES, meshes=False)
+    path = path_of(xarm[1], meshes=False)
+    record_path(tmp_path / "path.rrd", path, xarm[0], [], frames=FRAMES)
     with pytest.raises(RecordingError, match="no display .* add --web"):
         open_recordings([tmp_path / "path.rrd"], web=False)
 

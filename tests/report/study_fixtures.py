@@ -10,8 +10,7 @@ import pandas as pd
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.studies.execution import PLANNED, STRAIGHT
-from constraint_geodesics.studies.policy_benchmark import policy_table
-from constraint_geodesics.studies.policy_tasks import policy_figures
+from constraint_geodesics.studies.proposals import policy_figures, policy_table
 
 
 def policy_rows() -> pd.DataFrame:

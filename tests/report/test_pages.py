@@ -17,23 +17,29 @@ from tests.report.pages import DASHBOARD, check_page
 from tests.report.study_fixtures import write_study_reports
 
 from constraint_geodesics.learning.dataset import (
+    ShardTask,
     data_card,
     draw_shard,
     read_joints,
-    shard_tasks,
+    seed_of,
     write_joints,
 )
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.submanifold import extract, save_submanifold, submanifold_figures
+from constraint_geodesics.learning.submanifold import (
+    Surface,
+    extract,
+    save_submanifold,
+    submanifold_figures,
+)
 from constraint_geodesics.learning.vae import JointVae
 from constraint_geodesics.palette import planner_colour
 from constraint_geodesics.params import load_params
 from constraint_geodesics.pipeline.layout import Layout, in_checkout
-from constraint_geodesics.report.blocks import Recorded
 from constraint_geodesics.report.figures import PLANNERS
+from constraint_geodesics.report.page import Recorded
 from constraint_geodesics.report.pipeline_figures import latent_curves
 from constraint_geodesics.report.pipeline_page import write_report
-from constraint_geodesics.report.pipeline_tables import ablation_blocks, recorded_paths
+from constraint_geodesics.report.pipeline_tables import ablation_tables, recorded_paths
 from constraint_geodesics.report.results import (
     ReportError,
     compare_planners,
@@ -133,13 +139,13 @@ def small_params():
         update={"seeds": SEEDS, "illustrated_constraints": ("level_cup",), "analytic": ("plane",)}
     )
     submanifold = params.submanifold.model_copy(update={"grid": 20, "nodes": 30, "neighbours": 4})
-    queries = params.queries.model_copy(update={"count": QUERIES})
+    labels = params.labels.model_copy(update={"queries": QUERIES})
     return params.model_copy(
         update={
             "constraints": constraints,
             "geodesics": geodesics,
             "submanifold": submanifold,
-            "queries": queries,
+            "labels": labels,
         }
     )
 
@@ -227,7 +233,10 @@ def run(tmp_path_factory):
     rng = np.random.default_rng(0)
     for name in CONSTRAINTS:
         manifold = scene.manifold(params.constraints[name])
-        shards = [draw_shard(task) for task in shard_tasks(scene, manifold, name, 120, 120, 1)]
+        shards = [
+            draw_shard(task)
+            for task in shard_tasks(ShardTask(scene, manifold, 120, seed_of(name, 1)), 120)
+        ]
         write_joints(shards, layout.joints(name), {"seed": "1"})
         write_json(layout.report("label_joints", name), data_card(shards))
         write_csv(layout.report("benchmark_planners", name, "csv"), sampled_rows())
@@ -245,11 +254,10 @@ def run(tmp_path_factory):
                     read_joints(layout.joints(c)).free_joints for c in ("free", constraint)
                 )
                 constrained = scene.manifold(params.constraints[constraint])
-                found = extract(chart, constrained, free, own, world.free, params.submanifold)
+                surface = Surface(chart, constrained, world.free)
+                found = extract(surface, free, own, params.submanifold)
                 save_submanifold(found, layout.submanifold(name, constraint))
-                figures = submanifold_figures(
-                    found, chart, constrained, free, own, params.submanifold
-                )
+                figures = submanifold_figures(found, surface, free, own, params.submanifold)
                 write_json(layout.report("extract_submanifold", f"{name}-{constraint}"), figures)
     for manifold, constraint in searched_items(params):
         item, own = f"{manifold}-{constraint}", read_joints(layout.joints(constraint)).free_joints
@@ -374,7 +382,7 @@ def test_links_to_runs_are_filters_that_mlflow_takes(checked):
 
 
 def test_ablations_say_what_their_stages_measured(run):
-    searched, variance, families = ablation_blocks(*run)
+    searched, variance, families = ablation_tables(*run)
     rows = {row[0]: row[1:] for row in searched.rows}
     assert rows["plane, corrected reward, cubic"] == ["0.200", "0.100", "0.300", "2", "0.020"]
     assert rows["plane, reward as printed"] == ["3.000", "2.000", "4.000", "2", "0.020"]

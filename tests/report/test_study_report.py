@@ -38,7 +38,7 @@ def test_the_cup_on_both_paths(reported):
     assert block.rows[0] == ["planned path", "2", "100%", "100%", "0.6", "0", "0.002", "1.50"]
     assert block.rows[1][2:5] == ["25%", "0%", "90.0"]
     assert "tilts the cup by 115° or more" in block.note
-    planned, straight = block.looks
+    planned, straight = block.links
     (recorded,) = planned.recordings
     assert recorded.command == "geodesics replay data/recordings/execute_paths/level_cup/0.rrd"
     assert recorded.text == "query 0: executed, 12 of 12 spheres kept"

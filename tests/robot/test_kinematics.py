@@ -5,7 +5,7 @@ import pytest
 
 from constraint_geodesics.robot.kinematics import RobotError, load_robot, rotation_from_rpy
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.world import data_path
+from constraint_geodesics.scene.urdf import data_path
 
 ROBOTS = ["scene", "kuka_scene"]
 

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
+from constraint_geodesics.scene.body import Body
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.clearance import (
     ClearanceModel,
     clearance_batch,
@@ -14,12 +17,15 @@ from constraint_geodesics.scene.clearance import (
     link_clearances,
     outermost,
 )
-from constraint_geodesics.scene.world import Body, Box, Sphere, World, data_path
+from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.scene.urdf import data_path
+from constraint_geodesics.scene.world import World
 
 TABLE = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1), ("link_base",))
 KUKA_TABLE = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1), ("lbr_iiwa_link_0",))
 WALL = Box("wall", (0.6, 0.0, 0.5), (0.1, 2.0, 1.0))
 BALL = Sphere("ball", (0.35, 0.1, 0.4), 0.12)
+PIPE = Capsule("pipe", (0.4, 0.0, 0.2), (0.5, 0.1, 0.7), 0.12)
 BESIDE = Box("wall", (0.0, 0.55, 0.5), (4.0, 0.2, 4.0))
 SKIN = 0.004
 """Clearance [m] up to which PyBullet may report a contact: the margin of its collision shapes, and
@@ -64,6 +70,7 @@ def lift(tmp_path_factory: pytest.TempPathFactory) -> SerialRobot:
         ("xarm", (TABLE, WALL), 0.15),
         ("xarm", (BALL,), 0.1),
         ("xarm", (TABLE, BALL), 0.15),
+        ("xarm", (TABLE, PIPE), 0.15),
         ("kuka", (KUKA_TABLE,), 0.05),
         ("kuka", (KUKA_TABLE, WALL), 0.1),
         ("lift", (BESIDE,), 0.1),
@@ -73,6 +80,7 @@ def lift(tmp_path_factory: pytest.TempPathFactory) -> SerialRobot:
         "xarm wall",
         "xarm ball",
         "xarm table and ball",
+        "xarm table and pipe",
         "kuka table",
         "kuka wall",
         "sliding joint",
@@ -123,7 +131,13 @@ def distances(model: ClearanceModel, robot: SerialRobot, q: np.ndarray) -> tuple
 
 @pytest.mark.parametrize(
     ("name", "boxes"),
-    [("xarm", (TABLE, WALL)), ("xarm", (BALL,)), ("kuka", (KUKA_TABLE, WALL)), ("lift", (BESIDE,))],
+    [
+        ("xarm", (TABLE, WALL)),
+        ("xarm", (BALL,)),
+        ("xarm", (PIPE,)),
+        ("kuka", (KUKA_TABLE, WALL)),
+        ("lift", (BESIDE,)),
+    ],
 )
 def test_each_row_is_the_gradient_of_its_links_distance(request, name, boxes) -> None:
     robot: SerialRobot = request.getfixturevalue(name)
@@ -237,7 +251,7 @@ def test_links_of_any_collision_shape_are_known(tmp_path, shapes) -> None:
 
 
 @pytest.mark.parametrize(
-    "bodies", [(TABLE, BALL), (WALL, BALL, BESIDE)], ids=("table and ball", "three")
+    "bodies", [(TABLE, BALL), (WALL, BALL, BESIDE), (PIPE, WALL)], ids=("two", "three", "pipe")
 )
 def test_points_passed_over_in_groups_are_none_that_are_nearest(xarm, bodies) -> None:
     """Against every point asked one by one."""

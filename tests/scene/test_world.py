@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.world import Box, World
+from constraint_geodesics.scene.world import World
 
 
 def test_upright_is_free_and_bent_into_the_table_is_not(scene: Scene) -> None:

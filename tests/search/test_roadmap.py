@@ -16,7 +16,7 @@ from constraint_geodesics.geometry.graph import components, nearest_neighbour_ed
 from constraint_geodesics.params import Params
 from constraint_geodesics.scene.clearance import ClearanceModel, clearance_model
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.world import Sphere
+from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.band import BandSpace, project
 from constraint_geodesics.search.roadmap import (
     JOINED,

@@ -9,7 +9,7 @@ import pytest
 from tests.planner_fixtures import NAMES, manifold_of, packaged_planner, pairs_of
 
 from constraint_geodesics.scene.clearance import clearance_model
-from constraint_geodesics.scene.world import Sphere
+from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.band import BandSpace, project
 from constraint_geodesics.search.roadmap import edge_lengths
 from constraint_geodesics.search.tree import TreeSettings, tree_way

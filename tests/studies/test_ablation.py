@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from constraint_geodesics.geometry.curves import PinnedSpline
+from constraint_geodesics.geometry.curves import PinnedPolynomial, PinnedSpline
 from constraint_geodesics.geometry.manifold import EmbeddedManifold
 from constraint_geodesics.studies.ablation import (
     LearnedAblation,
@@ -10,20 +10,17 @@ from constraint_geodesics.studies.ablation import (
     family_ratios,
     path_figures,
     policy_variants,
-    variant_task,
 )
 
 
-def test_each_variant_changes_one_thing(params, tmp_path) -> None:
+def test_each_variant_changes_one_thing(params) -> None:
     variants = policy_variants(params.geodesics)
     assert list(variants) == ["printed_reward", "spline_2", "spline_4"]
-    printed, segments = variants["printed_reward"]
-    assert segments == 0
+    family, printed = variants["printed_reward"]
+    assert family == PinnedPolynomial(2, params.geodesics.degree)
     assert printed.reward.form == "printed"
     assert printed.model_copy(update={"reward": params.geodesics.reward}) == params.geodesics
-    task = variant_task("sphere", "spline_4", params.geodesics, 3, tmp_path, None)
-    assert task.curve == PinnedSpline(2, 4)
-    assert task.params == params.geodesics
+    assert variants["spline_4"] == (PinnedSpline(2, 4), params.geodesics)
 
 
 def test_richer_families_reach_further(params) -> None:

@@ -39,7 +39,7 @@ def timed(robot: SerialRobot, path: np.ndarray, acceleration: float = 4.0) -> np
 def run(
     scene: Scene, path: np.ndarray, times: np.ndarray, settings: CupSettings = QUICK
 ) -> Execution:
-    return execute(scene.robot, scene.workcell, path, times, UP_IN_TOOL, settings)
+    return execute(scene, path, times, UP_IN_TOOL, settings)
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +148,8 @@ SAME = """
 import sys
 import numpy as np
 from pathlib import Path
-from constraint_geodesics.scene.world import Box
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.cup import CupSettings, execute
 from constraint_geodesics.robot.kinematics import load_robot
 
@@ -156,7 +157,7 @@ given = np.load(sys.argv[1])
 robot = load_robot(Path(str(given["urdf"])), str(given["tool"]))
 table = Box("table", tuple(given["centre"]), tuple(given["size"]), ("link_base",))
 settings = CupSettings(settle_s=0.25)
-result = execute(robot, [table], given["path"], given["times"], given["axis"], settings)
+result = execute(Scene(robot, (table,)), given["path"], given["times"], given["axis"], settings)
 np.savez(sys.argv[2], spheres=result.sphere_positions, joints=result.joints, cup=result.cup_pose)
 """
 
@@ -170,8 +171,8 @@ def test_the_same_call_gives_the_same_in_a_fresh_process(
         tmp_path / "in.npz",
         urdf=str(scene.robot.urdf),
         tool=scene.robot.tool_link,
-        centre=table.centre,
-        size=table.size,
+        centre=table.centre_m,
+        size=table.size_m,
         path=path,
         times=timed(scene.robot, path),
         axis=UP_IN_TOOL,
@@ -197,9 +198,7 @@ def test_the_seed_moves_the_spheres_only(scene: Scene, level: np.ndarray) -> Non
 
 def test_a_cup_that_hangs_upside_down_is_empty(scene: Scene, level: np.ndarray) -> None:
     path = turned(level, 0, 0.2, rows=10)
-    result = execute(
-        scene.robot, scene.workcell, path, timed(scene.robot, path), -2.0 * UP_IN_TOOL, QUICK
-    )
+    result = execute(scene, path, timed(scene.robot, path), -2.0 * UP_IN_TOOL, QUICK)
     assert result.kept == 0
     assert result.largest_tilt_rad == pytest.approx(np.pi, abs=1e-2)
 
@@ -209,9 +208,7 @@ def test_another_robot_and_axis(kuka_scene: Scene) -> None:
     up = np.array([0.0, 0.6, 0.0, -1.2, 0.0, -1.8, 0.0])  # the tool's z axis points up
     path = turned(up, 0, 1.0)
     assert robot.forward(up)[1][2, 2] == pytest.approx(1.0, abs=1e-9)
-    result = execute(
-        robot, kuka_scene.workcell, path, timed(robot, path, 3.0), np.array([0.0, 0.0, 1.0]), QUICK
-    )
+    result = execute(kuka_scene, path, timed(robot, path, 3.0), np.array([0.0, 0.0, 1.0]), QUICK)
     assert result.kept == result.spheres
     assert result.joints.shape[1] == 7
     assert result.cup_pose[0, 2] == pytest.approx(
@@ -226,7 +223,7 @@ ROWS, TIMES = np.zeros((3, 6)) + np.arange(3)[:, None] * 0.1, np.arange(3.0)
     ("change", "message"),
     [
         ({"joints": ROWS[:, :5]}, r"joints has shape \(3, 5\): must be \(T, 6\)"),
-        ({"joints": ROWS[:1], "times": TIMES[:1]}, "at least two rows"),
+        ({"joints": ROWS[:1], "times": TIMES[:1]}, "at least two waypoints"),
         ({"times": TIMES[:2]}, r"times has shape \(2,\): must be \(3,\)"),
         ({"times": np.array([0.0, 1.0, 1.0])}, r"times\[2\] - times\[1\] = 0.0: must be positive"),
         ({"times": np.array([0.0, 1.0, np.nan])}, "times = nan: must be finite"),
@@ -241,7 +238,7 @@ ROWS, TIMES = np.zeros((3, 6)) + np.arange(3)[:, None] * 0.1, np.arange(3.0)
 def test_misuse_is_named(scene: Scene, change: dict, message: str) -> None:
     arguments = {"joints": ROWS, "times": TIMES, "cup_axis_in_tool": UP_IN_TOOL} | change
     with pytest.raises(ExecutionError, match=message):
-        execute(scene.robot, scene.workcell, **arguments)
+        execute(scene, **arguments)
 
 
 @pytest.mark.parametrize(

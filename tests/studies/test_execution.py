@@ -14,7 +14,7 @@ from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.learning.dataset import Queries, draw_queries
 from constraint_geodesics.learning.lift import densify
-from constraint_geodesics.params import Params
+from constraint_geodesics.params import ExecutionParams, Params
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.cup import CupSettings
@@ -24,6 +24,7 @@ from constraint_geodesics.studies.execution import (
     PLANNED,
     ROW_SPACING_RAD,
     STRAIGHT,
+    Carrying,
     Executed,
     ExecutionCheckError,
     TippingQueries,
@@ -36,6 +37,12 @@ from constraint_geodesics.studies.execution import (
 LEVEL = "level_cup"
 SEED, LEAST, ACCELERATION = 13, 2.0, 10.0
 CUP = CupSettings(spheres=3, settle_s=0.25)
+
+
+def wanted(queries: int, least_tilt_rad: float) -> ExecutionParams:
+    return ExecutionParams.model_construct(
+        queries=queries, least_tilt_rad=least_tilt_rad, seed=SEED, spheres=3, recorded=0
+    )
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +58,7 @@ def planner() -> Iterator[Planner]:
 
 @pytest.fixture(scope="module")
 def found(scene: Scene, manifold: ConstraintManifold) -> TippingQueries:
-    return tipping_queries(scene, manifold, LEVEL, 3, LEAST, SEED)
+    return tipping_queries(scene, manifold, LEVEL, wanted(3, LEAST))
 
 
 Results = tuple[pd.DataFrame, list[Executed]]
@@ -59,7 +66,7 @@ Results = tuple[pd.DataFrame, list[Executed]]
 
 def run(planner: Planner, scene: Scene, manifold: ConstraintManifold, queries: Queries) -> Results:
     plan = partial(planner.plan, constraint=LEVEL)
-    return execute_queries(plan, scene, manifold, LEVEL, queries, ACCELERATION, CUP)
+    return execute_queries(plan, Carrying(LEVEL, scene, manifold, ACCELERATION, CUP), queries)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +101,7 @@ def test_queries_are_the_first_whose_line_tips_the_cup(
 def test_more_pairs_are_drawn_while_too_few_tip_the_cup(
     scene: Scene, manifold: ConstraintManifold
 ) -> None:
-    rare = tipping_queries(scene, manifold, LEVEL, 1, 3.1, SEED)
+    rare = tipping_queries(scene, manifold, LEVEL, wanted(1, 3.1))
     assert rare.drawn > 8
     assert len(rare.queries) == 1
     assert line_tilts(manifold, rare.queries) == rare.tilt_rad >= 3.1
@@ -167,7 +174,7 @@ def test_a_tilt_that_means_nothing_is_named(
     with pytest.raises(
         ExecutionCheckError, match=f"least_tilt_rad = {least}: must lie between 0 and π"
     ):
-        tipping_queries(scene, manifold, LEVEL, 1, least, SEED)
+        tipping_queries(scene, manifold, LEVEL, wanted(1, least))
 
 
 def test_too_few_lines_that_tip_the_cup_are_named(
@@ -176,7 +183,7 @@ def test_too_few_lines_that_tip_the_cup_are_named(
     with pytest.raises(
         ExecutionCheckError, match=r"0 of 256 straight lines under 'level_cup' .* 1 are needed"
     ):
-        tipping_queries(scene, manifold, LEVEL, 1, 3.14159, SEED)
+        tipping_queries(scene, manifold, LEVEL, wanted(1, 3.14159))
 
 
 def test_figures_of_a_table_made_by_hand() -> None:

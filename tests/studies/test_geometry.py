@@ -8,15 +8,15 @@ import torch
 
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.graph_search import GraphSolver
-from constraint_geodesics.geodesics.problem import Box, ChartProblem, LearnedProblem, Samples
+from constraint_geodesics.geodesics.problem import ChartBox, ChartProblem, LearnedProblem, Samples
 from constraint_geodesics.geometry.analytic import Sphere
 from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.geometry.length import curve_length
 from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
 from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.studies.geometry import (
     GeometryBenchmark,
     alternately,
-    default_length,
     naive_length,
     naive_retracted_length,
     one_thread,
@@ -47,7 +47,7 @@ def test_all_sides_measure_the_same_lengths(benchmark) -> None:
     curves, _ = random_curves(benchmark.plain, 20)
     with torch.no_grad():
         ours, naive = (
-            measure(benchmark.manifold, curves) for measure in (default_length, naive_length)
+            measure(benchmark.manifold, curves) for measure in (curve_length, naive_length)
         )
     reference = reference_length(benchmark.manifold, curves)
     torch.testing.assert_close(ours, reference, rtol=1e-3, atol=0)
@@ -99,7 +99,7 @@ def test_finer_rules_err_less(benchmark) -> None:
 
 
 def test_solvers_are_compared_with_the_exact_distance_or_with_the_best() -> None:
-    problem = ChartProblem(Sphere(), PinnedPolynomial(2, 3), Box((-0.6, -0.6), (0.6, 0.6)))
+    problem = ChartProblem(Sphere(), PinnedPolynomial(2, 3), ChartBox((-0.6, -0.6), (0.6, 0.6)))
     ends = problem.sample_ends(5, np.random.default_rng(0))
     graph = GraphSolver.over_points(Sphere(), problem.domain.sample(100, np.random.default_rng(1)))
     solvers = {"gradient": GradientSolver(), "graph": graph}

@@ -23,9 +23,11 @@ from constraint_geodesics.peers.ompl_settings import OmplSettings
 from constraint_geodesics.peers.straight_band import StraightBand
 from constraint_geodesics.problem import PlanningProblem
 from constraint_geodesics.report.figures import save_png
-from constraint_geodesics.report.growth_figure import LABELS, growth_figure
+from constraint_geodesics.report.growth_figure import LABELS, growth_figure, slopes_markdown
 from constraint_geodesics.scene.clearance import clearance_model
-from constraint_geodesics.scene.world import Sphere, World
+from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.scene.world import World
+from constraint_geodesics.studies import growth
 from constraint_geodesics.studies.growth import (
     AWAY_M,
     AXES,
@@ -39,7 +41,6 @@ from constraint_geodesics.studies.growth import (
     measure_growth,
     place_spheres,
     slopes,
-    slopes_markdown,
 )
 
 SIZES = GrowthSizes(
@@ -101,10 +102,8 @@ def test_the_standard_error_is_that_of_the_textbook():
     rng = np.random.default_rng(0)
     values = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0])
     seconds = 0.3 * values**1.5 * np.exp(rng.normal(scale=0.2, size=6))
-    fit, textbook = (
-        slopes(law(values, seconds)).iloc[0],
-        linregress(np.log(values), np.log(seconds)),
-    )
+    fit = slopes(law(values, seconds)).iloc[0]
+    textbook = linregress(np.log(values), np.log(seconds))
     assert fit["slope"] == pytest.approx(textbook.slope)
     assert fit["standard_error"] == pytest.approx(textbook.stderr)
 
@@ -328,18 +327,19 @@ def queries(params, scene):
 
 def test_spheres_leave_room_around_both_ends(scene, queries):
     spheres = place_spheres(scene, queries, 5, 0.06, np.random.default_rng(2))
-    assert len({sphere.centre for sphere in spheres}) == len(spheres) == 5
+    assert len({sphere.centre_m for sphere in spheres}) == len(spheres) == 5
     assert spheres == place_spheres(scene, queries, 5, 0.06, np.random.default_rng(2))
-    wider = [replace(sphere, radius=sphere.radius + 0.9 * AWAY_M) for sphere in spheres]
+    wider = [replace(sphere, radius_m=sphere.radius_m + 0.9 * AWAY_M) for sphere in spheres]
     with World(scene.robot, (*scene.workcell, *wider)) as world:
         assert world.free(np.concatenate([queries.starts, queries.goals])).all()
 
 
-def test_spheres_that_do_not_fit_are_an_error(scene, queries):
+def test_spheres_that_do_not_fit_are_an_error(scene, queries, monkeypatch):
+    monkeypatch.setattr(growth, "TRIES", 10)
     with pytest.raises(
-        ValueError, match="no room for 3 spheres of 1.0 m beside the ends of 4 queries"
+        ValueError, match="no room for 3 spheres of 1.0 m near the ends of 4 queries"
     ):
-        place_spheres(scene, queries, 3, 1.0, np.random.default_rng(2), tries=10)
+        place_spheres(scene, queries, 3, 1.0, np.random.default_rng(2))
 
 
 @pytest.fixture(scope="module")

@@ -29,13 +29,11 @@ from constraint_geodesics.tracking import experiment
 from constraint_geodesics.tracking.experiment import (
     ChildRun,
     Subject,
-    TrackingError,
-    dvc_md5,
+    Work,
     subject_of,
     tracked_stage,
-    tracking_uri,
-    ui_command,
 )
+from constraint_geodesics.tracking.store import TrackingError, dvc_md5, tracking_uri, ui_command
 
 TWO = ComputeParams(backend="loky", workers=2)
 
@@ -101,9 +99,7 @@ def test_a_stage_is_a_parent_its_seeds_are_children(root: Path) -> None:
         **{f"p{i}": i for i in range(150)},
     }
     about = Subject({"constraint": "cup"}, {"manifold": {"latent_dim": 6}})
-    with tracked_stage(
-        "train", "planner-cup", params, [], experiment="tree", root=root, subject=about
-    ) as stage:
+    with tracked_stage(Work("train", "planner-cup", params, [], about), "tree", root) as stage:
         tasks = [(stage.child(f"seed {seed}", {"seed": seed}), seed) for seed in (1, 3)]
         curves = [
             [{"steps": 1.0, "loss": 1.0}, {"steps": 2.0, "loss": 5.0}],
@@ -156,7 +152,7 @@ def test_a_run_says_where_its_paths_are_recorded(root: Path) -> None:
             "recording": recording,
         }
 
-    with tracked_stage("train", "cup", {}, [], experiment="recorded", root=root) as stage:
+    with tracked_stage(Work("train", "cup"), "recorded", root) as stage:
         for seed in (0, 1):
             with stage.child(f"seed {seed}", {"seed": seed}):
                 pass
@@ -182,8 +178,9 @@ def test_a_run_says_where_its_paths_are_recorded(root: Path) -> None:
 def test_the_machine_is_watched_while_a_stage_runs(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(experiment, "SYSTEM_AFTER_S", 0.0)
     monkeypatch.setattr(experiment, "SYSTEM_EVERY_S", 0.05)
-    with tracked_stage("train", "cup", {}, [], experiment="watched", root=root) as stage:
+    with tracked_stage(Work("train", "cup"), "watched", root) as stage:
         time.sleep(0.5)
     metrics = MlflowClient(stage.tracking_uri).get_run(stage.run_id).data.metrics
     assert 0.0 < metrics["system/system_memory_usage_percentage"] < 100.0
@@ -195,7 +192,7 @@ def test_a_run_of_an_experiment_is_named_after_it(
 ) -> None:
     monkeypatch.setenv("DVC_EXP_NAME", "tilt-5")
     with (
-        tracked_stage("train", "cup", {}, [], experiment="named after", root=root) as stage,
+        tracked_stage(Work("train", "cup"), "named after", root) as stage,
         stage.child("seed 1", {"seed": 1}),
     ):
         pass
@@ -221,7 +218,7 @@ def test_runs_are_found_by_constraint_manifold_and_reward() -> None:
 
 
 def test_figures_that_some_seeds_lack_are_counted(root: Path) -> None:
-    with tracked_stage("train", "gaps", {}, [], experiment="gaps", root=root) as stage:
+    with tracked_stage(Work("train", "gaps"), "gaps", root) as stage:
         for seed in (1, 2, 3):
             with stage.child(f"seed {seed}", {}):
                 pass
@@ -246,7 +243,7 @@ def test_the_json_report_and_the_store_hold_the_same_numbers(root: Path, tmp_pat
         "zero": -0.0,
         "valid": True,
     }
-    with tracked_stage("label", "cup", {}, [], experiment="report", root=root) as stage:
+    with tracked_stage(Work("label", "cup"), "report", root) as stage:
         stage.report(figures, tmp_path / "new" / "cup.json")
         stage.report(dict(reversed(figures.items())), tmp_path / "again.json")
         stage.metric_logger()(7, {"epoch_loss": 0.5})
@@ -274,7 +271,7 @@ def test_the_json_report_and_the_store_hold_the_same_numbers(root: Path, tmp_pat
 
 def test_sources_that_differ_make_a_run_dirty_but_reports_do_not(root: Path) -> None:
     def dirty() -> str:
-        with tracked_stage("label", "cup", {}, [], experiment="dirty", root=root) as stage:
+        with tracked_stage(Work("label", "cup"), "dirty", root) as stage:
             pass
         return str(MlflowClient(stage.tracking_uri).get_run(stage.run_id).data.tags["git_dirty"])
 
@@ -293,7 +290,7 @@ def test_a_stage_that_fails_says_so_and_ends_its_children(
     root: Path, error: BaseException, status: str
 ) -> None:
     def stage() -> None:
-        with tracked_stage("train", "cup", {}, [], experiment=status, root=root) as run:
+        with tracked_stage(Work("train", "cup"), status, root) as run:
             run.child("abandoned", {}).__enter__()
             raise error
 
@@ -305,7 +302,7 @@ def test_a_stage_that_fails_says_so_and_ends_its_children(
 
 
 def test_a_child_that_fails_says_so_and_its_name_is_new(root: Path) -> None:
-    with tracked_stage("train", "cup", {}, [], experiment="child", root=root) as stage:
+    with tracked_stage(Work("train", "cup"), "child", root) as stage:
         child = stage.child("seed 1", {})
         with pytest.raises(ValueError, match="seed 1"):
             stage.child("seed 1", {})
@@ -317,7 +314,7 @@ def test_a_child_that_fails_says_so_and_its_name_is_new(root: Path) -> None:
 
 def first_run(task: tuple[Path, int]) -> str:
     root, number = task
-    stage = tracked_stage("train", f"item{number}", {}, [], experiment="fresh", root=root)
+    stage = tracked_stage(Work("train", f"item{number}"), "fresh", root)
     with stage as run, run.child("seed 1", {"seed": 1}) as child:
         child.log(1, {"loss": 1.0})
     return run.run_id
@@ -338,7 +335,7 @@ def test_the_named_store_is_used(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "sqlite:///elsewhere/runs.db")
     assert tracking_uri(root) == f"sqlite:///{tmp_path}/elsewhere/runs.db"
-    with tracked_stage("label", "cup", {}, [], experiment="named", root=root) as stage:
+    with tracked_stage(Work("label", "cup"), "named", root) as stage:
         stage.figure(root / "data" / "joints.csv")
     monkeypatch.delenv("MLFLOW_TRACKING_URI")
     assert set(runs_of(f"sqlite:///{tmp_path}/elsewhere/runs.db", "named")) == {"label cup"}
@@ -374,7 +371,7 @@ def test_a_store_that_fails_stops_the_stage_at_once_in_one_line(
     start = time.monotonic()
     with (
         pytest.raises(TrackingError) as caught,
-        tracked_stage("label", "cup", {}, [], experiment="none", root=tmp_path),
+        tracked_stage(Work("label", "cup"), "none", tmp_path),
     ):
         pytest.fail("the body must not start")
     assert time.monotonic() - start < 4
@@ -387,7 +384,7 @@ def test_a_store_that_fails_stops_the_stage_at_once_in_one_line(
 def test_a_missing_input_stops_the_stage_before_it_has_a_run(root: Path) -> None:
     with (
         pytest.raises(TrackingError, match=r"label cup: its input .*absent\.csv does not exist"),
-        tracked_stage("label", "cup", {}, [root / "absent.csv"], experiment="missing", root=root),
+        tracked_stage(Work("label", "cup", {}, [root / "absent.csv"]), "missing", root),
     ):
         pytest.fail("the body must not start")
     assert MlflowClient(tracking_uri(root)).get_experiment_by_name("missing") is None
@@ -410,10 +407,10 @@ PIPELINE: dict[str, Any] = {
 }
 TRAIN = """
 from pathlib import Path
-from constraint_geodesics.tracking.experiment import tracked_stage
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 inputs = [Path("data/joints"), Path("data/joints/a.csv"), Path("data/card.json")]
-with tracked_stage("train", "cup", {}, inputs, experiment="dvc", root=Path()) as run:
+with tracked_stage(Work("train", "cup", {}, inputs), "dvc", Path()) as run:
     run.report({"loss": 1}, Path("report.json"))
 """
 
@@ -467,7 +464,7 @@ def dashboard(root: Path) -> Iterator[str]:
 def test_a_moved_checkout_keeps_its_figures_and_a_server_can_be_the_store(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    with tracked_stage("report", "all", {}, [], experiment="moved", root=root) as stage:
+    with tracked_stage(Work("report", "all"), "moved", root) as stage:
         stage.figure(root / "data" / "joints.csv")
     moved = tmp_path / "moved"
     shutil.copytree(root, moved)
@@ -478,7 +475,7 @@ def test_a_moved_checkout_keeps_its_figures_and_a_server_can_be_the_store(
 
         monkeypatch.setenv("MLFLOW_TRACKING_URI", address)
         capfd.readouterr()
-        with tracked_stage("train", "cup", {}, [], experiment="served", root=root) as stage:
+        with tracked_stage(Work("train", "cup"), "served", root) as stage:
             child = stage.child("seed 1", {})
             with child:
                 child.artifact(root / "data" / "joints.csv")

@@ -25,16 +25,16 @@ from tests.tracking.test_experiment import dashboard
 
 from constraint_geodesics import Planner
 from constraint_geodesics.bundle import PACKAGED
-from constraint_geodesics.tracking.experiment import (
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
+from constraint_geodesics.tracking.registry import register_planner
+from constraint_geodesics.tracking.store import (
     CHAMPION,
     PLANNER_MODEL,
     TrackingError,
     client_of,
     fetch_artifacts,
-    tracked_stage,
     tracking_uri,
 )
-from constraint_geodesics.tracking.registry import register_planner
 
 ROOT = Path(__file__).resolve().parents[2]
 CODE = ROOT / "src/constraint_geodesics/tracking/served_model.py"
@@ -69,7 +69,7 @@ def own_store(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def registered(root: Path, files: Path) -> str:
-    with tracked_stage("build_planner", "planner", {}, [], experiment="built", root=root) as run:
+    with tracked_stage(Work("build_planner", "planner"), "built", root) as run:
         return register_planner(run, files, CODE, QUERY)
 
 
@@ -131,7 +131,7 @@ def test_a_model_has_a_signature_an_example_and_nothing_pickled(root: Path) -> N
         "served_model.py",
         "input_example.json",
         "planner.json",
-        "manifold.safetensors",
+        "roadmaps.safetensors",
     } <= files
     assert not [name for name in files if name.endswith((".pkl", ".pickle"))]
     needed = (model.parent / "requirements.txt").read_text().split()

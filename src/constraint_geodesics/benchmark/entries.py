@@ -31,7 +31,8 @@ from constraint_geodesics.peers.registry import BaselineBuilder, after, all_sett
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
-from constraint_geodesics.scene.scene import Scene, find_urdf
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.urdf import find_urdf
 
 JUDGED_BY = "benchmark.runner"
 """The module that asks the planners and judges their answers: every row depends on what it imports.
@@ -189,12 +190,14 @@ def _code_of(kind: str, settings: BaselineSettings) -> str:
 
 
 def _data_of(run: Run, settings: BaselineSettings) -> str:
-    """Of the trained files, where the planner is made of any."""
-    if not (settings.uses_bundle or settings.trained):
-        return ""
-    layout = run.layout
-    manifolds = [layout.manifold(name) for name in run.params.manifolds]
-    return data_digest(layout.planner, *manifolds, layout.submanifolds)
+    """Of the planner's files and of trained ones, where the planner is made of any."""
+    layout, folders = run.layout, []
+    if settings.uses_bundle:
+        folders.append(layout.planner)
+    if settings.trained:
+        folders += [layout.manifold(name) for name in run.params.manifolds]
+        folders += [layout.submanifolds, layout.learned]
+    return data_digest(*folders)
 
 
 def spread(numbered: Sequence[tuple[int, QueryBatch]]) -> list[QueryBatch]:

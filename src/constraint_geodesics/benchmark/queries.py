@@ -18,7 +18,7 @@ from constraint_geodesics.learning.dataset import DatasetError, draw_queries
 from constraint_geodesics.params import BenchmarkParams
 from constraint_geodesics.problem import PathPlanner, PlanningProblem
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.world import Sphere
+from constraint_geodesics.scene.sphere import Sphere
 
 TABLE, KEEP_OUT = "table", "keep_out"
 """Scenes: the workcell of params.yaml, and the same with a sphere between the ends."""
@@ -61,7 +61,7 @@ def write_queries(queries: Sequence[Query], file: Path) -> None:
     rows = []
     for query in queries:
         ball = query.obstacle
-        place = ("", "", "", "") if ball is None else (*ball.centre, ball.radius)
+        place = ("", "", "", "") if ball is None else (*ball.centre_m, ball.radius_m)
         rows.append(
             {"constraint": query.constraint, "scene": query.scene, "query": query.number}
             | {f"start_{k + 1}": value for k, value in enumerate(query.start)}

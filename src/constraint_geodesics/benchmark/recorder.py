@@ -13,8 +13,8 @@ from jaxtyping import Float
 
 from constraint_geodesics.benchmark.queries import Query
 from constraint_geodesics.benchmark.runner import Answer
+from constraint_geodesics.recording.recorder import status_text
 from constraint_geodesics.recording.recording import PathRecord, record_path
-from constraint_geodesics.recording.replay import status_text
 
 
 def first_queries(queries: Sequence[Query]) -> frozenset[tuple[str, str, int]]:
@@ -57,10 +57,11 @@ class PathRecorder:
             answer.joints,
             f"{text}\n- scene `{query.scene}`",
             scene=query.scene,
+            meshes=False,
         )
         file = (self.folder / query.constraint / name).resolve()
         workcell, root = answer.scene.workcell, self.root.resolve()
-        record_path(file, record, answer.manifold, workcell, frames=self.frames, meshes=False)
+        record_path(file, record, answer.manifold, workcell, frames=self.frames)
         return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.as_posix()
 
 

@@ -19,7 +19,6 @@ from constraint_geodesics.geodesics.episodes import (
     observation_size,
     observe,
 )
-from constraint_geodesics.geodesics.episodes import begin as begin
 from constraint_geodesics.geodesics.problem import GeodesicProblem
 
 
@@ -29,9 +28,7 @@ def _spaces(problem: GeodesicProblem) -> tuple[spaces.Box, spaces.Box]:
 
 
 class CurveVecEnv(VecEnv):
-    """Many curves at once.  Episodes end by time only, so every end is a truncation, and restarts
-    are automatic.
-    """
+    """Many curves at once.  Episodes end by time alone (truncation) and restart by themselves."""
 
     def __init__(
         self, problem: GeodesicProblem, settings: EpisodeSettings, count: int, seed: int
@@ -64,9 +61,7 @@ class CurveVecEnv(VecEnv):
         self._actions = np.array(actions, np.float64)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Advance all curves; finished episodes restart, their last observation stands in the
-        infos.
-        """
+        """Advance all curves; finished ones restart, their last observation is in the infos."""
         self.states, reward = advance(self.problem, self.settings, self.states, self._actions)
         self.returns += reward
         done = self.states.step >= self.settings.steps
@@ -91,9 +86,7 @@ class CurveVecEnv(VecEnv):
         return observation, reward.astype(np.float32), done, infos
 
     def pop_figures(self) -> dict[str, float]:
-        """Means over the episodes finished since the last call: the best curve's saving over the
-        straight, return.
-        """
+        """Mean saving over the straight line, and return, of episodes finished since last time."""
         figures = {
             "saving": float(np.mean(self.savings)) if self.savings else 0.0,
             "return": float(np.mean(self.episode_returns)) if self.episode_returns else 0.0,
@@ -162,7 +155,5 @@ class CurveEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 def scalar_environments(make: Callable[[], gymnasium.Env], count: int) -> VecEnv:
-    """One scalar environment a copy, stepped one after another: the usual way, and the measure of
-    `CurveVecEnv`.
-    """
+    """One scalar environment a copy, stepped in turn: the usual way."""
     return DummyVecEnv([make] * count)

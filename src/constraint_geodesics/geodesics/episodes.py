@@ -1,7 +1,6 @@
-"""Episodes of the search for a curve, eqs. 9-15, as pure functions of numpy arrays: a state is a
-curve, an action changes its coefficients.
+"""Episodes of the search for a curve, eqs. 9-15, as pure functions of numpy arrays.
 
-Nothing here learns or needs a library for it: training and planning step through the same
+A state is a curve, an action changes its coefficients.  Training and planning share these
 functions.
 """
 
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from constraint_geodesics.geodesics.problem import Ends, GeodesicProblem
+from constraint_geodesics.geodesics.problem import Ends, GeodesicProblem, Phi
 from constraint_geodesics.params import GeodesicParams, RewardParams
 
 DESCENT_SCALE = 0.5
@@ -47,12 +46,12 @@ def episode_settings(params: GeodesicParams) -> EpisodeSettings:
 
 @dataclass(frozen=True)
 class CurveStates:
-    """B curves under way: coefficients (in the chart's unit), ends, length, cost and feasibility
-    now, descent and features of the `Look` at them, cost of the straight line, steps taken, and the
-    cheapest curve met so far.
+    """B curves under way, and the cheapest one that each has met.
+
+    phi: in the chart's unit.  descent, features: of what is `Observed` at it.  step: steps taken.
     """
 
-    phi: Float[np.ndarray, "B p"]
+    phi: Phi
     ends: Ends
     length: Float[np.ndarray, "B"]
     cost: Float[np.ndarray, "B"]
@@ -61,7 +60,7 @@ class CurveStates:
     features: Float[np.ndarray, "B f"]
     straight_cost: Float[np.ndarray, "B"]
     step: Int[np.ndarray, "B"]
-    best_phi: Float[np.ndarray, "B p"]
+    best_phi: Phi
     best_cost: Float[np.ndarray, "B"]
 
     def replaced(self, rows: np.ndarray, other: "CurveStates") -> "CurveStates":
@@ -76,9 +75,9 @@ class CurveStates:
         return CurveStates(**fields)
 
 
-def begin(problem: GeodesicProblem, ends: Ends, phi: Float[np.ndarray, "B p"]) -> CurveStates:
+def begin(problem: GeodesicProblem, ends: Ends, phi: Phi) -> CurveStates:
     """First states of B episodes."""
-    now = problem.look(phi, ends)
+    now = problem.observed(phi, ends)
     costs, straight_cost = now.costs, now.costs.cost.copy()
     bent = np.flatnonzero(phi.any(axis=1))
     if len(bent):
@@ -100,19 +99,14 @@ def begin(problem: GeodesicProblem, ends: Ends, phi: Float[np.ndarray, "B p"]) -
 
 
 def draw_episodes(problem: GeodesicProblem, count: int, rng: np.random.Generator) -> CurveStates:
-    """Episodes on random ends; every other one starts from a random curve, so that bad ones are met
-    as well.
-    """
+    """Episodes on random ends; every other one starts from a random curve, to meet bad ones."""
     ends = problem.sample_ends(count, rng)
     phi = problem.sample_curves(ends, rng) * rng.integers(2, size=(count, 1))
     return begin(problem, ends, phi)
 
 
 def advance(
-    problem: GeodesicProblem,
-    settings: EpisodeSettings,
-    states: CurveStates,
-    actions: Float[np.ndarray, "B p"],
+    problem: GeodesicProblem, settings: EpisodeSettings, states: CurveStates, actions: Phi
 ) -> tuple[CurveStates, Float[np.ndarray, "B"]]:
     """One step of B episodes: new states and rewards (eq. 15).
 
@@ -121,7 +115,7 @@ def advance(
     far from it.
     """
     phi = states.phi + strides(settings, states)[:, None] * np.clip(actions, -1.0, 1.0)
-    now = problem.look(phi, states.ends)
+    now = problem.observed(phi, states.ends)
     costs = now.costs
     reward = rewards(settings.reward, states.cost, costs.cost, states.straight_cost)
     better = costs.cost < states.best_cost
@@ -210,6 +204,6 @@ def observe(settings: EpisodeSettings, states: CurveStates) -> Float[np.ndarray,
 def observation_size(problem: GeodesicProblem) -> int:
     """Length of an observation."""
     ends = problem.sample_ends(1, np.random.default_rng(0))
-    look = problem.look(np.zeros((1, problem.curve.coefficients)), ends)
+    look = problem.observed(np.zeros((1, problem.curve.coefficients)), ends)
     seen = look.descent.shape[1] + 1 + look.features.shape[1] if look.descent.shape[1] else 0
     return problem.curve.coefficients + 2 * problem.curve.dim + 3 + seen

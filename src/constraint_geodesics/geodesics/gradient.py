@@ -1,9 +1,6 @@
-"""Geodesics as minima of the energy, by a damped Newton method from several starts, all queries in
-one batch.
-"""
+"""Geodesics as minima of the energy: damped Newton from several starts, all in one batch."""
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,11 +9,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from constraint_geodesics.geodesics.problem import ChartProblem, Ends, Geodesic
-from constraint_geodesics.geodesics.solver import Candidates, goal_images, shortest_of
-from constraint_geodesics.geometry.length import energy_function, length_function, rules
+from constraint_geodesics.geodesics.solver import Candidates, Work, goal_images, shortest_of
+from constraint_geodesics.geometry.length import Objective, energy_function, length_function, rules
 from constraint_geodesics.geometry.manifold import GeometryError
-
-Objective = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 BLOCK = 64
 """Curves whose second derivatives are taken at once."""
@@ -69,10 +64,8 @@ class GradientSolver:
         start = ends.z_start[query]
         distance = np.linalg.norm(goal - start, axis=1)
         rng = np.random.default_rng(self.seed)
-        phi = (
-            rng.normal(scale=self.spread, size=(len(query), problem.curve.coefficients))
-            * distance[:, None]
-        )
+        size = len(query), problem.curve.coefficients
+        phi = rng.normal(scale=self.spread, size=size) * distance[:, None]
         # straight but for a hair: at a saddle the slope of the straight line is exactly zero, and
         # nothing would move
         phi[:: self.starts] *= HAIR
@@ -94,10 +87,8 @@ class GradientSolver:
         """
         began = time.perf_counter() if began is None else began
         rule = rules(tuple(problem.curve.breaks))[1]
-        energy, length = (
-            make(problem.manifold, problem.curve, rule)
-            for make in (energy_function, length_function)
-        )
+        energy = energy_function(problem.manifold, problem.curve, rule)
+        length = length_function(problem.manifold, problem.curve, rule)
         first = minimise(energy, candidates, self.iterations, self.tolerance)
         inside = problem.stays_inside(first.phi, candidates.ends())
         rows = _promising(candidates.query, np.where(inside, first.value, np.inf))
@@ -109,15 +100,10 @@ class GradientSolver:
         if given is not None:
             found = Candidates.join([found, given])
             converged = np.concatenate([converged, np.zeros(len(given.query), dtype=bool)])
-        return shortest_of(
-            problem,
-            ends,
-            found,
-            converged,
-            first.steps + second.steps,
-            first.evaluations + second.evaluations,
-            time.perf_counter() - began,
-        )
+        spent = time.perf_counter() - began
+        evaluations = first.evaluations + second.evaluations
+        work = Work(first.steps + second.steps, evaluations, spent)
+        return shortest_of(problem, ends, found, converged, work)
 
 
 def _promising(query: Int[np.ndarray, "C"], energy: Float[np.ndarray, "C"]) -> Int[np.ndarray, "K"]:
@@ -134,9 +120,7 @@ def _promising(query: Int[np.ndarray, "C"], energy: Float[np.ndarray, "C"]) -> I
 
 @dataclass(frozen=True)
 class Descent:
-    """Coefficients that a descent ended with, the function there, which of them are minima, steps
-    taken, values of the function taken.
-    """
+    """Where a descent ended, the function there, which are minima, and the work it took."""
 
     phi: Float[np.ndarray, "C p"]
     value: Float[np.ndarray, "C"]
@@ -148,9 +132,7 @@ class Descent:
 def minimise(
     function: Objective, candidates: Candidates, iterations: int, tolerance: float
 ) -> Descent:
-    """At most `iterations` damped Newton steps down a function of (phi, start, goal), all curves in
-    one batch.
-    """
+    """At most `iterations` damped Newton steps down a function, all curves in one batch."""
     phi, start, goal = (
         torch.from_numpy(np.array(x)) for x in (candidates.phi, candidates.start, candidates.goal)
     )
@@ -190,9 +172,7 @@ def minimise(
 def _expansion(
     function: Objective, phi: Tensor, start: Tensor, goal: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Which curves (C,) have finite derivatives, and of those K the value (K,), gradient (K, p),
-    curvatures (K, p) and their axes (K, p, p).
-    """
+    """Which curves have finite derivatives; their value, gradient, curvatures and axes."""
 
     def first(phi: Tensor, start: Tensor, goal: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         gradient, value = torch.func.grad_and_value(function)(phi, start, goal)

@@ -1,9 +1,7 @@
-"""Geodesics by a shortest path on a graph over points of the manifold: data for any N, a grid for N
-= 2.
+"""Geodesics by a shortest path on a graph over points of the manifold: data, or a grid for N = 2.
 
-The second is how the work the paper follows searches its latent plane.  Either way the path is
-fitted with one curve of the problem's family; `CombinedSolver` then lets it slide down to a
-geodesic.
+The path is fitted with one curve of the problem's family; `CombinedSolver` then lets it slide down
+to a geodesic.
 """
 
 import time
@@ -20,11 +18,12 @@ from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.problem import ChartProblem, Ends, Geodesic
 from constraint_geodesics.geodesics.solver import (
     Candidates,
+    Work,
     nearest_image,
     shortest_of,
     with_goals_bits,
 )
-from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
 from constraint_geodesics.geometry.graph import nearest_neighbour_edges, shortest_path
 from constraint_geodesics.geometry.length import estimate_length
 from constraint_geodesics.geometry.manifold import (
@@ -123,30 +122,22 @@ class GraphSolver:
     def candidates(
         self, problem: ChartProblem, ends: Ends
     ) -> tuple[Candidates, Int[np.ndarray, "B"]]:
-        """Fitted curves of the queries that have a path, and how many edges each query's path has
-        (0: none).
-        """
+        """Fitted curves of the queries that have a path, and the edges of each (0: none)."""
         paths = [
             self.path(start, goal) for start, goal in zip(ends.z_start, ends.z_goal, strict=True)
         ]
         found = [query for query, path in enumerate(paths) if path is not None]
         fits = [_fitted(problem, path) for path in paths if path is not None]
-        return Candidates(
-            np.array(found, dtype=np.int64),
-            np.array([fit[0] for fit in fits]).reshape(-1, problem.curve.coefficients),
-            ends.z_start[found],
-            with_goals_bits(
-                np.array([fit[1] for fit in fits]).reshape(-1, problem.curve.dim),
-                ends.z_goal[found],
-            ),
-        ), np.array([0 if path is None else len(path) - 1 for path in paths])
+        phi = np.array([fit[0] for fit in fits]).reshape(-1, problem.curve.coefficients)
+        last = np.array([fit[1] for fit in fits]).reshape(-1, problem.curve.dim)
+        goals = with_goals_bits(last, ends.z_goal[found])
+        fitted = Candidates(np.array(found, dtype=np.int64), phi, ends.z_start[found], goals)
+        return fitted, np.array([0 if path is None else len(path) - 1 for path in paths])
 
     def path(
         self, start: Float[np.ndarray, "N"], goal: Float[np.ndarray, "N"]
     ) -> Float[np.ndarray, "k N"] | None:
-        """Corners of the shortest path in the chart, from start to an image of goal; None where
-        they are not joined.
-        """
+        """Corners of the shortest path from start to an image of goal; None if not joined."""
         n = len(self.nodes)
         tails, heads, lengths = self._links(start, goal)
         edges = np.concatenate([self.edges, np.stack([tails, heads], axis=-1)])
@@ -179,8 +170,7 @@ class GraphSolver:
 
 @dataclass(frozen=True)
 class CombinedSolver:
-    """The path of a graph finds the way, the gradient makes it a geodesic; the straight line
-    competes.
+    """A graph's path made a geodesic by the gradient; the straight line competes.
 
     The graph decides what is connected.
     """
@@ -189,9 +179,7 @@ class CombinedSolver:
     gradient: GradientSolver = field(default_factory=lambda: GradientSolver(starts=1))
 
     def solve(self, problem: ChartProblem, ends: Ends) -> list[Geodesic]:
-        """The shortest minimum of the energy from the graph's path and from the gradient's own
-        starts.
-        """
+        """The shortest minimum from the graph's path and from the gradient's own starts."""
         return _answers(self.graph, problem, ends, self.gradient)
 
 
@@ -212,10 +200,8 @@ def _answers(
     own = Candidates(place[fitted.query], fitted.phi, fitted.start, fitted.goal)
     among = ends[joined]
     if gradient is None:
-        spent = time.perf_counter() - began
-        found = shortest_of(
-            problem, among, own, np.ones(len(joined), dtype=bool), 1, len(joined), spent
-        )
+        work = Work(1, len(joined), time.perf_counter() - began)
+        found = shortest_of(problem, among, own, np.ones(len(joined), dtype=bool), work)
     else:
         starts = Candidates.join([own, gradient.candidates(problem, among)])
         found = gradient.refine(problem, among, starts, given=own, began=began)
@@ -227,9 +213,7 @@ def _answers(
 def _fitted(
     problem: ChartProblem, corners: Float[np.ndarray, "k N"]
 ) -> tuple[Float[np.ndarray, "p"], np.ndarray]:
-    """Coefficients of the curve nearest to a polygon that is run through at constant speed, and the
-    polygon's end.
-    """
+    """Coefficients of the curve nearest to a polygon at constant speed; the polygon's end."""
     lengths = _straight_lengths(problem.manifold, corners[:-1], np.diff(corners, axis=0))
     passed = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(lengths), lengths, 0.0))])
     t = np.linspace(0.0, 1.0, FITTED)
@@ -241,15 +225,12 @@ def _fitted(
 def _straight_lengths(
     manifold: Manifold, start: Float[np.ndarray, "m N"], offset: Float[np.ndarray, "m N"]
 ) -> Float[np.ndarray, "m"]:
-    """Length of straight chart lines; inf where one leaves the manifold or its metric is not
-    finite.
-    """
+    """Length of straight chart lines; inf where one leaves the manifold or its metric."""
     line, first = PinnedPolynomial(manifold.dim, 1), torch.from_numpy(start)
     last = first + torch.from_numpy(offset)
     with torch.no_grad():
-        lengths = estimate_length(
-            manifold, line, first.new_zeros(len(first), 0), first, last
-        ).length.numpy()
+        lines = Curves(line, first.new_zeros(len(first), 0), first, last)
+        lengths = estimate_length(manifold, lines).length.numpy()
     if isinstance(manifold, BoundedManifold):
         t = torch.linspace(0.0, 1.0, ON_EDGE, dtype=first.dtype)[:, None]
         inside = manifold.contains((1 - t) * first[:, None] + t * last[:, None]).all(-1).numpy()

@@ -38,7 +38,8 @@ from constraint_geodesics.geodesics.problem import (
     Ends,
     Geodesic,
     GeodesicProblem,
-    Status,
+    Phi,
+    SearchStatus,
     repeated,
 )
 from constraint_geodesics.geodesics.solver import to_nearest_images
@@ -73,9 +74,7 @@ class Actor(nn.Module):
         """Mean actions."""
         return self.mean(self.body(observation))
 
-    def act(
-        self, observation: Float[np.ndarray, "B o"], noise: Float[np.ndarray, "B p"]
-    ) -> Float[np.ndarray, "B p"]:
+    def act(self, observation: Float[np.ndarray, "B o"], noise: Phi) -> Phi:
         """Mean actions plus the given multiples of the standard deviation."""
         with torch.no_grad():
             mean = self(torch.from_numpy(observation)).numpy()
@@ -95,9 +94,9 @@ def train_policy(
 ) -> TrainedPolicy:
     """Train one policy on random ends.
 
-    scratch: folder of the checkpoints; training interrupted at any time goes on from the last one
-    and ends as if it had never stopped.  report: called with (environment steps, figures) after
-    every rollout.
+    scratch: of the checkpoints, from which an interrupted training goes on as if it had never
+    stopped.
+    report: called with (environment steps, figures) after every rollout.
     """
     torch.manual_seed(seed)
     environment = CurveVecEnv(problem, episode_settings(params), params.environments, seed)
@@ -117,9 +116,7 @@ def train_policy(
 
 @dataclass(frozen=True)
 class PolicySolver:
-    """Policy search as a solver: roll-outs of a trained policy for every query, the same seed for
-    each.
-    """
+    """Policy search as a solver: roll-outs for every query, the same seed for each."""
 
     actor: Actor
     params: GeodesicParams
@@ -138,61 +135,41 @@ class PolicySolver:
             )
         near = to_nearest_images(problem, ends)
         rows = [near[np.array([row])] for row in range(len(ends))]
-        return [
-            search(problem, self.actor, self.params, row, self.seed, lambda _: True) for row in rows
-        ]
+        return [self.search(problem, row, lambda _: True) for row in rows]
 
+    def search(self, problem: GeodesicProblem, ends: Ends, accept: Accept) -> Geodesic:
+        """The shortest acceptable curve that a batch of roll-outs meets between one pair of ends.
 
-def search(
-    problem: GeodesicProblem,
-    actor: Actor,
-    params: GeodesicParams,
-    ends: Ends,
-    seed: int,
-    accept: Accept,
-) -> Geodesic:
-    """The shortest acceptable curve that a batch of roll-outs meets between one start and goal.
+        The first roll-out follows the policy's mean from the straight line, the others sample its
+        actions, half of them from the cheapest of many random curves.  Every curve met counts, the
+        straight line and the random ones included.
+        accept: an exact check (collision, say) of the feasible candidates, shortest first.
+        """
+        began, rng, params = time.perf_counter(), np.random.default_rng(self.seed), self.params
+        count, size = params.rollouts, problem.curve.coefficients
+        drawn = _random_curves(problem, ends, DRAWN_A_START * (count // 2), rng)
+        starts = drawn.phi[np.argsort(drawn.costs.cost, kind="stable")[: count // 2]]
+        phi = np.concatenate([np.zeros((count - len(starts), size)), starts])
+        noise = rng.normal(size=(params.episode_steps, count, size))
+        noise[:, 0] = 0.0
+        first = begin(problem, repeated(ends, count), phi)
+        visited = follow(problem, self.actor, episode_settings(params), first, noise)
+        met = [_Curves(s.phi, Costs(s.length, s.cost, s.feasible)) for s in visited]
+        return _first_accepted(problem, ends, [drawn, *met], accept, began)
 
-    The first roll-out follows the policy's mean from the straight line, the others sample its
-    actions, half of them from the cheapest of many random curves.  Every curve met counts, the
-    straight line and the random ones included.
-    accept: an exact check (collision, say) applied to the feasible candidates, shortest first.
-    """
-    began = time.perf_counter()
-    rng = np.random.default_rng(seed)
-    count, size = params.rollouts, problem.curve.coefficients
-    drawn = _random_curves(problem, ends, DRAWN_A_START * (count // 2), rng)
-    starts = drawn.phi[np.argsort(drawn.costs.cost, kind="stable")[: count // 2]]
-    phi = np.concatenate([np.zeros((count - len(starts), size)), starts])
-    noise = rng.normal(size=(params.episode_steps, count, size))
-    noise[:, 0] = 0.0
-    visited = follow(
-        problem, actor, episode_settings(params), begin(problem, repeated(ends, count), phi), noise
-    )
-    met = [
-        _Curves(states.phi, Costs(states.length, states.cost, states.feasible))
-        for states in visited
-    ]
-    return _first_accepted(problem, ends, [drawn, *met], accept, began)
-
-
-def search_at_random(
-    problem: GeodesicProblem, params: GeodesicParams, ends: Ends, seed: int, accept: Accept
-) -> Geodesic:
-    """The control of `search`: as many curves, all drawn at random and none by a policy, chosen by
-    the same rule.
-    """
-    began = time.perf_counter()
-    number = DRAWN_A_START * (params.rollouts // 2) + (params.episode_steps + 1) * params.rollouts
-    drawn = _random_curves(problem, ends, number, np.random.default_rng(seed))
-    return _first_accepted(problem, ends, [drawn], accept, began)
+    def search_at_random(self, problem: GeodesicProblem, ends: Ends, accept: Accept) -> Geodesic:
+        """The control of `search`: as many curves, none by a policy, chosen by the same rule."""
+        began, count = time.perf_counter(), self.params.rollouts
+        number = DRAWN_A_START * (count // 2) + (self.params.episode_steps + 1) * count
+        drawn = _random_curves(problem, ends, number, np.random.default_rng(self.seed))
+        return _first_accepted(problem, ends, [drawn], accept, began)
 
 
 @dataclass(frozen=True)
 class _Curves:
     """Candidates of one query that were measured together: one step of the search."""
 
-    phi: Float[np.ndarray, "B p"]
+    phi: Phi
     costs: Costs
 
 
@@ -212,9 +189,7 @@ def follow(
     states: CurveStates,
     noise: Float[np.ndarray, "I B p"],
 ) -> list[CurveStates]:
-    """The I + 1 states of B roll-outs; noise: multiples of the policy's standard deviation, 0 for
-    its mean.
-    """
+    """The I + 1 states of B roll-outs; noise in standard deviations of the policy."""
     visited = [states]
     for step_noise in noise:
         action = actor.act(observe(settings, visited[-1]), step_noise)
@@ -240,24 +215,15 @@ def _first_accepted(
         candidates = np.append(candidates, 0)
     row = next((int(row) for row in candidates if accept(phi[row])), None)
     if row is None:
-        status: Status = "not_found"
+        status: SearchStatus = "not_found"
         row, length = int(order[0]), float("nan")
     else:
         late = len(steps) > 1 and row >= len(phi) - len(steps[-1].phi)
         status = "iteration_limit" if late else "converged"
         length = float(problem.evaluate(phi[row][None], ends).length[0])
-    return Geodesic(
-        status,
-        problem.curve,
-        phi[row],
-        ends.z_start[0],
-        ends.z_goal[0],
-        length,
-        float(straight.length[0]),
-        len(steps),
-        len(phi),
-        time.perf_counter() - began,
-    )
+    found = status, problem.curve, phi[row], ends.z_start[0], ends.z_goal[0], length
+    work = len(steps), len(phi), time.perf_counter() - began
+    return Geodesic(*found, float(straight.length[0]), *work)
 
 
 def save_policy(policy: TrainedPolicy, folder: Path, seed: int) -> None:
@@ -284,15 +250,10 @@ def load_policy(folder: Path, seed: int) -> Actor:
 def actor_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
     """The actor's part of a stable-baselines3 policy, under this module's names."""
     prefix = "mlp_extractor.policy_net."
-    weights = {
-        f"body.{name.removeprefix(prefix)}": w
-        for name, w in state.items()
-        if name.startswith(prefix)
-    }
-    weights |= {f"mean.{part}": state[f"action_net.{part}"] for part in ("weight", "bias")}
-    return {
-        name: w.detach().clone() for name, w in (weights | {"log_std": state["log_std"]}).items()
-    }
+    names = {name: "body." + name.removeprefix(prefix) for name in state if name.startswith(prefix)}
+    names |= {f"action_net.{part}": f"mean.{part}" for part in ("weight", "bias")}
+    names["log_std"] = "log_std"
+    return {own: state[name].detach().clone() for name, own in names.items()}
 
 
 def ppo_model(environment: VecEnv, params: GeodesicParams, seed: int) -> PPO:
@@ -321,9 +282,7 @@ def ppo_model(environment: VecEnv, params: GeodesicParams, seed: int) -> PPO:
 
 
 class _Progress(BaseCallback):
-    """Reports each rollout and keeps a checkpoint from which training goes on as if it had never
-    stopped.
-    """
+    """Reports each rollout and keeps a checkpoint from which training goes on exactly."""
 
     def __init__(
         self,
@@ -354,9 +313,7 @@ class _Progress(BaseCallback):
         self.report(self.num_timesteps, figures)
 
     def save(self) -> None:
-        """Called between an update and the next rollout, where all that is still to come depends on
-        this state.
-        """
+        """Called where all that is still to come depends on this state alone."""
         environment, model = self.environment, self.model
         _, words, place, *_ = np.random.get_state(legacy=True)  # noqa: NPY002
         states = environment.states
@@ -376,9 +333,8 @@ class _Progress(BaseCallback):
         }
         self.file.parent.mkdir(parents=True, exist_ok=True)
         torch.save(content, self.file.with_suffix(".new"))
-        self.file.with_suffix(".new").replace(
-            self.file
-        )  # an interruption leaves the old or the new, never half
+        # an interruption leaves the old or the new, never half
+        self.file.with_suffix(".new").replace(self.file)
         self._saved_at = self.num_timesteps
 
     def restore(self, model: PPO) -> None:
@@ -389,14 +345,8 @@ class _Progress(BaseCallback):
         model.policy.load_state_dict(content["policy"])
         model.policy.optimizer.load_state_dict(content["optimiser"])
         torch.set_rng_state(content["torch_rng"])
-        place = (
-            "MT19937",
-            np.array(content["numpy_rng"], np.uint32),
-            content["numpy_rng_place"],
-            0,
-            0.0,
-        )
-        np.random.set_state(place)  # noqa: NPY002
+        words = np.array(content["numpy_rng"], np.uint32)
+        np.random.set_state(("MT19937", words, content["numpy_rng_place"], 0, 0.0))  # noqa: NPY002
         environment = self.environment
         environment.rng.bit_generator.state = json.loads(content["environment_rng"])
         ends = Ends(**{name: value.numpy() for name, value in content["ends"].items()})

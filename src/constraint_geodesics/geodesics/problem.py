@@ -1,6 +1,4 @@
-"""What a geodesic solver is asked and what it answers: ends, the cost of curves between them, the
-result.
-"""
+"""What a geodesic solver is asked and what it answers: ends, cost of curves, the result."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -15,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.geodesics.pull_kernels import tangential_pull
-from constraint_geodesics.geometry.curves import CurveFamily, PinnedPolynomial
+from constraint_geodesics.geometry.curves import CurveFamily, Curves, PinnedPolynomial
 from constraint_geodesics.geometry.length import Collocation, Quadrature, estimate_length
 from constraint_geodesics.geometry.manifold import (
     BoundedManifold,
@@ -26,11 +24,18 @@ from constraint_geodesics.geometry.manifold import (
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import (
     Lifted,
+    allowed_steps,
     as_executed,
-    correct_and_retract,
+    corrected,
     densify,
     jump_excess,
+    retracted,
 )
+
+Phi = Float[np.ndarray, "B p"]
+"""Coefficients of B curves."""
+Paths = Float[np.ndarray, "B S D"]
+"""Joints [rad] along B curves."""
 
 REDRAWN = 10
 """Times that a goal equal to its start is drawn again."""
@@ -56,9 +61,7 @@ SEEN_TOLERANCE = 0.2
 
 @dataclass(frozen=True)
 class Ends:
-    """Starts and goals of B curves, as chart points (B, N) and, on a robot's manifold, as joints
-    (B, D) [rad].
-    """
+    """Starts and goals of B curves, in the chart and, on a robot's manifold, as joints [rad]."""
 
     z_start: Float[np.ndarray, "B N"]
     z_goal: Float[np.ndarray, "B N"]
@@ -79,9 +82,7 @@ class Ends:
 
     @property
     def distance(self) -> Float[np.ndarray, "B"]:
-        """Distance of start and goal in the chart: the unit of coefficients, so that near and far
-        pairs look alike.
-        """
+        """Distance of start and goal in the chart, the unit of coefficients: scales look alike."""
         return np.maximum(np.linalg.norm(self.z_goal - self.z_start, axis=1), 1e-9)
 
     def replaced(self, rows: np.ndarray, other: "Ends") -> "Ends":
@@ -99,9 +100,7 @@ def repeated(ends: Ends, count: int) -> Ends:
 
 @dataclass(frozen=True)
 class Costs:
-    """Length of B curves, their cost (the length and what is wrong with them), and which are curves
-    one could use.
-    """
+    """Length of B curves, cost (the length and what is wrong), and which could be used."""
 
     length: Float[np.ndarray, "B"]
     cost: Float[np.ndarray, "B"]
@@ -109,17 +108,22 @@ class Costs:
 
 
 @dataclass(frozen=True)
-class Look:
-    """What a policy sees of B curves beside their coefficients.
+class Observed:
+    """What a policy sees of B curves apart from their coefficients.
 
-    descent: the step that a preconditioned descent of the energy would take, in the chart's unit;
-    no columns where a problem has none.  features: numbers of order 1, the same in number for every
-    problem of a class.
+    descent: the step of a preconditioned descent of the energy, in the chart's unit; no columns
+    where a problem has none.  features: numbers of order 1, as many for every problem of a class.
     """
 
     costs: Costs
     descent: Float[np.ndarray, "B d"]
     features: Float[np.ndarray, "B f"]
+
+    @classmethod
+    def alone(cls, costs: Costs) -> "Observed":
+        """Costs with neither descent nor features."""
+        nothing = np.zeros((len(costs.cost), 0))
+        return cls(costs, nothing, nothing)
 
 
 class GeodesicProblem(Protocol):
@@ -130,11 +134,11 @@ class GeodesicProblem(Protocol):
         """The family searched."""
         ...
 
-    def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
+    def evaluate(self, phi: Phi, ends: Ends) -> Costs:
         """Cost of the curves with coefficients phi."""
         ...
 
-    def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:
+    def observed(self, phi: Phi, ends: Ends) -> Observed:
         """The same costs with what else a policy sees of these curves."""
         ...
 
@@ -142,7 +146,7 @@ class GeodesicProblem(Protocol):
         """Ends to train on."""
         ...
 
-    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
+    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Phi:
         """Coefficients of one random curve between each of the given ends."""
         ...
 
@@ -151,35 +155,32 @@ class GeodesicProblem(Protocol):
         ...
 
 
-Status = Literal["converged", "iteration_limit", "not_found", "not_connected"]
+SearchStatus = Literal["converged", "iteration_limit", "not_found", "not_connected"]
 
 
 @dataclass(frozen=True)
 class Geodesic:
     """What a solver found between one start and goal: the one record of every solver.
 
-    status: "converged" (more of the same work would not shorten the curve: the gradient stands at a
-    local minimum, the graph has given its shortest path, the last step of the policy's roll-outs
-    met nothing shorter), "iteration_limit" (it was still getting shorter), "not_found" (every curve
-    tried jumps, collides, or leaves the limits or the manifold), "not_connected" (start and goal
-    are not joined, as far as the graph that was searched knows).
+    status: "converged" (more of the same work would not shorten the curve), "iteration_limit" (it
+    was still getting shorter), "not_found" (every curve tried jumps, collides, or leaves the limits
+    or the manifold), "not_connected" (not joined, as far as the graph that was searched knows).
     curve, phi, start, goal: γ_φ; on a periodic chart the goal may be another image of the one asked
     for.
-    length: of γ_φ, in the unit of the manifold; nan where nothing was found.  straight_length: of
-    the straight chart line to the nearest image of the goal.  iterations: steps of the solver.
-    evaluations: curves measured.
+    length: of γ_φ, nan where nothing was found.  straight_length: of the straight chart line to the
+    nearest image of the goal.  iterations: steps of the solver.  evaluations: curves measured.
     """
 
-    status: Status
+    status: SearchStatus
     curve: CurveFamily
     phi: Float[np.ndarray, "p"]
     start: Float[np.ndarray, "N"]
     goal: Float[np.ndarray, "N"]
-    length: float
-    straight_length: float
-    iterations: int
-    evaluations: int
-    time_s: float
+    length: float = np.nan
+    straight_length: float = np.nan
+    iterations: int = 0
+    evaluations: int = 0
+    time_s: float = 0.0
 
     @property
     def found(self) -> bool:
@@ -193,25 +194,17 @@ class Geodesic:
 
     @classmethod
     def nothing(
-        cls,
-        status: Status,
-        curve: CurveFamily,
-        start: Float[np.ndarray, "N"],
-        goal: Float[np.ndarray, "N"],
+        cls, status: SearchStatus, curve: CurveFamily, start: np.ndarray, goal: np.ndarray
     ) -> "Geodesic":
         """The answer where there is no curve: φ = 0, and no length."""
-        return cls(
-            status, curve, np.zeros(curve.coefficients), start, goal, np.nan, np.nan, 0, 0, 0.0
-        )
+        return cls(status, curve, np.zeros(curve.coefficients), start, goal)
 
 
 class GeodesicSolver(Protocol):
-    """A way to find geodesics.  `geodesics_between` calls it with ends that it has checked."""
+    """A solver of geodesics.  `geodesics_between` calls it with ends that it has checked."""
 
     def solve(self, problem: "ChartProblem", ends: Ends) -> list[Geodesic]:
-        """The shortest curve of the problem's family found between each start and goal, one record
-        each.
-        """
+        """The shortest curve of the problem's family found for each start and goal, in order."""
         ...
 
 
@@ -224,7 +217,7 @@ class Domain(Protocol):
 
 
 @dataclass(frozen=True)
-class Box:
+class ChartBox:
     """Points uniform in a box of the chart."""
 
     low: tuple[float, ...]
@@ -254,20 +247,19 @@ class ChartProblem:
     curve: CurveFamily
     domain: Domain
 
-    def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
-        """The cost is the length, at the default accuracy; a curve that leaves the manifold is not
-        feasible.
-        """
+    def evaluate(self, phi: Phi, ends: Ends) -> Costs:
+        """The cost is the length; a curve that leaves the manifold is not feasible."""
         free, start, goal = _tensors(phi, ends.z_start, ends.z_goal)
         with torch.no_grad():
-            length = estimate_length(self.manifold, self.curve, free, start, goal).length.numpy()
+            curves = Curves(self.curve, free, start, goal)
+            length = estimate_length(self.manifold, curves).length.numpy()
         return Costs(length, length, np.isfinite(length) & self.stays_inside(phi, ends))
 
-    def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:
+    def observed(self, phi: Phi, ends: Ends) -> Observed:
         """Costs alone."""
-        return Look(self.evaluate(phi, ends), np.zeros((len(phi), 0)), np.zeros((len(phi), 0)))
+        return Observed.alone(self.evaluate(phi, ends))
 
-    def stays_inside(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Bool[np.ndarray, "B"]:
+    def stays_inside(self, phi: Phi, ends: Ends) -> Bool[np.ndarray, "B"]:
         """Whether all of INSIDE_POINTS points of each curve belong to the manifold."""
         if not isinstance(self.manifold, BoundedManifold):
             return np.ones(len(phi), dtype=bool)
@@ -292,9 +284,7 @@ class ChartProblem:
         return Ends(start, goal, start, goal)
 
     def sample_ends(self, count: int, rng: np.random.Generator) -> Ends:
-        """Random pairs of points of the domain; a set may hold one twice, so pairs of one point are
-        drawn again.
-        """
+        """Random pairs of points of the domain; pairs of one point are drawn again."""
         start, goal = self.domain.sample(count, rng), self.domain.sample(count, rng)
         for _ in range(REDRAWN):
             same = np.flatnonzero((start == goal).all(axis=1))
@@ -303,10 +293,8 @@ class ChartProblem:
             goal[same] = self.domain.sample(len(same), rng)
         return Ends(start, goal, start, goal)
 
-    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
-        """Cubics with normal coefficients, whatever the family; the ends' distance is their
-        standard deviation.
-        """
+    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Phi:
+        """Cubics with normal coefficients of the ends' distance, whatever the family."""
         cubic = PinnedPolynomial(self.curve.dim, 3)
         phi = rng.normal(size=(len(ends), cubic.coefficients)) * ends.distance[:, None]
         if self.curve == cubic:
@@ -325,10 +313,10 @@ class ChartProblem:
 class LearnedProblem:
     """Geodesics on a learned manifold under a constraint, between configurations that satisfy it.
 
-    With `retract` the curve is decoded, its ends corrected, every point retracted onto the
-    constraint, and the length is that of the retracted path with the decoder's deviation beside it:
-    ∫ √(‖q̇‖² + ‖σ̇‖²) dt. Without, it is the length of the latent curve as the paper measures it, ∫
-    ‖ḟ‖ dt, and the cost rises by `inclusion_weight` times the mean of ι_C along the curve.
+    With `retract` curves are decoded, their ends corrected, every point retracted onto the
+    constraint, and the length is that of the path with the decoder's deviation: ∫ √(‖q̇‖² + ‖σ̇‖²)
+    dt.  Without, it is the length of the latent curve as the paper measures it, ∫ ‖ḟ‖ dt, and the
+    cost rises by `inclusion_weight` times the mean of ι_C along the curve.
     degree: of the polynomials that lengths are measured with (Collocation), on one point more.
     """
 
@@ -341,7 +329,7 @@ class LearnedProblem:
     inclusion_weight: float
     retraction: Retraction = field(default_factory=lambda: Retraction(accuracy=1e-3, iterations=6))
 
-    def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
+    def evaluate(self, phi: Phi, ends: Ends) -> Costs:
         """Length and cost; a curve is feasible if it has no jump, stays within the limits and,
         retracted, converged.
 
@@ -351,7 +339,7 @@ class LearnedProblem:
         decoded, deviation = self._decoded(phi, ends)
         return self._costs(self._lifted(decoded, ends), decoded, deviation)
 
-    def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:
+    def observed(self, phi: Phi, ends: Ends) -> Observed:
         """Costs, descent and features; both describe the constraint by what it does to the curve.
 
         descent: K⁻¹ ∫ (J̄⁺ P q̈) b_k dt in the chart, with P the projector on the tangent space of
@@ -364,35 +352,27 @@ class LearnedProblem:
         embedding.
         """
         if not self.retract:
-            return Look(self.evaluate(phi, ends), np.zeros((len(phi), 0)), np.zeros((len(phi), 0)))
+            return Observed.alone(self.evaluate(phi, ends))
         decoded, deviation = self._decoded(phi, ends)
         lifted = self._lifted(decoded, ends)
         constraint = np.broadcast_to(self._constraint, (len(phi), 12))
         costs = self._costs(lifted, decoded, deviation)
-        return self._look(costs, lifted, self._pulls(lifted.joints), constraint, ends)
+        return self._observed(costs, lifted, self._pulls(lifted.joints), constraint, ends)
 
-    def _decoded(
-        self, phi: Float[np.ndarray, "B p"], ends: Ends
-    ) -> tuple[Float[np.ndarray, "B S D"], Float[np.ndarray, "B S D"]]:
-        """Decoder mean and deviation along the curves, at the times lengths are measured with
-        [rad].
-        """
+    def _decoded(self, phi: Phi, ends: Ends) -> tuple[Paths, Paths]:
+        """Decoder mean and deviation [rad] at the times that lengths are measured with."""
         embedded = self.chart.embed_points(
             self.latent_points(phi, ends, _rule(self.degree).times.numpy())
         )
         dof = self.manifold.robot.dof
         return embedded[..., :dof].astype(np.float64), embedded[..., dof:]
 
-    def _lifted(self, decoded: Float[np.ndarray, "B S D"], ends: Ends) -> Lifted:
-        t, retraction = _rule(self.degree).times.numpy(), self.retraction if self.retract else None
-        return correct_and_retract(self.manifold, decoded, t, ends.q_start, ends.q_goal, retraction)
+    def _lifted(self, decoded: Paths, ends: Ends) -> Lifted:
+        t = _rule(self.degree).times.numpy()
+        joints = corrected(decoded, t, ends.q_start, ends.q_goal)
+        return retracted(self.manifold, joints, self.retraction if self.retract else None)
 
-    def _costs(
-        self,
-        lifted: Lifted,
-        decoded: Float[np.ndarray, "B S D"],
-        deviation: Float[np.ndarray, "B S D"],
-    ) -> Costs:
+    def _costs(self, lifted: Lifted, decoded: Paths, deviation: Paths) -> Costs:
         rule = _rule(self.degree)
         shape = np.concatenate(
             [lifted.joints if self.retract else decoded, deviation], axis=-1, dtype=np.float32
@@ -400,20 +380,15 @@ class LearnedProblem:
         length, error = _length_and_error(rule, shape)
         outside = -np.minimum(self.manifold.robot.limit_distance(lifted.joints), 0.0).sum(-1)
         if not self.retract:
-            cost = (length + error) * (
-                1.0 + self.inclusion_weight * self.manifold.violation(decoded).mean(-1)
-            )
-            return Costs(length, cost + outside, outside == 0.0)
+            factor = 1.0 + self.inclusion_weight * self.manifold.violation(decoded).mean(-1)
+            return Costs(length, (length + error) * factor + outside, outside == 0.0)
         excess = jump_excess(lifted.joints, rule.times.numpy())
         left = lifted.violation.max(axis=-1)
         cost = length + error + JUMP_WEIGHT * excess + outside + left
-        return Costs(
-            length,
-            cost,
-            (excess == 0.0) & (outside == 0.0) & (left <= 10 * self.retraction.accuracy),
-        )
+        kept = left <= 10 * self.retraction.accuracy
+        return Costs(length, cost, (excess == 0.0) & (outside == 0.0) & kept)
 
-    def _pulls(self, joints: Float[np.ndarray, "B S D"]) -> Float[np.ndarray, "B S D"]:
+    def _pulls(self, joints: Paths) -> Paths:
         manifold, robot = self.manifold, self.manifold.robot
         pulls = np.empty_like(joints)
         tangential_pull(
@@ -430,14 +405,14 @@ class LearnedProblem:
         )
         return pulls
 
-    def _look(
+    def _observed(
         self,
         costs: Costs,
         lifted: Lifted,
-        pulls: Float[np.ndarray, "B S D"],
+        pulls: Paths,
         constraint: Float[np.ndarray, "B 12"],
         ends: Ends,
-    ) -> Look:
+    ) -> Observed:
         t, (basis, between) = _rule(self.degree).times.numpy(), self._bases
         robot, joints, far = self.manifold.robot, lifted.joints, ends.distance[:, None]
         descent = self._coefficients(pulls, basis)
@@ -446,10 +421,8 @@ class LearnedProblem:
         steps = np.diff(joints, axis=1)
         lengths = np.linalg.norm(steps, axis=-1)
         excess = np.maximum(lengths - allowed_steps(joints, t), 0.0)
-        jump = (
-            self._coefficients(steps * (excess / np.maximum(lengths, 1e-12))[..., None], between)
-            / far
-        )
+        beyond = steps * (excess / np.maximum(lengths, 1e-12))[..., None]
+        jump = self._coefficients(beyond, between) / far
         over = np.maximum(joints - robot.upper, 0.0) + np.minimum(joints - robot.lower, 0.0)
         outside = self._coefficients(over, basis) / far
         sizes = np.stack([excess.sum(1), np.abs(over).sum((1, 2)), lifted.violation.max(1)], axis=1)
@@ -462,11 +435,9 @@ class LearnedProblem:
             shown.reshape(len(joints), -1) / np.pi,
             constraint,
         )
-        return Look(costs, descent, np.concatenate(seen, axis=1))
+        return Observed(costs, descent, np.concatenate(seen, axis=1))
 
-    def _coefficients(
-        self, joints: Float[np.ndarray, "B S D"], basis: Float[np.ndarray, "S m"]
-    ) -> Float[np.ndarray, "B p"]:
+    def _coefficients(self, joints: Paths, basis: Float[np.ndarray, "S m"]) -> Phi:
         """Σ_s J̄⁺ q_s b_k(t_s), preconditioned by K⁻¹, as coefficients of the family."""
         weights = basis @ self._stiffness
         summed = (joints.transpose(0, 2, 1) @ weights).transpose(0, 2, 1) @ self._to_latent.T
@@ -498,7 +469,7 @@ class LearnedProblem:
         return np.concatenate([self.manifold.held, self.manifold.tolerance / SEEN_TOLERANCE])
 
     def latent_points(
-        self, phi: Float[np.ndarray, "B p"], ends: Ends, t: Float[np.ndarray, "T"]
+        self, phi: Phi, ends: Ends, t: Float[np.ndarray, "T"]
     ) -> Float[np.ndarray, "B T N"]:
         """γ_φ(t) in the latent space, eqs. 9-11."""
         free, start, goal, times = _tensors(phi, ends.z_start, ends.z_goal, t)
@@ -518,15 +489,12 @@ class LearnedProblem:
         while True:
             t = np.linspace(0.0, 1.0, points)
             decoded = self.chart.decode(self.latent_points(phi[None], ends, t))
-            joints = correct_and_retract(
-                self.manifold, decoded, t, ends.q_start, ends.q_goal, exact
-            ).joints[0]
+            line = corrected(decoded, t, ends.q_start, ends.q_goal)
+            joints = retracted(self.manifold, line, exact).joints[0]
             if np.linalg.norm(np.diff(joints, axis=0), axis=-1).max() <= 0.1 or points > 1000:
-                return (
-                    as_executed(self.manifold, joints, spacing)
-                    if self.retract
-                    else densify(joints, spacing)
-                )
+                if self.retract:
+                    return as_executed(self.manifold, joints, spacing)
+                return densify(joints, spacing)
             points = 2 * points - 1
 
     def ends(self, start: Float[np.ndarray, "B D"], goal: Float[np.ndarray, "B D"]) -> Ends:
@@ -538,10 +506,8 @@ class LearnedProblem:
         rows = rng.integers(len(self.joints), size=(2, count))
         return self.ends(self.joints[rows[0]], self.joints[rows[1]])
 
-    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
-        """Curves bent towards random configurations of the constraint's data: where a straight line
-        changes its branch, the way round leads past some of them.
-        """
+    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Phi:
+        """Curves bent towards random configurations of the data: the way round a branch."""
         past = self.chart.encode(self.joints[rng.integers(len(self.joints), size=len(ends))])
         share = rng.uniform(size=(len(ends), 1))
         bend = share * (past - 0.5 * (ends.z_start + ends.z_goal))
@@ -558,22 +524,12 @@ class LearnedProblem:
         )
 
 
-def allowed_steps(
-    joints: Float[np.ndarray, "B S D"], t: Float[np.ndarray, "S"]
-) -> Float[np.ndarray, "B S-1"]:
-    """Longest steps [rad] of curves that do not jump, as `jump_excess` has them."""
-    direct = np.linalg.norm(joints[:, -1] - joints[:, 0], axis=-1)
-    return 0.05 + 4.0 * direct[:, None] * np.diff(t)
-
-
 @dataclass(frozen=True)
 class ProblemSet:
-    """Several constraints on one learned manifold as one problem: each pair of ends belongs to one
-    member.
+    """Several constraints on one learned manifold as one problem: each pair of ends has its member.
 
-    Rows are decoded and priced together; only the retraction and the pull go by members.
-    Raises GeometryError if the members differ in anything but the constraint and its data, or do
-    not retract.
+    Curves are decoded and priced together; only what depends on the constraint goes by members.
+    Raises GeometryError if the members differ in more than constraint and data, or do not retract.
     """
 
     members: Sequence[LearnedProblem]
@@ -584,8 +540,7 @@ class ProblemSet:
             same = replace(member, manifold=first.manifold, joints=first.joints) == first
             if not (same and member.retract and member.manifold.robot is first.manifold.robot):
                 raise GeometryError(
-                    "members of a problem set differ in more than constraint and data, or do "
-                    "not retract"
+                    "members of a problem set differ in more than constraint and data"
                 )
 
     @property
@@ -593,13 +548,13 @@ class ProblemSet:
         """The family of all members."""
         return self.members[0].curve
 
-    def evaluate(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
+    def evaluate(self, phi: Phi, ends: Ends) -> Costs:
         """Each row as its member measures it."""
         first = self.members[0]
         decoded, deviation = first._decoded(phi, ends)
         return first._costs(self._lifted(decoded, ends), decoded, deviation)
 
-    def look(self, phi: Float[np.ndarray, "B p"], ends: Ends) -> Look:
+    def observed(self, phi: Phi, ends: Ends) -> Observed:
         """Each row as its member sees it."""
         first = self.members[0]
         decoded, deviation = first._decoded(phi, ends)
@@ -608,11 +563,10 @@ class ProblemSet:
         for member, rows in self._rows(ends):
             pulls[rows] = member._pulls(lifted.joints[rows])
         constraint = np.stack([member._constraint for member in self.members])[ends.member]
-        return first._look(
-            first._costs(lifted, decoded, deviation), lifted, pulls, constraint, ends
-        )
+        costs = first._costs(lifted, decoded, deviation)
+        return first._observed(costs, lifted, pulls, constraint, ends)
 
-    def _lifted(self, decoded: Float[np.ndarray, "B S D"], ends: Ends) -> Lifted:
+    def _lifted(self, decoded: Paths, ends: Ends) -> Lifted:
         lifted = Lifted(np.empty_like(decoded), np.empty(decoded.shape[:2]))
         for member, rows in self._rows(ends):
             part = member._lifted(decoded[rows], ends[rows])
@@ -628,7 +582,7 @@ class ProblemSet:
             joints[:, rows] = member.joints[rng.integers(len(member.joints), size=(2, len(rows)))]
         return replace(self.members[0].ends(*joints), member=chosen)
 
-    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Float[np.ndarray, "B p"]:
+    def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Phi:
         """Each curve as its member draws it."""
         phi = np.empty((len(ends), self.curve.coefficients))
         for member, rows in self._rows(ends):
@@ -644,7 +598,7 @@ class ProblemSet:
         return [(member, r) for member, r in zip(self.members, rows, strict=True) if len(r)]
 
 
-def bent_halfway(curve: CurveFamily, bend: Float[np.ndarray, "B N"]) -> Float[np.ndarray, "B p"]:
+def bent_halfway(curve: CurveFamily, bend: Float[np.ndarray, "B N"]) -> Phi:
     """Coefficients of parabolas that pass `bend` away from the straight line halfway."""
     t = torch.linspace(0.0, 1.0, 4 * curve.functions + 3, dtype=torch.float64)
     height = (4.0 * t * (1.0 - t))[:, None]

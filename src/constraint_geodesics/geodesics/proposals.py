@@ -1,6 +1,4 @@
-"""Proposals of trained policies for new queries, with numpy alone: no noise, no random curves, no
-learning library.
-"""
+"""Proposals of trained policies for new queries, with numpy alone and without noise."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -46,10 +44,8 @@ class MeanPolicy:
 
 
 @dataclass(frozen=True)
-class Proposals:
-    """The best curve that each of A policies met for each of B queries: feasible if any was, then
-    the cheapest.
-    """
+class BestCurves:
+    """The best curve of each of A policies for each of B queries: feasible, then cheap."""
 
     phi: Float[np.ndarray, "A B p"]
     cost: Float[np.ndarray, "A B"]
@@ -63,10 +59,8 @@ class Proposals:
 
 def propose(
     problem: GeodesicProblem, policies: Sequence[MeanPolicy], settings: EpisodeSettings, ends: Ends
-) -> Proposals:
-    """Follow every policy's mean from the straight line for one episode; the straight line is met
-    too.
-    """
+) -> BestCurves:
+    """Follow every policy's mean from the straight line, which counts too, for one episode."""
     count, queries = len(policies), len(ends)
     states = begin(
         problem,
@@ -85,7 +79,7 @@ def propose(
         )
         phi = np.where(better[:, None], states.phi, phi)
         cost, feasible = np.where(better, states.cost, cost), feasible | states.feasible
-    return Proposals(
+    return BestCurves(
         phi.reshape(count, queries, -1),
         cost.reshape(count, queries),
         feasible.reshape(count, queries),

@@ -1,10 +1,9 @@
-"""The driver of every geodesic solver: checks the ends, answers what needs no search, hands on the
-rest.
-"""
+"""The driver of every geodesic solver: checks the ends and answers what needs no search."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,13 +14,22 @@ from constraint_geodesics.geodesics.problem import (
     Ends,
     Geodesic,
     GeodesicSolver,
-    Status,
+    SearchStatus,
 )
+from constraint_geodesics.geometry.curves import Curves
 from constraint_geodesics.geometry.length import estimate_length
 from constraint_geodesics.geometry.manifold import Manifold, PeriodicManifold
 
 LENGTH_TOLERANCE = 1e-6
 """Relative error aimed at for the lengths that candidates are ranked by and results carry."""
+
+
+class Work(NamedTuple):
+    """What a batch of queries took: steps of the solver, curves measured, seconds."""
+
+    iterations: int
+    evaluations: int
+    time_s: float
 
 
 @dataclass(frozen=True)
@@ -43,12 +51,8 @@ class Candidates:
     @classmethod
     def join(cls, parts: Sequence["Candidates"]) -> "Candidates":
         """All rows of several."""
-        return cls(
-            *(
-                np.concatenate([getattr(part, name) for part in parts])
-                for name in cls.__dataclass_fields__
-            )
-        )
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        return cls(*(np.concatenate(column) for column in columns))
 
 
 def geodesics_between(
@@ -67,28 +71,13 @@ def geodesics_between(
     found = iter(solver.solve(problem, ends[np.flatnonzero(~same)]) if not same.all() else [])
     zero = np.zeros(problem.curve.coefficients)
     return [
-        Geodesic(
-            "converged",
-            problem.curve,
-            zero,
-            ends.z_start[row],
-            ends.z_start[row],
-            0.0,
-            0.0,
-            0,
-            0,
-            0.0,
-        )
-        if same[row]
-        else next(found)
-        for row in range(len(ends))
+        Geodesic("converged", problem.curve, zero, z, z, 0.0, 0.0) if here else next(found)
+        for here, z in zip(same, ends.z_start, strict=True)
     ]
 
 
 def nearest_image(manifold: Manifold, offset: Float[np.ndarray, "m N"]) -> Float[np.ndarray, "m N"]:
-    """Offsets between points of the chart, with every periodic coordinate taken the shorter way
-    round.
-    """
+    """Offsets in the chart, with every periodic coordinate taken the shorter way round."""
     period = _periods(manifold)
     finite = np.isfinite(period)
     turned = offset.copy()
@@ -105,18 +94,14 @@ def to_nearest_images(problem: ChartProblem, ends: Ends) -> Ends:
 def with_goals_bits(
     images: Float[np.ndarray, "*#B N"], goal: Float[np.ndarray, "*#B N"]
 ) -> Float[np.ndarray, "*B N"]:
-    """Images of goals; a coordinate that is no turn away, but for rounding, gets the bits of the
-    goal's own.
-    """
+    """Images of goals; coordinates that are no turn away get the bits of the goal's own."""
     return np.where(np.abs(images - goal) < 1e-9, goal, images)
 
 
 def goal_images(
     problem: ChartProblem, ends: Ends
 ) -> tuple[Int[np.ndarray, "C"], Float[np.ndarray, "C N"]]:
-    """Images of the goals worth a try, and the query each belongs to: both ways round each periodic
-    coordinate.
-    """
+    """Images of the goals, both ways round each periodic coordinate, and their queries."""
     period = _periods(problem.manifold)
     near = to_nearest_images(problem, ends).z_goal
     other = np.where(near >= ends.z_start, -1.0, 1.0) * np.where(np.isfinite(period), period, 0.0)
@@ -131,59 +116,44 @@ def shortest_of(
     ends: Ends,
     candidates: Candidates,
     converged: Bool[np.ndarray, "C"],
-    iterations: int,
-    evaluations: int,
-    time_s: float,
+    work: Work,
 ) -> list[Geodesic]:
     """The shortest curve of each query that stays on the manifold; "not_found" where there is none.
 
-    iterations and evaluations: of the whole batch; each record carries its query's share of the
-    evaluations and time.
+    work: of the whole batch; each record carries its query's share of the evaluations and time.
     """
     length = _lengths(problem, candidates.phi, candidates.ends())
     length = np.where(problem.stays_inside(candidates.phi, candidates.ends()), length, np.inf)
-    straight = _lengths(
-        problem, np.zeros((len(ends), problem.curve.coefficients)), to_nearest_images(problem, ends)
-    )
+    lines = np.zeros((len(ends), problem.curve.coefficients))
+    straight = _lengths(problem, lines, to_nearest_images(problem, ends))
     # of curves that are alike to within their accuracy one that has converged is the answer
     rank = length * np.where(converged, 1.0, 1.0 + LENGTH_TOLERANCE)
     results = []
     for query in range(len(ends)):
         rows = np.flatnonzero(candidates.query == query)
         best = rows[np.argmin(rank[rows])]
-        status: Status = "converged" if converged[best] else "iteration_limit"
+        status: SearchStatus = "converged" if converged[best] else "iteration_limit"
         if not np.isfinite(length[best]):
             status = "not_found"
-        results.append(
-            Geodesic(
-                status,
-                problem.curve,
-                candidates.phi[best],
-                candidates.start[best],
-                candidates.goal[best],
-                float(length[best]) if status != "not_found" else float("nan"),
-                float(straight[query]),
-                iterations,
-                evaluations * len(rows) // len(length),
-                time_s / len(ends),
-            )
-        )
+        found = candidates.phi[best], candidates.start[best], candidates.goal[best]
+        own = float(length[best]) if status != "not_found" else float("nan")
+        evaluations, time_s = work.evaluations * len(rows) // len(length), work.time_s / len(ends)
+        spent = work.iterations, evaluations, time_s
+        line = float(straight[query])
+        results.append(Geodesic(status, problem.curve, *found, own, line, *spent))
     return results
 
 
 def _lengths(
     problem: ChartProblem, phi: Float[np.ndarray, "C p"], ends: Ends
 ) -> Float[np.ndarray, "C"]:
-    free, start, goal = (torch.from_numpy(values) for values in (phi, ends.z_start, ends.z_goal))
+    arrays = (torch.from_numpy(values) for values in (phi, ends.z_start, ends.z_goal))
     with torch.no_grad():
-        return estimate_length(
-            problem.manifold, problem.curve, free, start, goal, LENGTH_TOLERANCE
-        ).length.numpy()
+        curves = Curves(problem.curve, *arrays)
+        return estimate_length(problem.manifold, curves, LENGTH_TOLERANCE).length.numpy()
 
 
 def _periods(manifold: Manifold) -> Float[np.ndarray, "N"]:
-    return (
-        np.array(manifold.periods)
-        if isinstance(manifold, PeriodicManifold)
-        else np.full(manifold.dim, np.inf)
-    )
+    if isinstance(manifold, PeriodicManifold):
+        return np.array(manifold.periods)
+    return np.full(manifold.dim, np.inf)

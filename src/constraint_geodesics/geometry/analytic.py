@@ -1,18 +1,23 @@
-"""Manifolds whose answer is known: the plane, the sphere S² and the torus T², in closed form.
+"""Manifolds whose answer is known: plane, sphere S² and torus T², and circles cut out of them.
 
-Only the torus' distance takes more, a root of an elliptic integral.  They are the oracle every
-solver is tested against, and the examples of Fig. 2.
+They are the oracle that every solver is tested against, and the examples of Fig. 2.  Only the
+torus' distance is no closed form, but a root of an elliptic integral.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from constraint_geodesics.geometry.graph import OUTSIDE
 from constraint_geodesics.geometry.manifold import GeometryError, require_dim, require_finite
 from constraint_geodesics.geometry.torus_distance import torus_distance
+
+Points = Float[Tensor, "*#batch N"]
 
 
 @dataclass(frozen=True)
@@ -43,12 +48,8 @@ class Plane:
         require_dim(z, self.dim, "z")
         return torch.eye(self.dim, dtype=z.dtype, device=z.device).expand(*z.shape, self.dim)
 
-    def distance(
-        self, a: Float[Tensor, "*#batch N"], b: Float[Tensor, "*#batch N"]
-    ) -> Float[Tensor, "*batch"]:
-        """Euclidean distance.  Raises NonFiniteError with the place of the first coordinate that is
-        not finite.
-        """
+    def distance(self, a: Points, b: Points) -> Float[Tensor, "*batch"]:
+        """Euclidean distance.  Raises NonFiniteError with the place of the first bad coordinate."""
         _require_points(self.dim, a, b)
         return torch.linalg.vector_norm(b - a, dim=-1)
 
@@ -66,22 +67,10 @@ class Sphere:
     def __post_init__(self) -> None:
         _require_positive("radius", self.radius)
 
-    @property
-    def dim(self) -> int:
-        """2."""
-        return 2
-
-    @property
-    def ambient_dim(self) -> int:
-        """3."""
-        return 3
-
-    @property
-    def periods(self) -> tuple[float, float]:
-        """The azimuth wraps at 2π; the elevation has a reflection beyond the poles, but no period
-        of its own.
-        """
-        return math.inf, 2 * math.pi
+    dim = 2
+    ambient_dim = 3
+    periods = (math.inf, 2 * math.pi)
+    """The azimuth wraps; the elevation is reflected at the poles, but has no period."""
 
     def embed(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch 3"]:
         """The point r (cos θ cos α, cos θ sin α, sin θ)."""
@@ -101,16 +90,14 @@ class Sphere:
             torch.stack([torch.ones_like(ring), ring**2], dim=-1)
         )
 
-    def distance(
-        self, a: Float[Tensor, "*#batch N"], b: Float[Tensor, "*#batch N"]
-    ) -> Float[Tensor, "*batch"]:
+    def distance(self, a: Points, b: Points) -> Float[Tensor, "*batch"]:
         """Length of the shorter great circle arc, 0 to πr.
 
         The arc is 2r atan2(sin(δ/2), cos(δ/2)), with both squares written as sums in the chart
         (haversines), so that inside the chart nothing cancels: coincident and antipodal points keep
         full accuracy, where acos(a·b) loses half its digits.  Elevations beyond a pole are
         understood, with an error of up to 5e-8 r.
-        Raises NonFiniteError with the place of the first coordinate that is not finite.
+        Raises NonFiniteError with the first bad coordinate.
         """
         _require_points(self.dim, a, b)
         half_rise, half_turn = ((b - a) / 2).unbind(-1)
@@ -121,9 +108,7 @@ class Sphere:
         return 2 * self.radius * torch.atan2(near.clamp(min=0).sqrt(), far.clamp(min=0).sqrt())
 
     def elevation(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch"]:
-        """Elevation of the embedded point, −π/2 to π/2 [rad]: Fig. 2a's sub-manifolds are its level
-        sets.
-        """
+        """Elevation of the embedded point, −π/2 to π/2 [rad]; Fig. 2a shows its level sets."""
         require_dim(z, self.dim, "z")
         return torch.atan2(torch.sin(z[..., 0]), torch.cos(z[..., 0]).abs())
 
@@ -149,20 +134,9 @@ class Torus:
                 f"itself"
             )
 
-    @property
-    def dim(self) -> int:
-        """2."""
-        return 2
-
-    @property
-    def ambient_dim(self) -> int:
-        """3."""
-        return 3
-
-    @property
-    def periods(self) -> tuple[float, float]:
-        """Both angles wrap at 2π."""
-        return 2 * math.pi, 2 * math.pi
+    dim = 2
+    ambient_dim = 3
+    periods = (2 * math.pi, 2 * math.pi)
 
     def embed(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch 3"]:
         """The point ((R + r cos v) cos u, (R + r cos v) sin u, r sin v)."""
@@ -182,9 +156,7 @@ class Torus:
             torch.stack([ring**2, torch.full_like(ring, self.minor**2)], dim=-1)
         )
 
-    def distance(
-        self, a: Float[Tensor, "*#batch N"], b: Float[Tensor, "*#batch N"]
-    ) -> Float[Tensor, "*batch"]:
+    def distance(self, a: Points, b: Points) -> Float[Tensor, "*batch"]:
         """Length of the shortest of all geodesics between two points, whichever way round the ring
         and the tube.
 
@@ -192,7 +164,7 @@ class Torus:
         is a few 1e-15 R for R ≥ 1.1 r and grows to 2e-13 R at R = 1.0001 r.  Symmetric to the bit,
         0 where a equals b.
         An oracle, not a loss: the result carries no gradient.
-        Raises NonFiniteError with the place of the first coordinate that is not finite.
+        Raises NonFiniteError with the first bad coordinate.
         """
         _require_points(self.dim, a, b)
         dtype = torch.promote_types(torch.result_type(a, b), torch.float32)
@@ -217,3 +189,192 @@ def _require_points(dim: int, a: Tensor, b: Tensor) -> None:
     for name, points in (("a", a), ("b", b)):
         require_dim(points, dim, name)
         require_finite(points, name)
+
+
+TOUCH = 1e-12
+"""Bands this close [rad] touch: levels and tolerances written as decimals meet only up to rounding.
+"""
+
+
+class LevelSetError(GeometryError):
+    """No circle is cut out by the input; the message names it, its value and what is allowed."""
+
+
+@dataclass(frozen=True)
+class LevelCircle:
+    """The circle S¹ on which one chart coordinate of a sphere or torus is held, charted by the
+    other one, u [rad].
+
+    coordinate: index of the one held.  level: its value [rad].  Raises LevelSetError as LevelSet
+    does.
+    """
+
+    manifold: Sphere | Torus
+    coordinate: int
+    level: float
+
+    def __post_init__(self) -> None:
+        _require_coordinate(self.manifold, self.coordinate)
+        _require_level(self.manifold, "level", self.level)
+
+    dim = 1
+    ambient_dim = 3
+    periods = (2 * math.pi,)
+
+    @property
+    def radius(self) -> float:
+        """Radius of the circle, in the unit of the manifold's radii."""
+        metric = self.manifold.metric(self.point(torch.zeros(1, dtype=torch.float64)))
+        return math.sqrt(metric[1 - self.coordinate, 1 - self.coordinate])
+
+    def point(self, u: Float[Tensor, "*batch 1"]) -> Float[Tensor, "*batch 2"]:
+        """The point in the chart of the manifold that the circle lies on."""
+        require_dim(u, self.dim, "u")
+        held = torch.full_like(u, self.level)
+        return torch.cat([held, u] if self.coordinate == 0 else [u, held], dim=-1)
+
+    def embed(self, u: Float[Tensor, "*batch 1"]) -> Float[Tensor, "*batch 3"]:
+        """The point in R³."""
+        return self.manifold.embed(self.point(u))
+
+    def metric(self, u: Float[Tensor, "*batch 1"]) -> Float[Tensor, "*batch 1 1"]:
+        """The entry of the manifold's metric along the circle: its squared radius, everywhere."""
+        free = 1 - self.coordinate
+        return self.manifold.metric(self.point(u))[..., free : free + 1, free : free + 1]
+
+    def distance(self, a: Points, b: Points) -> Float[Tensor, "*batch"]:
+        """Length of the shorter arc, 0 to π times the radius: the way on the circle, not across the
+        manifold.
+
+        Raises NonFiniteError with the first bad coordinate.
+        """
+        _require_points(self.dim, a, b)
+        return self.radius * _wrapped(b - a)[..., 0].abs()
+
+
+@dataclass(frozen=True)
+class LevelSet:
+    """The points where one chart coordinate is at one of several levels: a set of circles S¹.
+
+    manifold, coordinate: Sphere with 0, its elevation (Fig. 2a); Torus with 1, its tube angle (Fig.
+    2b), or with 0, its ring angle.  The sphere's azimuth is refused: its level sets run from pole
+    to pole and don't close.
+    levels: values of that coordinate [rad], at least one.  Levels that differ by whole periods are
+    one.
+    tolerance: deviation of the coordinate that still counts as held [rad], at least 0; the set is
+    then made of bands about the levels.  Bands that overlap or touch (to 1e-12 rad) are one
+    component.
+    Raises LevelSetError on anything else, such as an elevation at a pole, |θ| ≥ π/2, where the
+    circle has no length.
+    """
+
+    manifold: Sphere | Torus
+    coordinate: int
+    levels: tuple[float, ...]
+    tolerance: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require_coordinate(self.manifold, self.coordinate)
+        if not self.levels:
+            raise LevelSetError("levels = (): must hold at least one")
+        for k, level in enumerate(self.levels):
+            _require_level(self.manifold, f"levels[{k}]", level)
+        if not (math.isfinite(self.tolerance) and self.tolerance >= 0):
+            raise LevelSetError(f"tolerance = {self.tolerance}: must be finite and at least 0")
+
+    def inclusion(self, z: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
+        """The inclusion map ι(z) [rad], eqs. 7-8: how far the coordinate is from the nearest level,
+        beyond `tolerance`.
+
+        Zero to the bit where the constraint holds.  Elevations beyond a pole are understood.
+        Raises NonFiniteError with the first bad coordinate.
+        """
+        return (self._deviations(z).amin(-1) - self.tolerance).clamp(min=0)
+
+    def components(self) -> tuple[LevelCircle, ...]:
+        """The connected components, by rising level from −π.
+
+        A band that several levels share is given by the circle of the one that `levels` names
+        first.
+        """
+        return tuple(self._circle(min(level.number for level in group)) for group in self._groups())
+
+    def component_of(self, z: Float[Tensor, "*batch 2"]) -> Int[Tensor, "*batch"]:
+        """Each point's place in `components()`, −1 where the constraint doesn't hold."""
+        component = [0] * len(self.levels)
+        for index, group in enumerate(self._groups()):
+            for level in group:
+                component[level.number] = index
+        nearest = self._deviations(z).argmin(-1)
+        found = torch.tensor(component, device=z.device)[nearest]
+        return torch.where(self.inclusion(z) > 0, OUTSIDE, found)
+
+    def _circle(self, index: int) -> LevelCircle:
+        return LevelCircle(self.manifold, self.coordinate, self.levels[index])
+
+    def _deviations(self, z: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch L"]:
+        """Distance of the coordinate to each level, [rad]."""
+        require_dim(z, self.manifold.dim, "z")
+        require_finite(z, "z")
+        held = z[..., self.coordinate]
+        if isinstance(self.manifold, Sphere):
+            # Elevation by way of the embedded point is inexact by a bit, so only where it has to
+            # be.
+            held = torch.where(held.abs() <= math.pi / 2, held, self.manifold.elevation(z))
+        offsets = held[..., None] - torch.tensor(self.levels, dtype=z.dtype, device=z.device)
+        return (_wrapped(offsets) if self._wraps else offsets).abs()
+
+    @property
+    def _wraps(self) -> bool:
+        return math.isfinite(self.manifold.periods[self.coordinate])
+
+    def _groups(self) -> list[list["_Level"]]:
+        """The levels by component, in the order of `components`."""
+        width = 2 * self.tolerance + TOUCH
+        levels = torch.tensor(self.levels, dtype=torch.float64)
+        values = _wrapped(levels) if self._wraps else levels
+        ordered = sorted(_Level(value, number) for number, value in enumerate(values.tolist()))
+        groups = [[ordered[0]]]
+        for before, level in itertools.pairwise(ordered):
+            if level.value - before.value > width:
+                groups.append([])
+            groups[-1].append(level)
+        if (
+            self._wraps
+            and len(groups) > 1
+            and ordered[0].value + 2 * math.pi - ordered[-1].value <= width
+        ):
+            # The last band runs on into the first across the seam of the chart.
+            groups = [*groups[1:-1], groups[-1] + groups[0]]
+        return groups
+
+
+class _Level(NamedTuple):
+    """A level's value, wrapped to [−π, π] if the coordinate repeats, and its place in `levels`."""
+
+    value: float
+    number: int
+
+
+def _wrapped(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """An angle's image in [−π, π], exact for those within it."""
+    return angle - 2 * math.pi * torch.round(angle / (2 * math.pi))
+
+
+def _require_coordinate(manifold: Sphere | Torus, coordinate: int) -> None:
+    if coordinate not in (0, 1):
+        raise LevelSetError(f"coordinate = {coordinate}: must be 0 or 1")
+    if not math.isfinite(manifold.periods[1 - coordinate]):
+        raise LevelSetError(
+            f"coordinate = {coordinate}: the other one doesn't repeat, so its level sets "
+            f"don't close"
+        )
+
+
+def _require_level(manifold: Sphere | Torus, name: str, level: float) -> None:
+    if not math.isfinite(level):
+        raise LevelSetError(f"{name} = {level}: must be finite")
+    if isinstance(manifold, Sphere) and abs(level) >= math.pi / 2:
+        raise LevelSetError(
+            f"{name} = {level}: an elevation must lie between the poles, −π/2 to π/2"
+        )

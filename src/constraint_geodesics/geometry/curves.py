@@ -1,14 +1,12 @@
 """Curves in a chart that start and end exactly where they must (eqs. 9-11).
 
-Every family is the straight line between the ends plus a basis that vanishes there, γ_φ(t) = (1 −
-t) start + t goal + Σ_k φ_{n,k} b_k(t), so φ = 0 is the straight line and no φ moves an end.
+Every family is the straight line between the ends plus a basis that vanishes there.
 """
 
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cache
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -17,99 +15,20 @@ from torch import Tensor
 
 from constraint_geodesics.geometry.manifold import GeometryError, require_finite
 
+Coefficients = Float[Tensor, "*#batch p"]
+Points = Float[Tensor, "*#batch N"]
+Times = Float[Tensor, "*#batch T"]
+
 
 class CurveError(GeometryError):
-    """A curve can't be built from the input; the message names it, its shape or value and what is
-    allowed.
-    """
+    """A curve can't be built from the input; names it, its shape or value and what is allowed."""
 
 
-@runtime_checkable
-class CurveFamily(Protocol):
-    """All curves γ_φ in N dimensions between two given ends, one for each vector of free numbers φ.
+class CurveFamily(ABC):
+    """All curves γ_φ(t) = (1 − t) start + t goal + Σ_k φ_{n,k} b_k(t) in N dimensions.
 
-    A new family is a subclass of PinnedFamily, which has everything but the basis.
-    """
-
-    @property
-    def dim(self) -> int:
-        """Dimension N of the chart the curves live in."""
-        ...
-
-    @property
-    def functions(self) -> int:
-        """Number m of basis functions, the same for every dimension."""
-        ...
-
-    @property
-    def coefficients(self) -> int:
-        """Number p = N m of free numbers in φ; φ = 0 is the straight line in the chart."""
-        ...
-
-    @property
-    def breaks(self) -> tuple[float, ...]:
-        """Rising times from 0 to 1 between which the curves are polynomials; at the inner ones they
-        are C² only.
-        """
-        ...
-
-    def evaluate(
-        self,
-        phi: Float[Tensor, "*#batch p"],
-        start: Float[Tensor, "*#batch N"],
-        goal: Float[Tensor, "*#batch N"],
-        t: Float[Tensor, "*#batch T"],
-    ) -> tuple[Float[Tensor, "*batch T N"], Float[Tensor, "*batch T N"]]:
-        """Points γ(t) and velocities γ̇(t) at times t in [0, 1]; γ(0) = start and γ(1) = goal to
-        the bit.
-
-        t: (T,) for all curves, or a row of times for each of them.
-        """
-        ...
-
-    def acceleration(
-        self,
-        phi: Float[Tensor, "*#batch p"],
-        start: Float[Tensor, "*#batch N"],
-        goal: Float[Tensor, "*#batch N"],
-        t: Float[Tensor, "*#batch T"],
-    ) -> Float[Tensor, "*batch T N"]:
-        """Second derivatives γ̈(t) in the chart."""
-        ...
-
-    def basis(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
-        """Basis functions b_k(t), zero to the bit at t = 0 and t = 1."""
-        ...
-
-    def basis_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
-        """Derivatives ḃ_k(t)."""
-        ...
-
-    def from_basis(
-        self,
-        phi: Float[Tensor, "*#batch p"],
-        start: Float[Tensor, "*#batch N"],
-        goal: Float[Tensor, "*#batch N"],
-        t: Float[Tensor, "*#batch T"],
-        basis: Float[Tensor, "*#batch T m"],
-        derivative: Float[Tensor, "*#batch T m"],
-    ) -> tuple[Float[Tensor, "*batch T N"], Float[Tensor, "*batch T N"]]:
-        """`evaluate` for callers that keep b_k(t) and ḃ_k(t) of the same times for many curves."""
-        ...
-
-    def fit(
-        self, points: Float[Tensor, "*batch T N"], t: Float[Tensor, "T"]
-    ) -> Float[Tensor, "*batch p"]:
-        """Coefficients of the curves nearest to sampled ones whose first and last points are the
-        ends.
-        """
-        ...
-
-
-class PinnedFamily(ABC):
-    """What all families share, given a basis: γ_φ(t) = (1 − t) start + t goal + Σ_k φ_{n,k} b_k(t).
-
-    φ holds the m numbers of the first dimension, then those of the next.
+    A new family brings its dimension N, its basis b_k and two derivatives.  φ holds the m numbers
+    of the first dimension, then those of the next; φ = 0 is the straight line in the chart.
     """
 
     dim: int
@@ -117,12 +36,12 @@ class PinnedFamily(ABC):
     @property
     @abstractmethod
     def functions(self) -> int:
-        """Number m of basis functions."""
+        """Number m of basis functions, the same for every dimension."""
 
     @property
     @abstractmethod
     def breaks(self) -> tuple[float, ...]:
-        """Rising times from 0 to 1 between which the basis is polynomial."""
+        """Rising times from 0 to 1 between which the basis is polynomial; C² at the inner ones."""
 
     @abstractmethod
     def basis(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
@@ -138,61 +57,30 @@ class PinnedFamily(ABC):
 
     @property
     def coefficients(self) -> int:
-        """Number of free numbers, p = N m."""
+        """Number of free numbers in φ, p = N m."""
         return self.dim * self.functions
 
     def evaluate(
-        self,
-        phi: Float[Tensor, "*#batch p"],
-        start: Float[Tensor, "*#batch N"],
-        goal: Float[Tensor, "*#batch N"],
-        t: Float[Tensor, "*#batch T"],
+        self, phi: Coefficients, start: Points, goal: Points, t: Times
     ) -> tuple[Float[Tensor, "*batch T N"], Float[Tensor, "*batch T N"]]:
-        """Points γ(t) and velocities γ̇(t); t is (T,) for all curves, or has a row for each.
+        """Points γ(t) and velocities γ̇(t); γ(0) = start and γ(1) = goal to the bit.
 
-        Batches of phi, start and goal broadcast, and t to theirs.  Raises CurveError on a wrong
-        shape.
-        """
-        return self.from_basis(phi, start, goal, t, self.basis(t), self.basis_derivative(t))
-
-    def from_basis(
-        self,
-        phi: Float[Tensor, "*#batch p"],
-        start: Float[Tensor, "*#batch N"],
-        goal: Float[Tensor, "*#batch N"],
-        t: Float[Tensor, "*#batch T"],
-        basis: Float[Tensor, "*#batch T m"],
-        derivative: Float[Tensor, "*#batch T m"],
-    ) -> tuple[Float[Tensor, "*batch T N"], Float[Tensor, "*batch T N"]]:
-        """Points and velocities from `basis(t)` and `basis_derivative(t)`, which a caller may keep.
-
+        Batches of phi, start and goal broadcast; t is (T,) for all curves, or has a row for each.
         Raises CurveError on a wrong shape.
         """
         self._check(phi, start, goal)
         if t.ndim != 1:
             self._batch(t, phi, start, goal)
-        for name, values in (("basis", basis), ("derivative", derivative)):
-            if values.shape != (*t.shape, self.functions):
-                raise CurveError(
-                    f"{name} has shape {tuple(values.shape)}: must be {(*t.shape, self.functions)}"
-                )
         start, goal, time = start[..., None, :], goal[..., None, :], t[..., None]
-        # Weighting both ends, not start + t (goal − start), is what makes the goal exact in
-        # floating point.
-        points = (1 - time) * start + time * goal + self._bend(phi, basis)
-        velocities = (goal - start) + self._bend(phi, derivative)
+        # Weighting both ends, not start + t (goal − start), makes the goal exact.
+        points = (1 - time) * start + time * goal + self._bend(phi, self.basis(t))
+        velocities = (goal - start) + self._bend(phi, self.basis_derivative(t))
         return points, velocities
 
     def acceleration(
-        self,
-        phi: Float[Tensor, "*#batch p"],
-        start: Float[Tensor, "*#batch N"],
-        goal: Float[Tensor, "*#batch N"],
-        t: Float[Tensor, "*#batch T"],
+        self, phi: Coefficients, start: Points, goal: Points, t: Times
     ) -> Float[Tensor, "*batch T N"]:
-        """Second derivatives γ̈(t) in the chart; the ends only give them their batch.  Raises as
-        `evaluate` does.
-        """
+        """Second derivatives γ̈(t); the ends only give their batch.  Raises as `evaluate` does."""
         self._check(phi, start, goal)
         batch = self._batch(t, phi, start, goal)
         bend = self._bend(phi, self.basis_second_derivative(t))
@@ -201,14 +89,12 @@ class PinnedFamily(ABC):
     def fit(
         self, points: Float[Tensor, "*batch T N"], t: Float[Tensor, "T"]
     ) -> Float[Tensor, "*batch p"]:
-        """Coefficients of the curves nearest to sampled ones, by least squares over the samples,
-        all of equal weight.
+        """Coefficients of the curves nearest to sampled ones, by least squares over the samples.
 
         The first and last points are the ends, t[0] = 0 and t[-1] = 1.  Members of the family come
         back as they were.
         Raises CurveError on a wrong shape, other first and last times, or times too few or too
-        close to tell the basis functions apart; NonFiniteError with the place of the first entry
-        that is not finite.
+        close to tell the basis functions apart; NonFiniteError with the first bad entry.
         """
         self._check_samples(points, t)
         time = t.to(points)
@@ -238,9 +124,7 @@ class PinnedFamily(ABC):
                 )
 
     def _batch(self, t: Tensor, phi: Tensor, start: Tensor, goal: Tensor) -> tuple[int, ...]:
-        """The curves' batch, which rows of times must not enlarge: times in a column are a
-        mistake.
-        """
+        """The curves' batch, which rows of times must not enlarge."""
         batch = tuple(torch.broadcast_shapes(phi.shape[:-1], start.shape[:-1], goal.shape[:-1]))
         sizes = zip(reversed(t.shape[:-1]), reversed(batch), strict=False)
         if not 1 <= t.ndim <= len(batch) + 1 or any(rows not in (1, size) for rows, size in sizes):
@@ -272,17 +156,44 @@ class PinnedFamily(ABC):
             )
 
 
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Curves γ_φ of one family: coefficients phi, ends start and goal; their batches broadcast."""
+
+    family: CurveFamily
+    phi: Coefficients
+    start: Points
+    goal: Points
+
+    def __getitem__(self, rows: Tensor | slice | int) -> "Curves":
+        return Curves(self.family, self.phi[rows], self.start[rows], self.goal[rows])
+
+    @property
+    def batch(self) -> torch.Size:
+        """The batch that coefficients and ends share."""
+        ends = self.start.shape[:-1], self.goal.shape[:-1]
+        return torch.broadcast_shapes(self.phi.shape[:-1], *ends)
+
+    def flat(self) -> "Curves":
+        """The same curves in a batch of one axis."""
+        batch, arrays = self.batch, (self.phi, self.start, self.goal)
+        return Curves(
+            self.family,
+            *(x.expand(*batch, x.shape[-1]).reshape(batch.numel(), x.shape[-1]) for x in arrays),
+        )
+
+    def at(self, t: Times) -> tuple[Float[Tensor, "*batch T N"], Float[Tensor, "*batch T N"]]:
+        """Points and velocities, as `CurveFamily.evaluate`."""
+        return self.family.evaluate(self.phi, self.start, self.goal, t)
+
+
 @dataclass(frozen=True)
-class PinnedPolynomial(PinnedFamily):
-    """Polynomials of degree K in N dimensions with both ends given, eqs. 9-11, in a
-    well-conditioned basis:
+class PinnedPolynomial(CurveFamily):
+    """Polynomials of degree K in N dimensions with both ends given, eqs. 9-11.
 
-    γ(t) = (1 − t) start + t goal + Σ_k φ_{n,k} b_k(t),  b_k(t) = t (1 − t) P*_k(t),  k = 0 … K − 2,
-
-    with P*_k the Legendre polynomials shifted to [0, 1].  The space is that of eq. 11 with the goal
-    pinned as well (`to_monomial` gives its coefficients), but no two b_k are nearly alike, as
-    powers of t are. φ holds the K − 1 numbers of the first dimension, then those of the next: N (K
-    − 1) in all, 4 for a planar cubic.
+    b_k(t) = t (1 − t) P*_k(t), k = 0 … K − 2, with P*_k the Legendre polynomials shifted to [0, 1].
+    The space is that of eq. 11 with the goal pinned as well (`to_monomial` gives its coefficients),
+    but no two b_k are nearly alike, as powers of t are.  p = N (K − 1), 4 for a planar cubic.
 
     dim: N, at least 1.  degree: K, at least 1 (the straight line).  Raises CurveError otherwise.
     """
@@ -298,42 +209,28 @@ class PinnedPolynomial(PinnedFamily):
         """K − 1."""
         return self.degree - 1
 
-    @property
-    def breaks(self) -> tuple[float, ...]:
-        """0 and 1: one piece."""
-        return (0.0, 1.0)
+    breaks = (0.0, 1.0)
 
-    def basis(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times {self.degree}-1"]:
+    def basis(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
         """Basis b_k(t) = t (1 − t) P*_k(t), zero at t = 0 and t = 1."""
         legendre, _ = shifted_legendre(t, self.functions)
         return (t * (1 - t))[..., None] * legendre
 
-    def basis_derivative(
-        self, t: Float[Tensor, "*times"]
-    ) -> Float[Tensor, "*times {self.degree}-1"]:
+    def basis_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
         """Derivatives ḃ_k(t) = (1 − 2t) P*_k(t) + t (1 − t) Ṗ*_k(t)."""
         legendre, derivative = shifted_legendre(t, self.functions)
         return (1 - 2 * t)[..., None] * legendre + (t * (1 - t))[..., None] * derivative
 
-    def basis_second_derivative(
-        self, t: Float[Tensor, "*times"]
-    ) -> Float[Tensor, "*times {self.degree}-1"]:
-        """Second derivatives b̈_k(t) = (1 − 2t) Ṗ*_k(t) − (k² + k + 2) P*_k(t), by Legendre's
-        differential equation.
-        """
+    def basis_second_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
+        """b̈_k(t) = (1 − 2t) Ṗ*_k(t) − (k² + k + 2) P*_k(t), by Legendre's differential equation."""
         legendre, derivative = shifted_legendre(t, self.functions)
         k = torch.arange(self.functions, dtype=t.dtype, device=t.device)
         return (1 - 2 * t)[..., None] * derivative - (k * k + k + 2) * legendre
 
     def to_monomial(
-        self,
-        phi: Float[Tensor, "*#batch p"],
-        start: Float[Tensor, "*#batch N"],
-        goal: Float[Tensor, "*#batch N"],
+        self, phi: Coefficients, start: Points, goal: Points
     ) -> Float[Tensor, "*batch N {self.degree}+1"]:
-        """Coefficients φ_{n,k} of t^k in eq. 9: φ_{n,0} = start_n and Σ_{k≥1} φ_{n,k} = goal_n −
-        start_n.
-        """
+        """Coefficients of t^k in eq. 9: φ_{n,0} = start_n, Σ_{k≥1} φ_{n,k} = goal_n − start_n."""
         self._check(phi, start, goal)
         powers = _basis_in_powers(self.degree).to(phi)
         bent = self._by_dimension(phi) @ powers
@@ -345,14 +242,13 @@ class PinnedPolynomial(PinnedFamily):
 
 
 @dataclass(frozen=True)
-class PinnedSpline(PinnedFamily):
+class PinnedSpline(CurveFamily):
     """Cubic C² splines on S equal pieces in N dimensions with both ends given.
 
     The basis is that of the clamped cubic B-splines (de Boor, A Practical Guide to Splines, ch.
     IX), S + 3 in number; the first and last, which alone are not zero at the ends, give way to the
     straight line.  One piece spans the cubics of PinnedPolynomial(N, 3).  A coefficient acts on
-    four pieces at most. φ holds the S + 1 numbers of the first dimension, then those of the next: N
-    (S + 1) in all.
+    four pieces at most.  p = N (S + 1).
 
     dim: N, at least 1.  segments: S, at least 1.  Raises CurveError otherwise.
     """
@@ -373,19 +269,15 @@ class PinnedSpline(PinnedFamily):
         """Knots 0, 1/S … 1; the third derivative jumps at the inner ones."""
         return tuple(k / self.segments for k in range(self.segments + 1))
 
-    def basis(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times {self.segments}+1"]:
+    def basis(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
         """Inner B-splines b_k(t), zero at t = 0 and t = 1."""
         return self._derivative(t, 0)
 
-    def basis_derivative(
-        self, t: Float[Tensor, "*times"]
-    ) -> Float[Tensor, "*times {self.segments}+1"]:
+    def basis_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
         """Derivatives ḃ_k(t), quadratic on each piece."""
         return self._derivative(t, 1)
 
-    def basis_second_derivative(
-        self, t: Float[Tensor, "*times"]
-    ) -> Float[Tensor, "*times {self.segments}+1"]:
+    def basis_second_derivative(self, t: Float[Tensor, "*times"]) -> Float[Tensor, "*times m"]:
         """Second derivatives b̈_k(t), linear on each piece."""
         return self._derivative(t, 2)
 
@@ -412,9 +304,7 @@ def shifted_legendre(
 
 
 def _basis_in_powers(degree: int) -> Tensor:
-    """Coefficients of t^0 … t^K in b_k(t), (K − 1, K + 1), each rounded once from the exact
-    integer.
-    """
+    """Coefficients of t^0 … t^K in b_k(t), (K − 1, K + 1), each an exact integer."""
     rows = torch.zeros(degree - 1, degree + 1, dtype=torch.float64)
     for k in range(degree - 1):
         legendre = [(-1) ** (k + j) * math.comb(k, j) * math.comb(k + j, j) for j in range(k + 1)]
@@ -431,8 +321,7 @@ def _bernstein(u: Tensor, degree: int) -> Tensor:
 
 @cache
 def _bezier_ordinates(segments: int, order: int) -> Float[np.ndarray, "S d m"]:
-    """Bézier ordinates (S, 4 − order, S + 1) of the inner B-splines' derivatives to t, on each
-    piece.
+    """Bézier ordinates (S, 4 − order, S + 1) of the inner B-splines' derivatives on each piece.
 
     Ordinate j of the piece [k, k + 1] is the blossom at 3 − j times k and j times k + 1 (Ramshaw,
     Blossoms are polar forms, 1989), in units of the pieces.  Each derivative of a Bézier curve of

@@ -1,6 +1,4 @@
-"""Graphs over points of a manifold: neighbours, connected components, shortest paths; nodes are
-numbered from 0.
-"""
+"""Graphs over points of a manifold: neighbours, components, shortest paths; nodes count from 0."""
 
 from typing import NamedTuple
 
@@ -17,28 +15,20 @@ OUTSIDE = -1
 
 
 class GraphError(GeometryError):
-    """A graph can't be built or searched; the message names the input, its value and what is
-    allowed.
-    """
+    """A graph can't be built or searched; names the input, its value and what is allowed."""
 
 
 class ShortestPath(NamedTuple):
-    """A path as its nodes from source to target (k,), and its length; no nodes and inf where there
-    is none.
-    """
+    """Nodes from source to target (k,) and the length; no nodes and inf where there is none."""
 
     nodes: Int[np.ndarray, "k"]
     length: float
 
 
 def nearest_neighbour_edges(points: Float[np.ndarray, "n d"], neighbours: int) -> Edges:
-    """Undirected edges from every point to its `neighbours` nearest others: unique pairs i < j, in
-    lexical order.
+    """Undirected edges from every point to its `neighbours` nearest: unique pairs i < j, in order.
 
-    A point has more edges where others count it among their neighbours; points that coincide are
-    joined too.
-    Raises NonFiniteError with the place of the first coordinate that is not finite, GraphError if
-    neighbours < 1.
+    Raises NonFiniteError with the first bad coordinate, GraphError if neighbours < 1.
     """
     if neighbours < 1:
         raise GraphError(f"neighbours = {neighbours}: must be at least 1")

@@ -1,6 +1,4 @@
-"""A plane with a conformal metric known at the nodes of a regular grid, as metrics of latent spaces
-are exchanged.
-"""
+"""A plane with a conformal metric known at the nodes of a regular grid."""
 
 import math
 from dataclasses import dataclass, field
@@ -24,25 +22,19 @@ WALL = 100.0
 
 
 class GridError(GeometryError):
-    """Arrays or bounds that are no grid of a metric; the message names the input, its value and
-    what is allowed.
-    """
+    """Arrays or bounds that are no grid of a metric; names the input and what is allowed."""
 
 
 @dataclass(frozen=True, eq=False)
 class GridManifold:
-    """The metric M(z) = g(z) I on a rectangle of the plane, g given at the nodes of a grid,
-    bilinear between them.
+    """The metric M(z) = g(z) I on a rectangle, g given at the nodes of a grid and bilinear between.
 
-    values: g (rows, columns), rows along the first coordinate: positive, in the square of the unit
-    of length over that of the chart.  lower, upper: chart coordinates of the first node of both
-    axes and of the last.
-    blocked: nodes that don't belong to the manifold; what `values` holds there is never read.  None
-    blocks no node. A point is blocked where its nearest node is.  In a blocked region g still leads
-    out: a blocked node carries WALL times the largest free value, times its distance to the nearest
-    free node in steps of the finer axis, so that g falls towards the free nodes from everywhere in
-    it.  By bilinearity the half of a cell that is free next to a blocked node takes part in that
-    slope.
+    values: g (rows, columns), rows along the first coordinate, positive.  lower, upper: chart
+    coordinates of the first and last node of both axes.
+    blocked: nodes that don't belong to the manifold, None for none; what `values` holds there is
+    never read.  A point is blocked where its nearest node is.  There g still leads out: a blocked
+    node carries WALL times the largest free value, times its distance to the nearest free node in
+    steps of the finer axis.
     Raises GridError on a shape that is no grid, bounds that don't rise, values that aren't positive
     and finite at the free nodes, or if every node is blocked.
     """
@@ -68,15 +60,13 @@ class GridManifold:
         shape: tuple[int, int],
         dtype: torch.dtype = torch.float64,
     ) -> "GridManifold":
-        """The volume √det M of another manifold's metric at the nodes of a grid, taken for the
-        conformal factor g.
+        """The volume √det M of another manifold's metric at the nodes of a grid, as the factor g.
 
-        For a conformal metric M = g I the volume is g itself, and distances agree as the grid gets
-        finer; of any other metric only the volume of small regions is kept, not its lengths in
-        single directions.
+        For a conformal metric M = g I distances agree as the grid gets finer; of any other only the
+        volume of small regions is kept.
         shape: nodes along both axes.  dtype: what the manifold computes in.  Nodes that a
-        BoundedManifold doesn't contain are blocked.  Raises GridError unless the manifold has dim
-        2, and where the volume isn't positive.
+        BoundedManifold doesn't contain are blocked.  Raises GridError unless dim is 2 and the
+        volume positive.
         """
         if manifold.dim != 2:
             raise GridError(f"manifold has dim {manifold.dim}: must be 2")
@@ -88,10 +78,7 @@ class GridManifold:
             volume.reshape(shape), lower, upper, None if blocked is None else blocked.reshape(shape)
         )
 
-    @property
-    def dim(self) -> int:
-        """2."""
-        return 2
+    dim = 2
 
     @property
     def spacing(self) -> Bounds:
@@ -103,9 +90,7 @@ class GridManifold:
         return first, second
 
     def nodes(self) -> Float[Tensor, "rows*columns 2"]:
-        """Chart points of the nodes, row by row; the first and the last lie on `lower` and `upper`
-        to the bit.
-        """
+        """Chart points of the nodes, row by row; first and last lie on the bounds to the bit."""
         rows, columns = self.values.shape
         return _nodes((rows, columns), self.lower, self.upper, self.values)
 
@@ -129,9 +114,7 @@ class GridManifold:
         return factor[..., None, None] * torch.eye(self.dim, dtype=factor.dtype, device=z.device)
 
     def contains(self, z: Float[Tensor, "*batch N"]) -> Bool[Tensor, "*batch"]:
-        """Whether each point is finite, on the grid (its border included), and nearest to a node
-        that isn't blocked.
-        """
+        """Whether each point is finite, on the grid or its border, and nearest to a free node."""
         require_dim(z, self.dim, "z")
         lower, upper = (
             torch.tensor(bound, dtype=z.dtype, device=z.device)
@@ -173,9 +156,7 @@ def _nodes(
 def _with_walls(
     values: Float[Tensor, "rows columns"], blocked: Bool[Tensor, "rows columns"], spacing: Bounds
 ) -> Float[Tensor, "rows columns"]:
-    """The values with those of blocked nodes replaced by walls that rise with the distance to the
-    free ones.
-    """
+    """The values, with blocked nodes as walls that rise with the distance to the free ones."""
     depth = ndimage.distance_transform_edt(blocked.cpu().numpy(), sampling=spacing) / min(spacing)
     walls = WALL * values[~blocked].max() * torch.from_numpy(depth).to(values)
     return torch.where(blocked, walls, values)

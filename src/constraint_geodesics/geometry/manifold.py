@@ -1,6 +1,4 @@
-"""What a manifold is to the rest of the project: a chart with a metric, and what some manifolds
-have beside it.
-"""
+"""What a manifold is to the rest of the project: a chart with a metric, and what some add."""
 
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
@@ -50,9 +48,7 @@ class Manifold(Protocol):
 
 @runtime_checkable
 class EmbeddedManifold(Manifold, Protocol):
-    """A manifold embedded into R^A, with the metric M = JᵀJ that the embedding's Jacobian J
-    induces.
-    """
+    """A manifold embedded into R^A, with the metric M = JᵀJ of the embedding's Jacobian J."""
 
     @property
     def ambient_dim(self) -> int:
@@ -60,9 +56,7 @@ class EmbeddedManifold(Manifold, Protocol):
         ...
 
     def embed(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch A"]:
-        """The embedding f(z).  It acts on each point by itself and is differentiable in forward
-        mode.
-        """
+        """The embedding f(z), of each point by itself, differentiable in forward mode."""
         ...
 
 
@@ -114,9 +108,7 @@ def pullback_metric(embed: Embedding, z: Float[Tensor, "*batch N"]) -> Float[Ten
 
 
 def require_finite(values: Float[Tensor, "..."], what: str) -> None:
-    """Raise NonFiniteError with the first entry of `values`, called `what` in the message, that is
-    not finite.
-    """
+    """Raise NonFiniteError with the first entry of `values`, called `what`, that is not finite."""
     finite = torch.isfinite(values)
     if not finite.all():
         index = tuple(int(i) for i in torch.nonzero(~finite)[0])
@@ -124,9 +116,7 @@ def require_finite(values: Float[Tensor, "..."], what: str) -> None:
 
 
 def require_dim(points: Float[Tensor, "..."], dim: int, what: str) -> None:
-    """Raise GeometryError unless the last axis of `points`, called `what` in the message, has `dim`
-    entries.
-    """
+    """Raise GeometryError unless the last axis of `points`, called `what`, has `dim` entries."""
     if points.ndim == 0 or points.shape[-1] != dim:
         raise GeometryError(
             f"{what} has shape {tuple(points.shape)}: its last axis must have {dim} entries"

@@ -19,6 +19,8 @@ Two neighbours that keep |a_i| ≤ A keep it at any common slower pace, so the s
 which the goal can be reached are an interval that begins at 0.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 from numba import njit
@@ -36,11 +38,19 @@ _ROUNDING = 1e-11
 off.
 """
 _NUDGE = 1e-3
-"""Relative change of a ratio of speeds by which the side of the better ratios is told."""
+"""Relative change of a ratio of speeds that shows the side of the better ratios."""
 _SECTIONS = 20
 """Golden sections of an interval of ratios: they leave less than 1e-4 of it."""
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 _COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
+
+
+class _Step(NamedTuple):
+    """A step between two rows: its direction (D,), its length, and a speed or its upper limit."""
+
+    direction: Float[np.ndarray, "D"]
+    length: float
+    speed: float
 
 
 def time_parametrisation(
@@ -123,19 +133,9 @@ def _times(q, spacing, velocity, acceleration, times):
         # the ratio found on the way back is allowed at every pace, so what is allowed is never
         # empty
         allowed = ratios[i - 1] * speed
-        most = min(fastest[i], largest * speed)
-        speed = max(
-            allowed,
-            _fastest_beside(
-                speed,
-                directions[i - 1],
-                spacing[i - 1],
-                directions[i],
-                spacing[i],
-                acceleration,
-                most,
-            ),
-        )
+        before = _Step(directions[i - 1], spacing[i - 1], speed)
+        step = _Step(directions[i], spacing[i], min(fastest[i], largest * speed))
+        speed = max(allowed, _fastest_next_to(before, step, acceleration))
         times[i + 1] = times[i] + spacing[i] / speed
     # where a step takes a tiny share of the time, rounding makes its acceleration so uncertain that
     # once is not enough
@@ -150,32 +150,25 @@ def _times(q, spacing, velocity, acceleration, times):
 
 @njit(**_COMPILE)
 def _controllable(directions, spacing, acceleration, fastest, ratios):
-    """Lowers `fastest` (T-1,) to the largest speeds from which the goal can be reached, from the
-    last step backward.
+    """Lowers `fastest` (T-1,) to the largest speeds from which the goal can be reached, backward.
 
     ratios[i]: speed of step i + 1 over that of step i with which the largest speed of step i is
     reached; it is allowed at every slower speed too.
     """
     for i in range(spacing.shape[0] - 2, -1, -1):
-        u, s, u_next, s_next = directions[i], spacing[i], directions[i + 1], spacing[i + 1]
-        smallest, largest = _ratio_window(s, s_next)
-        most = min(fastest[i], fastest[i + 1] / smallest)
-        speed = _fastest_beside(fastest[i + 1], u_next, s_next, u, s, acceleration, most)
+        smallest, largest = _ratio_window(spacing[i], spacing[i + 1])
+        step = _Step(directions[i], spacing[i], min(fastest[i], fastest[i + 1] / smallest))
+        behind = _Step(directions[i + 1], spacing[i + 1], fastest[i + 1])
+        speed = _fastest_next_to(behind, step, acceleration)
         ratio = fastest[i + 1] / speed
-        if (
-            ratio > largest
-        ):  # so slow beside the next step's largest speed that this one must be lowered as well
+        if ratio > largest:  # too slow for the next step's largest speed, which must be lowered
             ratio, speed = largest, 0.0
         # Where a joint turns back or speeds up, going slower after the row can allow to go faster
         # before it.
-        limit = fastest[i + 1]
         lower = ratio * (1.0 - _NUDGE)
-        if (
-            speed < most
-            and _speed_at_ratio(lower, u, s, u_next, s_next, acceleration, most, limit) > speed
-        ):
-            trial = _best_ratio(smallest, ratio, u, s, u_next, s_next, acceleration, most, limit)
-            reached = _speed_at_ratio(trial, u, s, u_next, s_next, acceleration, most, limit)
+        if speed < step.speed and _speed_at_ratio(lower, step, behind, acceleration) > speed:
+            trial = _best_ratio(smallest, ratio, step, behind, acceleration)
+            reached = _speed_at_ratio(trial, step, behind, acceleration)
             if reached > speed:
                 speed, ratio = reached, trial
         fastest[i] = speed
@@ -184,57 +177,53 @@ def _controllable(directions, spacing, acceleration, fastest, ratios):
 
 @njit(**_COMPILE)
 def _ratio_window(s, s_next):
-    """Smallest and largest ratio of a step's speed to that of the step before it, at constant
-    acceleration along both.
+    """Smallest and largest ratio of a step's speed to the one before, at constant acceleration.
 
-    The extremes are those of an arm that comes to rest at the end of the second step or starts at
-    rest into the first. Beyond them the differences would allow any change of speed, because a slow
-    step's time makes it look gentle.
+    Beyond them (coming to rest, starting at rest) the differences would allow any change of speed,
+    because a slow step's time makes it look gentle.
     """
     return 1.0 / (1.0 + np.sqrt(1.0 + s / s_next)), 1.0 + np.sqrt(1.0 + s_next / s)
 
 
 @njit(**_COMPILE)
-def _speed_at_ratio(ratio, u, s, u_next, s_next, acceleration, most, most_next):
-    """Largest speed of a step, up to `most`, if the next one's, up to `most_next`, is `ratio` times
-    it.
-    """
-    square = min(most, most_next / ratio) ** 2
-    length = s_next / ratio + s
+def _speed_at_ratio(ratio, step, behind, acceleration):
+    """Largest speed of a step if that of the one behind is `ratio` times it; both within theirs."""
+    square = min(step.speed, behind.speed / ratio) ** 2
+    length = behind.length / ratio + step.length
     for j in range(acceleration.shape[0]):
-        change = 2.0 * abs(u_next[j] * ratio - u[j])
+        change = 2.0 * abs(behind.direction[j] * ratio - step.direction[j])
         if change * square > acceleration[j] * length:
             square = acceleration[j] * length / change
     return np.sqrt(square)
 
 
 @njit(**_COMPILE)
-def _best_ratio(low, high, u, s, u_next, s_next, acceleration, most, most_next):
+def _best_ratio(low, high, step, behind, acceleration):
     """Ratio between low and high with the largest `_speed_at_ratio`, by golden sections."""
     inner, outer = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    at_inner = _speed_at_ratio(inner, u, s, u_next, s_next, acceleration, most, most_next)
-    at_outer = _speed_at_ratio(outer, u, s, u_next, s_next, acceleration, most, most_next)
+    at_inner = _speed_at_ratio(inner, step, behind, acceleration)
+    at_outer = _speed_at_ratio(outer, step, behind, acceleration)
     for _ in range(_SECTIONS):
         if at_inner > at_outer:
             high, outer, at_outer = outer, inner, at_inner
             inner = high - _GOLDEN * (high - low)
-            at_inner = _speed_at_ratio(inner, u, s, u_next, s_next, acceleration, most, most_next)
+            at_inner = _speed_at_ratio(inner, step, behind, acceleration)
         else:
             low, inner, at_inner = inner, outer, at_outer
             outer = low + _GOLDEN * (high - low)
-            at_outer = _speed_at_ratio(outer, u, s, u_next, s_next, acceleration, most, most_next)
+            at_outer = _speed_at_ratio(outer, step, behind, acceleration)
     return inner if at_inner > at_outer else outer
 
 
 @njit(**_COMPILE)
-def _fastest_beside(x, a, s_x, b, s_y, acceleration, most):
-    """Largest speed y ≤ most along direction b, beside a step of speed x along a: 2 |b y - a x| ≤ A
-    (s_y/y + s_x/x).
+def _fastest_next_to(known, step, acceleration):
+    """Largest speed y of a step, up to its own, next to one of known speed x.
 
-    The condition is the same for the step before and the one behind.  Of the joint that breaks it
-    the largest root below is taken, until no joint breaks it.
+    2 |b y - a x| ≤ A (s_y/y + s_x/x), the same for the step before and the one behind.  Of the
+    joint that breaks it the largest root below is taken, until no joint breaks it.
     """
-    y = most
+    a, s_x, x = known
+    b, s_y, y = step
     time = s_x / x
     lowered = True
     while lowered:
@@ -259,9 +248,7 @@ def _fastest_beside(x, a, s_x, b, s_y, acceleration, most):
 
 @njit(**_COMPILE)
 def _used(q, times, velocity, acceleration):
-    """Factor by which times may shrink, or must grow if above 1, for all differences of the rows to
-    keep the limits.
-    """
+    """Factor by which times may shrink, or must grow if above 1, to keep the limits everywhere."""
     worst = 0.0
     last = q.shape[0] - 1
     for j in range(q.shape[1]):

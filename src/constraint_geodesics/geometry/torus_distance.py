@@ -58,7 +58,7 @@ class Parallels(NamedTuple):
     outer: Numbers
 
 
-class Ends(NamedTuple):
+class EndPair(NamedTuple):
     """Both ends of the curves sought: the one nearer to the inner equator, the other, and what lies
     between them.
 
@@ -75,12 +75,23 @@ class Ends(NamedTuple):
 
 
 class Advance(NamedTuple):
-    """What geodesics gain on a stretch of the tube: ring angle `turn` = U [rad] and `action` =
-    W.
-    """
+    """What geodesics gain on a stretch of tube: ring angle `turn` = U [rad], `action` = W."""
 
     turn: Numbers
     action: Numbers
+
+
+class Stretch(NamedTuple):
+    """Tube angles from an inner parallel to an outer one, on one side of the tube.
+
+    margin: ρ − c at the start.  gap: what ρ − c grows by.  Given, as differences of nearly equal
+    numbers hold nothing.
+    """
+
+    start: Parallels
+    end: Parallels
+    margin: Numbers
+    gap: Numbers
 
 
 Family = Callable[[Numbers], Advance]
@@ -104,10 +115,10 @@ def torus_distance(
     return 2 * minor * np.minimum(outward, inward)
 
 
-def _ends(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]) -> Ends:
+def _ends(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]) -> EndPair:
     tube = _wrapped(np.stack([a[:, 1], b[:, 1]]))
     near, far = np.abs(tube).max(axis=0), np.abs(tube).min(axis=0)
-    return Ends(
+    return EndPair(
         near=Parallels(np.cos(near / 2) ** 2, np.sin(near / 2) ** 2),
         far=Parallels(np.cos(far / 2) ** 2, np.sin(far / 2) ** 2),
         gap=np.sin((near - far) / 2) * np.sin((near + far) / 2),
@@ -116,7 +127,7 @@ def _ends(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]) -> Ends:
     )
 
 
-def _outward_length(hole: float, ends: Ends) -> Numbers:
+def _outward_length(hole: float, ends: EndPair) -> Numbers:
     """Lengths in the outward family.
 
     It is run through by one number t: c = ρ + t below the ring ρ of the nearer end, then c = ρ − t,
@@ -132,30 +143,24 @@ def _outward_length(hole: float, ends: Ends) -> Numbers:
         margin = np.abs(t)
         c, turned = ring - margin, np.maximum(t, 0.0)
         turning = Parallels(near.inner - turned, near.outer + turned)
-        away = _leg(hole, c, near, end, margin, rise)
-        across = _leg(hole, c, far, equator, margin + gap, fall)
-        swing = _leg(hole, c, turning, near, np.zeros_like(t), turned)
+        away = _leg(hole, c, Stretch(near, end, margin, rise))
+        across = _leg(hole, c, Stretch(far, equator, margin + gap, fall))
+        swing = _leg(hole, c, Stretch(turning, near, np.zeros_like(t), turned))
         return _sum(away, across, swing, swing)
 
     t = _shortfall(family, ends.turn, -ring, near.inner)
     return (ring - np.abs(t)) * ends.turn + family(t).action
 
 
-def _inward_length(hole: float, ends: Ends) -> Numbers:
-    """Lengths in the inward family, c = hole + t below the ring of the inner equator; no meaning
-    unless opposite.
-    """
+def _inward_length(hole: float, ends: EndPair) -> Numbers:
+    """Lengths in the inward family, c = hole + t; no meaning unless opposite."""
     equator = Parallels(np.zeros_like(ends.turn), np.ones_like(ends.turn))
     stops = ends.near, ends.far
     gaps = [np.where(ends.opposite, end.inner, 0.0) for end in stops]
 
     def family(t: Numbers) -> Advance:
-        return _sum(
-            *(
-                _leg(hole, hole + t, equator, end, -t, gap)
-                for end, gap in zip(stops, gaps, strict=True)
-            )
-        )
+        legs = (Stretch(equator, end, -t, gap) for end, gap in zip(stops, gaps, strict=True))
+        return _sum(*(_leg(hole, hole + t, leg) for leg in legs))
 
     t = _shortfall(family, ends.turn, np.full_like(ends.turn, -hole), np.zeros_like(ends.turn))
     return (hole + t) * ends.turn + family(t).action
@@ -177,34 +182,25 @@ def _sum(*legs: Advance) -> Advance:
     )
 
 
-def _leg(
-    hole: float, c: Numbers, start: Parallels, end: Parallels, margin: Numbers, gap: Numbers
-) -> Advance:
-    """Gain between two parallels on one side of the tube, from the inner to the outer; 0 where they
-    are one.
-
-    margin: ρ − c at the start.  gap: what ρ − c grows by.  Given, as differences of nearly equal
-    numbers hold nothing.
-    """
+def _leg(hole: float, c: Numbers, stretch: Stretch) -> Advance:
+    """Gain on a stretch; 0 where its two parallels are one."""
     advance = Advance(np.zeros_like(c), np.zeros_like(c))
-    some = gap > POINT
+    some = stretch.gap > POINT
     if not some.any():
         return advance
-    start, end = (Parallels(at.inner[some], at.outer[some]) for at in (start, end))
-    advance.turn[some], advance.action[some] = _elliptic(
-        hole, c[some], start, end, margin[some], gap[some]
-    )
+    start, end = (Parallels(at.inner[some], at.outer[some]) for at in stretch[:2])
+    part = Stretch(start, end, stretch.margin[some], stretch.gap[some])
+    advance.turn[some], advance.action[some] = _elliptic(hole, c[some], part)
     return advance
 
 
-def _elliptic(
-    hole: float, c: Numbers, start: Parallels, end: Parallels, margin: Numbers, gap: Numbers
-) -> Advance:
+def _elliptic(hole: float, c: Numbers, stretch: Stretch) -> Advance:
     """U and W as Carlson's integrals (DLMF 19.29.4 and 8): with y = cos²(v/2) and s² = (ρ + c) (ρ −
     c) y (1 − y),
 
     2 U = ∫ (ρ + c) / (ρ s) dy − ∫ dy / s,  2 W = ∫ (ρ + c) / s dy − c ∫ (ρ + c) / (ρ s) dy.
     """
+    start, end, margin, gap = stretch
     x = [np.sqrt(factor) for factor in (hole + end.inner + c, margin + gap, end.inner, end.outer)]
     y = [np.sqrt(factor) for factor in (hole + start.inner + c, margin, start.inner, start.outer)]
     u, v, w = (

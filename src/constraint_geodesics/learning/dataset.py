@@ -1,13 +1,12 @@
-"""Labelled joint configurations: drawn in shards, projected onto a constraint, judged by PyBullet,
-kept as parquet.
+"""Labelled joint configurations: drawn in shards, projected, judged by PyBullet, kept as parquet.
 
-A shard's rows depend on its seed alone, and every shard opens a physics world of its own (a world
-remembers contacts), so the bytes written are the same whatever the number of workers.
+A shard's rows depend on its seed alone, and each opens a physics world of its own (a world
+remembers contacts), so the bytes are the same for any number of workers.
 """
 
 import zlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,37 +21,17 @@ from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.scene.scene import Scene
 
-POSE_COLUMNS = (
-    "tool_x",
-    "tool_y",
-    "tool_z",
-    "quaternion_x",
-    "quaternion_y",
-    "quaternion_z",
-    "quaternion_w",
-)
+POSE_COLUMNS = (*(f"tool_{x}" for x in "xyz"), *(f"quaternion_{x}" for x in "xyzw"))
 RPY_COLUMNS = ("roll", "pitch", "yaw")
-UNITS = {
-    "joint": "rad",
-    "tool": "m",
-    "quaternion": "1",
-    "roll": "rad",
-    "pitch": "rad",
-    "yaw": "rad",
-    "self_collision": "bool",
-    "workcell_collision": "bool",
-    "limit_distance": "rad",
-    "residual": "m or rad",
-}
+UNITS = {"tool": "m", "quaternion": "1", "residual": "m or rad"} | dict.fromkeys(
+    ("self", "workcell"), "bool"
+)
+"""Of columns, by the first part of their names; the others are in rad."""
 HISTOGRAM_BINS = 24
-
-Map = Callable[[Callable[["ShardTask"], "Shard"], Sequence["ShardTask"]], list["Shard"]]
 
 
 class DatasetError(ValueError):
-    """A table that can't be used, or a constraint that no configuration satisfies; the message says
-    which.
-    """
+    """A table that can't be used, or a constraint that no configuration satisfies."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +70,7 @@ class JointSet:
 
 @dataclass(frozen=True)
 class Queries:
-    """Start and goal pairs [rad] on one constraint manifold, free of collision and within the
-    limits.
-    """
+    """Start and goal pairs [rad] on one constraint manifold, free and within the limits."""
 
     starts: Float[np.ndarray, "n D"]
     goals: Float[np.ndarray, "n D"]
@@ -102,20 +79,19 @@ class Queries:
         return len(self.starts)
 
 
-def shard_tasks(
-    scene: Scene, manifold: ConstraintManifold, name: str, rows: int, shard_rows: int, seed: int
-) -> list[ShardTask]:
-    """The shards of one constraint's set; the constraint's name takes part in the seed."""
-    sizes = [min(shard_rows, rows - first) for first in range(0, rows, shard_rows)]
-    return [
-        ShardTask(scene, manifold, n, (seed, zlib.crc32(name.encode()), i))
-        for i, n in enumerate(sizes)
-    ]
+def seed_of(constraint: str, seed: int) -> tuple[int, int]:
+    """A seed in which the constraint's name takes part."""
+    return seed, zlib.crc32(constraint.encode())
+
+
+def shard_tasks(whole: ShardTask, shard_rows: int) -> list[ShardTask]:
+    """A task in shards of so many rows at most, each with a seed of its own."""
+    sizes = [min(shard_rows, whole.rows - first) for first in range(0, whole.rows, shard_rows)]
+    return [replace(whole, rows=n, seed=(*whole.seed, i)) for i, n in enumerate(sizes)]
 
 
 def draw_shard(task: ShardTask) -> Shard:
-    """Draw uniformly within the limits, project onto the constraint, keep what stays within them,
-    and label it.
+    """Draw uniformly within the limits, project onto the constraint, keep what stays, label it.
 
     A tolerance is used evenly: each configuration is projected onto its own share of the band.
     Raises DatasetError if hardly anything satisfies the constraint within the limits.
@@ -143,6 +119,12 @@ def draw_shard(task: ShardTask) -> Shard:
     return Shard(_label(task, joints), drawn, not_converged, outside)
 
 
+def draw_free(task: ShardTask) -> Float[np.ndarray, "m D"]:
+    """Those of a shard's configurations that are free of collision."""
+    frame = draw_shard(task).frame
+    return joints_of(frame)[free_rows(frame)]
+
+
 def _label(task: ShardTask, joints: np.ndarray) -> pd.DataFrame:
     with task.scene.world() as world:
         labels = world.label(joints)
@@ -150,9 +132,8 @@ def _label(task: ShardTask, joints: np.ndarray) -> pd.DataFrame:
         f"joint_{i + 1}": joints[:, i] for i in range(joints.shape[1])
     }
     poses = np.concatenate([labels.position, labels.quaternion], axis=1)
-    columns |= dict(zip(POSE_COLUMNS, poses.T, strict=True)) | dict(
-        zip(RPY_COLUMNS, labels.rpy.T, strict=True)
-    )
+    columns |= dict(zip(POSE_COLUMNS, poses.T, strict=True))
+    columns |= dict(zip(RPY_COLUMNS, labels.rpy.T, strict=True))
     columns["self_collision"] = labels.self_collision
     columns["workcell_collision"] = labels.workcell_collision
     columns["limit_distance"] = task.scene.robot.limit_distance(joints)
@@ -164,20 +145,13 @@ def _label(task: ShardTask, joints: np.ndarray) -> pd.DataFrame:
 def draw_queries(
     scene: Scene, manifold: ConstraintManifold, name: str, count: int, seed: int
 ) -> Queries:
-    """Pairs of configurations drawn like the data, from a seed of their own, and free of
-    collision.
-    """
-    free: list[np.ndarray] = []
-    found = 0
+    """Pairs of configurations drawn like the data, from a seed of their own, and free."""
+    ends = np.empty((0, scene.robot.dof))
     for attempt in range(100):
-        shard = draw_shard(
-            ShardTask(scene, manifold, 4 * count, (seed, zlib.crc32(name.encode()), attempt, 1))
-        )
-        free.append(joints_of(shard.frame)[free_rows(shard.frame)])
-        found += len(free[-1])
-        if found >= 2 * count:
-            ends = np.concatenate(free)[: 2 * count]
-            return Queries(ends[:count], ends[count:])
+        task = ShardTask(scene, manifold, 4 * count, (*seed_of(name, seed), attempt, 1))
+        ends = np.concatenate([ends, draw_free(task)])
+        if len(ends) >= 2 * count:
+            return Queries(ends[:count], ends[count : 2 * count])
     raise DatasetError(f"constraint {name!r}: hardly any configuration is free of collision")
 
 
@@ -186,14 +160,12 @@ def data_card(shards: Sequence[Shard]) -> dict[str, Any]:
     frame = pd.concat([shard.frame for shard in shards], ignore_index=True)
     drawn = sum(shard.drawn for shard in shards)
     numeric = frame.select_dtypes("number")
+    ranges = {str(name): [float(x.min()), float(x.max())] for name, x in numeric.items()}
     histograms = {}
-    for name in numeric:
-        counts, edges = np.histogram(numeric[name], bins=HISTOGRAM_BINS)
-        histograms[str(name)] = {
-            "first": float(edges[0]),
-            "last": float(edges[-1]),
-            "counts": counts.tolist(),
-        }
+    for name, values in numeric.items():
+        counts, edges = np.histogram(values, bins=HISTOGRAM_BINS)
+        first, last = float(edges[0]), float(edges[-1])
+        histograms[str(name)] = {"first": first, "last": last, "counts": counts.tolist()}
     return {
         "rows": len(frame),
         "drawn": drawn,
@@ -202,20 +174,19 @@ def data_card(shards: Sequence[Shard]) -> dict[str, Any]:
         "self_collision": float(frame["self_collision"].mean()),
         "workcell_collision": float(frame["workcell_collision"].mean()),
         "free": float(free_rows(frame).mean()),
-        "ranges": {
-            str(name): [float(numeric[name].min()), float(numeric[name].max())] for name in numeric
-        },
+        "ranges": ranges,
         "histograms": histograms,
     }
 
 
 def write_joints(shards: Sequence[Shard], file: Path, about: dict[str, str]) -> None:
-    """One parquet file, with each column's unit in its field and `about` (seed, robot, constraint)
-    in the schema.
-    """
+    """One parquet file: each column's unit in its field, `about` (seed, robot …) in the schema."""
     frame = pd.concat([shard.frame for shard in shards], ignore_index=True)
     table = pa.Table.from_pandas(frame, preserve_index=False)
-    fields = [field.with_metadata({"unit": _unit(field.name)}) for field in table.schema]
+    fields = [
+        field.with_metadata({"unit": UNITS.get(field.name.split("_")[0], "rad")})
+        for field in table.schema
+    ]
     table = table.cast(
         pa.schema(fields, metadata={"constraint_geodesics." + k: v for k, v in about.items()})
     )
@@ -224,9 +195,7 @@ def write_joints(shards: Sequence[Shard], file: Path, about: dict[str, str]) -> 
 
 
 def read_joints(file: Path) -> JointSet:
-    """Read and check one set.  Raises DatasetError naming the file and the column if a row can't be
-    used.
-    """
+    """Read and check one set.  Raises DatasetError with file and column of a bad row."""
     frame = _checked(pd.read_parquet(file), file)
     return JointSet(joints_of(frame), free_rows(frame))
 
@@ -256,10 +225,6 @@ def joints_of(frame: pd.DataFrame) -> Float[np.ndarray, "n D"]:
 def free_rows(frame: pd.DataFrame) -> Bool[np.ndarray, "n"]:
     """Which rows are free of collision."""
     return ~(frame["self_collision"] | frame["workcell_collision"]).to_numpy(bool)
-
-
-def _unit(column: str) -> str:
-    return UNITS[column] if column in UNITS else UNITS[column.split("_")[0]]
 
 
 def _checked(frame: pd.DataFrame, file: Path) -> pd.DataFrame:

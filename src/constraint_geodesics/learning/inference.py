@@ -11,8 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from safetensors.numpy import load_file
 
-from constraint_geodesics.learning.files import WEIGHTS
-
 Arrays = Mapping[str, np.ndarray]
 SPREAD = 0.3
 """Standard deviation of samples around a centre, in its bandwidths: so wide, samples are as often
@@ -51,9 +49,7 @@ class FrozenManifold:
         return (self.arrays["centre"] + self.arrays["scale"] * decoded).astype(np.float64)
 
     def sample(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count N"]:
-        """Latent points spread like the training data: normal around the centres of the precision
-        network.
-        """
+        """Latent points spread like the training data, about the precision network's centres."""
         centres, width = self.arrays["precision.centres"], self.arrays["precision.bandwidth"]
         chosen = rng.integers(len(centres), size=count)
         return centres[chosen] + SPREAD * width[chosen, None] * rng.normal(size=(count, self.dim))
@@ -62,7 +58,7 @@ class FrozenManifold:
 def perceptron(
     arrays: Arrays, name: str, x: Float[np.ndarray, "*batch I"]
 ) -> Float[np.ndarray, "*batch O"]:
-    """Output of the `vae.Perceptron` called `name`: SiLU layers with a linear path beside them."""
+    """Output of the `vae.Perceptron` called `name`: SiLU layers plus a linear path."""
     y, layer = x, 0
     while f"{name}.nonlinear.{layer + 2}.weight" in arrays:
         y = (
@@ -75,3 +71,10 @@ def perceptron(
         y @ arrays[f"{name}.nonlinear.{layer}.weight"].T + arrays[f"{name}.nonlinear.{layer}.bias"]
     )
     return last + x @ arrays[f"{name}.linear.weight"].T
+
+
+WEIGHTS, CARD = "weights.safetensors", "manifold.json"
+
+
+class ManifoldFileError(ValueError):
+    """A saved manifold that is missing, incomplete or altered; the message names the file."""

@@ -1,6 +1,4 @@
-"""A trained manifold: the stochastic embedding f(z) = (μ(z), σ(z)), its pullback metric (eq. 5),
-and its files.
-"""
+"""A trained manifold: embedding f(z) = (μ(z), σ(z)), pullback metric (eq. 5), and its files."""
 
 import copy
 import hashlib
@@ -18,7 +16,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from constraint_geodesics.geometry.manifold import pullback_metric
-from constraint_geodesics.learning.files import CARD, WEIGHTS, ManifoldFileError
+from constraint_geodesics.learning.inference import CARD, WEIGHTS, ManifoldFileError
 from constraint_geodesics.learning.vae import JointVae
 
 PIECE = 1024
@@ -75,9 +73,7 @@ class LearnedManifold:
             )
 
     def embed_joints(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch A"]:
-        """The embedding of encoded configurations: where a joint path lies on the manifold
-        [rad].
-        """
+        """The embedding of encoded configurations: where a joint path lies on the manifold."""
         with torch.no_grad():
             return self.embed(self.vae.encode(self.tensor(q))[0]).numpy().astype(np.float64)
 
@@ -124,9 +120,7 @@ class LearnedManifold:
 
     @classmethod
     def load(cls, folder: Path) -> "LearnedManifold":
-        """Read what `save` wrote.  Raises ManifoldFileError if a file is missing or its checksum
-        differs.
-        """
+        """Read what `save` wrote.  Raises ManifoldFileError if a file is missing or altered."""
         try:
             card = json.loads((folder / CARD).read_text())
             found = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
@@ -141,3 +135,42 @@ class LearnedManifold:
         except (OSError, KeyError, json.JSONDecodeError, SafetensorError, RuntimeError) as error:
             raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None
         return cls(vae.eval().requires_grad_(False))
+
+
+PRECISION = 1e12
+"""Precision of every joint [1/rad²], the same everywhere: the deviation adds nothing to a length.
+"""
+
+
+class JointManifold(LearnedManifold):
+    """The chart z = (q − c) / s of joint space: a learned manifold whose networks are the identity,
+    in float64.
+
+    dim N = D.  Straight chart lines are straight joint lines, and the metric is s² I.
+    """
+
+    @classmethod
+    def of(cls, joints: Float[np.ndarray, "n D"]) -> "JointManifold":
+        """The chart in which the given configurations [rad] have mean 0 and, over the joints, mean
+        variance 1.
+
+        That is the size of the latent coordinates of a trained manifold.  Raises ValueError unless
+        they differ.
+        """
+        joints = np.asarray(joints, np.float64)
+        if joints.ndim != 2 or not (np.isfinite(joints).all() and np.ptp(joints, axis=0).any()):
+            raise ValueError(
+                f"joints has shape {joints.shape}: must be (n, D), finite, and not one "
+                f"configuration"
+            )
+        dof = joints.shape[1]
+        vae = JointVae(dof, dof, (), 0).double().requires_grad_(False)
+        for weight in vae.parameters():
+            weight.zero_()
+        vae.centre.copy_(torch.from_numpy(joints.mean(axis=0)))
+        vae.scale.fill_(float(np.sqrt(joints.var(axis=0).mean())))
+        vae.encoder.linear.weight[:dof].copy_(torch.eye(dof))
+        vae.decoder.linear.weight.copy_(torch.eye(dof))
+        vae.precision.floor.fill_(PRECISION)
+        vae.precision.spread.fill_(torch.inf)  # the floor never falls
+        return cls(vae.eval())

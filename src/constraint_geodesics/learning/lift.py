@@ -1,6 +1,4 @@
-"""From a latent curve to joint space: decode, correct the ends, retract every point onto the
-constraint.
-"""
+"""From a decoded latent curve to a joint path: the ends corrected, every point retracted."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -31,73 +29,65 @@ class Chart(Protocol):
 
 @dataclass(frozen=True)
 class Lifted:
-    """Joint curves (*batch, T, D) [rad] and what of the violation the retraction left at each point
-    [rad or m].
-    """
+    """Joint curves [rad] and the violation [rad or m] that is left at each of their points."""
 
     joints: Float[np.ndarray, "*batch T D"]
     violation: Float[np.ndarray, "*batch T"]
 
 
-def lift(
-    chart: Chart,
-    manifold: ConstraintManifold,
-    z: Float[np.ndarray, "*batch T N"],
-    t: Float[np.ndarray, "T"],
-    start: Float[np.ndarray, "*batch D"],
-    goal: Float[np.ndarray, "*batch D"],
-    retraction: Retraction | None,
-) -> Lifted:
-    """Joint curves q(t) = R(μ(z(t)) + (1 − t)(q_start − μ(z(0))) + t (q_goal − μ(z(1)))), with the
-    retraction R.
-
-    z runs from t = 0 to t = 1, so both ends are exact; without a retraction R is the identity.
-    """
-    decoded = chart.decode(z)
-    return correct_and_retract(manifold, decoded, t, start, goal, retraction)
-
-
-def correct_and_retract(
-    manifold: ConstraintManifold,
+def corrected(
     decoded: Float[np.ndarray, "*batch T D"],
     t: Float[np.ndarray, "T"],
     start: Float[np.ndarray, "*batch D"],
     goal: Float[np.ndarray, "*batch D"],
-    retraction: Retraction | None,
-) -> Lifted:
-    """The part of `lift` after the decoder."""
+) -> Float[np.ndarray, "*batch T D"]:
+    """Decoded curves μ(t) moved to their ends: μ(t) + (1 − t)(start − μ(0)) + t (goal − μ(1)).
+
+    t runs from 0 to 1; both ends are exact.
+    """
     time = t[:, None]
     correction = (1 - time) * (start - decoded[..., 0, :])[..., None, :]
     correction += time * (goal - decoded[..., -1, :])[..., None, :]
     joints = decoded + correction
     joints[..., 0, :], joints[..., -1, :] = start, goal
+    return joints
+
+
+def retracted(
+    manifold: ConstraintManifold,
+    joints: Float[np.ndarray, "*batch T D"],
+    retraction: Retraction | None,
+) -> Lifted:
+    """Curves with every point but the ends retracted onto the constraint; as they are for None."""
     if retraction is None:
         return Lifted(joints, manifold.violation(joints))
     result = retract(manifold, joints, retraction)
     # an end that satisfies the constraint to within the accuracy is the caller's own, to the bit
-    result.joints[..., 0, :], result.joints[..., -1, :] = start, goal
+    result.joints[..., [0, -1], :] = joints[..., [0, -1], :]
     return Lifted(result.joints, result.violation)
+
+
+def allowed_steps(
+    joints: Float[np.ndarray, "*batch T D"], t: Float[np.ndarray, "T"]
+) -> Float[np.ndarray, "*batch T-1"]:
+    """Longest steps [rad] of curves that do not jump: four times an even pace, and 0.05 rad.
+
+    t: rising times of the points, 0 to 1.
+    """
+    direct = np.linalg.norm(joints[..., -1, :] - joints[..., 0, :], axis=-1)
+    return 0.05 + 4.0 * direct[..., None] * np.diff(t)
 
 
 def jump_excess(
     joints: Float[np.ndarray, "*batch T D"], t: Float[np.ndarray, "T"]
 ) -> Float[np.ndarray, "*batch"]:
-    """How far a curve's steps exceed what a continuous one needs [rad]; more than 0 where it
-    changes its branch.
-
-    t: rising times of the points, 0 to 1.  Needed is at most four times an even pace from end to
-    end, and 0.05 rad.
-    """
+    """How far a curve's steps exceed the allowed ones [rad]; above 0 where it changes branch."""
     steps = np.linalg.norm(np.diff(joints, axis=-2), axis=-1)
-    direct = np.linalg.norm(joints[..., -1, :] - joints[..., 0, :], axis=-1)
-    allowed = 0.05 + 4.0 * direct[..., None] * np.diff(t)
-    return np.maximum(steps - allowed, 0.0).sum(axis=-1)
+    return np.maximum(steps - allowed_steps(joints, t), 0.0).sum(axis=-1)
 
 
 def densify(joints: Float[np.ndarray, "T D"], spacing: float) -> Float[np.ndarray, "n D"]:
-    """Points along the straight lines between the given ones, at most `spacing` [rad] apart; the
-    given ones stay.
-    """
+    """The given points, and more on the lines between, at most `spacing` [rad] apart."""
     pieces = np.ceil(np.linalg.norm(np.diff(joints, axis=0), axis=-1) / spacing).astype(int).clip(1)
     rows = np.repeat(np.arange(len(pieces)), pieces)
     share = (np.arange(len(rows)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / pieces[rows]
@@ -108,12 +98,10 @@ def densify(joints: Float[np.ndarray, "T D"], spacing: float) -> Float[np.ndarra
 def as_executed(
     manifold: ConstraintManifold, joints: Float[np.ndarray, "T D"], spacing: float
 ) -> Float[np.ndarray, "n D"]:
-    """A path's rows at most about `spacing` [rad] apart, the new ones on the constraint; the given
-    ones stay.
+    """Waypoints at most about `spacing` [rad] apart, the new ones on the constraint.
 
-    Between its rows an arm moves in straight joint lines, so rows far apart leave the constraint
-    however well each of them keeps it.  A jump stays one: what lies between its sides retracts to
-    one side or the other.
+    Between waypoints an arm moves in straight joint lines, which leave the constraint where they
+    are long.  A jump stays one: what lies between its sides retracts to one or the other.
     """
     if len(joints) < 2:
         return joints

@@ -1,6 +1,4 @@
-"""Training of a learned manifold with Lightning: the mean first, then the variance with the mean
-frozen (eq. 4).
-"""
+"""Training of a learned manifold with Lightning: the mean, then the variance alone (eq. 4)."""
 
 import logging
 import warnings
@@ -41,12 +39,41 @@ class TrainedManifold:
     history: list[dict[str, float]]
 
 
-class _MeanPhase(lightning.LightningModule):
-    """Encoder and decoder mean."""
+@dataclass(frozen=True)
+class TrainingRun:
+    """What surrounds a training.
+
+    scratch: where checkpoints go.  report: called with (epoch, figures) after every epoch.
+    progress: whether a bar is drawn.
+    """
+
+    scratch: Path
+    report: Report
+    progress: bool = True
+
+
+class _Phase(lightning.LightningModule):
+    """One phase of the training: its name, and its epochs at most."""
 
     def __init__(self, vae: JointVae, params: ManifoldParams) -> None:
         super().__init__()
         self.vae, self.params = vae, params
+
+    name: str
+
+    @property
+    def epochs(self) -> int:
+        raise NotImplementedError
+
+
+class _MeanPhase(_Phase):
+    """Encoder and decoder mean."""
+
+    name = "mean"
+
+    @property
+    def epochs(self) -> int:
+        return self.params.epochs
 
     def training_step(self, batch: list[Tensor]) -> Tensor:
         (q,) = batch
@@ -74,12 +101,14 @@ class _MeanPhase(lightning.LightningModule):
         return {"optimizer": optimiser, "lr_scheduler": schedule}
 
 
-class _VariancePhase(lightning.LightningModule):
+class _VariancePhase(_Phase):
     """Precision network, everything else frozen."""
 
-    def __init__(self, vae: JointVae, params: ManifoldParams) -> None:
-        super().__init__()
-        self.vae, self.params = vae, params
+    name = "variance"
+
+    @property
+    def epochs(self) -> int:
+        return self.params.variance_epochs
 
     def training_step(self, batch: list[Tensor]) -> Tensor:
         loss = variance_loss(self.vae, batch[0])
@@ -114,64 +143,29 @@ class _History(Callback):
 
 
 def train_manifold(
-    joints: Float[np.ndarray, "n D"],
-    robot: SerialRobot,
-    params: ManifoldParams,
-    scratch: Path,
-    report: Report,
-    *,
-    progress: bool = True,
+    joints: Float[np.ndarray, "n D"], robot: SerialRobot, params: ManifoldParams, run: TrainingRun
 ) -> TrainedManifold:
-    """Learn the manifold of the given configurations [rad].
-
-    scratch: where checkpoints go.  report: called with (epoch, figures) after every epoch.
-    """
+    """Learn the manifold of the given configurations [rad]."""
     torch.manual_seed(params.seed)
     rows = torch.as_tensor(np.random.default_rng(params.seed).permutation(joints)).float()
-    held_out = max(int(len(rows) * params.held_out), 1)
+    count = max(int(len(rows) * params.held_out), 1)
+    held_out, rows = rows[:count], rows[count:]
     vae = JointVae(robot.dof, params.latent_dim, params.hidden, params.variance_centres)
     vae.centre.copy_(torch.as_tensor(0.5 * (robot.lower + robot.upper)))
     vae.scale.copy_(torch.as_tensor(0.5 * (robot.upper - robot.lower)))
-
-    history = _fit(
-        _MeanPhase(vae, params),
-        "mean",
-        params.epochs,
-        rows,
-        held_out,
-        params,
-        scratch,
-        0,
-        report,
-        progress,
-    )
-    _place_variance(vae, rows[held_out:], params)
+    history = _fit(_MeanPhase(vae, params), rows, held_out, run, 0)
+    _place_variance(vae, rows, params)
     vae.encoder.requires_grad_(False)
     vae.decoder.requires_grad_(False)
-    history += _fit(
-        _VariancePhase(vae, params),
-        "variance",
-        params.variance_epochs,
-        rows,
-        held_out,
-        params,
-        scratch,
-        len(history),
-        report,
-        progress,
-    )
+    history += _fit(_VariancePhase(vae, params), rows, held_out, run, len(history))
     manifold = LearnedManifold(vae.eval().requires_grad_(False))
-    return TrainedManifold(
-        manifold, held_out_figures(manifold, robot, rows[:held_out].numpy()), history
-    )
+    return TrainedManifold(manifold, held_out_figures(manifold, robot, held_out.numpy()), history)
 
 
 def held_out_figures(
     manifold: LearnedManifold, robot: SerialRobot, joints: Float[np.ndarray, "n D"]
 ) -> dict[str, float]:
-    """Reconstruction error in degrees and millimetres, deviation, and condition of the metric (eq.
-    5).
-    """
+    """Reconstruction error [°, mm], deviation, and condition of the metric (eq. 5)."""
     joints = np.asarray(joints, np.float64)
     z = manifold.encode(joints)
     decoded = manifold.decode(z)
@@ -182,72 +176,53 @@ def held_out_figures(
     condition = (eigenvalues[:, -1] / eigenvalues[:, 0].clamp_min(1e-12)).numpy()
     with torch.no_grad():
         deviation = np.degrees(manifold.vae.deviation(manifold.tensor(z)).numpy())
-    return {
-        "joint_error_mean_deg": float(error_deg.mean()),
-        "joint_error_p95_deg": float(np.quantile(error_deg, 0.95)),
-        "tool_error_median_mm": float(np.median(tool_mm)),
-        "tool_error_p95_mm": float(np.quantile(tool_mm, 0.95)),
-        "deviation_median_deg": float(np.median(deviation)),
-        "metric_condition_median": float(np.median(condition)),
-        "metric_condition_p95": float(np.quantile(condition, 0.95)),
-        "metric_volume_median": float(np.median(eigenvalues.prod(-1).clamp_min(0).sqrt().numpy())),
+    figures = {
+        "joint_error_mean_deg": error_deg.mean(),
+        "joint_error_p95_deg": np.quantile(error_deg, 0.95),
+        "tool_error_median_mm": np.median(tool_mm),
+        "tool_error_p95_mm": np.quantile(tool_mm, 0.95),
+        "deviation_median_deg": np.median(deviation),
+        "metric_condition_median": np.median(condition),
+        "metric_condition_p95": np.quantile(condition, 0.95),
+        "metric_volume_median": np.median(eigenvalues.prod(-1).clamp_min(0).sqrt().numpy()),
     }
+    return {name: float(value) for name, value in figures.items()}
 
 
 def _fit(
-    module: "_MeanPhase | _VariancePhase",
-    phase: str,
-    epochs: int,
-    rows: Tensor,
-    held_out: int,
-    params: ManifoldParams,
-    scratch: Path,
-    first: int,
-    report: Report,
-    progress: bool,
+    phase: _Phase, rows: Tensor, held_out: Tensor, run: TrainingRun, first: int
 ) -> list[dict[str, float]]:
+    """Figures of every epoch, the first of which has number `first`; the best weights stay."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module="lightning")
-    history = _History(phase, first, report)
-    checkpoint = ModelCheckpoint(
-        scratch / phase, "best", monitor="held_out_loss", enable_version_counter=False
-    )
+    params, folder = phase.params, run.scratch / phase.name
+    history = _History(phase.name, first, run.report)
+    best = ModelCheckpoint(folder, "best", monitor="held_out_loss", enable_version_counter=False)
+    bar = [RichProgressBar(leave=True)] if run.progress else []
     trainer = lightning.Trainer(
         accelerator="cpu",
         devices=1,
-        max_epochs=epochs,
+        max_epochs=phase.epochs,
         logger=False,
         enable_model_summary=False,
-        enable_progress_bar=progress,
+        enable_progress_bar=run.progress,
         num_sanity_val_steps=0,
-        default_root_dir=scratch,
-        callbacks=[
-            history,
-            checkpoint,
-            EarlyStopping("held_out_loss", patience=params.patience),
-            *([RichProgressBar(leave=True)] if progress else []),
-        ],
+        default_root_dir=run.scratch,
+        callbacks=[history, best, EarlyStopping("held_out_loss", patience=params.patience), *bar],
     )
-    generator = torch.Generator().manual_seed(params.seed)
-    trainer.fit(
-        module,
-        _batches(rows[held_out:], params.batch_size, generator),
-        _batches(rows[:held_out], 8192, None),
-    )
-    best = torch.load(checkpoint.best_model_path, weights_only=False)["state_dict"]
-    module.load_state_dict(best)
+    order = torch.Generator().manual_seed(params.seed)
+    shuffled, fixed = _batches(rows, params.batch_size, order), _batches(held_out, 8192, None)
+    trainer.fit(phase, shuffled, fixed)
+    phase.load_state_dict(torch.load(best.best_model_path, weights_only=False)["state_dict"])
     return history.rows
 
 
 def _batches(rows: Tensor, size: int, generator: torch.Generator | None) -> DataLoader:
     dataset = TensorDataset(rows)
-    order = (
-        SequentialSampler(dataset)
-        if generator is None
-        else RandomSampler(dataset, generator=generator)
-    )
+    shuffled = generator is not None
+    order = RandomSampler(dataset, generator=generator) if shuffled else SequentialSampler(dataset)
     # a batch of indices at once: collating row by row costs more than a training step here
-    sampler = BatchSampler(order, min(size, len(rows)), drop_last=generator is not None)
+    sampler = BatchSampler(order, min(size, len(rows)), drop_last=shuffled)
     return DataLoader(dataset, sampler=sampler, batch_size=None)
 
 

@@ -1,8 +1,7 @@
 """The variational autoencoder of joint configurations: modules and pure losses, no training loop.
 
-Phase one trains the encoder and the decoder mean (eq. 4 with a fixed variance), phase two the
-variance network with both frozen, as the work the paper follows does.  Joints are scaled to [−1, 1]
-by the robot's limits inside.
+Phase one trains the encoder and the decoder mean (eq. 4), phase two the variance network alone.
+Joints are scaled to [−1, 1] by the robot's limits inside.
 """
 
 import math
@@ -14,9 +13,7 @@ from torch import Tensor, nn
 
 
 class Perceptron(nn.Module):
-    """Smooth multilayer perceptron with a linear path beside it, so that a linear map needs no
-    hidden unit.
-    """
+    """Smooth multilayer perceptron plus a linear path: a linear map needs no hidden unit."""
 
     def __init__(self, inputs: int, hidden: Sequence[int], outputs: int) -> None:
         super().__init__()
@@ -58,9 +55,7 @@ class RbfPrecision(nn.Module):
     def place(
         self, centres: Tensor, bandwidth: Tensor, floor: float, spread: float, precision: float
     ) -> None:
-        """Set the centres (K, N), their bandwidths (K,), the floor's height and spread, and the
-        first weights.
-        """
+        """Set centres (K, N), bandwidths (K,), the floor's height and spread, first weights."""
         self.centres.copy_(centres)
         self.bandwidth.copy_(bandwidth)
         self.floor.fill_(floor)
@@ -123,9 +118,7 @@ class JointVae(nn.Module):
 def evidence_loss(
     vae: JointVae, q: Float[Tensor, "b D"], beta: float, noise: Float[Tensor, "b N"]
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Negative ELBO of eq. 4 with unit variance in scaled joints: reconstruction + β KL; also the
-    reconstruction.
-    """
+    """Negative ELBO of eq. 4 in scaled joints, reconstruction + β KL; and the reconstruction."""
     mean, log_variance = vae.encode(q)
     z = mean + noise * torch.exp(0.5 * log_variance)
     error = (vae.mean(z) - q) / vae.scale

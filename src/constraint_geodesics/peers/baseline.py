@@ -10,7 +10,8 @@ from pydantic import BaseModel, ConfigDict
 
 from constraint_geodesics.bundle import Bundle, read_bundle
 from constraint_geodesics.constraints.pose import ConstraintManifold
-from constraint_geodesics.params import Params, Positive
+from constraint_geodesics.fields import Positive
+from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.problem import PathPlanner
 from constraint_geodesics.scene.scene import Scene

@@ -16,11 +16,10 @@ from bayes_opt import BayesianOptimization, SequentialDomainReductionTransformer
 from jaxtyping import Float
 from pydantic import Field
 
+from constraint_geodesics.fields import Count, Name, NonNegative, Positive
 from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, repeated
 from constraint_geodesics.geometry.curves import PinnedPolynomial
-from constraint_geodesics.learning.joint_chart import JointChart
-from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.params import Count, Name, NonNegative, Positive
+from constraint_geodesics.learning.learned_manifold import JointManifold, LearnedManifold
 from constraint_geodesics.peers.baseline import MANIFOLD, BaselineSettings, Context
 from constraint_geodesics.peers.latent_geodesic import (
     EXACT,
@@ -199,9 +198,9 @@ class _Cost:
         return max(float(np.linalg.norm(self.problem.goal - self.problem.start)), 1e-9)
 
 
-def joint_chart(robot: SerialRobot) -> JointChart:
+def joint_chart(robot: SerialRobot) -> JointManifold:
     """Joint space in units of its own size: the scale of configurations spread over the limits."""
-    return JointChart.of(robot.sample(LIMIT_SAMPLES, np.random.default_rng(0)))
+    return JointManifold.of(robot.sample(LIMIT_SAMPLES, np.random.default_rng(0)))
 
 
 BASELINE = BayesianSettings

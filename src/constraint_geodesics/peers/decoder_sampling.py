@@ -43,7 +43,6 @@ class DecoderSettings(OmplSettings):
     """RRTConnect's, in the only space that takes samples from elsewhere."""
 
     family: ClassVar = "birrt"
-    uses_bundle: ClassVar = True
 
     space: Literal["projected"] = "projected"
 
@@ -51,7 +50,7 @@ class DecoderSettings(OmplSettings):
         """Samples of the planner's own manifold."""
         from constraint_geodesics.learning.inference import FrozenManifold
 
-        return DecoderSampling(FrozenManifold(context.bundle.manifold), self)
+        return DecoderSampling(FrozenManifold.load(context.layout.manifold(context.searched)), self)
 
     @property
     def trained(self) -> tuple[str, ...]:

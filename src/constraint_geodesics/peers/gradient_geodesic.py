@@ -16,11 +16,11 @@ from jaxtyping import Float, Int
 from pydantic import Field
 from scipy import optimize
 
+from constraint_geodesics.fields import Count
 from constraint_geodesics.geodesics.problem import Ends, LearnedProblem, repeated
 from constraint_geodesics.geometry.curves import PinnedSpline
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.lift import correct_and_retract
-from constraint_geodesics.params import Count
+from constraint_geodesics.learning.lift import corrected, retracted
 from constraint_geodesics.peers.baseline import MANIFOLD, BaselineSettings, Context
 from constraint_geodesics.peers.latent_geodesic import (
     EXACT,
@@ -90,7 +90,7 @@ class GradientGeodesic:
     """The shortest retracted curve of a family that descent finds from several starts, one of them
     straight.
 
-    All starts go down together along the problem's own descent (`LearnedProblem.look`: the
+    All starts go down together along the problem's own descent (`LearnedProblem.observed`: the
     tangential part of the path's curvature, pulled back to the chart), each with a step size of its
     own.  That stands still where the mean Jacobian of the decoder is no longer exact; from there
     BFGS on the cost itself polishes the best.  Where every one of these collides, they are pushed
@@ -174,11 +174,11 @@ def descended(
     before.
     """
     many = repeated(ends, len(phi))
-    seen = learned.look(phi, many)
+    seen = learned.observed(phi, many)
     value, descent, stride = ranks(seen.costs), seen.descent, np.ones((len(phi), 1))
     for _ in range(steps):
         tried = phi + stride * descent
-        seen = learned.look(tried, many)
+        seen = learned.observed(tried, many)
         cheaper = (ranks(seen.costs) < value)[:, None]
         phi, descent = np.where(cheaper, tried, phi), np.where(cheaper, seen.descent, descent)
         value = np.minimum(ranks(seen.costs), value)
@@ -214,9 +214,8 @@ class _Cost:
             return value
         t, manifold = self._times, self.learned.manifold
         decoded = self.learned.chart.decode(self.learned.latent_points(phi, many, t))
-        joints = correct_and_retract(
-            manifold, decoded, t, many.q_start, many.q_goal, self.learned.retraction
-        ).joints
+        line = corrected(decoded, t, many.q_start, many.q_goal)
+        joints = retracted(manifold, line, self.learned.retraction).joints
         missing = np.maximum(
             MARGIN - self.clearance.clearance(manifold.robot, joints[:, 1:-1]), 0.0
         )

@@ -13,16 +13,17 @@ from pydantic import Field
 
 from constraint_geodesics.constraints.pose import Constraint
 from constraint_geodesics.constraints.projection import Retraction
+from constraint_geodesics.fields import Count
 from constraint_geodesics.geometry.graph import shortest_path
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.lift import lift
+from constraint_geodesics.learning.lift import corrected, retracted
 from constraint_geodesics.learning.submanifold import (
     Free,
     GraphSubmanifold,
+    Surface,
     check_edges,
     load_submanifold,
 )
-from constraint_geodesics.params import Count
 from constraint_geodesics.peers.baseline import GRAPH, BaselineError, BaselineSettings, Context
 from constraint_geodesics.peers.elastic_band import is_clear
 from constraint_geodesics.peers.latent_geodesic import (
@@ -153,16 +154,10 @@ class LatentGraphSearch:
             :TRIED
         ]
         found: list[int] = []
+        surface = Surface(self.chart, problem.manifold, _all_free(problem))
         for block in np.array_split(near, max(len(near) // 8, 1)):
             starts = np.broadcast_to(joints[end], (len(block), joints.shape[1]))
-            lengths = check_edges(
-                self.chart,
-                problem.manifold,
-                starts,
-                joints[block],
-                _all_free(problem),
-                self.settings.edge_points,
-            )
+            lengths = check_edges(surface, starts, joints[block], self.settings.edge_points)
             found += [int(node) for node in block[np.isfinite(lengths)]]
             if len(found) >= ENOUGH:
                 break
@@ -177,9 +172,8 @@ class LatentGraphSearch:
         t = np.linspace(0.0, 1.0, int(np.ceil(np.linalg.norm(goal - start) / EDGE_SPACING)) + 2)
         z_start, z_goal = self.chart.encode(np.stack([start, goal]))
         z = (1.0 - t[:, None]) * z_start + t[:, None] * z_goal
-        lifted = lift(
-            self.chart, problem.manifold, z[None], t, start[None], goal[None], Retraction()
-        )
+        line = corrected(self.chart.decode(z[None]), t, start[None], goal[None])
+        lifted = retracted(problem.manifold, line, Retraction())
         joints = lifted.joints[0]
         longest = np.linalg.norm(np.diff(joints, axis=0), axis=1).max()
         if longest > 3.0 * EDGE_SPACING or lifted.violation.max() > SATISFIED:

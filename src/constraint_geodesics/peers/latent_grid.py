@@ -19,15 +19,15 @@ from scipy.spatial import KDTree
 
 from constraint_geodesics.constraints.pose import Constraint
 from constraint_geodesics.constraints.projection import Retraction
+from constraint_geodesics.fields import Count, Name
 from constraint_geodesics.geodesics.graph_search import KNIGHT
-from constraint_geodesics.geodesics.problem import Ends, LearnedProblem, allowed_steps
+from constraint_geodesics.geodesics.problem import Ends, LearnedProblem
 from constraint_geodesics.geometry.curves import PinnedSpline
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.graph import OUTSIDE, shortest_path
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.lift import lift
+from constraint_geodesics.learning.lift import allowed_steps, corrected, retracted
 from constraint_geodesics.learning.submanifold import GridSubmanifold, load_submanifold
-from constraint_geodesics.params import Count, Name
 from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings, Context
 from constraint_geodesics.peers.elastic_band import is_clear
 from constraint_geodesics.peers.latent_geodesic import (
@@ -227,9 +227,8 @@ class GridSearch:
         t = np.linspace(0.0, 1.0, LOOKED_AT)
         z = learned.latent_points(phi[None], ends, t)
         retraction = Retraction() if self.settings.retracted else None
-        joints = lift(
-            self.chart, problem.manifold, z, t, ends.q_start, ends.q_goal, retraction
-        ).joints
+        line = corrected(self.chart.decode(z), t, ends.q_start, ends.q_goal)
+        joints = retracted(problem.manifold, line, retraction).joints
         jumps = np.linalg.norm(np.diff(joints[0], axis=0), axis=1) > allowed_steps(joints, t)[0]
         wrong = np.concatenate([jumps, [False]]) | (
             problem.manifold.robot.limit_distance(joints[0]) < 0.0

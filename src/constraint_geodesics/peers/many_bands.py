@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints.pose import ConstraintManifold
-from constraint_geodesics.params import Count
-from constraint_geodesics.peers.baseline import GRAPH, BaselineSettings, Context
+from constraint_geodesics.fields import Count
+from constraint_geodesics.peers.baseline import BaselineSettings, Context
 from constraint_geodesics.peers.elastic_band import (
     Configurations,
     bent_lines,
@@ -33,7 +33,7 @@ class ManyBandsSettings(BaselineSettings):
     starts: Count = 32
 
     def make(self, context: Context) -> PathPlanner:
-        """Bends past the nodes of the constraint's graph; where there is none, past random ones."""
+        """Bends past the nodes of the constraint's roadmap; without one, past random ones."""
         roadmap = context.bundle.roadmaps.get(context.constraint)
         if roadmap is None or not len(roadmap.joints):
             return MultiStartBand(self.starts)
@@ -45,11 +45,6 @@ class ManyBandsSettings(BaselineSettings):
             return nodes[rng.integers(len(nodes), size=count)]
 
         return MultiStartBand(self.starts, configurations)
-
-    @property
-    def trained(self) -> tuple[str, ...]:
-        """The graph."""
-        return GRAPH
 
 
 @dataclass(frozen=True)

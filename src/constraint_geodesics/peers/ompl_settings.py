@@ -4,7 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from constraint_geodesics.params import Count, Positive
+from constraint_geodesics.fields import Count, Positive
 from constraint_geodesics.peers.baseline import BaselineSettings
 
 

@@ -3,36 +3,38 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, get_args
 
-from constraint_geodesics.params import Positive, SphereParams
+from constraint_geodesics.fields import Positive
+from constraint_geodesics.methods import open_method
 from constraint_geodesics.peers.baseline import GRAPH, BaselineSettings, Context
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
-from constraint_geodesics.scene.world import Sphere
 from constraint_geodesics.search.candidates import ALL_PARTS, Parts
 
 Part = Literal["straight", "policy", "graph", "refinement", "tree"]
 
 
 class PlannerSettings(BaselineSettings):
-    """without: parts that are switched off.  only: those that are left, null: all that the planner
-    has by itself.  budget_s: time [s] it goes on shortening its path for.
+    """method: how it looks for curves (`Planner.load`).  without: parts that are switched off.
+    only: those that are left, null: all that the planner has by itself.  budget_s: time [s] it goes
+    on shortening its path for.
     """
 
     family: ClassVar = "planner"
-    uses_bundle: ClassVar = True
     random: ClassVar = False
     uses_clearance: ClassVar = False  # it makes its own model
+    uses_bundle: ClassVar = True
 
+    method: Literal["planner", "learned", "learned+band"] = "planner"
     without: tuple[Part, ...] = ()
     only: tuple[Part, ...] | None = None
     budget_s: Positive | None = None
 
     def make(self, context: Context) -> PathPlanner:
-        """Baselines made together share one planner, opened once."""
-        if "planner" not in context.shared:
-            context.shared["planner"] = _opened(context)
+        """Baselines made together share one planner of each method, opened once."""
+        if self.method not in context.shared:
+            context.shared[self.method] = _opened(context, self.method)
         parts = replace(ALL_PARTS, **dict.fromkeys(self.switched_off, False))
-        return OwnPlanner(context.shared["planner"], parts, self.budget_s)
+        return OwnPlanner(context.shared[self.method], parts, self.budget_s)
 
     @property
     def switched_off(self) -> set[str]:
@@ -42,10 +44,10 @@ class PlannerSettings(BaselineSettings):
 
     @property
     def trained(self) -> tuple[str, ...]:
-        """The graph, policies and their bundle; nothing where neither graph nor policies are on."""
-        if {"graph", "policy"} <= self.switched_off:
+        """The paper's system for the learned methods, nothing else."""
+        if self.method == "planner":
             return ()
-        return (*GRAPH, "train_policies {searched}", "build_planner")
+        return (*GRAPH, "train_policies {searched}", "build_learned")
 
     @property
     def ends_by_counting(self) -> bool:
@@ -80,28 +82,16 @@ class OwnPlanner:
         return Solution(path.status, path.joints, path.planning_time_s, 1, explanation)
 
 
-def _opened(context: Context) -> Planner:
+def _opened(context: Context, method: str) -> Planner:
     """The planner in the context's scene, its graph and networks loaded."""
-    workcell, bundle = context.params.workcell, context.bundle
-    balls = {
-        body.name: SphereParams(
-            centre_m=body.centre, radius_m=body.radius, exempt_links=body.exempt_links
-        )
-        for body in context.scene.workcell
-        if isinstance(body, Sphere)
-    }
-    within = workcell.model_copy(update={"spheres": {**workcell.spheres, **balls}})
-    planner = context.opened.enter_context(
-        Planner(replace(bundle, workcell=within), "the pipeline's outputs")
-    )
+    within = context.bundle.workcell.including(*context.scene.workcell)
+    bundle = replace(context.bundle, workcell=within)
+    found = open_method(method, context.layout.planner, bundle)
+    planner = context.opened.enter_context(Planner(bundle, "the pipeline's outputs", found))
     constraint = context.manifold.constraint
     planner.prepare(constraint)
-    nodes = planner.nodes(constraint)
-    for parts in (
-        Parts(straight=False, graph=False, tree=False),
-        Parts(straight=False, graph=False, policy=False),
-    ):  # loads the networks and the trees' compiled code
-        planner.plan(nodes[0], nodes[-1], constraint, parts=parts)
+    nodes, trees = planner.nodes(constraint), Parts(straight=False, graph=False)
+    planner.plan(nodes[0], nodes[-1], constraint, parts=trees)  # loads the trees' compiled code
     return planner
 
 

@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from constraint_geodesics.params import Positive
+from constraint_geodesics.fields import Positive
 from constraint_geodesics.peers.baseline import Context
 from constraint_geodesics.peers.ompl_settings import OmplSettings
 from constraint_geodesics.problem import PathPlanner

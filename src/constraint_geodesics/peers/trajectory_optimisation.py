@@ -24,7 +24,7 @@ from scipy.optimize import BFGS, NonlinearConstraint, OptimizeResult, minimize
 
 from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
-from constraint_geodesics.params import Count, Positive
+from constraint_geodesics.fields import Count, Positive
 from constraint_geodesics.peers.baseline import BaselineSettings, Context
 from constraint_geodesics.peers.elastic_band import (
     Configurations,

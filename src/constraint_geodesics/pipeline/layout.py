@@ -49,9 +49,19 @@ class Layout:
         return self.root / "data" / "geodesics" / f"{manifold}-{constraint}"
 
     @property
+    def code(self) -> Path:
+        """Folder of the digests of the code of each stage (text)."""
+        return self.root / "data" / "code"
+
+    @property
     def planner(self) -> Path:
         """Folder of the planner's files (safetensors and JSON)."""
         return self.root / "data" / "planner"
+
+    @property
+    def learned(self) -> Path:
+        """Folder of the learned method's files (safetensors and JSON)."""
+        return self.root / "data" / "learned"
 
     @property
     def pretrained(self) -> Path:
@@ -93,6 +103,10 @@ class Layout:
     def benchmark(self, constraint: str) -> Path:
         """Folder of the sampled paths (npz)."""
         return self.root / "data" / "benchmark" / constraint
+
+    def executions(self, constraint: str) -> Path:
+        """Folder of what became of executed paths, for their recordings (npz)."""
+        return self.root / "data" / "executions" / constraint
 
     def recordings(self, stage: str, item: str) -> Path:
         """Folder of the Rerun recordings of one stage's item."""

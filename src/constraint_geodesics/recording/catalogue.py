@@ -15,17 +15,13 @@ from constraint_geodesics.pipeline.layout import RECORDINGS, Layout, in_checkout
 FOLDERS = (RECORDINGS, "first_path")
 """Where recordings lie, relative to the checkout."""
 HEADINGS = (
-    "#",
-    "constraint",
-    "scene",
-    "manifold",
-    "planner",
-    "query",
-    "seed",
-    "length [rad]",
-    "valid",
-    "file",
+    *("#", "constraint", "scene", "manifold", "planner", "query", "seed"),
+    *("length [rad]", "valid", "file"),
 )
+
+
+SEARCHING = ("train_geodesics", "benchmark_planners", "execute_paths")
+"""Stages whose tables name recordings, besides the benchmark."""
 
 
 class CatalogueError(ValueError):
@@ -33,16 +29,14 @@ class CatalogueError(ValueError):
 
 
 @dataclass(frozen=True)
-class Entry:
+class Listed:
     """One recording; what is not known of it is "" or None."""
 
     number: int
     """Its place in the whole list, from 1."""
     constraint: str
     scene: str
-    """What stands round the robot, in the benchmark of all planners; its queries are others than
-    those without.
-    """
+    """What stands round the robot in the benchmark; its queries differ from those without."""
     planner: str
     """Or what was executed."""
     query: int | None
@@ -61,7 +55,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class Filter:
     """What is asked for; an empty one asks for nothing."""
 
     constraint: str | None = None
@@ -76,11 +70,22 @@ class Wanted:
         """Whether it says whose paths of which query, so that they can be opened at once."""
         return self.constraint is not None and self.query is not None and bool(self.planners)
 
+    @property
+    def values(self) -> dict[str, tuple[str, ...]]:
+        """Of what a recording must have one, by its field."""
+        names = {key: getattr(self, key) for key in ("constraint", "scene", "manifold")}
+        return {
+            **{key: () if name is None else (plain(name),) for key, name in names.items()},
+            "query": () if self.query is None else (str(self.query),),
+            "planner": tuple(plain(name) for name in self.planners),
+            "seed": tuple(str(seed) for seed in self.seeds),
+        }
 
-Read = Callable[[Path], Entry]
+
+Read = Callable[[Path], Listed]
 
 
-def catalogue(root: Path, read: Read) -> list[Entry]:
+def catalogue(root: Path, read: Read) -> list[Listed]:
     """All recordings of a checkout: as the tables name them, then what no table names, numbered
     from 1.
 
@@ -90,16 +95,12 @@ def catalogue(root: Path, read: Read) -> list[Entry]:
     known = {entry.file for entry in named}
     found = sorted(file for folder in FOLDERS for file in (root / folder).rglob("*.rrd"))
     others = [file for file in found if file.relative_to(root).as_posix() not in known]
-    entries = named + [
-        replace(read(file), file=file.relative_to(root).as_posix()) for file in others
-    ]
-    return [replace(entry, number=k) for k, entry in enumerate(entries, 1)]
+    own = [replace(read(file), file=file.relative_to(root).as_posix()) for file in others]
+    return [replace(entry, number=k) for k, entry in enumerate(named + own, 1)]
 
 
-def read_entry(file: Path) -> Entry:
-    """What a recording says of itself; a file that is no recording of one path says so instead of a
-    planner.
-    """
+def read_entry(file: Path) -> Listed:
+    """What a recording says of itself; one that is not of one path says so as its planner."""
     import numpy as np
 
     from constraint_geodesics.recording.recording import RecordingError, read_recording
@@ -107,42 +108,27 @@ def read_entry(file: Path) -> Entry:
     try:
         summary = read_recording(file)
     except RecordingError:
-        return Entry(0, "", "", "(not one path)", None, None, None, None, file.as_posix())
+        return Listed(0, "", "", "(not one path)", None, None, None, None, file.as_posix())
     about, steps = summary.about, np.diff(summary.joints, axis=0)
     length = float(np.linalg.norm(steps, axis=1).sum())
-    return Entry(
-        0,
-        about.constraint,
-        about.scene,
-        about.planner,
-        about.query,
-        about.seed,
-        length,
-        None,
-        file.as_posix(),
-    )
+    own = (about.constraint, about.scene, about.planner, about.query, about.seed)
+    return Listed(0, *own, length, None, file.as_posix())
 
 
-def _rows(layout: Layout) -> Iterator[Entry]:
+def _rows(layout: Layout) -> Iterator[Listed]:
     """Learned paths that keep a cup level first, then by stage."""
-    reports = layout.root / "reports"
-    learned = sorted((reports / "train_geodesics").glob("*.csv"), key=_first_to_see)
-    for file in (
-        *learned,
-        *sorted((reports / "benchmark_planners").glob("*.csv")),
-        layout.benchmark_table,
-        *sorted((reports / "execute_paths").glob("*.csv")),
-    ):
-        rows = [_entry(row, file.stem) for row in _named(file)]
+    stages = (layout.root / "reports" / stage for stage in SEARCHING)
+    learned, sampled, executed = (sorted(folder.glob("*.csv")) for folder in stages)
+    learned.sort(key=_first_to_see)
+    for file in (*learned, *sampled, layout.benchmark_table, *executed):
+        rows = [_listed(row, file.stem) for row in _named(file)]
         yield from sorted(
-            rows, key=lambda entry: (*entry.problem, not entry.planner.startswith("learned"))
+            rows, key=lambda row: (*row.problem, not row.planner.startswith("learned"))
         )
 
 
 def _first_to_see(table: Path) -> tuple[bool, bool, str]:
-    """Before the paper's latent plane, whose paths do not keep the constraint, comes the manifold
-    that people use.
-    """
+    """The manifold that people use comes before the paper's plane, which keeps no constraint."""
     return table.name != "planner-level_cup.csv", not table.name.startswith("planner-"), table.name
 
 
@@ -155,54 +141,41 @@ def _named(file: Path) -> Iterator[Mapping[str, str]]:
         yield from (row for row in csv.DictReader(lines) if row.get("recording"))
 
 
-def _entry(row: Mapping[str, str], table: str) -> Entry:
+def _listed(row: Mapping[str, str], table: str) -> Listed:
     seed, length, valid = row.get("seed"), float(row.get("length_rad") or "nan"), row.get("valid")
-    return Entry(
-        0,
-        row.get("constraint") or table,
-        row.get("scene", ""),
-        row.get("planner") or row.get("kind", ""),
-        int(row["query"]),
-        int(seed) if seed else None,
-        length if math.isfinite(length) else None,
-        valid == "True" if valid else None,
-        in_checkout(row["recording"]),
-        row.get("manifold", ""),
+    return Listed(
+        number=0,
+        constraint=row.get("constraint") or table,
+        scene=row.get("scene", ""),
+        planner=row.get("planner") or row.get("kind", ""),
+        query=int(row["query"]),
+        seed=int(seed) if seed else None,
+        length_rad=length if math.isfinite(length) else None,
+        valid=valid == "True" if valid else None,
+        file=in_checkout(row["recording"]),
+        manifold=row.get("manifold", ""),
     )
 
 
-def narrowed(entries: Sequence[Entry], wanted: Wanted) -> list[Entry]:
+def narrowed(entries: Sequence[Listed], wanted: Filter) -> list[Listed]:
     """Those that are as asked for.  Raises CatalogueError if none is, with what there is."""
     left = list(entries)
-    for what, values, own in (
-        (
-            "constraint",
-            () if wanted.constraint is None else (plain(wanted.constraint),),
-            lambda e: plain(e.constraint),
-        ),
-        ("scene", () if wanted.scene is None else (plain(wanted.scene),), lambda e: plain(e.scene)),
-        (
-            "manifold",
-            () if wanted.manifold is None else (plain(wanted.manifold),),
-            lambda e: plain(e.manifold),
-        ),
-        ("query", () if wanted.query is None else (str(wanted.query),), lambda e: str(e.query)),
-        ("planner", tuple(plain(name) for name in wanted.planners), lambda e: plain(e.planner)),
-        ("seed", tuple(str(seed) for seed in wanted.seeds), lambda e: str(e.seed)),
-    ):
-        if not values:
-            continue
-        there = sorted({own(entry) for entry in left} - {"", "None"})
-        if missing := sorted(set(values) - set(there)):
-            instead = ", ".join(there) or "none"
-            raise CatalogueError(
-                f"no recording of {what} {missing[0]} is as asked for: there is {instead}"
-            )
-        left = [entry for entry in left if own(entry) in values]
+    for what, values in wanted.values.items():
+        own = [_text(getattr(entry, what)) for entry in left]
+        if missing := sorted(set(values) - set(own)):
+            instead = ", ".join(sorted(set(own) - {""})) or "none"
+            none = f"no recording of {what} {missing[0]} is as asked for"
+            raise CatalogueError(f"{none}: there is {instead}")
+        if values:
+            left = [entry for entry, value in zip(left, own, strict=True) if value in values]
     return left
 
 
-def one_of_each(entries: Sequence[Entry], wanted: Wanted) -> list[Entry]:
+def _text(value: str | int | None) -> str:
+    return plain(value) if isinstance(value, str) else "" if value is None else str(value)
+
+
+def one_of_each(entries: Sequence[Listed], wanted: Filter) -> list[Listed]:
     """What is opened at once: the first recording of each planner that is asked for, or each of the
     seeds asked for.
 
@@ -211,7 +184,7 @@ def one_of_each(entries: Sequence[Entry], wanted: Wanted) -> list[Entry]:
     Raises CatalogueError if a planner has none there.
     """
     order = [plain(name) for name in wanted.planners]
-    problems: dict[tuple[str, str, int], list[Entry]] = {}
+    problems: dict[tuple[str, str, int], list[Listed]] = {}
     for entry in entries:
         problems.setdefault(entry.problem, []).append(entry)
     most = max(problems.values(), key=lambda own: len({plain(entry.planner) for entry in own}))
@@ -219,19 +192,16 @@ def one_of_each(entries: Sequence[Entry], wanted: Wanted) -> list[Entry]:
         where = f" in scene {most[0].scene}" if most[0].scene else ""
         raise CatalogueError(
             f"{missing[0]} has no path of the query that the others have{where}: queries are "
-            f"others in each scene; "
-            f"choose with --scene, or open files"
+            f"others in each scene; choose with --scene, or open files"
         )
-    firsts: dict[tuple[str, int | None], Entry] = {}
+    firsts: dict[tuple[str, int | None], Listed] = {}
     for entry in sorted(most, key=lambda entry: entry.valid is False):
         firsts.setdefault((plain(entry.planner), entry.seed if wanted.seeds else None), entry)
     return sorted(firsts.values(), key=lambda entry: order.index(plain(entry.planner)))
 
 
-def by_words(entries: Sequence[Entry], words: Sequence[str]) -> list[Entry]:
-    """The recordings of some numbers, as the list has them.  Raises CatalogueError for what is no
-    number of it.
-    """
+def by_words(entries: Sequence[Listed], words: Sequence[str]) -> list[Listed]:
+    """The recordings of some numbers.  Raises CatalogueError for what is no number of the list."""
     numbered = {str(entry.number): entry for entry in entries}
     for word in words:
         if word not in numbered:
@@ -244,17 +214,16 @@ def plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", name.lower().replace("rrt*", "rrt_star")).strip("_")
 
 
-def as_table(entries: Sequence[Entry]) -> str:
+def as_table(entries: Sequence[Listed]) -> str:
     """The list as text, one recording a line, its file last."""
     rows = [HEADINGS, *(_cells(entry) for entry in entries)]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(HEADINGS) - 1)]
-    return "\n".join(
-        "  ".join([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[-1]])
-        for row in rows
-    )
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    widths[-1] = 0
+    padded = [[cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in rows]
+    return "\n".join("  ".join(row) for row in padded)
 
 
-def _cells(entry: Entry) -> tuple[str, ...]:
+def _cells(entry: Listed) -> tuple[str, ...]:
     length = "" if entry.length_rad is None else f"{entry.length_rad:.3f}"
     valid = {None: "", True: "yes", False: "no"}[entry.valid]
     numbers = ("" if value is None else str(value) for value in (entry.query, entry.seed))
@@ -262,6 +231,6 @@ def _cells(entry: Entry) -> tuple[str, ...]:
     return (*about, *numbers, length, valid, entry.file)
 
 
-def as_records(entries: Sequence[Entry]) -> list[dict[str, object]]:
+def as_records(entries: Sequence[Listed]) -> list[dict[str, object]]:
     """The list for JSON."""
     return [asdict(entry) for entry in entries]

@@ -18,35 +18,18 @@ from rerun.chunk import Chunk
 from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.palette import BLUE, SKY, VERMILION, planner_colour
-from constraint_geodesics.recording.recording import (
-    About,
-    Frames,
-    RecordingError,
-    about_chunk,
-    arranged,
-    colours,
-    digest,
-    joint_chunks,
-    joint_panel,
-    moving,
-    rgb,
-    scalars,
-    scene_chunks,
-    scene_panel,
-    static,
-    tool_chunks,
-    write_recording,
-)
+from constraint_geodesics.recording import recording
+from constraint_geodesics.recording.recording import About, Frames, RecordingError, moving, static
 from constraint_geodesics.robot.kinematics import SerialRobot
-from constraint_geodesics.scene.world import Solid
+from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.studies.cup import CupSettings, Execution
 
 TIME = "time"
 """The timeline, in seconds from the start of the path."""
 
-_BESIDE_CUP_M = (0.25, -0.25, 0.15)
+_EYE_M = (0.25, -0.25, 0.15)
 """From where the cup is looked at, seen from its centre."""
-_CUP, _TILT, _KEPT = (*rgb(SKY), 60), rgb(VERMILION), rgb(BLUE)
+_CUP, _TILT, _KEPT = (*recording.rgb(SKY), 60), recording.rgb(VERMILION), recording.rgb(BLUE)
 
 
 @dataclass(frozen=True)
@@ -72,7 +55,7 @@ def record_execution(
     file: Path,
     record: ExecutionRecord,
     robot: SerialRobot,
-    workcell: Sequence[Solid],
+    workcell: Sequence[Shape],
     *,
     meshes: bool = True,
 ) -> None:
@@ -82,34 +65,31 @@ def record_execution(
     Raises RecordingError if the execution is not one of this robot and cup, or a mesh that is to be
     written is missing.
     """
-    execution = _checked(record, robot)
-    frames = Frames(
-        execution.joints,
-        robot.forward(execution.joints)[0],
-        None,
-        rr.TimeColumn(TIME, duration=execution.times),
-    )
+    execution, cup = _checked(record, robot), record.cup
+    time = rr.TimeColumn(TIME, duration=execution.times)
+    frames = Frames(execution.joints, robot.forward(execution.joints)[0], None, time)
     chunks = [
-        *scene_chunks(robot, workcell, frames, meshes=meshes),
-        *tool_chunks(frames, rgb(planner_colour(record.kind))),
-        *_cup_chunks(execution, record.cup, frames.time),
-        *_sphere_chunks(execution, record.cup, frames.time),
-        *_series_chunks(execution, record.cup, frames.time),
-        *joint_chunks(robot, frames),
-        about_chunk(About(record.kind, record.constraint, query=record.query, executed=True)),
-        static("status", rr.TextDocument(_status(record), media_type=rr.MediaType.MARKDOWN)),
-        static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP),
+        *recording.scene_chunks(robot, workcell, frames, meshes=meshes),
+        *recording.tool_chunks(frames, recording.rgb(planner_colour(record.kind))),
+        *_cup_chunks(execution, cup, time),
+        *_sphere_chunks(execution, cup, time),
+        *_series_chunks(execution, cup, time),
+        *recording.joint_chunks(robot, frames),
+        recording.about_chunk(
+            About(record.kind, record.constraint, query=record.query, executed=True)
+        ),
+        *recording.text_chunks(_status(record)),
     ]
     name = f"{record.constraint}, query {record.query}: {record.kind}, executed"
-    own = f"{record.constraint}-{record.name}-executed-{digest(frames)}"
-    write_recording(file, own, name, chunks, _blueprint(frames, execution.spheres))
+    own = f"{record.constraint}-{record.name}-executed-{recording.digest(frames)}"
+    recording.write_recording(file, own, name, chunks, _blueprint(frames, execution.spheres))
 
 
 def record_executions(
     folder: Path,
     records: Sequence[ExecutionRecord | None],
     robot: SerialRobot,
-    workcell: Sequence[Solid],
+    workcell: Sequence[Shape],
 ) -> list[str]:
     """Record executions, one file each without meshes; returns the file of each, or "" where there
     is None.
@@ -126,15 +106,11 @@ def record_executions(
 
 def in_cup(execution: Execution, cup: CupSettings) -> Float[np.ndarray, "F"]:
     """How many spheres have their centre in the cup, below its rim, at each frame."""
-    local = np.einsum(
-        "fji,fsj->fsi",
-        _cup_rotations(execution),
-        execution.sphere_positions - execution.cup_pose[:, None, :3],
-    )
-    beside = np.hypot(local[..., 0], local[..., 1]) < cup.inner_radius_m + cup.wall_m
-    return np.asarray(
-        (beside & (np.abs(local[..., 2]) < 0.5 * cup.height_m)).sum(axis=1), dtype=float
-    )
+    from_centre = execution.sphere_positions - execution.cup_pose[:, None, :3]
+    local = np.einsum("fji,fsj->fsi", _cup_rotations(execution), from_centre)
+    within = np.hypot(local[..., 0], local[..., 1]) < cup.inner_radius_m + cup.wall_m
+    below = np.abs(local[..., 2]) < 0.5 * cup.height_m
+    return np.asarray((within & below).sum(axis=1), dtype=float)
 
 
 def tilt(execution: Execution) -> Float[np.ndarray, "F"]:
@@ -166,19 +142,17 @@ def _cup_chunks(execution: Execution, cup: CupSettings, time: rr.TimeColumn) -> 
     """
     yield moving("cup", rr.Transform3D.columns(translation=execution.cup_pose[:, :3]), time)
     yield moving("cup/wall", rr.Transform3D.columns(quaternion=execution.cup_pose[:, 3:]), time)
-    yield static(
-        "cup/wall",
-        rr.Cylinders3D(
-            lengths=[cup.height_m],
-            radii=[cup.inner_radius_m + cup.wall_m],
-            colors=[_CUP],
-            fill_mode="transparentfillmajorwireframe",
-        ),
+    wall = rr.Cylinders3D(
+        lengths=[cup.height_m],
+        radii=[cup.inner_radius_m + cup.wall_m],
+        colors=[_CUP],
+        fill_mode="transparentfillmajorwireframe",
     )
+    yield static("cup/wall", wall)
 
 
 def _sphere_chunks(execution: Execution, cup: CupSettings, time: rr.TimeColumn) -> Iterator[Chunk]:
-    own = colours(np.arange(execution.spheres))
+    own = recording.colours(np.arange(execution.spheres))
     yield static("spheres", rr.Points3D.from_fields(colors=own, radii=[cup.sphere_radius_m]))
     columns = rr.Points3D.columns(positions=execution.sphere_positions.reshape(-1, 3))
     yield moving("spheres", columns.partition([execution.spheres] * len(execution.times)), time)
@@ -190,52 +164,42 @@ def _series_chunks(execution: Execution, cup: CupSettings, time: rr.TimeColumn) 
         ("cup_spheres", "spheres", _KEPT, in_cup(execution, cup)),
     ):
         yield static(entity, rr.SeriesLines(names=[name], colors=[colour], widths=[2.0]))
-        yield scalars(entity, values, time)
+        yield recording.scalars(entity, values, time)
 
 
 def _status(record: ExecutionRecord) -> str:
     execution = record.execution
-    return "\n".join(
-        (
-            f"**{record.kind}**, constraint `{record.constraint}`, query {record.query}, "
-            f"executed in simulation",
-            "",
-            f"- {execution.kept} of {execution.spheres} spheres stayed in the cup",
-            f"- largest tilt of the cup {np.degrees(execution.largest_tilt_rad):.2f}°",
-            f"- duration {execution.duration_s:.2f} s, "
-            f"largest tracking error {np.degrees(execution.largest_tracking_error_rad):.4f}°",
-        )
+    error = np.degrees(execution.largest_tracking_error_rad)
+    return (
+        f"**{record.kind}**, constraint `{record.constraint}`, query {record.query}, "
+        f"executed in simulation\n\n"
+        f"- {execution.kept} of {execution.spheres} spheres stayed in the cup\n"
+        f"- largest tilt of the cup {np.degrees(execution.largest_tilt_rad):.2f}°\n"
+        f"- duration {execution.duration_s:.2f} s, largest tracking error {error:.4f}°"
     )
 
 
 def _blueprint(frames: Frames, spheres: int) -> Any:
     # it follows the cup but does not turn with it; the arm is left out, it would often hide the cup
-    cup = rrb.Spatial3DView(
-        origin="/",
-        name="Cup",
-        contents=[f"+ /{entity}/**" for entity in ("workcell", "cup", "spheres")],
-        spatial_information=rrb.SpatialInformation(target_frame="tf#/cup"),
-        eye_controls=rrb.EyeControls3D(
-            position=_BESIDE_CUP_M, look_target=(0.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
-        ),
-        line_grid=rrb.LineGrid3D(visible=False),
+    follow = rrb.SpatialInformation(target_frame="tf#/cup")
+    shown = ("workcell", "cup", "spheres")
+    cup = recording.space_view("Cup", shown, _EYE_M, (0.0, 0.0, 0.0), spatial_information=follow)
+    right = rrb.Vertical(
+        cup, *cup_panels(spheres), recording.joint_panel(), row_shares=[2.5, 1.0, 1.0, 1.5]
     )
-    right = rrb.Vertical(cup, *cup_panels(spheres), joint_panel(), row_shares=[2.5, 1.0, 1.0, 1.5])
-    return arranged(scene_panel(frames, "cup", "spheres"), right, execution_time())
+    return recording.arranged(
+        recording.scene_panel(frames, "cup", "spheres"), right, execution_time()
+    )
 
 
 def cup_panels(spheres: float) -> list[Any]:
     """The cup's tilt, and how many of its spheres are still in it."""
-    tilted = rrb.ScalarAxis(range=(0.0, 180.0))
-    counted = rrb.ScalarAxis(range=(0.0, 1.1 * spheres))
     return [
-        rrb.TimeSeriesView(origin="cup_tilt", name="Tilt of the cup [deg]", axis_y=tilted),
-        rrb.TimeSeriesView(origin="cup_spheres", name="Spheres in the cup", axis_y=counted),
+        recording.series_view("cup_tilt", "Tilt of the cup [deg]", (0.0, 180.0)),
+        recording.series_view("cup_spheres", "Spheres in the cup", (0.0, 1.1 * spheres)),
     ]
 
 
 def execution_time() -> Any:
     """The time panel of executions: they play as fast as they were executed."""
-    return rrb.TimePanel(
-        state="collapsed", timeline=TIME, playback_speed=1.0, play_state="playing", loop_mode="all"
-    )
+    return recording.time_panel(timeline=TIME, playback_speed=1.0)

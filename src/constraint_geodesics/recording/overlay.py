@@ -1,5 +1,4 @@
-"""Several recordings put together as one, to be seen at once: over each other, or beside each
-other.
+"""Several recordings put together as one, to be seen at once: over each other, or side by side.
 
 Each recording keeps what is its own below an entity of its own, in the colour of its planner; what
 it shares with the others (the workcell, the limits) is there once.  Recordings that name URDFs get
@@ -22,29 +21,10 @@ from jaxtyping import Float
 from rerun.chunk import Chunk
 
 from constraint_geodesics.palette import planner_colour
+from constraint_geodesics.recording import recording
 from constraint_geodesics.recording.execution_recording import TIME, cup_panels, execution_time
-from constraint_geodesics.recording.recording import (
-    LIMIT,
-    ROOT_FRAME,
-    TIMELINE,
-    About,
-    RecordingError,
-    about_of,
-    arranged,
-    has,
-    latent_view_of,
-    mesh_chunks,
-    path_time,
-    range_panel,
-    read_chunks,
-    residual_panel,
-    rgb,
-    scalars,
-    scene_view,
-    static,
-    violation_panel,
-)
-from constraint_geodesics.scene.scene import find_urdf
+from constraint_geodesics.recording.recording import About, RecordingError, static
+from constraint_geodesics.scene.urdf import find_urdf
 
 OTHERS_OPACITY = 0.45
 """Of the robots over the first one."""
@@ -104,9 +84,9 @@ def opened(file: Path) -> Opened:
     Raises RecordingError if it is not a recording or a mesh is missing, and RobotError if a URDF
     is.
     """
-    stored, chunks, _ = read_chunks(file)
+    stored, chunks, _ = recording.read_chunks(file)
     added = _missing_meshes(chunks)
-    about = about_of(stored.recording_id, chunks)
+    about = recording.about_of(stored.recording_id, chunks)
     return Opened(file, stored.recording_id, about, (*chunks, *added), tuple(added))
 
 
@@ -114,13 +94,13 @@ def _missing_meshes(chunks: Sequence[Chunk]) -> list[Chunk]:
     drawn = [chunk.entity_path for chunk in chunks if "/visual_geometries/" in chunk.entity_path]
     added = []
     for chunk in chunks:
-        if has(chunk, "urdf") and not any(
-            path.startswith(f"{chunk.entity_path}/") for path in drawn
+        entity = chunk.entity_path
+        if recording.has(chunk, "urdf") and not any(
+            path.startswith(f"{entity}/") for path in drawn
         ):
             row = chunk.to_record_batch().to_pylist()[0]
-            added += mesh_chunks(
-                find_urdf(row["urdf"][0]), chunk.entity_path, row.get("frame_prefix", [None])[0]
-            )
+            urdf, prefix = find_urdf(row["urdf"][0]), row.get("frame_prefix", [None])[0]
+            added += recording.mesh_chunks(urdf, entity, prefix)
     return added
 
 
@@ -135,32 +115,26 @@ def overlaid(sources: Sequence[Opened]) -> Composed:
     if sources[0].about.executed:
         raise RecordingError("executed paths are not laid over each other: add --side-by-side")
     if len(constraints := {source.about.constraint for source in sources}) > 1:
-        raise RecordingError(
-            f"paths of several constraints ({', '.join(sorted(constraints))}): add --side-by-side"
-        )
+        several = f"several constraints ({', '.join(sorted(constraints))})"
+        raise RecordingError(f"paths of {several}: add --side-by-side")
     _same_surroundings(sources)
-    parts, shared = (
-        _parts(sources),
-        [chunk for chunk in sources[0].chunks if _is_surroundings(chunk)],
-    )
+    parts = _parts(sources)
+    shared = [chunk for chunk in sources[0].chunks if _is_surroundings(chunk)]
     own = [
         chunk
         for k, part in enumerate(parts)
         for chunk in _in_space(part, 1.0 if k == 0 else OTHERS_OPACITY)
         if not _is_surroundings(chunk, part.entity)
     ]
-    return _composed(parts, shared + _ends_once(own), beside=False)
+    return _composed(parts, shared + _ends_once(own), apart=False)
 
 
 def side_by_side(sources: Sequence[Opened]) -> Composed:
-    """Paths or executed paths, each in a view of its own.  Raises RecordingError for paths among
-    executed ones.
-    """
+    """Paths, or executed ones, each in its own view.  Raises RecordingError for a mix of both."""
     _of_one_kind(sources)
     parts = _parts(sources)
-    return _composed(
-        parts, [chunk for part in parts for chunk in _in_space(part, 1.0)], beside=True
-    )
+    own = [chunk for part in parts for chunk in _in_space(part, 1.0)]
+    return _composed(parts, own, apart=True)
 
 
 def _of_one_kind(sources: Sequence[Opened]) -> None:
@@ -170,32 +144,32 @@ def _of_one_kind(sources: Sequence[Opened]) -> None:
     executed = [source.file for source in sources if source.about.executed]
     planned = [source.file for source in sources if not source.about.executed]
     if executed and planned:
-        raise RecordingError(
-            f"{executed[0]} is an executed path, in seconds, and {planned[0]} is a path, in "
-            f"frames: "
-            "open them one after another"
+        both = (
+            f"{executed[0]} is an executed path, in seconds, and {planned[0]} is a path, in frames"
         )
+        raise RecordingError(f"{both}: open them one after another")
 
 
 def _same_surroundings(sources: Sequence[Opened]) -> None:
     first = _surroundings(sources[0])
     for source in sources[1:]:
         if _surroundings(source) != first:
+            both = f"{sources[0].file} and {source.file}"
             raise RecordingError(
-                f"{sources[0].file} and {source.file} have different bodies round the robot: "
-                f"add --side-by-side"
+                f"{both} have different bodies round the robot: add --side-by-side"
             )
 
 
 def _surroundings(source: Opened) -> dict[tuple[str, ...], Any]:
     """The bodies as they stand, meshes and names of URDFs left out."""
-    return {
-        (chunk.entity_path, *_components(chunk)): chunk.to_record_batch()
-        .select(_components(chunk))
-        .to_pylist()
-        for chunk in source.chunks
-        if _is_surroundings(chunk) and not has(chunk, "Asset3D:", "urdf")
-    }
+    bodies = [chunk for chunk in source.chunks if _is_surroundings(chunk)]
+    found = {}
+    for chunk in bodies:
+        if not recording.has(chunk, "Asset3D:", "urdf"):
+            names = _components(chunk)
+            rows = chunk.to_record_batch().select(names).to_pylist()
+            found[chunk.entity_path, *names] = rows
+    return found
 
 
 def _is_surroundings(chunk: Chunk, below: str = "") -> bool:
@@ -206,11 +180,8 @@ def _is_surroundings(chunk: Chunk, below: str = "") -> bool:
 
 def _components(chunk: Chunk) -> list[str]:
     """Its columns but for the row ids."""
-    return [
-        name
-        for name in chunk.to_record_batch().schema.names
-        if not name.startswith("rerun.controls")
-    ]
+    names = chunk.to_record_batch().schema.names
+    return [name for name in names if not name.startswith("rerun.controls")]
 
 
 def _ends_once(chunks: Sequence[Chunk]) -> list[Chunk]:
@@ -218,7 +189,7 @@ def _ends_once(chunks: Sequence[Chunk]) -> list[Chunk]:
     kept, seen = [], []
     for chunk in chunks:
         marks = chunk.entity_path.endswith(("/tool/start", "/tool/goal"))
-        row = chunk.to_record_batch().column("Points3D:positions").to_pylist() if marks else None
+        row = recording.component(chunk, "Points3D:positions") if marks else None
         if row is None or row not in seen:
             kept.append(chunk)
             seen += [] if row is None else [row]
@@ -229,35 +200,24 @@ def _parts(sources: Sequence[Opened]) -> list[_Part]:
     labels = labels_of([source.about for source in sources])
     colours = shades([planner_colour(source.about.planner) for source in sources])
     places = np.linspace(0.0, 1.0, len(sources) + 2)[1:-1]
-    return [
-        _Part(
-            source,
-            label,
-            f"path{k}_{re.sub(r'[^a-z0-9]+', '_', label.lower()).strip('_')}",
-            colour,
-            float(place),
-        )
-        for k, (source, label, colour, place) in enumerate(
-            zip(sources, labels, colours, places, strict=True)
-        )
-    ]
+    parts = []
+    for k, (source, label) in enumerate(zip(sources, labels, strict=True)):
+        entity = f"path{k}_{re.sub(r'[^a-z0-9]+', '_', label.lower()).strip('_')}"
+        parts.append(_Part(source, label, entity, colours[k], float(places[k])))
+    return parts
 
 
 def labels_of(abouts: Sequence[About]) -> list[str]:
-    """The planner of each, with constraint, scene and query where they differ, and the seed where
-    that alone does.
-    """
+    """The planner of each; constraint, scene and query where they differ; else the seed."""
     labels = [about.planner or "path" for about in abouts]
     for what, words in (("constraint", "{}"), ("scene", "{}"), ("query", "query {}")):
         values = [getattr(about, what) for about in abouts]
         if len(set(values)) > 1:
-            labels = [
-                _with_value(label, words, value)
-                for label, value in zip(labels, values, strict=True)
-            ]
+            both = zip(labels, values, strict=True)
+            labels = [_with_value(label, words, value) for label, value in both]
     alike = Counter(labels)
     labels = [
-        _with_value(label, "seed {}", about.seed) if alike[label] > 1 else label
+        _with_value(label, "seed {}", about.seed if alike[label] > 1 else None)
         for label, about in zip(labels, abouts, strict=True)
     ]
     several, seen = Counter(labels), Counter[str]()
@@ -277,7 +237,7 @@ def shades(colours: Sequence[str]) -> list[Colour]:
     found = []
     for colour in colours:
         white = 1.0 - 0.6 ** seen[colour]
-        red, green, blue = (round(value + white * (255 - value)) for value in rgb(colour))
+        red, green, blue = (round(value + white * (255 - value)) for value in recording.rgb(colour))
         found.append((red, green, blue))
         seen[colour] += 1
     return found
@@ -290,34 +250,24 @@ def _in_space(part: _Part, opacity: float) -> Iterator[Chunk]:
         if path.split("/")[1] not in _IN_SPACE:
             continue
         moved = _with_frames(chunk, f"{part.entity}/").with_entity_path(f"/{part.entity}{path}")
-        if has(chunk, "Asset3D:blob") and path.startswith("/robot/"):
-            yield from _changed(
-                moved,
-                "Asset3D:albedo_factor",
-                rr.Asset3D.from_fields(albedo_factor=(*part.colour, round(255 * opacity))),
-            )
+        if recording.has(chunk, "Asset3D:blob") and path.startswith("/robot/"):
+            factor = (*part.colour, round(255 * opacity))
+            own = rr.Asset3D.from_fields(albedo_factor=factor)
+            yield from _changed(moved, "Asset3D:albedo_factor", own)
         elif path == "/tool/trace":
-            yield from _changed(
-                moved, "LineStrips3D:colors", rr.LineStrips3D.from_fields(colors=[part.colour])
-            )
+            yield from _coloured(moved, rr.LineStrips3D, part.colour)
             yield static(f"{part.entity}/tool/name", _name(part, chunk))
         elif path == "/tool/position" and chunk.is_static:
-            yield from _changed(
-                moved, "Points3D:colors", rr.Points3D.from_fields(colors=[part.colour])
-            )
+            yield from _coloured(moved, rr.Points3D, part.colour)
         else:
             yield moved
 
 
 def _name(part: _Part, trace: Chunk) -> Any:
-    """The part's words on its trace, a place along it for each part, so that those of equal paths
-    do not meet.
-    """
-    points = trace.to_record_batch().column("LineStrips3D:strips").to_pylist()[0][0]
-    at = points[round(part.place * (len(points) - 1))]
-    return rr.Points3D(
-        [at], colors=[part.colour], radii=[rr.Radius.ui_points(0.0)], labels=[part.label]
-    )
+    """The part's name on its trace, at its own place, so that those of equal paths do not meet."""
+    points = recording.component(trace, "LineStrips3D:strips")[0][0]
+    at, unseen = points[round(part.place * (len(points) - 1))], rr.Radius.ui_points(0.0)
+    return rr.Points3D([at], colors=[part.colour], radii=[unseen], labels=[part.label])
 
 
 def _with_frames(chunk: Chunk, prefix: str) -> Chunk:
@@ -326,119 +276,100 @@ def _with_frames(chunk: Chunk, prefix: str) -> Chunk:
     for name in ("CoordinateFrame:frame", "Transform3D:child_frame", "Transform3D:parent_frame"):
         if name in batch.schema.names:
             rows = [
-                [frame if frame.startswith(ROOT_FRAME) else prefix + frame for frame in row]
+                [
+                    frame if frame.startswith(recording.ROOT_FRAME) else prefix + frame
+                    for frame in row
+                ]
                 for row in batch.column(name).to_pylist()
             ]
             at = batch.schema.get_field_index(name)
-            batch = batch.set_column(
-                at, batch.schema.field(at), pa.array(rows, batch.schema.field(at).type)
-            )
+            field = batch.schema.field(at)
+            batch = batch.set_column(at, field, pa.array(rows, field.type))
     (changed,) = Chunk.from_record_batch(batch)
     return changed
 
 
-def _changed(chunk: Chunk, component: str, archetype: Any) -> Iterator[Chunk]:
+def _changed(chunk: Chunk, name: str, archetype: Any) -> Iterator[Chunk]:
     """A static chunk without one component, then what replaces it."""
     batch = chunk.to_record_batch()
-    if component in batch.schema.names:
-        batch = batch.drop_columns([component])
+    if name in batch.schema.names:
+        batch = batch.drop_columns([name])
     yield from Chunk.from_record_batch(batch)
     yield static(chunk.entity_path, archetype)
 
 
-def _composed(parts: Sequence[_Part], in_space: Sequence[Chunk], *, beside: bool) -> Composed:
+def _coloured(chunk: Chunk, kind: Any, colour: Colour) -> Iterator[Chunk]:
+    own = kind.from_fields(colors=[colour])
+    return _changed(chunk, f"{kind.__name__}:colors", own)
+
+
+def _composed(parts: Sequence[_Part], in_space: Sequence[Chunk], *, apart: bool) -> Composed:
     series = [_series_of(part.source.chunks) for part in parts]
     latent, latent_view = _latent(parts)
-    panels = [] if latent_view is None else [latent_view]
-    panels += _panels(series)
-    chunks = [
-        *in_space,
-        *_series_chunks(parts, series),
-        *latent,
-        static("status", rr.TextDocument(_texts(parts), media_type=rr.MediaType.MARKDOWN)),
-        static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP),
+    panels = ([] if latent_view is None else [latent_view]) + _panels(series)
+    texts = [
+        recording.component(chunk, "TextDocument:text")[0][0]
+        for part in parts
+        for chunk in part.source.chunks
+        if chunk.entity_path == "/status"
     ]
-    ids = " ".join([part.source.recording_id for part in parts] + [str(beside)])
+    own = [*_series_chunks(parts, series), *latent, *recording.text_chunks("\n\n".join(texts))]
+    ids = " ".join([part.source.recording_id for part in parts] + [str(apart)])
     name = f"{', '.join(part.label for part in parts)}: {parts[0].source.about.constraint}"
     return Composed(
         f"together-{hashlib.sha256(ids.encode()).hexdigest()[:12]}",
         name,
-        chunks,
-        _beside(parts, panels) if beside else _over(parts, panels),
+        [*in_space, *own],
+        _side_by_side(parts, panels) if apart else _over(parts, panels),
     )
-
-
-def _texts(parts: Sequence[_Part]) -> str:
-    texts = []
-    for part in parts:
-        rows = [chunk for chunk in part.source.chunks if chunk.entity_path == "/status"]
-        texts += [
-            chunk.to_record_batch().column("TextDocument:text").to_pylist()[0][0] for chunk in rows
-        ]
-    return "\n\n".join(texts)
 
 
 def _series_of(chunks: Sequence[Chunk]) -> dict[str, _Lines]:
     names, values = {}, {}
     for chunk in chunks:
-        entity = re.sub(
-            r"\\(.)", r"\1", chunk.entity_path.strip("/")
-        )  # Rerun escapes spaces and the like
-        if has(chunk, "SeriesLines:names"):
-            names[entity] = chunk.to_record_batch().column("SeriesLines:names").to_pylist()[0]
-        elif has(chunk, "Scalars:scalars"):
-            rows = np.array(
-                chunk.to_record_batch().column("Scalars:scalars").to_pylist(), dtype=float
-            )
+        # Rerun escapes spaces and the like
+        entity = re.sub(r"\\(.)", r"\1", chunk.entity_path.strip("/"))
+        if recording.has(chunk, "SeriesLines:names"):
+            names[entity] = recording.component(chunk, "SeriesLines:names")[0]
+        elif recording.has(chunk, "Scalars:scalars"):
+            rows = np.array(recording.component(chunk, "Scalars:scalars"), dtype=float)
             values[entity] = (rows, _time(chunk))
-    return {
-        entity: _Lines(names[entity], *values[entity]) for entity in names.keys() & values.keys()
-    }
+    found = names.keys() & values.keys()
+    return {entity: _Lines(names[entity], *values[entity]) for entity in found}
 
 
 def _time(chunk: Chunk) -> rr.TimeColumn:
     (timeline,) = chunk.timeline_names
-    times = chunk.to_record_batch().column(timeline).to_pylist()
-    return (
-        rr.TimeColumn(TIME, duration=times)
-        if timeline == TIME
-        else rr.TimeColumn(TIMELINE, sequence=times)
-    )
+    times = recording.component(chunk, timeline)
+    how = {"duration": times} if timeline == TIME else {"sequence": times}
+    return rr.TimeColumn(timeline, **how)
 
 
 def _series_chunks(parts: Sequence[_Part], series: Sequence[dict[str, _Lines]]) -> Iterator[Chunk]:
     """One line a recording in its colour, then each limit once."""
-    limits: dict[str, tuple[str, float, rr.TimeColumn, int]] = {}
-    alone = Counter(
-        entity.rpartition("/")[0] for entity in {entity for own in series for entity in own}
-    )
+    limits: dict[str, _Lines] = {}
+    entities = {entity for own in series for entity in own}
+    alone = Counter(entity.rpartition("/")[0] for entity in entities)
     for part, own in zip(parts, series, strict=True):
         for entity, lines in own.items():
-            what = (
-                f": {entity.rpartition('/')[2]}"
-                if "/" in entity and alone[entity.rpartition("/")[0]] > 1
-                else ""
-            )
+            group, _, last = entity.rpartition("/")
+            what = f": {last}" if group and alone[group] > 1 else ""
             for shown, names, values in _own_lines(entity, lines, f"{part.label}{what}"):
-                yield from _lines(
-                    f"{shown}/{part.entity}", names, part.colour, _Lines(names, values, lines.time)
-                )
+                drawn = _Lines(names, values, lines.time)
+                yield from _lines(f"{shown}/{part.entity}", part.colour, drawn)
             for shown, name, value in _limits(entity, lines, part.source.chunks):
-                name = f"{name}{what}"
-                if len(lines.values) > limits.get(shown, ("", 0.0, None, 0))[3]:
-                    limits[shown] = (name, value, lines.time, len(lines.values))
-    for shown, (name, value, time, count) in limits.items():
-        yield from _lines(
-            shown, [name], LIMIT, _Lines([name], np.full((count, 1), value), time), width=1.0
-        )
+                # as long as the longest of the paths
+                if shown not in limits or len(lines.values) > len(limits[shown].values):
+                    level = np.full((len(lines.values), 1), value)
+                    limits[shown] = _Lines([f"{name}{what}"], level, lines.time)
+    for shown, lines in limits.items():
+        yield from _lines(shown, recording.LIMIT, lines, width=1.0)
 
 
 def _own_lines(
     entity: str, lines: _Lines, label: str
 ) -> Iterator[tuple[str, list[str], np.ndarray]]:
-    """Where the lines of one recording go, what they are called, and their values without the
-    limits.
-    """
+    """Of one recording: where lines go, their names, and their values without the limits."""
     if entity == "joints":
         for k, joint in enumerate(lines.names):
             yield f"joint/{joint}", [label], lines.values[:, k : k + 1]
@@ -455,7 +386,7 @@ def _limits(
     """The limits that belong to some lines: where each goes, what it is called, and its value."""
     if entity == "joints":
         for chunk in chunks:
-            if chunk.entity_path == "/joints" and has(chunk, "lower"):
+            if chunk.entity_path == "/joints" and recording.has(chunk, "lower"):
                 row = chunk.to_record_batch().to_pylist()[0]
                 for side in ("lower", "upper"):
                     for joint, value in zip(lines.names, row[side], strict=True):
@@ -467,74 +398,62 @@ def _limits(
         yield f"{entity}/limit_{lines.values[0, 1]:.6g}", "limit", float(lines.values[0, 1])
 
 
-def _lines(
-    entity: str, names: Sequence[str], colour: Colour, lines: _Lines, width: float = 2.0
-) -> Iterator[Chunk]:
-    count = len(names)
+def _lines(entity: str, colour: Colour, lines: _Lines, width: float = 2.0) -> Iterator[Chunk]:
+    count = len(lines.names)
     entity = str(rr.new_entity_path(entity.split("/")))
-    yield static(
-        entity, rr.SeriesLines(names=list(names), colors=[colour] * count, widths=[width] * count)
-    )
-    yield scalars(entity, lines.values, lines.time)
+    style = {"colors": [colour] * count, "widths": [width] * count}
+    yield static(entity, rr.SeriesLines(names=list(lines.names), **style))
+    yield recording.scalars(entity, lines.values, lines.time)
 
 
 def _panels(series: Sequence[dict[str, _Lines]]) -> list[Any]:
     """A panel for each quantity that any of the recordings has."""
-    found = {entity for own in series for entity in own}
-    panels = []
-    for unit in ("deg", "mm"):
-        tops = [
-            lines.values.max()
-            for own in series
-            for entity, lines in own.items()
-            if entity.startswith(f"constraint/{unit}/")
-        ]
-        panels += [residual_panel(unit, float(max(tops)))] if tops else []
-    panels += [violation_panel(legend=not panels)] if "violation" in found else []
-    if "cup_spheres" in found:
-        panels += cup_panels(
-            max(own["cup_spheres"].values.max() for own in series if "cup_spheres" in own)
-        )
-    joints = sorted({joint for own in series if "joints" in own for joint in own["joints"].names})
+    found: dict[str, list[_Lines]] = defaultdict(list)
+    for own in series:
+        for entity, lines in own.items():
+            found[entity].append(lines)
+
+    def top(begin: str) -> float | None:
+        own = [one for entity, lines in found.items() if entity.startswith(begin) for one in lines]
+        return max((float(lines.values.max()) for lines in own), default=None)
+
+    tops = {unit: top(f"constraint/{unit}/") for unit in ("deg", "mm")}
+    panels = [
+        recording.residual_panel(unit, most) for unit, most in tops.items() if most is not None
+    ]
+    panels += [recording.violation_panel(legend=not panels)] if "violation" in found else []
+    if (spheres := top("cup_spheres")) is not None:
+        panels += cup_panels(spheres)
+    joints = sorted({joint for lines in found["joints"] for joint in lines.names})
     single = [
         rrb.TimeSeriesView(origin=f"joint/{joint}", name=f"{joint} [rad or m]") for joint in joints
     ]
-    together = [range_panel(legend=False)] if "joint_range" in found else []
+    together = [recording.range_panel(legend=False)] if "joint_range" in found else []
     return [*panels, rrb.Tabs(*together, *single, active_tab=0)]
 
 
 def _over(parts: Sequence[_Part], panels: Sequence[Any]) -> Any:
     entities = ["workcell", "transforms", *(part.entity for part in parts)]
     shares = [2.0 if isinstance(panel, rrb.Spatial2DView) else 1.0 for panel in panels[:-1]] + [1.3]
-    return arranged(
-        scene_view("Robots", entities, _reach(parts)),
-        rrb.Vertical(*panels, row_shares=shares),
-        _clock(parts),
-    )
+    scene = recording.scene_view("Robots", entities, _reach(parts))
+    return recording.arranged(scene, rrb.Vertical(*panels, row_shares=shares), _clock(parts))
 
 
-def _beside(parts: Sequence[_Part], panels: Sequence[Any]) -> Any:
+def _side_by_side(parts: Sequence[_Part], panels: Sequence[Any]) -> Any:
     reach = _reach(parts)
-    scenes = rrb.Grid(*(scene_view(part.label, [part.entity], reach) for part in parts))
-    status = rrb.TextDocumentView(origin="status", name="Status")
-    return rrb.Blueprint(
-        rrb.Vertical(scenes, rrb.Horizontal(status, *panels), row_shares=[3.0, 1.5]),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        _clock(parts),
-        auto_views=False,
-        auto_layout=False,
-    )
+    scenes = rrb.Grid(*(recording.scene_view(part.label, [part.entity], reach) for part in parts))
+    below = rrb.Horizontal(recording.status_panel(), *panels)
+    return recording.blueprint(rrb.Vertical(scenes, below, row_shares=[3.0, 1.5]), _clock(parts))
 
 
 def _clock(parts: Sequence[_Part]) -> Any:
-    return execution_time() if parts[0].source.about.executed else path_time()
+    return execution_time() if parts[0].source.about.executed else recording.path_time()
 
 
 def _reach(parts: Sequence[_Part]) -> float:
     """The farthest that any of the tools gets from the base [m]."""
     traces = [
-        chunk.to_record_batch().column("LineStrips3D:strips").to_pylist()[0][0]
+        recording.component(chunk, "LineStrips3D:strips")[0][0]
         for part in parts
         for chunk in part.source.chunks
         if chunk.entity_path == "/tool/trace"
@@ -543,26 +462,23 @@ def _reach(parts: Sequence[_Part]) -> float:
 
 
 def _latent(parts: Sequence[_Part]) -> tuple[list[Chunk], Any]:
-    """The first sub-manifold that is shown, the curves of all recordings that show the same one,
-    and the view.
-    """
+    """The first sub-manifold shown, all curves on it, and the view."""
     of = {part.entity: _latent_chunks(part.source) for part in parts}
     shown = [part for part in parts if "submanifold" in of[part.entity]]
     if not shown:
         return [], None
     points, axes = (of[shown[0].entity][name][0] for name in ("submanifold", "axes"))
-    shown = [
-        part for part in shown if _points(of[part.entity]["submanifold"][0]) == _points(points)
-    ]
+    same = _positions(points)
+    shown = [part for part in shown if _positions(of[part.entity]["submanifold"][0]) == same]
     chunks = [points, axes]
     for k, part in enumerate(shown):
         for name in ("curve", "position", *(("start", "goal") if k == 0 else ())):
             for chunk in of[part.entity][name]:
                 chunks += _in_latent(chunk, name, part)
-    strips = axes.to_record_batch().column("LineStrips2D:strips").to_pylist()[0]
+    strips = recording.component(axes, "LineStrips2D:strips")[0]
     corners = np.array(strips[0] + strips[1]) * [1.0, -1.0]  # the plane's second axis points down
-    names = axes.to_record_batch().column("LineStrips2D:labels").to_pylist()[0]
-    return chunks, latent_view_of(names, corners.min(axis=0), corners.max(axis=0))
+    names = recording.component(axes, "LineStrips2D:labels")[0]
+    return chunks, recording.latent_view_of(names, corners.min(axis=0), corners.max(axis=0))
 
 
 def _latent_chunks(source: Opened) -> dict[str, list[Chunk]]:
@@ -573,17 +489,15 @@ def _latent_chunks(source: Opened) -> dict[str, list[Chunk]]:
     return found
 
 
-def _points(chunk: Chunk) -> Any:
+def _positions(chunk: Chunk) -> Any:
     return chunk.to_record_batch().column("Points2D:positions")
 
 
 def _in_latent(chunk: Chunk, name: str, part: _Part) -> Iterator[Chunk]:
     own = chunk.with_entity_path(f"/latent/{name}/{part.entity}")
     if name == "curve":
-        yield from _changed(
-            own, "LineStrips2D:colors", rr.LineStrips2D.from_fields(colors=[part.colour])
-        )
+        yield from _coloured(own, rr.LineStrips2D, part.colour)
     elif name == "position" and chunk.is_static:
-        yield from _changed(own, "Points2D:colors", rr.Points2D.from_fields(colors=[part.colour]))
+        yield from _coloured(own, rr.Points2D, part.colour)
     else:
         yield own

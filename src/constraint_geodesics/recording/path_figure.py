@@ -1,50 +1,52 @@
-"""The picture of one planned path: the arm along its way, its joints over time, how well it keeps
+"""The picture of one planned path: the arm along it, its joints over time, how well it keeps
 the constraint.
 """
 
 from collections.abc import Sequence
-from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from constraint_geodesics.report.figures import BLUE, GOAL, GREY, LIGHT, ORANGE, START, VERMILION
+from constraint_geodesics.palette import BLUE, GOAL, GREY, LIGHT, ORANGE, START, VERMILION
 
 SHOWN = 9
 """Configurations of the arm that are drawn."""
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#222222")
 
 
-def path_figure(
-    times: Float[np.ndarray, "T"],
-    joints: Float[np.ndarray, "T D"],
-    skeletons: Float[np.ndarray, "T n 3"],
-    violation: Float[np.ndarray, "T"],
-    bound: float,
-    names: Sequence[str],
-    title: str,
-) -> Figure:
-    """The arm from start to goal with its tool's way, joint positions, and the violation at the
-    rows with its bound.
+class DrawnPath(NamedTuple):
+    """What is drawn of a path: times [s], waypoints [rad] under the joints' names, base, joint
+    origins and tool of each [m], its violation and the bound on it [rad or m].
+    """
 
-    times [s], joints [rad], skeletons: base, joint origins and tool of every row [m], violation and
-    bound [rad or m].
+    times: Float[np.ndarray, "T"]
+    joints: Float[np.ndarray, "T D"]
+    names: Sequence[str]
+    skeletons: Float[np.ndarray, "T n 3"]
+    violation: Float[np.ndarray, "T"]
+    bound: float
+
+
+def path_figure(path: DrawnPath, title: str) -> Figure:
+    """The arm from start to goal with its tool's curve, joint positions, and the violation at the
+    waypoints with its bound.
     """
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     grid = figure.add_gridspec(2, 2, width_ratios=(1.0, 1.25))
-    _draw_arm(figure, grid[:, 0], skeletons)
+    _draw_arm(figure, grid[:, 0], path.skeletons)
     axes = figure.add_subplot(grid[0, 1])
-    for k, name in enumerate(names):
-        axes.plot(times, joints[:, k], color=_COLOURS[k % len(_COLOURS)], lw=1.4, label=name)
+    for k, name in enumerate(path.names):
+        colour = _COLOURS[k % len(_COLOURS)]
+        axes.plot(path.times, path.joints[:, k], color=colour, lw=1.4, label=name)
     axes.set_ylabel("joint position [rad]")
     axes.legend(ncols=3, fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(0.0, 1.28))
     below = figure.add_subplot(grid[1, 1], sharex=axes)
-    below.semilogy(times, np.maximum(violation, 1e-12), color=BLUE, lw=1.2, label="at the rows")
-    below.axhline(
-        max(bound, 1e-12), color=VERMILION, lw=1.2, ls="--", label="bound on the whole path"
-    )
+    violation, bound = np.maximum(path.violation, 1e-12), max(path.bound, 1e-12)
+    below.semilogy(path.times, violation, color=BLUE, lw=1.2, label="at the waypoints")
+    below.axhline(bound, color=VERMILION, lw=1.2, ls="--", label="bound on the whole path")
     below.set(xlabel="time [s]", ylabel="violation [rad or m]", ylim=(1e-13, 1e-2))
     below.legend(fontsize=7, frameon=False, loc="upper right")
     for panel in (axes, below):
@@ -73,13 +75,5 @@ def _draw_arm(figure: Figure, place: object, skeletons: Float[np.ndarray, "T n 3
     axes.set_zlim(min(0.0, centre[2] - half), centre[2] + half)
     axes.legend(fontsize=7, frameon=False, loc="upper left")
     axes.view_init(elev=22, azim=-58)
-    for first, second in pairwise(
-        ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
-    ):  # the table's edge
-        axes.plot(
-            [0.4 * first[0], 0.4 * second[0]],
-            [0.4 * first[1], 0.4 * second[1]],
-            [0, 0],
-            color=GREY,
-            lw=0.6,
-        )
+    x, y = 0.4 * np.array([[-1, 1, 1, -1, -1], [-1, -1, 1, 1, -1]])
+    axes.plot(x, y, np.zeros(5), color=GREY, lw=0.6)  # the table's edge

@@ -1,9 +1,9 @@
 """Rerun recordings: one file a path, with the robot moving, what the constraint says and the curve
 in latent space.
 
-The first importer of rerun; the others are execution_recording.py, for which the functions further
-down without an underscore are there, overlay.py, which puts recordings together, and viewer.py,
-which opens them.  A recording holds no wall-clock time, so that equal paths give equal recordings.
+execution_recording.py records executions with the functions further down that have no underscore,
+overlay.py puts recordings together, and viewer.py opens them.  A recording holds no wall-clock
+time, so that equal paths give equal recordings.
 """
 
 import contextlib
@@ -29,8 +29,9 @@ from rerun.urdf import UrdfTree
 from constraint_geodesics import palette
 from constraint_geodesics.certification.certifier import Limits
 from constraint_geodesics.constraints.pose import AXES, ConstraintManifold
-from constraint_geodesics.robot.kinematics import SerialRobot, rotation_from_rpy
-from constraint_geodesics.scene.world import Box, Solid, Sphere, data_path
+from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.urdf import urdf_name
 
 APPLICATION = "constraint_geodesics"
 TIMELINE = "frame"
@@ -54,20 +55,12 @@ _START, _GOAL, _NOW, _INK = (
     rgb(colour) for colour in (palette.START, palette.GOAL, palette.BLUE, palette.BLACK)
 )
 _BOX, _OUTSIDE, _PAPER = (150, 150, 150), (200, 200, 200), (255, 255, 255)
-_PALETTE = tuple(
-    rgb(colour)
-    for colour in (
-        palette.SKY,
-        palette.ORANGE,
-        palette.PURPLE,
-        palette.BLUE,
-        palette.YELLOW,
-        palette.GREEN,
-        palette.VERMILION,
-    )
-)
+_PALETTE = tuple(rgb(colour) for colour in palette.SERIES)
+_WIDTH, _POINT, _END = (rr.Radius.ui_points(size) for size in (2.0, 5.0, 7.0))
+"""Of lines, moving points and a path's ends, in points of the screen."""
 _OLD_ID = re.compile(
-    r"(?P<constraint>.+)-query(?P<query>\d+)-(?P<planner>.+?)(-seed(?P<seed>\d+)|-(?P<executed>executed))$"
+    r"(?P<constraint>.+)-query(?P<query>\d+)-(?P<planner>.+?)"
+    r"(-seed(?P<seed>\d+)|-(?P<executed>executed))$"
 )
 
 
@@ -104,9 +97,13 @@ class PathRecord:
     text: str
     latent: LatentView | None = None
     scene: str = ""
-    """What stands round the robot beside its workcell, where that has a name."""
+    """What stands round the robot besides its workcell, where that has a name."""
     tolerance: float = Limits.violation_tolerance
     """What the judge grants a violation [rad or m]."""
+    meshes: bool = True
+    """Whether the file holds the meshes of robot and bodies, to be opened anywhere; without them it
+    is a tenth as large and names the URDFs that `geodesics replay` adds them from.
+    """
 
     @property
     def name(self) -> str:
@@ -172,56 +169,40 @@ def record_path(
     file: Path,
     path: PathRecord,
     manifold: ConstraintManifold,
-    workcell: Sequence[Solid],
+    workcell: Sequence[Shape],
     *,
     frames: int,
-    meshes: bool = True,
 ) -> None:
-    """Write the recording of one path, its blueprint inside.
+    """Write the recording of one path at so many frames, its blueprint inside.
 
-    meshes: with those of the robot and the bodies, to be opened anywhere; without them the file is
-    a tenth as large and names the URDFs that `geodesics replay` adds them from.
     Raises RecordingError if the path is not one of the manifold's robot or a mesh that is to be
     written is missing.
     """
-    record_frames(file, path, sample(path, manifold, frames), manifold, workcell, meshes=meshes)
-
-
-def record_frames(
-    file: Path,
-    path: PathRecord,
-    sampled: Frames,
-    manifold: ConstraintManifold,
-    workcell: Sequence[Solid],
-    *,
-    meshes: bool,
-) -> None:
-    """Write the recording of a path that is sampled already."""
-    series = [
-        *_residuals(manifold, sampled.joints),
-        *_violations(manifold, sampled.joints, path.tolerance),
-    ]
-    robot = manifold.robot
+    robot, sampled = manifold.robot, sample(path, manifold, frames)
+    residuals = _residuals(manifold, sampled.joints)
+    series = [*residuals, *_violations(manifold, sampled.joints, path.tolerance)]
     chunks = [
-        *scene_chunks(robot, workcell, sampled, meshes=meshes),
+        *scene_chunks(robot, workcell, sampled, meshes=path.meshes),
         *tool_chunks(sampled, rgb(palette.planner_colour(path.planner))),
         *_series_chunks(series, sampled),
         *joint_chunks(robot, sampled),
         *_latent_chunks(path.latent, sampled),
         about_chunk(About(path.planner, path.constraint, path.scene, path.query, path.seed)),
-        static("status", rr.TextDocument(path.text, media_type=rr.MediaType.MARKDOWN)),
-        static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP),
+        *text_chunks(path.text),
     ]
     name = f"{path.constraint}, query {path.query}: {path.planner}, seed {path.seed}"
-    write_recording(
-        file, f"{path.name}-{digest(sampled)}", name, chunks, _blueprint(path, sampled, series)
-    )
+    blueprint = _blueprint(path, sampled, series)
+    write_recording(file, f"{path.name}-{digest(sampled)}", name, chunks, blueprint)
+
+
+def text_chunks(text: str) -> list[Chunk]:
+    """The status in markdown; and the view's third axis points up."""
+    document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+    return [static("status", document), static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)]
 
 
 def digest(sampled: Frames) -> str:
-    """Of the joints: recordings of equal paths have equal ids, and the viewer takes no two others
-    for one.
-    """
+    """Of the joints: equal paths have equal ids, and the viewer takes no others for one."""
     return hashlib.sha256(np.ascontiguousarray(sampled.joints).tobytes()).hexdigest()[:8]
 
 
@@ -234,9 +215,7 @@ def about_chunk(about: About) -> Chunk:
 def write_recording(
     file: Path, recording_id: str, name: str, chunks: Sequence[Chunk], blueprint: Any = None
 ) -> None:
-    """Write chunks, and a blueprint where there is one, as one recording; without a name it is a
-    part of another.
-    """
+    """Write chunks and a blueprint as one recording; without a name it is a part of another."""
     file.parent.mkdir(parents=True, exist_ok=True)
     # the properties would hold the time of writing
     stream = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
@@ -289,14 +268,11 @@ def about_of(recording_id: str, chunks: Sequence[Chunk]) -> About:
             row = chunk.to_record_batch().to_pylist()[0]
             return About(**{name: row[name][0] for name in vars(About()) if name in row})
     if found := _OLD_ID.match(recording_id):
-        seed = found["seed"]
-        return About(
-            found["planner"],
-            found["constraint"],
-            query=int(found["query"]),
-            seed=None if seed is None else int(seed),
-            executed=found["executed"] is not None,
+        query, seed = (
+            None if found[name] is None else int(found[name]) for name in ("query", "seed")
         )
+        executed = found["executed"] is not None
+        return About(found["planner"], found["constraint"], "", query, seed, executed)
     return About()
 
 
@@ -305,38 +281,30 @@ def same_recordings(a: Path, b: Path) -> bool:
 
     Raises RecordingError if a file is missing.
     """
-    result = subprocess.run(
-        rerun_command("rrd", "compare", "--unordered", str(existing(a)), str(existing(b))),
-        capture_output=True,
-        check=False,
-    )
-    return result.returncode == 0
+    command = rerun_command("rrd", "compare", "--unordered", str(existing(a)), str(existing(b)))
+    return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
 def sample(path: PathRecord, manifold: ConstraintManifold, frames: int) -> Frames:
-    """The path at points of equal joint arc length.  Raises RecordingError if it is not one of the
-    robot.
-    """
+    """The path at points of equal joint length.  Raises RecordingError if it is not the robot's."""
     joints = np.asarray(path.joints, dtype=float)
-    name, dof = path.name, manifold.robot.dof
-    if joints.ndim != 2 or len(joints) < 2 or joints.shape[1] != dof:
-        raise RecordingError(
-            f"{name}: joints of shape {joints.shape}: must be (T, {dof}) with T of 2 or more"
-        )
+    name, dof, shape = path.name, manifold.robot.dof, joints.shape
+    if joints.ndim != 2 or len(joints) < 2 or shape[1] != dof:
+        must = f"must be (T, {dof}) with T of 2 or more"
+        raise RecordingError(f"{name}: joints of shape {shape}: {must}")
     if not np.isfinite(joints).all():
         raise RecordingError(f"{name}: joints that are not finite")
     if frames < 2:
         raise RecordingError(f"{name}: frames = {frames}: must be 2 or more")
-    if path.latent is not None and path.latent.curve.shape != (len(joints), 2):
-        raise RecordingError(
-            f"{name}: latent curve of shape {path.latent.curve.shape}: must be {(len(joints), 2)}"
-        )
+    if path.latent is not None and (curve := path.latent.curve).shape != (shape[0], 2):
+        must = f"must be {(shape[0], 2)}"
+        raise RecordingError(f"{name}: latent curve of shape {curve.shape}: {must}")
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(joints, axis=0), axis=1))])
     at = np.linspace(0.0, length[-1], frames)
     sampled = _interpolate(at, length, joints)
-    curve = None if path.latent is None else _interpolate(at, length, path.latent.curve)
+    latent = None if path.latent is None else _interpolate(at, length, path.latent.curve)
     time = rr.TimeColumn(TIMELINE, sequence=range(frames))
-    return Frames(sampled, manifold.robot.forward(sampled)[0], curve, time)
+    return Frames(sampled, manifold.robot.forward(sampled)[0], latent, time)
 
 
 def _interpolate(at: np.ndarray, length: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -344,7 +312,7 @@ def _interpolate(at: np.ndarray, length: np.ndarray, values: np.ndarray) -> np.n
 
 
 def scene_chunks(
-    robot: SerialRobot, workcell: Sequence[Solid], sampled: Frames, *, meshes: bool
+    robot: SerialRobot, workcell: Sequence[Shape], sampled: Frames, *, meshes: bool
 ) -> Iterator[Chunk]:
     """The robot over the timeline and the workcell, with their meshes or with the names of their
     URDFs alone.
@@ -352,13 +320,14 @@ def scene_chunks(
     Raises RecordingError if a mesh that is asked for is missing.
     """
     yield from _robot_chunks(robot, sampled)
-    for body in workcell:
-        yield from _body_chunks(body)
+    for shape in workcell:
+        yield from _shape_chunks(shape)
     if meshes:
         yield from mesh_chunks(robot.urdf, "/robot")
-        for body in workcell:
-            if not isinstance(body, (Box, Sphere)):
-                yield from mesh_chunks(body.urdf, _entity("workcell", body.name), f"{body.name}/")
+        for shape in workcell:
+            if placed := shape.urdf_model():
+                entity = _entity("workcell", shape.name)
+                yield from mesh_chunks(placed.file, entity, f"{shape.name}/")
 
 
 def _robot_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
@@ -380,60 +349,24 @@ def _robot_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
             yield static(entity, joint.compute_transform(0.0, clamp=False))
 
 
-def _body_chunks(body: Solid) -> Iterator[Chunk]:
-    """A body of the workcell at its place."""
-    entity = _entity("workcell", body.name)
-    if isinstance(body, Box):
-        yield static(
-            entity,
-            rr.Boxes3D(
-                centers=[body.centre],
-                sizes=[body.size],
-                colors=[_BOX],
-                fill_mode="solid",
-                labels=[body.name],
-                show_labels=False,
-            ),
-        )
+def _shape_chunks(shape: Shape) -> Iterator[Chunk]:
+    """A shape of the workcell at its place."""
+    entity, placed = _entity("workcell", shape.name), shape.urdf_model()
+    style = {"colors": [_BOX], "fill_mode": "solid", "labels": [shape.name], "show_labels": False}
+    archetype = shape.drawn(rr, style)
+    if archetype is not None:
+        yield static(entity, archetype)
+    if placed is None:
         return
-    if isinstance(body, Sphere):
-        yield static(
-            entity,
-            rr.Ellipsoids3D(
-                centers=[body.centre],
-                radii=[body.radius],
-                colors=[_BOX],
-                fill_mode="solid",
-                labels=[body.name],
-                show_labels=False,
-            ),
-        )
-        return
-    tree = UrdfTree.from_file_path(body.urdf, frame_prefix=f"{body.name}/")
-    yield static(entity, rr.AnyValues(urdf=urdf_name(body.urdf), frame_prefix=f"{body.name}/"))
-    yield static(
-        _entity("transforms", body.name, "base"),
-        rr.Transform3D(
-            translation=body.position,
-            mat3x3=rotation_from_rpy(np.array(body.rpy)),
-            parent_frame=ROOT_FRAME,
-            child_frame=f"{body.name}/{tree.root_link().name}",
-        ),
-    )
+    prefix = f"{shape.name}/"
+    tree = UrdfTree.from_file_path(placed.file, frame_prefix=prefix)
+    yield static(entity, rr.AnyValues(urdf=urdf_name(placed.file), frame_prefix=prefix))
+    root = {"parent_frame": ROOT_FRAME, "child_frame": prefix + tree.root_link().name}
+    pose = rr.Transform3D(translation=placed.position, mat3x3=placed.rotation, **root)
+    yield static(_entity("transforms", shape.name, "base"), pose)
     for joint in tree.joints():
-        yield static(
-            _entity("transforms", body.name, joint.name), joint.compute_transform(0.0, clamp=False)
-        )
-
-
-def urdf_name(urdf: Path) -> str:
-    """A URDF as params.yaml names it: within pybullet_data, within this checkout, or by its whole
-    path.
-    """
-    for folder in (data_path().resolve(), Path.cwd()):
-        if urdf.resolve().is_relative_to(folder):
-            return urdf.resolve().relative_to(folder).as_posix()
-    return urdf.resolve().as_posix()
+        place = _entity("transforms", shape.name, joint.name)
+        yield static(place, joint.compute_transform(0.0, clamp=False))
 
 
 def mesh_chunks(urdf: Path, entity: str, frame_prefix: str | None = None) -> list[Chunk]:
@@ -447,12 +380,9 @@ def mesh_chunks(urdf: Path, entity: str, frame_prefix: str | None = None) -> lis
         chunks = [chunk.with_entity_path(f"{entity}{chunk.entity_path}") for chunk in stream]
     chunks = [chunk for chunk in chunks if "/collision_geometries/" not in chunk.entity_path]
     # Rerun only warns of a mesh that it can't find, and leaves its entity with a pose alone
+    pose = ("InstancePoses3D:", "CoordinateFrame:")
     placed = {chunk.entity_path for chunk in chunks if has(chunk, "InstancePoses3D:translations")}
-    drawn = {
-        chunk.entity_path
-        for chunk in chunks
-        if not has(chunk, "InstancePoses3D:", "CoordinateFrame:")
-    }
+    drawn = {chunk.entity_path for chunk in chunks if not has(chunk, *pose)}
     if missing := sorted(path.split("/visual_geometries/")[-1] for path in placed - drawn):
         raise RecordingError(f"{urdf}: no mesh could be read for {', '.join(missing)}")
     if not drawn:
@@ -478,21 +408,20 @@ def _package_path(urdf: Path) -> Iterator[None]:
 
 def tool_chunks(sampled: Frames, colour: tuple[int, int, int]) -> Iterator[Chunk]:
     """The tool's trace with its ends, and where it is."""
-    tool = sampled.tool
-    size = rr.Radius.ui_points
-    yield static("tool/trace", rr.LineStrips3D([tool], colors=[colour], radii=[size(2.0)]))
-    for name, point, own in (("start", tool[0], _START), ("goal", tool[-1], _GOAL)):
-        yield static(
-            f"tool/{name}", rr.Points3D([point], colors=[own], radii=[size(7.0)], labels=[name])
-        )
-    yield static("tool/position", rr.Points3D.from_fields(colors=[_INK], radii=[size(5.0)]))
-    yield moving("tool/position", rr.Points3D.columns(positions=tool), sampled.time)
+    yield static("tool/trace", rr.LineStrips3D([sampled.tool], colors=[colour], radii=[_WIDTH]))
+    for name, point, own in _ends(sampled.tool):
+        marker = rr.Points3D([point], colors=[own], radii=[_END], labels=[name])
+        yield static(f"tool/{name}", marker)
+    yield static("tool/position", rr.Points3D.from_fields(colors=[_INK], radii=[_POINT]))
+    yield moving("tool/position", rr.Points3D.columns(positions=sampled.tool), sampled.time)
+
+
+def _ends(points: np.ndarray) -> tuple[tuple[str, np.ndarray, tuple[int, int, int]], ...]:
+    return ("start", points[0], _START), ("goal", points[-1], _GOAL)
 
 
 def _residuals(manifold: ConstraintManifold, joints: np.ndarray) -> list[_Series]:
-    """Held positions each by itself [mm]; held angles that share one tolerance together, as the
-    constraint does.
-    """
+    """Held positions each by itself [mm]; held angles of one tolerance together."""
     residual, tolerance = manifold.residual(joints), manifold.tolerance
     series = [
         _Series(AXES[i], "mm", 1e3 * abs(residual[:, i]), 1e3 * tolerance[i])
@@ -525,38 +454,26 @@ def _series_chunks(series: Sequence[_Series], sampled: Frames) -> Iterator[Chunk
         entity = one.name if one.name == "violation" else _entity("constraint", one.unit, one.name)
         names = [one.name, f"limit of {one.name}"]  # the panel says the unit
         yield static(entity, rr.SeriesLines(names=names, colors=[_NOW, LIMIT], widths=[2.0, 1.0]))
-        yield scalars(
-            entity,
-            np.stack([one.values, np.full_like(one.values, one.limit)], axis=1),
-            sampled.time,
-        )
+        limit = np.full_like(one.values, one.limit)
+        yield scalars(entity, np.stack([one.values, limit], axis=1), sampled.time)
 
 
 def joint_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
-    """Joint positions as series, [rad or m] with the limits beside them, and as shares of each
-    joint's range.
-    """
+    """Joint positions [rad or m] with their limits, and as shares of each joint's range."""
     own, names = colours(np.arange(robot.dof)), list(robot.joint_names)
     yield static("joints", rr.SeriesLines(names=names, colors=own))
     yield static("joints", rr.AnyValues(lower=robot.lower.tolist(), upper=robot.upper.tolist()))
     yield scalars("joints", sampled.joints, sampled.time)
     share = range_share(sampled.joints, robot.lower, robot.upper)
     ends = np.broadcast_to([1.0, -1.0], (len(share), 2))
-    yield static(
-        "joint_range",
-        rr.SeriesLines(
-            names=[*names, "upper limit", "lower limit"],
-            colors=np.concatenate([own, [LIMIT, LIMIT]]),
-            widths=[1.5] * robot.dof + [1.0, 1.0],
-        ),
-    )
+    shown = [*names, "upper limit", "lower limit"]
+    colors, widths = np.concatenate([own, [LIMIT, LIMIT]]), [1.5] * robot.dof + [1.0, 1.0]
+    yield static("joint_range", rr.SeriesLines(names=shown, colors=colors, widths=widths))
     yield scalars("joint_range", np.concatenate([share, ends], axis=1), sampled.time)
 
 
 def range_share(
-    joints: Float[np.ndarray, "frames D"],
-    lower: Float[np.ndarray, "D"],
-    upper: Float[np.ndarray, "D"],
+    joints: Float[np.ndarray, "frames D"], lower: np.ndarray, upper: np.ndarray
 ) -> Float[np.ndarray, "frames D"]:
     """Where each joint is within its range: -1 at its lower limit, 1 at its upper one."""
     return np.asarray((2.0 * joints - lower - upper) / (upper - lower))
@@ -565,32 +482,20 @@ def range_share(
 def _latent_chunks(latent: LatentView | None, sampled: Frames) -> Iterator[Chunk]:
     if latent is None or sampled.curve is None:
         return
-    curve, size = _upright(sampled.curve), rr.Radius.ui_points
-    low, high = _latent_bounds(latent)
+    curve, (low, high) = _upright(sampled.curve), _latent_bounds(latent)
     # discs that just cover a grid of this many points
     spacing = math.sqrt(float(np.prod(high - low)) / max(len(latent.points), 1))
-    yield static(
-        "latent/submanifold",
-        rr.Points2D(
-            _upright(latent.points),
-            colors=colours(latent.values),
-            radii=[math.sqrt(0.5) * spacing],
-            draw_order=0.0,
-        ),
-    )
+    points, own, radii = _upright(latent.points), colours(latent.values), [math.sqrt(0.5) * spacing]
+    shown = rr.Points2D(points, colors=own, radii=radii, draw_order=0.0)
+    yield static("latent/submanifold", shown)
     yield static("latent/axes", _axes(low, high, latent.axis_names))
-    yield static(
-        "latent/curve", rr.LineStrips2D([curve], colors=[_INK], radii=[size(2.0)], draw_order=20.0)
-    )
-    for name, point, colour in (("start", curve[0], _START), ("goal", curve[-1], _GOAL)):
-        marker = rr.Points2D(
-            [point], colors=[colour], radii=[size(7.0)], labels=[name], draw_order=30.0
-        )
+    line = rr.LineStrips2D([curve], colors=[_INK], radii=[_WIDTH], draw_order=20.0)
+    yield static("latent/curve", line)
+    for name, point, colour in _ends(curve):
+        marker = rr.Points2D([point], colors=[colour], radii=[_END], labels=[name], draw_order=30.0)
         yield static(f"latent/{name}", marker)
-    yield static(
-        "latent/position",
-        rr.Points2D.from_fields(colors=[_INK], radii=[size(5.0)], draw_order=40.0),
-    )
+    now = rr.Points2D.from_fields(colors=[_INK], radii=[_POINT], draw_order=40.0)
+    yield static("latent/position", now)
     yield moving("latent/position", rr.Points2D.columns(positions=curve), sampled.time)
 
 
@@ -602,14 +507,8 @@ def _upright(points: np.ndarray) -> np.ndarray:
 def _axes(low: np.ndarray, high: np.ndarray, names: tuple[str, str]) -> Any:
     corner = [[[low[0], low[1]], [high[0], low[1]]], [[low[0], low[1]], [low[0], high[1]]]]
     strips = [_upright(np.array(line)) for line in corner]
-    return rr.LineStrips2D(
-        strips,
-        colors=[_INK],
-        radii=[rr.Radius.ui_points(1.0)],
-        labels=list(names),
-        show_labels=True,
-        draw_order=10.0,
-    )
+    thin = {"colors": [_INK], "radii": [rr.Radius.ui_points(1.0)], "draw_order": 10.0}
+    return rr.LineStrips2D(strips, labels=list(names), show_labels=True, **thin)
 
 
 def _latent_bounds(latent: LatentView) -> tuple[np.ndarray, np.ndarray]:
@@ -632,13 +531,19 @@ def colours(values: np.ndarray) -> np.ndarray:
     return np.asarray(matplotlib.colormaps["cividis_r"](scaled, bytes=True))[:, :3]
 
 
+def component(chunk: Chunk, name: str) -> list[Any]:
+    """One component of a chunk, row by row, as lists."""
+    return list(chunk.to_record_batch().column(name).to_pylist())
+
+
 def _blueprint(path: PathRecord, sampled: Frames, series: Sequence[_Series]) -> Any:
-    right: list[Any] = [] if path.latent is None else [_latent_panel(path.latent)]
-    right += [
-        _residual_panel(unit, series)
-        for unit in ("deg", "mm")
-        if any(one.unit == unit for one in series)
-    ]
+    right: list[Any] = []
+    if path.latent is not None:
+        right.append(latent_view_of(path.latent.axis_names, *_latent_bounds(path.latent)))
+    for unit in ("deg", "mm"):
+        if shown := [one for one in series if one.unit == unit]:
+            top = max(max(one.limit, float(one.values.max())) for one in shown)
+            right.append(residual_panel(unit, top))
     right += [violation_panel() for one in series if one.name == "violation"]
     shares = [2.5 if isinstance(panel, rrb.Spatial2DView) else 1.0 for panel in right]
     right.append(joint_panel())
@@ -648,26 +553,29 @@ def _blueprint(path: PathRecord, sampled: Frames, series: Sequence[_Series]) -> 
 
 def path_time() -> Any:
     """The time panel of paths."""
-    return rrb.TimePanel(
-        state="collapsed", timeline=TIMELINE, fps=30.0, play_state="playing", loop_mode="all"
-    )
+    return time_panel(timeline=TIMELINE, fps=30.0)
+
+
+def time_panel(**how: Any) -> Any:
+    """A time panel that plays from the start, again and again."""
+    return rrb.TimePanel(state="collapsed", play_state="playing", loop_mode="all", **how)
 
 
 def arranged(scene: Any, right: Any, time: Any) -> Any:
-    """The blueprint of a recording: the scene with the status below it, the other panels beside
-    it.
-    """
-    status = rrb.TextDocumentView(origin="status", name="Status")
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(scene, status, row_shares=[3.0, 1.0]), right, column_shares=[3.0, 2.0]
-        ),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        time,
-        auto_views=False,
-        auto_layout=False,
-    )
+    """A blueprint: the scene, the status below it, the other panels to its right."""
+    left = rrb.Vertical(scene, status_panel(), row_shares=[3.0, 1.0])
+    return blueprint(rrb.Horizontal(left, right, column_shares=[3.0, 2.0]), time)
+
+
+def status_panel() -> Any:
+    """The path's status as text."""
+    return rrb.TextDocumentView(origin="status", name="Status")
+
+
+def blueprint(panels: Any, time: Any) -> Any:
+    """Some panels and a time panel, and nothing else open."""
+    closed = [kind(state="collapsed") for kind in (rrb.BlueprintPanel, rrb.SelectionPanel)]
+    return rrb.Blueprint(panels, *closed, time, auto_views=False, auto_layout=False)
 
 
 def scene_panel(sampled: Frames, *more: str) -> Any:
@@ -678,81 +586,60 @@ def scene_panel(sampled: Frames, *more: str) -> Any:
 
 def scene_view(name: str, entities: Sequence[str], reach_m: float) -> Any:
     """What lies below some entities, seen from beyond the robot's reach."""
-    eye = rrb.EyeControls3D(
-        position=(1.2 * reach_m, -1.2 * reach_m, 0.9 * reach_m),
-        look_target=(0.0, 0.0, 0.45 * reach_m),
-        eye_up=(0.0, 0.0, 1.0),
-    )
+    eye = [1.2 * reach_m, -1.2 * reach_m, 0.9 * reach_m]
+    return space_view(name, entities, eye, (0.0, 0.0, 0.45 * reach_m))
+
+
+def space_view(
+    name: str, entities: Sequence[str], eye: Sequence[float], target: Sequence[float], **more: Any
+) -> Any:
+    """What lies below some entities, seen from the eye to the target [m]; the third axis is up."""
+    eyes = rrb.EyeControls3D(position=eye, look_target=target, eye_up=(0.0, 0.0, 1.0))
+    contents = [f"+ /{entity}/**" for entity in entities]
     # a grid at z = 0 would flicker with the top of a table there
-    return rrb.Spatial3DView(
-        origin="/",
-        name=name,
-        eye_controls=eye,
-        contents=[f"+ /{entity}/**" for entity in entities],
-        line_grid=rrb.LineGrid3D(visible=False),
-    )
-
-
-def _residual_panel(unit: str, series: Sequence[_Series]) -> Any:
-    shown = [one for one in series if one.unit == unit]
-    return residual_panel(unit, max(max(one.limit, float(one.values.max())) for one in shown))
+    grid = rrb.LineGrid3D(visible=False)
+    shown = {"contents": contents, "eye_controls": eyes, "line_grid": grid, **more}
+    return rrb.Spatial3DView(origin="/", name=name, **shown)
 
 
 def residual_panel(unit: str, largest: float) -> Any:
     """What the constraint bounds, on a scale of at least one unit: an exactly held axis has
     rounding errors only.
     """
-    axis = rrb.ScalarAxis(range=(0.0, 1.2 * max(1.0, largest)))
-    return rrb.TimeSeriesView(
-        origin=f"constraint/{unit}", name=f"Constraint residual [{unit}]", axis_y=axis
-    )
+    top = 1.2 * max(1.0, largest)
+    return series_view(f"constraint/{unit}", f"Constraint residual [{unit}]", (0.0, top))
 
 
 def violation_panel(*, legend: bool = True) -> Any:
     """Powers of ten, up to ten rad."""
-    axis, words = (
-        rrb.ScalarAxis(range=(math.log10(LOWEST_VIOLATION) - 0.5, 1.0)),
-        rrb.PlotLegend(visible=legend),
-    )
-    return rrb.TimeSeriesView(
-        origin="violation",
-        name="Violation beyond the tolerance [log10 rad or m]",
-        axis_y=axis,
-        plot_legend=words,
-    )
+    name, low = "Violation beyond the tolerance [log10 rad or m]", math.log10(LOWEST_VIOLATION)
+    return series_view("violation", name, (low - 0.5, 1.0), legend=legend)
 
 
 def joint_panel() -> Any:
     """All joints as shares of their range, and behind that in their own units."""
-    return rrb.Tabs(
-        range_panel(),
-        rrb.TimeSeriesView(origin="joints", name="Joint positions [rad or m]"),
-        active_tab=0,
-    )
+    own = rrb.TimeSeriesView(origin="joints", name="Joint positions [rad or m]")
+    return rrb.Tabs(range_panel(), own, active_tab=0)
 
 
 def range_panel(*, legend: bool = True) -> Any:
     """All joints as shares of their range."""
-    axis, words = rrb.ScalarAxis(range=(-1.1, 1.1)), rrb.PlotLegend(visible=legend)
-    return rrb.TimeSeriesView(
-        origin="joint_range", name="Joints within their limits (±1)", axis_y=axis, plot_legend=words
-    )
+    return series_view("joint_range", "Joints within their limits (±1)", (-1.1, 1.1), legend=legend)
 
 
-def _latent_panel(latent: LatentView) -> Any:
-    return latent_view_of(latent.axis_names, *_latent_bounds(latent))
+def series_view(origin: str, name: str, limits: tuple[float, float], *, legend: bool = True) -> Any:
+    """The series below an entity between two values."""
+    axis, words = rrb.ScalarAxis(range=limits), rrb.PlotLegend(visible=legend)
+    return rrb.TimeSeriesView(origin=origin, name=name, axis_y=axis, plot_legend=words)
 
 
 def latent_view_of(axis_names: Sequence[str], low: np.ndarray, high: np.ndarray) -> Any:
     """The latent plane between two corners."""
     room = 0.1 * (high - low)  # for the axes' names
     low, high = low - room, high + room
-    return rrb.Spatial2DView(
-        origin="latent",
-        name=f"Latent space: {', '.join(axis_names)}",
-        background=_PAPER,
-        visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),
-    )
+    bounds = rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1]))
+    name = f"Latent space: {', '.join(axis_names)}"
+    return rrb.Spatial2DView(origin="latent", name=name, background=_PAPER, visual_bounds=bounds)
 
 
 def _entity(*parts: str) -> str:
@@ -761,9 +648,8 @@ def _entity(*parts: str) -> str:
 
 def static(entity: str, archetype: Any) -> Chunk:
     """What an entity has all the time."""
-    columns = [
-        batch.partition([len(batch.as_arrow_array())]) for batch in archetype.as_component_batches()
-    ]
+    batches = archetype.as_component_batches()
+    columns = [batch.partition([len(batch.as_arrow_array())]) for batch in batches]
     return Chunk.from_columns(entity, [], columns)
 
 
@@ -783,12 +669,12 @@ def has(chunk: Chunk, *components: str) -> bool:
     return any(name.startswith(component) for name in names for component in components)
 
 
-def _column(file: Path, chunks: Sequence[Chunk], entity: str, component: str) -> list[Any]:
+def _column(file: Path, chunks: Sequence[Chunk], entity: str, name: str) -> list[Any]:
     """One component of one entity, row by row, as lists."""
     for chunk in chunks:
-        if chunk.entity_path == entity and has(chunk, component):
-            return list(chunk.to_record_batch().column(component).to_pylist())
-    raise RecordingError(f"{file}: has no {component} at {entity}: not a recording of a path")
+        if chunk.entity_path == entity and has(chunk, name):
+            return component(chunk, name)
+    raise RecordingError(f"{file}: has no {name} at {entity}: not a recording of a path")
 
 
 def rerun_command(*arguments: str) -> list[str]:

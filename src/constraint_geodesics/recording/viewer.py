@@ -1,6 +1,4 @@
-"""Rerun's viewer: recordings shown in a window or in a browser on this machine, or put together in
-one file.
-"""
+"""Rerun's viewer: recordings shown in a window or a local browser, or put together in one file."""
 
 import contextlib
 import os
@@ -26,67 +24,61 @@ VIEWER_PORT, WEB_PORT = 9876, 9090
 
 
 def open_recordings(
-    files: Sequence[Path], *, web: bool, beside: bool = False, web_port: int = WEB_PORT
+    files: Sequence[Path], *, web: bool, apart: bool = False, web_port: int = WEB_PORT
 ) -> int:
     """Show recordings until the viewer is closed, in a window or (web) served to a browser on this
     machine alone.
 
-    Several paths of one constraint are laid over each other, or shown beside each other (beside);
-    several executed paths are shown beside each other; paths of several constraints are opened each
-    by itself. Prints the address to open.  Returns the viewer's exit code.  Raises RecordingError
-    if a file is missing or is no recording, if what is asked for can't be shown together, or if
-    there is no display for a window.
+    Several paths of one constraint are laid over each other, or each has a view of its own (apart);
+    several executed paths are shown side by side; paths of several constraints are opened each by
+    itself.  Prints the address to open.  Returns the viewer's exit code.  Raises RecordingError if
+    a file is missing or is no recording, if what is asked for can't be shown together, or if there
+    is no display for a window.
     """
     for file in files:
         existing(file)
     if not web and not display():
-        raise RecordingError(
-            "there is no display for Rerun's window: add --web to open it in a browser"
-        )
+        none = "there is no display for Rerun's window"
+        raise RecordingError(f"{none}: add --web to open it in a browser")
     with _stopped_like_interrupted(), tempfile.TemporaryDirectory(prefix="geodesics-") as folder:
-        shown = [str(file) for file in prepared(files, Path(folder), beside=beside)]
+        shown = [str(file) for file in prepared(files, Path(folder), apart=apart)]
         port, page = _free_port(VIEWER_PORT), _free_port(web_port)
         # without --bind the viewer listens on every address, the window's one too
-        options = ["--bind", LOOPBACK, "--port", str(port)]
+        options, source = (
+            ["--bind", LOOPBACK, "--port", str(port)],
+            f"http://{LOOPBACK}:{port}/proxy",
+        )
         if web:
             options += ["--serve-web", "--web-viewer-port", str(page)]
-            print(
-                f"http://{LOOPBACK}:{page}?url=rerun%2Bhttp://{LOOPBACK}:{port}/proxy", flush=True
-            )
-        else:
-            print(f"rerun+http://{LOOPBACK}:{port}/proxy", flush=True)
+        web_page = f"http://{LOOPBACK}:{page}?url=rerun%2B{source}"
+        print(web_page if web else f"rerun+{source}", flush=True)
         return subprocess.call(rerun_command(*options, *shown))
 
 
-def save_recordings(files: Sequence[Path], out: Path, *, beside: bool = False) -> None:
+def save_recordings(files: Sequence[Path], out: Path, *, apart: bool = False) -> None:
     """Write what `open_recordings` would show as one file that holds its meshes.
 
     Raises RecordingError as that does, and for what it would open as several recordings.
     """
     with tempfile.TemporaryDirectory(prefix="geodesics-") as folder:
-        shown = prepared(files, Path(folder), beside=beside)
+        shown = prepared(files, Path(folder), apart=apart)
         if len(shown) > 1:
-            raise RecordingError(
-                "paths of several constraints can't be saved as one recording: add --side-by-side"
-            )
+            several = "paths of several constraints can't be saved as one recording"
+            raise RecordingError(f"{several}: add --side-by-side")
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(shown[0], out)
 
 
-def prepared(files: Sequence[Path], folder: Path, *, beside: bool) -> list[Path]:
+def prepared(files: Sequence[Path], folder: Path, *, apart: bool) -> list[Path]:
     """The files to open, one for each recording that the viewer lists; what is made for them goes
     to the folder.
     """
     sources = [opened(file) for file in files]
-    executed = any(source.about.executed for source in sources)
-    if len(sources) > 1 and (
-        beside or executed or len({source.about.constraint for source in sources}) == 1
-    ):
-        composed = side_by_side(sources) if beside or executed else overlaid(sources)
+    apart = apart or any(source.about.executed for source in sources)
+    if len(sources) > 1 and (apart or len({source.about.constraint for source in sources}) == 1):
+        one = side_by_side(sources) if apart else overlaid(sources)
         file = folder / "together.rrd"
-        write_recording(
-            file, composed.recording_id, composed.name, composed.chunks, composed.blueprint
-        )
+        write_recording(file, one.recording_id, one.name, one.chunks, one.blueprint)
         return [file]
     return [_with_meshes(source, folder / f"{k}.rrd") for k, source in enumerate(sources)]
 
@@ -97,23 +89,18 @@ def _with_meshes(source: Opened, file: Path) -> Path:
         return source.file
     meshes = file.with_suffix(".meshes.rrd")
     write_recording(meshes, source.recording_id, "", source.added)
+    merge = rerun_command("rrd", "merge", str(source.file), str(meshes))
     with file.open("wb") as whole:
         # one file: the viewer arranges what it sees first, and would not take the second one's
         # blueprint
-        subprocess.run(
-            rerun_command("rrd", "merge", str(source.file), str(meshes)),
-            stdout=whole,
-            stderr=subprocess.DEVNULL,
-            check=True,
-        )
+        subprocess.run(merge, stdout=whole, stderr=subprocess.DEVNULL, check=True)
     return file
 
 
 def display() -> bool:
     """Whether a window can be opened."""
-    return not sys.platform.startswith("linux") or any(
-        os.environ.get(n) for n in ("WAYLAND_DISPLAY", "DISPLAY")
-    )
+    named = (os.environ.get(name) for name in ("WAYLAND_DISPLAY", "DISPLAY"))
+    return not sys.platform.startswith("linux") or any(named)
 
 
 @contextlib.contextmanager

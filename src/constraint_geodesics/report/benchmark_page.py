@@ -26,8 +26,7 @@ from constraint_geodesics.report.benchmark_tables import (
     table_i_cells,
     verdict_cells,
 )
-from constraint_geodesics.report.blocks import Block, Look, Recorded
-from constraint_geodesics.report.page import Picture, Section, write_page
+from constraint_geodesics.report.page import Links, Picture, Recorded, Section, Table, write_page
 from constraint_geodesics.report.results import ReportError, fixed
 
 Case = tuple[str, str, str]
@@ -101,7 +100,7 @@ def _overview_sections(params: Params, layout: Layout, overview: pd.DataFrame) -
             "parts",
             "The planner without its parts",
             "The same queries with a part left out, with a longer budget, or with nothing learned.",
-            blocks=_overview_blocks(own, (), "the planner and its parts"),
+            tables=_overview_blocks(own, (), "the planner and its parts"),
         ),
     ]
 
@@ -109,9 +108,9 @@ def _overview_sections(params: Params, layout: Layout, overview: pd.DataFrame) -
 def _budget_section(layout: Layout, budgets: pd.DataFrame) -> Section:
     pictures = [_picture(layout, name) for name in ("success_over_budget", "length_over_budget")]
     note = "a case is a constraint in a scene; from reports/benchmark/budgets.csv"
-    cases = Block("Cases by budget", note, *_parted(verdict_cells(budgets)))
+    cases = Table("Cases by budget", note, *_parted(verdict_cells(budgets)))
     header, rows = _parted(ahead_cells(budgets))
-    behind = Block("Baselines that are ahead", note, header, rows)
+    behind = Table("Baselines that are ahead", note, header, rows)
     return Section(
         "budgets", "Within a time budget", ahead_text(budgets), pictures, [cases], [behind]
     )
@@ -124,7 +123,7 @@ def _published_section(params: Params, rows: pd.DataFrame) -> Section:
         f"Table I and {constraint}, scene {TABLE}", "from reports/benchmark.csv", cells
     )
     return Section(
-        "published", "Next to the paper: Table I", TABLE_I_NOTE.replace("`", ""), blocks=[block]
+        "published", "Next to the paper: Table I", TABLE_I_NOTE.replace("`", ""), tables=[block]
     )
 
 
@@ -144,7 +143,7 @@ def _growth_section(layout: Layout) -> Section:
         "rows, on one thread."
     )
     note = "of seconds over size, in log-log; from reports/growth/slopes.csv"
-    block = Block(
+    block = Table(
         "Exponents",
         note,
         GROWTH,
@@ -160,18 +159,18 @@ def _repeat_section(layout: Layout) -> Section:
         "Two runs", "from reports/benchmark_repeat/repeat.csv", repeated_cells(table)
     )
     told = "Part of the queries answered a second time, by the planners whose search no clock ends."
-    return Section("repeat", "The same again", told, blocks=[block])
+    return Section("repeat", "The same again", told, tables=[block])
 
 
 def _case_section(summary: pd.DataFrame, recorded: Mapping[Case, Sequence[Recorded]]) -> Section:
     blocks = []
     for (constraint, scene), case in summary.groupby(["constraint", "scene"], sort=False):
-        looks = [
-            Look("", recorded.get((str(constraint), str(scene), str(name)), ()))
+        links = [
+            Links("", recorded.get((str(constraint), str(scene), str(name)), ()))
             for name in case["planner"]
         ]
         note = f"{counted(case)}; from reports/benchmark/summary.csv"
-        blocks.append(_of_planners(f"{constraint}, scene {scene}", note, case_cells(case), looks))
+        blocks.append(_of_planners(f"{constraint}, scene {scene}", note, case_cells(case), links))
     told = (
         "Recorded paths stand below the table that they belong to. The benchmark makes no "
         "MLflow runs: its rows are in "
@@ -210,7 +209,7 @@ def _two(value: float) -> str:
     return f"{value:.2f}" if np.isfinite(value) else "–"
 
 
-def _overview_blocks(summary: pd.DataFrame, in_python: Sequence[str], which: str) -> list[Block]:
+def _overview_blocks(summary: pd.DataFrame, in_python: Sequence[str], which: str) -> list[Table]:
     source = "from reports/benchmark/overview.csv"
     return [
         _of_planners(
@@ -220,16 +219,16 @@ def _overview_blocks(summary: pd.DataFrame, in_python: Sequence[str], which: str
     ]
 
 
-def _of_planners(title: str, note: str, cells: Cells, looks: Sequence[Look] = ()) -> Block:
+def _of_planners(title: str, note: str, cells: Cells, links: Sequence[Links] = ()) -> Table:
     """A block whose rows begin with their planner's name."""
     header, rows = _parted(cells)
-    return Block(
+    return Table(
         title,
         note,
         header,
         rows,
         planners=[row[0].removeprefix("learned geodesic; here ") for row in rows],
-        looks=looks,
+        links=links,
     )
 
 

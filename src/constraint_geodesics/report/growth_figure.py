@@ -1,5 +1,6 @@
-"""The figure of how cost grows: a panel an axis, in log-log, with the exponents in its legends."""
+"""How cost grows: a figure with a log-log panel an axis, and a table of the exponents."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,13 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, NullLocator
 
-from constraint_geodesics.report.figures import BLACK, BLUE, GREEN, LIGHT, ORANGE, PURPLE, VERMILION
+from constraint_geodesics.palette import BLACK, BLUE, GREEN, LIGHT, ORANGE, PURPLE, VERMILION
+from constraint_geodesics.report.results import fixed, markdown_table
 
 COLUMNS = 3
 FAMILIES = (("planner", ORANGE), ("band and trees", ORANGE), ("straight", GREEN), ("BiRRT", BLUE))
-"""How the names of a family begin, and its colour, as in the benchmark's figures; others take the
-next of OTHERS.
-"""
+"""How a family's names begin, and its colour; others take the next of OTHERS."""
 OTHERS = (VERMILION, PURPLE, BLACK)
 DASHES = ("-", "--", ":", "-.")
 """Tell members of one family apart."""
@@ -29,16 +29,25 @@ LABELS = {
 }
 """What is below each axis' panel."""
 NOTE = (
-    "shaded: quartiles;  dotted: fit to sizes above 0;  hollow: fewer than half of the "
-    "queries solved"
+    "shaded: quartiles;  dotted: fit to sizes above 0;  "
+    "hollow: fewer than half of the queries solved"
 )
 LEGEND_ROOM = 0.27
 """Of a panel's height, above what is drawn."""
 
 
+def slopes_markdown(fits: pd.DataFrame) -> str:
+    """The exponents as a table, axis by axis.  fits: `growth.slopes`."""
+    rows: list[Sequence[str]] = [("grows with", "what", "exponent", "± standard error", "points")]
+    for row in fits.to_dict("records"):
+        slope, error = (fixed(row[name]) for name in ("slope", "standard_error"))
+        rows.append((row["axis"], row["what"], slope, error, str(row["points"])))
+    return f"{markdown_table(rows)}\n"
+
+
 def growth_figure(table: pd.DataFrame, fits: pd.DataFrame) -> Figure:
     """Seconds over size: medians joined, quartiles shaded, the fitted line thin, its slope ±
-    standard error beside it.
+    standard error next to it.
 
     table: as `growth.measure_growth` has it.  fits: its `growth.slopes`.
     """
@@ -62,25 +71,17 @@ def _draw_panel(panel: Axes, table: pd.DataFrame, fits: pd.DataFrame) -> None:
         fit = fits[fits["what"] == what].iloc[0]
         panel.plot(value, own["seconds"], label=f"{what}: {_slope(fit)}", linewidth=1.3, **style)
         panel.fill_between(value, own["low"], own["high"], color=colour, alpha=0.12, linewidth=0)
-        inside = [
-            "white" if share < 0.5 else colour for share in own["solved"]
-        ]  # nan, no query, is filled
-        panel.scatter(
-            value, own["seconds"], s=14, c=inside, edgecolors=colour, linewidths=0.9, zorder=3
-        )
+        # nan, no query, is filled
+        inside = ["white" if share < 0.5 else colour for share in own["solved"]]
+        edge: Any = {"edgecolors": colour, "linewidths": 0.9, "zorder": 3}
+        panel.scatter(value, own["seconds"], s=14, c=inside, **edge)
         above = value[value > 0]
         if np.isfinite(fit["slope"]):
             ends = np.array([above.min(), above.max()])
-            panel.plot(
-                ends,
-                fit["seconds_at_1"] * ends ** fit["slope"],
-                color=colour,
-                linewidth=0.8,
-                linestyle=":",
-            )
-    _scale(
-        panel, np.unique(table["value"].to_numpy(float)), table["low"].min(), table["high"].max()
-    )
+            line = fit["seconds_at_1"] * ends ** fit["slope"]
+            panel.plot(ends, line, color=colour, lw=0.8, ls=":")
+    values = np.unique(table["value"].to_numpy(float))
+    _scale(panel, values, table["low"].min(), table["high"].max())
     panel.grid(color=LIGHT, linewidth=0.6)
     panel.tick_params(labelsize=7, which="both")
     panel.legend(fontsize=7, frameon=False, loc="upper left")
@@ -117,9 +118,8 @@ def _styles(names: list[str]) -> dict[str, dict[str, Any]]:
     met: dict[str, int] = {}
     styles, others = {}, iter(OTHERS * len(names))
     for name in names:
-        colour = next(
-            (colour for begin, colour in FAMILIES if name.startswith(begin)), None
-        ) or next(others)
+        own = (colour for begin, colour in FAMILIES if name.startswith(begin))
+        colour = next(own, None) or next(others)
         met[colour] = met.get(colour, -1) + 1
         styles[name] = {"color": colour, "linestyle": DASHES[met[colour] % len(DASHES)]}
     return styles

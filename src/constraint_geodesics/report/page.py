@@ -1,22 +1,105 @@
-"""Pages that open offline: one look for all, figures embedded, nothing asked of the network."""
+"""Pages that open offline: figures embedded, tables whose rows link to their recordings and runs,
+nothing asked of the network.
+"""
 
 import base64
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
-from constraint_geodesics.palette import FAMILIES
+from constraint_geodesics.palette import FAMILIES, planner_colour, planner_family
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.report.blocks import Block
 from constraint_geodesics.report.results import ReportError
+
+DASHBOARD = "http://127.0.0.1:5000"
+"""Where `make ui` shows the runs, on this machine alone."""
+EXPERIMENT = 1
+"""MLflow's number of the pipeline's experiment: the first in a new store, behind MLflow's own 0."""
+
+
+class Recorded(NamedTuple):
+    """A recorded path: its file in the checkout, and what it shows."""
+
+    file: str
+    text: str
+
+    @property
+    def command(self) -> str:
+        """What replays it."""
+        return f"geodesics replay {shlex.quote(self.file)}"
+
+
+class Links(NamedTuple):
+    """Where one row of a table leads.  runs: an address in MLflow's dashboard, or empty."""
+
+    runs: str = ""
+    recordings: Sequence[Recorded] = ()
+
+
+class Row(NamedTuple):
+    """One row as the page shows it.  colour: of its planner, empty where it is of none."""
+
+    cells: Sequence[str]
+    colour: str
+    links: Links
 
 
 @dataclass(frozen=True)
-class Picture:
+class Table:
+    """A table of the report: a title, how to read it, its header, and its rows of texts.
+
+    groups: titles over the columns after the first, each with the number of columns it spans.
+    planners: the planner of each row, and links: where each leads; empty for a table that has none.
+    """
+
+    title: str
+    note: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    groups: Sequence[tuple[str, int]] = ()
+    planners: Sequence[str] = ()
+    links: Sequence[Links] = ()
+
+    @property
+    def shown(self) -> Iterator[Row]:
+        """The rows with their colours and links."""
+        families = [planner_family(name) for name in self.planners]
+        colours = [
+            "" if family is None else planner_colour(name)
+            for name, family in zip(self.planners, families, strict=True)
+        ] or [""] * len(self.rows)
+        links = self.links or [Links()] * len(self.rows)
+        return (Row(*row) for row in zip(self.rows, colours, links, strict=True))
+
+    @property
+    def linked(self) -> bool:
+        """Whether any row leads somewhere."""
+        return any(own.runs or own.recordings for own in self.links)
+
+    @property
+    def recorded(self) -> int:
+        """How many of its paths are recorded."""
+        return sum(len(own.recordings) for own in self.links)
+
+
+def runs_link(stage: str, item: str) -> str:
+    """Address of a stage's runs in the dashboard: by their tags, as a run's own number is another
+    one each time.
+
+    item: of the stage's matrix; a % in it stands for anything.
+    """
+    compared = "LIKE" if "%" in item else "="
+    query = f"tags.stage = '{stage}' and tags.item {compared} '{item}'"
+    return f"{DASHBOARD}/#/experiments/{EXPERIMENT}/runs?searchFilter={quote(query, safe='')}"
+
+
+class Picture(NamedTuple):
     """A figure on a page.  file: the PNG, somewhere below the page's folder.  alt: what is said
     where it isn't seen.
     """
@@ -28,18 +111,15 @@ class Picture:
     file: Path
 
 
-@dataclass(frozen=True)
-class Section:
-    """A part of a page: its anchor and title, what comes first, its figures, and tables, some of
-    them folded.
-    """
+class Section(NamedTuple):
+    """A part of a page: anchor, title, text, figures, and tables, some of them folded."""
 
     name: str
     title: str
     text: str
     pictures: Sequence[Picture] = ()
-    blocks: Sequence[Block] = ()
-    folded: Sequence[Block] = ()
+    tables: Sequence[Table] = ()
+    folded: Sequence[Table] = ()
 
 
 def write_page(layout: Layout, name: str, **content: Any) -> Path:

@@ -1,10 +1,7 @@
-"""The figures of a run's report with their titles and captions, from the stages' tables, metrics
-and data.
-"""
+"""The figures of a run's report with titles and captions, from its tables, metrics and data."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -27,23 +24,23 @@ from constraint_geodesics.report import figures
 from constraint_geodesics.report.figures import LatentCurves
 from constraint_geodesics.report.results import (
     LEARNED,
+    metrics_of,
     read_metrics,
     read_paths,
     searched_items,
     short,
+    studies_at_hand,
 )
 
 DRAWN_QUERY = 0
 """The query whose geodesics Fig. 4c shows: the first, which is also recorded."""
 DATA_POINTS = 5000
 """Training configurations encoded for the figures."""
+CURVE_POINTS = 101
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """A figure of the report: its file's name, what it shows, how to read it, and what is said
-    where it isn't seen.
-    """
+class Drawn(NamedTuple):
+    """A figure of the report: file's name, title, how to read it; alt: said where it isn't seen."""
 
     name: str
     title: str
@@ -59,19 +56,21 @@ def draw_figures(params: Params, layout: Layout, table: pd.DataFrame) -> list[Dr
     out.
     """
     free = read_joints(layout.joints("free")).free_joints[:DATA_POINTS]
-    charts = {name: LearnedManifold.load(layout.manifold(name)) for name in params.manifolds}
-    data = {name: chart.encode(free) for name, chart in charts.items()}
+    learned = {name: LearnedManifold.load(layout.manifold(name)) for name in params.manifolds}
+    data = {name: manifold.encode(free) for name, manifold in learned.items()}
     drawn = [_draw_analytic_submanifolds()]
     if "plane" in params.geodesics.analytic:
         drawn.append(_draw_plane_search(layout))
-    drawn += [_draw_length_rules(layout), *_draw_ablation(params, layout)]
-    planes = [name for name in params.geodesics.illustrated if charts[name].dim == 2]
+    studies = studies_at_hand(params, layout)
+    drawn += [_draw_length_rules(layout)] if "geometry" in studies else []
+    drawn += _draw_ablation(params, layout) if "ablations" in studies else []
+    planes = [name for name in params.geodesics.illustrated if learned[name].dim == 2]
     if planes and params.geodesics.illustrated_constraints:
-        drawn += _draw_plane(params, layout, planes[0], charts[planes[0]], data[planes[0]])
-    drawn += [_draw_growth(charts, data), _draw_training(params, layout)]
+        drawn += _draw_plane(params, layout, planes[0], learned[planes[0]], data[planes[0]])
+    drawn += [_draw_growth(learned, data), _draw_training(params, layout)]
     for name in params.geodesics.searched:
         drawn.append(_draw_comparison(table, name))
-        if charts[name].dim > 2:
+        if learned[name].dim > 2:
             drawn.append(_draw_components(params, layout, name, data[name]))
     if searched_items(params):
         drawn.append(_draw_learning(params, layout))
@@ -85,10 +84,9 @@ def draw_data_cards(params: Params, layout: Layout) -> list[Drawn]:
 
 def _draw_analytic_submanifolds() -> Drawn:
     caption = (
-        "Left: the surfaces with the function that a constraint holds. Right: where it is "
-        "held, coloured by connected "
-        "component: one circle on the sphere, a set of circles on the torus. Nothing is "
-        "learned here."
+        "Left: the surfaces with the function that a constraint holds. Right: where it is held, "
+        "coloured by connected component: one circle on the sphere, a set of circles on the torus. "
+        "Nothing is learned here."
     )
     title = "Fig. 2: sub-manifolds of the sphere and the torus"
     return Drawn("fig2_analytic_submanifolds", title, caption, figures.analytic_submanifolds())
@@ -99,14 +97,12 @@ def _draw_plane_search(layout: Layout) -> Drawn:
         sampled, learned = arrays["sampled"], arrays["learned"]
     ratio = read_metrics(layout.report("train_analytic", "plane"))["mean_ratio"]
     caption = (
-        f"Curves met while the policy searches between one pair of points (grey) and the one "
-        f"it ends with (orange). "
-        f"The exact answer is the straight line. Over unseen pairs the learned path is "
-        f"{_mean_of(ratio):.4f} times as "
-        f"long as it, mean over {len(ratio)} seeds."
+        "Curves met while the policy searches between one pair of points (grey) and the one it "
+        "ends with (orange). The exact answer is the straight line. Over unseen pairs the learned "
+        f"path is {np.mean(ratio):.4f} times as long as it, mean over {len(ratio)} seeds."
     )
-    title = "Fig. 3: policy search in the plane"
-    return Drawn("fig3_plane_search", title, caption, figures.plane_search(sampled, learned))
+    figure = figures.plane_search(sampled, learned)
+    return Drawn("fig3_plane_search", "Fig. 3: policy search in the plane", caption, figure)
 
 
 def _draw_length_rules(layout: Layout) -> Drawn:
@@ -114,18 +110,14 @@ def _draw_length_rules(layout: Layout) -> Drawn:
     geometry = read_metrics(layout.root / "reports" / "geometry.json")
     length, error = geometry["curve_length"], geometry["curve_length"]["error"]
     caption = (
-        f"Relative error against {error['reference_points']:,} chords of lengths by a fixed "
-        f"number of points, over "
-        f"{error['curves']:.0f} random curves on the manifold {geometry['manifold']}; lines: "
-        f"95th percentile, bands: "
-        "up to the worst curve. By default curves are measured by collocation with 9 points, "
-        "and again with 17, 33 "
-        f"and 65 where the error estimate asks for it: error {short(error['median'])} (median), "
-        f"{short(error['max'])} (worst), {length['per_second']:,.0f} lengths a second in "
-        f"batches of "
-        f"{length['batch']}, {length['ratio_to_naive']:.0f} times as many as with the full "
-        f"Jacobian at 101 points, a "
-        "curve at a time."
+        f"Relative error against {error['reference_points']:,} chords of lengths by a fixed number "
+        f"of points, over {error['curves']:.0f} random curves on the manifold "
+        f"{geometry['manifold']}; lines: 95th percentile, bands: up to the worst curve. By default "
+        "curves are measured by collocation with 9 points, and again with 17, 33 and 65 where the "
+        f"error estimate asks for it: error {short(error['median'])} (median), "
+        f"{short(error['max'])} (worst), {length['per_second']:,.0f} lengths a second in batches "
+        f"of {length['batch']}, {length['ratio_to_naive']:.0f} times as many as with the full "
+        "Jacobian at 101 points, a curve at a time."
     )
     title = "Length of a curve: error against cost"
     return Drawn("length_rules", title, caption, figures.length_rules(table, TOLERANCE))
@@ -135,27 +127,17 @@ def _draw_ablation(params: Params, layout: Layout) -> list[Drawn]:
     names = [str(name) for name in params.geodesics.analytic]
     if not names:
         return []
-    ablated = {name: read_metrics(layout.report("ablate_analytic", name)) for name in names}
-    searched = {
-        name: {
-            "corrected_reward": read_metrics(layout.report("train_analytic", name))["mean_ratio"]
-        }
-        | {
-            variant: found["mean_ratio"]
-            for variant, found in ablated[name]["policy_search"].items()
-        }
-        for name in names
-    }
-    reached = {
-        name: {family: found["mean_ratio"] for family, found in ablated[name]["gradient"].items()}
-        for name in names
-    }
-    learned = {
-        name: read_metrics(layout.report("ablate_manifold", name)) for name in params.manifolds
-    }
-    told = "; ".join(
-        f"{name}: {_mean_of(ratios['corrected_reward']) - 1:.2%} against "
-        f"{_mean_of(ratios['printed_reward']) - 1:.2%}"
+    searched: dict[str, dict[str, list[float]]] = {}
+    reached: dict[str, dict[str, float]] = {}
+    for name in names:
+        own = read_metrics(layout.report("train_analytic", name))["mean_ratio"]
+        ablated = read_metrics(layout.report("ablate_analytic", name))
+        searched[name] = {"corrected_reward": own, **_ratios(ablated["policy_search"])}
+        reached[name] = _ratios(ablated["gradient"])
+    learned = metrics_of(layout, "ablate_manifold", params.manifolds)
+    excess = "; ".join(
+        f"{name}: {np.mean(ratios['corrected_reward']) - 1:.2%} against "
+        f"{np.mean(ratios['printed_reward']) - 1:.2%}"
         for name, ratios in searched.items()
     )
     free = "; ".join(
@@ -164,22 +146,18 @@ def _draw_ablation(params: Params, layout: Layout) -> list[Drawn]:
         for name, found in learned.items()
     )
     caption = (
-        f"Left: how much longer than the exact distance the learned path is, over unseen "
-        f"pairs. Mean excess with the "
-        f"corrected reward against that of eq. 15 as printed: {told}. Middle: the same for "
-        f"the best curve of each "
-        "family, found by the gradient: what a search could reach. Right: geodesics whose "
-        "decoded joints touch "
-        f"nothing, between configurations whose straight latent line collides: {free}."
+        "Left: how much longer than the exact distance the learned path is, over unseen pairs. "
+        "Mean excess with the corrected reward against that of eq. 15 as printed: "
+        f"{excess}. Middle: the same for the best curve of each family, found by the gradient: "
+        "what a search could reach. Right: geodesics whose decoded joints touch nothing, between "
+        f"configurations whose straight latent line collides: {free}."
     )
-    return [
-        Drawn(
-            "ablation",
-            "What each choice is worth",
-            caption,
-            figures.ablation(searched, reached, learned),
-        )
-    ]
+    figure = figures.ablation(searched, reached, learned)
+    return [Drawn("ablation", "What each choice is worth", caption, figure)]
+
+
+def _ratios(found: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    return {name: own["mean_ratio"] for name, own in found.items()}
 
 
 def _share(found: Mapping[str, Any]) -> str:
@@ -190,95 +168,81 @@ def _share(found: Mapping[str, Any]) -> str:
 def _draw_plane(
     params: Params,
     layout: Layout,
-    manifold: str,
-    chart: LearnedManifold,
+    name: str,
+    manifold: LearnedManifold,
     data: Float[np.ndarray, "n 2"],
 ) -> list[Drawn]:
     """Fig. 4 a to c."""
     names = params.geodesics.illustrated_constraints
-    loaded = {name: load_submanifold(layout.submanifold(manifold, name)) for name in names}
-    planes = {name: plane for name, plane in loaded.items() if isinstance(plane, GridSubmanifold)}
-    angles_only = {name: not any(params.constraints[name].axes[:3]) for name in planes}
+    loaded = {own: load_submanifold(layout.submanifold(name, own)) for own in names}
+    planes = {own: plane for own, plane in loaded.items() if isinstance(plane, GridSubmanifold)}
+    angles_only = {own: not any(params.constraints[own].axes[:3]) for own in planes}
     curves = {
-        name: (plane, latent_curves(params, layout, chart, manifold, name))
-        for name, plane in planes.items()
+        own: (plane, latent_curves(params, layout, manifold, name, own))
+        for own, plane in planes.items()
     }
-    resolution = np.degrees(params.submanifold.resolution_rad)
+    metric = (
+        "Volume √det M of the metric of eq. 5 over the latent plane, on a logarithmic scale, and "
+        "encoded training configurations (white). No constraint is involved."
+    )
+    kept = (
+        "Inclusion map ι of eqs. 7-8 at the decoded pose (grey), and the connected components "
+        "where it is zero (colours); what is held exactly counts as kept within "
+        f"{np.degrees(params.submanifold.resolution_rad):.1f}° and "
+        f"{1e3 * params.submanifold.resolution_m:.0f} mm. The manifold is that of Fig. 4a, not "
+        "trained again."
+    )
+    found = (
+        f"Query {DRAWN_QUERY} of each constraint: the curve that every seed's policy found, and "
+        "the straight line. The ends are encoded configurations that keep the constraint exactly; "
+        "where they lie off the coloured components, the plane does not represent them well enough."
+    )
+    volume = figures.latent_metric(manifold, data)
+    components = figures.submanifolds_in_plane(planes, angles_only)
+    geodesics = figures.geodesics_in_plane(curves)
+    titles = (f"metric of the manifold {name}", "sub-manifolds of the same plane")
     return [
-        Drawn(
-            "fig4a_latent_metric",
-            f"Fig. 4a: metric of the manifold {manifold}",
-            "Volume √det M of the metric of eq. 5 over the latent plane, on a logarithmic "
-            "scale, and encoded training "
-            "configurations (white). No constraint is involved.",
-            figures.latent_metric(chart, data),
-        ),
-        Drawn(
-            "fig4b_submanifolds",
-            "Fig. 4b: sub-manifolds of the same plane",
-            "Inclusion map ι of eqs. 7-8 at the decoded pose (grey), and the connected "
-            "components where it is zero "
-            f"(colours); what is held exactly counts as kept within {resolution:.1f}° and "
-            f"{1e3 * params.submanifold.resolution_m:.0f} mm. The manifold is that of Fig. "
-            f"4a, not trained again.",
-            figures.submanifolds_in_plane(planes, angles_only),
-        ),
-        Drawn(
-            "fig4c_geodesics",
-            "Fig. 4c: learned geodesics in the plane",
-            f"Query {DRAWN_QUERY} of each constraint: the curve that every seed's policy "
-            f"found, and the straight line. "
-            "The ends are encoded configurations that keep the constraint exactly; where they "
-            "lie off the coloured "
-            "components, the plane does not represent them well enough.",
-            figures.geodesics_in_plane(curves),
-        ),
+        Drawn("fig4a_latent_metric", f"Fig. 4a: {titles[0]}", metric, volume),
+        Drawn("fig4b_submanifolds", f"Fig. 4b: {titles[1]}", kept, components),
+        Drawn("fig4c_geodesics", "Fig. 4c: learned geodesics in the plane", found, geodesics),
     ]
 
 
 def latent_curves(
-    params: Params,
-    layout: Layout,
-    chart: LearnedManifold,
-    manifold: str,
-    constraint: str,
-    points: int = 101,
+    params: Params, layout: Layout, manifold: LearnedManifold, name: str, constraint: str
 ) -> LatentCurves:
     """The curves that the seeds found for the drawn query, and the straight line."""
-    with np.load(
-        layout.geodesics(manifold, constraint) / "curves.npz", allow_pickle=False
-    ) as arrays:
+    file = layout.geodesics(name, constraint) / "curves.npz"
+    with np.load(file, allow_pickle=False) as arrays:
         phi, seeds = arrays["phi"][:, DRAWN_QUERY], arrays["seeds"]
-        ends = [chart.encode(arrays[name][DRAWN_QUERY]) for name in ("starts", "goals")]
-    rows = read_paths(layout.report("train_geodesics", f"{manifold}-{constraint}", "csv"), manifold)
-    mine = rows[
-        (rows["planner"] == LEARNED) & (rows["query"] == DRAWN_QUERY) & (rows["status"] == "solved")
-    ]
-    found = phi[np.isin(seeds, mine["seed"])]
-    curve = PinnedPolynomial(chart.dim, params.geodesics.degree)
-    t = torch.linspace(0.0, 1.0, points, dtype=torch.float64)
+        ends = [manifold.encode(arrays[end][DRAWN_QUERY]) for end in ("starts", "goals")]
+    rows = read_paths(layout.report("train_geodesics", f"{name}-{constraint}", "csv"), name)
+    learned = rows[(rows["planner"] == LEARNED) & (rows["status"] == "solved")]
+    found = phi[np.isin(seeds, learned.loc[learned["query"] == DRAWN_QUERY, "seed"])]
+    curve = PinnedPolynomial(manifold.dim, params.geodesics.degree)
+    t = torch.linspace(0.0, 1.0, CURVE_POINTS, dtype=torch.float64)
     start, goal = (torch.from_numpy(end) for end in ends)
     straight = torch.zeros(curve.coefficients, dtype=torch.float64)
-    learned = curve.evaluate(torch.from_numpy(found), start, goal, t)[0].numpy()
-    return LatentCurves(learned, curve.evaluate(straight, start, goal, t)[0].numpy())
+    coefficients = (torch.from_numpy(found), straight)
+    return LatentCurves(*(curve.evaluate(own, start, goal, t)[0].numpy() for own in coefficients))
 
 
 def _draw_growth(
-    charts: Mapping[str, LearnedManifold], data: Mapping[str, Float[np.ndarray, "n N"]]
+    manifolds: Mapping[str, LearnedManifold], data: Mapping[str, Float[np.ndarray, "n N"]]
 ) -> Drawn:
-    growths = {name: figures.follow_rays(chart, data[name]) for name, chart in charts.items()}
-    told = "; ".join(
-        f"{name}: at most {short(growth.largest_on_data)} rad² on the data, "
-        f"{short(float(np.median(growth.trace[-1])))} rad² at {growth.distance[-1]:g} radii "
-        f"(median), "
-        f"{np.median(growth.deviation_trace[-1]) / np.median(growth.trace[-1]):.0%} of it from σ"
-        for name, growth in growths.items()
-    )
+    growths = {name: figures.follow_rays(own, data[name]) for name, own in manifolds.items()}
+    measured = []
+    for name, growth in growths.items():
+        trace, deviation = np.median(growth.trace[-1]), np.median(growth.deviation_trace[-1])
+        measured.append(
+            f"{name}: at most {short(growth.largest_on_data)} rad² on the data, "
+            f"{short(float(trace))} rad² at {growth.distance[-1]:g} radii (median), "
+            f"{deviation / trace:.0%} of it from σ"
+        )
     caption = (
-        f"Trace of the metric along {figures.RAYS} random rays out of the data, and the part "
-        f"of it that the decoder's "
-        f"standard deviation σ adds, which grows without end where no configuration was seen. "
-        f"{told}."
+        f"Trace of the metric along {figures.RAYS} random rays out of the data, and the part of it "
+        "that the decoder's standard deviation σ adds, which grows without end where no "
+        f"configuration was seen. {'; '.join(measured)}."
     )
     title = "The metric on the data and away from it"
     return Drawn("metric_growth", title, caption, figures.metric_growth(growths))
@@ -289,26 +253,23 @@ def _draw_training(params: Params, layout: Layout) -> Drawn:
         name: pd.read_csv(layout.report("train_manifold", name, "csv")) for name in params.manifolds
     }
     caption = (
-        "Loss of eq. 4 a sample: first the encoder and the decoder's mean, then its variance "
-        "with both frozen. The "
-        "epoch with the lowest held-out loss is kept."
+        "Loss of eq. 4 a sample: first the encoder and the decoder's mean, then its variance with "
+        "both frozen. The epoch with the lowest held-out loss is kept."
     )
-    return Drawn(
-        "training_curves", "Training of the manifolds", caption, figures.training_curves(histories)
-    )
+    figure = figures.training_curves(histories)
+    return Drawn("training_curves", "Training of the manifolds", caption, figure)
 
 
 def _draw_comparison(table: pd.DataFrame, manifold: str) -> Drawn:
     caption = (
-        "Share of valid paths; joint length of valid paths over the shortest valid path that "
-        "any planner found for the "
-        "same query; time of every row, failures included. Marks are medians, lines reach to "
-        "the 95th percentile. "
-        "The straight latent line takes no search, so it has no time."
+        "Share of valid paths; joint length of valid paths over the shortest valid path that any "
+        "planner found for the same query; time of every row, failures included. Marks are "
+        "medians, lines reach to the 95th percentile. The straight latent line takes no search, so "
+        "it has no time."
     )
-    rows = table[table["manifold"] == manifold]
     title = f"Success, length and time: {manifold}"
-    return Drawn(f"comparison_{manifold}", title, caption, figures.planner_comparison(rows))
+    figure = figures.planner_comparison(table[table["manifold"] == manifold])
+    return Drawn(f"comparison_{manifold}", title, caption, figure)
 
 
 def _draw_components(
@@ -319,17 +280,14 @@ def _draw_components(
     }
     graphs = {name: graph for name, graph in loaded.items() if isinstance(graph, GraphSubmanifold)}
     caption = (
-        f"Encoded configurations of each constraint in the first two principal axes of the "
-        f"same manifold, in "
-        f"{data.shape[1]} dimensions; those that checked edges join have one colour. Grey: "
-        f"what the manifold was "
-        "trained on. Ends in different components are not connected within the joint limits, "
-        "as far as the graph knows."
+        "Encoded configurations of each constraint in the first two principal axes of the same "
+        f"manifold, in {data.shape[1]} dimensions; those that checked edges join have one colour. "
+        "Grey: what the manifold was trained on. Ends in different components are not connected "
+        "within the joint limits, as far as the graph knows."
     )
-    drawn = figures.components_in_principal_axes(graphs, data[:1500])
-    return Drawn(
-        f"submanifolds_{manifold}", f"One manifold, every constraint: {manifold}", caption, drawn
-    )
+    figure = figures.components_in_principal_axes(graphs, data[:1500])
+    title = f"One manifold, every constraint: {manifold}"
+    return Drawn(f"submanifolds_{manifold}", title, caption, figure)
 
 
 def _draw_learning(params: Params, layout: Layout) -> Drawn:
@@ -338,34 +296,26 @@ def _draw_learning(params: Params, layout: Layout) -> Drawn:
         file = layout.report("train_geodesics", f"{manifold}-{constraint}-learning", "csv")
         panels.setdefault(constraint, {})[manifold] = pd.read_csv(file)
     caption = (
-        "How much less the best curve of an episode costs than the straight line, mean over "
-        "the episodes of a rollout; "
-        "line and band: mean and standard deviation over the seeds."
+        "How much less the best curve of an episode costs than the straight line, mean over the "
+        "episodes of a rollout; line and band: mean and standard deviation over the seeds."
     )
-    return Drawn(
-        "learning_curves", "Policy search while it learns", caption, figures.learning_curves(panels)
-    )
+    figure = figures.learning_curves(panels)
+    return Drawn("learning_curves", "Policy search while it learns", caption, figure)
 
 
 def _draw_data_card(layout: Layout, constraint: str) -> Drawn:
     card = read_metrics(layout.report("label_joints", constraint))
     caption = (
         f"{card['rows']:,} rows kept of {card['drawn']:,} drawn: "
-        f"{card['rejected_not_converged']:.1%} did not reach "
-        f"the constraint, {card['rejected_outside_limits']:.1%} left the joint limits. "
+        f"{card['rejected_not_converged']:.1%} did not reach the constraint, "
+        f"{card['rejected_outside_limits']:.1%} left the joint limits. "
         f"{card['self_collision']:.1%} of the rows touch the arm itself, "
-        f"{card['workcell_collision']:.1%} the "
-        f"workcell; {card['free']:.1%} touch nothing."
+        f"{card['workcell_collision']:.1%} the workcell; {card['free']:.1%} touch nothing."
     )
+    figure = figures.data_histograms(card, _unit)
     alt = f"Histograms of joints and tool poses of the set {constraint}"
-    return Drawn(
-        f"data_{constraint}", constraint, caption, figures.data_histograms(card, _unit), alt
-    )
+    return Drawn(f"data_{constraint}", constraint, caption, figure, alt)
 
 
 def _unit(column: str) -> str:
     return UNITS[column] if column in UNITS else UNITS[column.split("_")[0]]
-
-
-def _mean_of(values: Sequence[float]) -> float:
-    return float(np.mean(values))

@@ -2,38 +2,28 @@
 (reports/index.html).
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.report import figures
+from constraint_geodesics.report import figures, pipeline_tables, study_report
 from constraint_geodesics.report.figures import PLANNERS
 from constraint_geodesics.report.page import Picture, write_page
 from constraint_geodesics.report.pipeline_figures import Drawn, draw_data_cards, draw_figures
-from constraint_geodesics.report.pipeline_tables import (
-    ablation_blocks,
-    data_card_block,
-    metric_blocks,
-    published_block,
-    result_blocks,
-)
 from constraint_geodesics.report.results import (
     LEARNED,
     ReportError,
     compare_planners,
     findings,
     geometry_table,
-    read_metrics,
+    metrics_of,
     result_table,
-)
-from constraint_geodesics.report.study_report import (
-    execution_block,
-    execution_markdown,
-    policies_markdown,
-    policy_blocks,
+    studies_at_hand,
 )
 
 ABLATION = "ablation"
@@ -55,14 +45,17 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
     reports = layout.root / "reports"
     table.to_csv(reports / "table.csv", index=False, float_format="%.6g")
     (reports / "table.md").write_text(result_table(layout))
-    (reports / "geometry.md").write_text(geometry_table(layout))
-    (reports / "execution.md").write_text(execution_markdown(params, layout))
-    (reports / "policies.md").write_text(policies_markdown(params, layout))
-    pictures = [save_figure(layout, entry) for entry in drawn]
-    described = [save_figure(layout, entry) for entry in cards]
-    ablated, others = (
-        [p for p in pictures if (p.name == ABLATION) is wanted] for wanted in (True, False)
-    )
+    studies = studies_at_hand(params, layout)
+    if "geometry" in studies:
+        (reports / "geometry.md").write_text(geometry_table(layout))
+    executed = study_report.execution_markdown(params, layout)
+    (reports / "execution.md").write_text(executed)
+    if "policies" in studies:
+        (reports / "policies.md").write_text(study_report.policies_markdown(params, layout))
+    saved = parallel_map(partial(save_figure, layout), [*drawn, *cards], params.compute)
+    pictures, described = saved[: len(drawn)], saved[len(drawn) :]
+    ablated = [picture for picture in pictures if picture.name == ABLATION]
+    others = [picture for picture in pictures if picture.name != ABLATION]
     write_page(layout, "index", drawn=others, ablated=ablated, cards=described, **content)
     return [picture.file for picture in (*pictures, *described)]
 
@@ -75,22 +68,23 @@ def save_figure(layout: Layout, entry: Drawn) -> Picture:
 
 
 def page_content(params: Params, layout: Layout, table: pd.DataFrame) -> dict[str, Any]:
-    """What the page says beside its figures."""
-    metrics = {
-        name: read_metrics(layout.report("train_manifold", name)) for name in params.manifolds
-    }
+    """What the page says besides its figures."""
+    metrics = metrics_of(layout, "train_manifold", params.manifolds)
     compared = params.geodesics.illustrated_constraints[:1]
+    studies = studies_at_hand(params, layout)
     return {
         "params": params,
         "learned": PLANNERS[LEARNED].label,
         "findings": findings(params, table, metrics),
         "published": [
-            published_block(params, layout, table, constraint) for constraint in compared
+            pipeline_tables.published_table(params, layout, table, name) for name in compared
         ],
-        "executed": [execution_block(params, layout)],
-        "proposals": policy_blocks(params, layout),
-        "results": result_blocks(params, layout, table),
-        "ablations": ablation_blocks(params, layout),
-        "metrics": metric_blocks(params, layout, metrics),
-        "data": data_card_block(params, layout),
+        "executed": [study_report.execution_block(params, layout)],
+        "proposals": study_report.policy_blocks(params, layout) if "policies" in studies else [],
+        "results": pipeline_tables.result_tables(params, layout, table),
+        "ablations": (
+            pipeline_tables.ablation_tables(params, layout) if "ablations" in studies else []
+        ),
+        "metrics": pipeline_tables.metric_tables(params, layout, metrics),
+        "data": pipeline_tables.data_card_table(params, layout),
     }

@@ -5,10 +5,9 @@ lies in a folder.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -22,18 +21,14 @@ from constraint_geodesics.report.figures import PLANNERS
 LEARNED = "learned_geodesic"
 TEXTS = ("reason", "recording")
 
+LENGTH_RATES = ("per_second", "naive_per_second", "ratio_to_naive")
+STEP_RATES = ("steps_per_second", "dummy_vec_env_steps_per_second", "ratio_to_dummy_vec_env")
+"""Keys of a rate, that of the usual way, and their ratio in reports/geometry.json."""
+
 COUNTED = {"valid": "valid paths", "found": "all paths found, valid or not"}
 COLUMNS = (
-    "constraint",
-    "planner",
-    "valid",
-    "queries",
-    "shortest",
-    "average ± std",
-    "joint length [rad]",
-    "time [s]",
-    "violation, median [°]",
-    "worst [°]",
+    *("constraint", "planner", "valid", "queries", "shortest", "average ± std"),
+    *("joint length [rad]", "time [s]", "violation, median [°]", "worst [°]"),
 )
 
 
@@ -61,24 +56,16 @@ def compare_planners(params: Params, layout: Layout) -> pd.DataFrame:
     """
     items = searched_items(params)
     if not items:
-        raise ReportError(
-            "geodesics.searched and geodesics.illustrated name no manifold: there is nothing "
-            "to compare"
-        )
+        none = "geodesics.searched and geodesics.illustrated name no manifold"
+        raise ReportError(f"{none}: there is nothing to compare")
     tables = []
     for manifold, constraint in items:
         settings = params.manifolds[manifold]
         counted: Counted = "valid" if settings.retract else "found"
-        summary = summarise(
-            read_comparison(params, layout, manifold, constraint), manifold, counted
-        )
-        about = {
-            "manifold": manifold,
-            "latent_dim": settings.latent_dim,
-            "constraint": constraint,
-            "counted": counted,
-        }
-        tables.append(pd.DataFrame([about] * len(summary)).join(summary))
+        rows = read_comparison(params, layout, manifold, constraint)
+        about = {"manifold": manifold, "latent_dim": settings.latent_dim, "constraint": constraint}
+        summary = summarise(rows, manifold, counted)
+        tables.append(pd.DataFrame([about | {"counted": counted}] * len(summary)).join(summary))
     return pd.concat(tables, ignore_index=True)
 
 
@@ -86,13 +73,10 @@ def read_comparison(params: Params, layout: Layout, manifold: str, constraint: s
     """The rows of all planners under one constraint, sampled first, in the order they are shown."""
     sampled = read_paths(layout.report("benchmark_planners", constraint, "csv"), manifold)
     sampled = sampled[sampled["planner"].isin(params.benchmark.compared_kinds)]
-    searched = read_paths(
-        layout.report("train_geodesics", f"{manifold}-{constraint}", "csv"), manifold
-    )
-    rows = pd.concat([sampled, searched], ignore_index=True)
-    return rows.sort_values(
-        "planner", key=lambda names: names.map(list(PLANNERS).index), kind="stable"
-    )
+    file = layout.report("train_geodesics", f"{manifold}-{constraint}", "csv")
+    rows = pd.concat([sampled, read_paths(file, manifold)], ignore_index=True)
+    order = list(PLANNERS)
+    return rows.sort_values("planner", key=lambda names: names.map(order.index), kind="stable")
 
 
 def read_paths(file: Path, manifold: str) -> pd.DataFrame:
@@ -100,13 +84,8 @@ def read_paths(file: Path, manifold: str) -> pd.DataFrame:
 
     Raises ReportError naming the file and the column if a row can't be used.
     """
-    columns = (
-        "length_rad",
-        f"latent_length_{manifold}",
-        "max_violation_rad",
-        "max_violation_m",
-        "time_s",
-    )
+    columns = ["length_rad", f"latent_length_{manifold}", "time_s"]
+    columns += ["max_violation_rad", "max_violation_m"]
     schema = pandera.DataFrameSchema(
         {
             "planner": pandera.Column(str, pandera.Check.isin(list(PLANNERS))),
@@ -117,9 +96,8 @@ def read_paths(file: Path, manifold: str) -> pd.DataFrame:
         }
     )
     frame = pd.read_csv(file, float_precision="round_trip", dtype=dict.fromkeys(TEXTS, str))
-    frame = frame.fillna(
-        dict.fromkeys(TEXTS, "")
-    )  # CSV does not tell an empty text from a missing one
+    # CSV does not tell an empty text from a missing one
+    frame = frame.fillna(dict.fromkeys(TEXTS, ""))
     try:
         return schema.validate(frame)
     except pandera.errors.SchemaError as error:
@@ -135,25 +113,43 @@ def read_metrics(file: Path) -> dict[str, Any]:
     return content
 
 
+def metrics_of(layout: Layout, stage: str, names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """The metrics of some items of a stage, by their names."""
+    return {str(name): read_metrics(layout.report(stage, name)) for name in names}
+
+
 def result_table(layout: Layout) -> str:
     """The result table as Markdown, from reports/table.csv; columns are aligned, so that it reads
     in a terminal too.
     """
     table = pd.read_csv(layout.root / "reports" / "table.csv")
-    parts = []
-    for (manifold, latent_dim, counted), rows in table.groupby(
-        ["manifold", "latent_dim", "counted"], sort=False
-    ):
+    parts, named = [], ["manifold", "latent_dim", "counted"]
+    for (manifold, latent_dim, counted), rows in table.groupby(named, sort=False):
         cells: list[Sequence[str]] = [COLUMNS]
         for constraint, group in rows.groupby("constraint", sort=False):
             for k, row in enumerate(records(group)):
                 cells.append((str(constraint) if k == 0 else "", *table_cells(row)))
-        heading = (
-            f"`{manifold}`, {latent_dim} latent dimensions; lengths are those of "
-            f"{COUNTED[str(counted)]}"
-        )
+        lengths = f"lengths are those of {COUNTED[str(counted)]}"
+        heading = f"`{manifold}`, {latent_dim} latent dimensions; {lengths}"
         parts.append(f"{heading}:\n\n{markdown_table(cells)}")
     return "\n\n".join(parts) + "\n"
+
+
+def studies_at_hand(params: Params, layout: Layout) -> frozenset[str]:
+    """Which studies of `make bench` have left all of their reports: the pipeline runs without."""
+    manifold, analytic = params.geodesics.searched[0], map(str, params.geodesics.analytic)
+    files = {
+        "geometry": [
+            layout.root / "reports" / "geometry.json",
+            layout.report("benchmark_geometry", "quadrature", "csv"),
+        ],
+        "ablations": [
+            *(layout.report("ablate_analytic", name) for name in analytic),
+            *(layout.report("ablate_manifold", name) for name in params.manifolds),
+        ],
+        "policies": [layout.report("benchmark_policies", manifold)],
+    }
+    return frozenset(n for n, own in files.items() if all(file.is_file() for file in own))
 
 
 def geometry_table(layout: Layout) -> str:
@@ -163,46 +159,35 @@ def geometry_table(layout: Layout) -> str:
     rates: list[Sequence[str]] = [
         (f"on `{geometry['manifold']}`, a second", "here", "the usual way", "ratio")
     ]
-    for suffix, told in (("", ""), ("_retracted", f", retracted onto {constraint}")):
+    for suffix, how in (("", ""), ("_retracted", f", retracted onto {constraint}")):
         lengths, steps = geometry[f"curve_length{suffix}"], geometry[f"environment{suffix}"]
-        rates += [
-            (
-                f"curve lengths, batches of {lengths['batch']}{told}",
-                f"{lengths['per_second']:,.0f}",
-                f"{lengths['naive_per_second']:,.0f}",
-                f"{lengths['ratio_to_naive']:.0f}",
-            ),
-            (
-                f"environment steps, PPO included{told}",
-                f"{steps['steps_per_second']:,.0f}",
-                f"{steps['dummy_vec_env_steps_per_second']:,.0f}",
-                f"{steps['ratio_to_dummy_vec_env']:.0f}",
-            ),
-        ]
-    found: list[Sequence[str]] = [
+        for what, found, (own, naive, ratio) in (
+            (f"curve lengths, batches of {lengths['batch']}", lengths, LENGTH_RATES),
+            ("environment steps, PPO included", steps, STEP_RATES),
+        ):
+            rates.append(
+                (
+                    f"{what}{how}",
+                    f"{found[own]:,.0f}",
+                    f"{found[naive]:,.0f}",
+                    f"{found[ratio]:.0f}",
+                )
+            )
+    ratios: list[Sequence[str]] = [
         (
-            "length over exact distance, mean",
-            "random curve",
-            "policy (worst seed)",
-            "gradient",
-            "domain of the pairs",
+            *("length over exact distance, mean", "random curve", "policy (worst seed)"),
+            *("gradient", "domain of the pairs"),
         )
     ]
     for name, searched in geometry["policy_search"].items():
-        found.append(
-            (
-                name,
-                f"{np.mean(searched['first_mean_ratio']):.3f}",
-                f"{max(searched['mean_ratio']):.4f}",
-                f"{geometry['solvers'][name]['gradient']['mean_ratio']:.5f}",
-                searched["domain"].replace("|", "\\|"),
-            )
-        )
-    return f"{markdown_table(rates)}\n\n{markdown_table(found)}\n"
+        random, policy = np.mean(searched["first_mean_ratio"]), max(searched["mean_ratio"])
+        gradient = geometry["solvers"][name]["gradient"]["mean_ratio"]
+        domain = searched["domain"].replace("|", "\\|")
+        ratios.append((name, f"{random:.3f}", f"{policy:.4f}", f"{gradient:.5f}", domain))
+    return f"{markdown_table(rates)}\n\n{markdown_table(ratios)}\n"
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """What the table says of one thing, good and bad, in sentences."""
 
     about: str
@@ -216,31 +201,24 @@ def findings(
 
     table: what `compare_planners` returns.  manifolds: each learned manifold's held-out metrics.
     """
-    told = [
-        _told_of(params, str(name), rows, manifolds[str(name)])
+    found = [
+        _found_on(params, str(name), rows, manifolds[str(name)])
         for name, rows in table.groupby("manifold", sort=False)
     ]
-    sampled = table[~table["planner"].isin([LEARNED, *APART])].drop_duplicates(
-        ["constraint", "planner"]
-    )
-    refused = ", ".join(
-        f"{PLANNERS[str(name)].label} {_share(rows, 'refused')}"
-        for name, rows in sampled.groupby("planner", sort=False)
-    )
+    sampled = table[~table["planner"].isin([LEARNED, *APART])]
+    refused = _by_planner(sampled.drop_duplicates(["constraint", "planner"]), "refused")
     seeds, queries = len(params.geodesics.seeds), params.labels.queries
     cautions = [
-        f"This is {queries} queries a constraint and {seeds} policies each: enough to see "
-        f"large differences, not small "
-        "ones.",
+        f"This is {queries} queries a constraint and {seeds} policies each: enough to see large "
+        "differences, not small ones.",
         "Training the manifolds and policies is not in the planning times.",
-        "No planner's own word counts: of all rows, the share in which a sampling planner "
-        "returned a path that the "
-        f"judge refused is {refused}.",
+        "No planner's own word counts: of all rows, the share in which a sampling planner returned "
+        f"a path that the judge refused is {refused}.",
     ]
-    return [*told, Finding("To keep in mind", cautions)]
+    return [*found, Finding("To keep in mind", cautions)]
 
 
-def _told_of(
+def _found_on(
     params: Params, manifold: str, rows: pd.DataFrame, held_out: Mapping[str, float]
 ) -> Finding:
     settings = params.manifolds[manifold]
@@ -248,61 +226,47 @@ def _told_of(
         rows[rows["planner"] == name].set_index("constraint")
         for name in (LEARNED, STRAIGHT, RANDOM)
     )
-    sampled = rows[~rows["planner"].isin([LEARNED, *APART])]
-    how = (
-        "curves retracted onto the constraint"
-        if settings.retract
-        else "curves decoded and their ends corrected, nothing retracted"
-    )
+    others = _by_planner(rows[~rows["planner"].isin([LEARNED, *APART])], "success")
+    decoded = "curves decoded and their ends corrected, nothing retracted"
+    how = "curves retracted onto the constraint" if settings.retract else decoded
     shares = ", ".join(f"{name} {share:.0%}" for name, share in learned["success"].items())
-    others = ", ".join(
-        f"{PLANNERS[str(name)].label} {_share(group, 'success')}"
-        for name, group in sampled.groupby("planner", sort=False)
-    )
-    return Finding(
-        f"{manifold}: {settings.latent_dim} latent dimensions, {how}",
-        [
-            f"The judge accepts {_share(learned, 'success')} of the learned geodesics ({shares}).",
-            f"Under the same constraints it accepts {_share(straight, 'success')} of the "
-            f"straight latent lines, and of "
-            f"the sampling planners' answers: {others}.",
-            f"The learned geodesics returned violate the constraint by "
-            f"{short(learned['violation_max_deg'].max())}° at "
-            f"worst; the median path of the worst constraint by "
-            f"{short(learned['violation_median_deg'].max())}°.",
-            _shortest_under(rows),
-            f"The decoder reproduces unseen poses to "
-            f"{short(held_out['joint_error_mean_deg'])}° a joint (mean) "
-            f"and {short(held_out['tool_error_median_mm'])} mm at the tool (median).",
-            f"Without a policy, as many random curves as the search meets, chosen by the same "
-            f"rule, give "
-            f"{_share(random, 'success')}.",
-            f"No connection in the sampled graph, and so no search: "
-            f"{_share(learned, 'not_connected')} of the queries.",
-        ],
+    worst, median = (short(learned[f"violation_{which}_deg"].max()) for which in ("max", "median"))
+    sentences = [
+        f"The judge accepts {_share(learned, 'success')} of the learned geodesics ({shares}).",
+        f"Under the same constraints it accepts {_share(straight, 'success')} of the straight "
+        f"latent lines, and of the sampling planners' answers: {others}.",
+        f"The learned geodesics returned violate the constraint by {worst}° at worst; the median "
+        f"path of the worst constraint by {median}°.",
+        _shortest_under(rows),
+        f"The decoder reproduces unseen poses to {short(held_out['joint_error_mean_deg'])}° a "
+        f"joint (mean) and {short(held_out['tool_error_median_mm'])} mm at the tool (median).",
+        "Without a policy, as many random curves as the search meets, chosen by the same rule, "
+        f"give {_share(random, 'success')}.",
+        "No connection in the sampled graph, and so no search: "
+        f"{_share(learned, 'not_connected')} of the queries.",
+    ]
+    return Finding(f"{manifold}: {settings.latent_dim} latent dimensions, {how}", sentences)
+
+
+def _by_planner(rows: pd.DataFrame, column: str) -> str:
+    return ", ".join(
+        f"{PLANNERS[str(name)].label} {_share(group, column)}"
+        for name, group in rows.groupby("planner", sort=False)
     )
 
 
 def _shortest_under(rows: pd.DataFrame) -> str:
-    """Under which constraints the learned geodesic is the shortest, in the mean over the common
-    queries.
-    """
+    """Where the learned geodesic is the shortest, in the mean over the common queries."""
     comparable = rows[~rows["planner"].isin(APART)].dropna(subset=["latent_mean"])
     shortest = comparable.loc[comparable.groupby("constraint", sort=False)["latent_mean"].idxmin()]
     won = shortest.loc[shortest["planner"] == LEARNED, "constraint"].tolist()
-    lost = [
-        f"{row['constraint']} ({PLANNERS[row['planner']].label})"
-        for row in records(shortest[shortest["planner"] != LEARNED])
-    ]
-    told = (
-        f"On the queries that all planners solved, their mean latent length is the shortest "
-        f"under {_listed(won)}"
+    others = records(shortest[shortest["planner"] != LEARNED])
+    lost = [f"{row['constraint']} ({PLANNERS[row['planner']].label})" for row in others]
+    mine = (
+        "On the queries that all planners solved, their mean latent length is the shortest under "
+        + (", ".join(won) or "no constraint")
     )
-    return f"{told}; another planner's is under {_listed(lost)}." if lost else f"{told}."
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names) or "no constraint"
+    return f"{mine}; another planner's is under {', '.join(lost)}." if lost else f"{mine}."
 
 
 def _share(rows: pd.DataFrame, column: str) -> str:
@@ -347,17 +311,12 @@ def plus_minus(mean: float, deviation: float, number: Callable[[float], str]) ->
 
 
 def markdown_table(rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table, its header first; columns are aligned, so that it reads in a terminal
-    too.
-    """
+    """A Markdown table, its header first, aligned, so that it reads in a terminal too."""
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    # names to the left, figures to the right
-    padded = [
-        [
-            cell.ljust(width) if k < 2 else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        for row in rows
-    ]
+
+    def line(cells: Sequence[str]) -> str:  # names to the left, figures to the right
+        sized = enumerate(zip(cells, widths, strict=True))
+        return " | ".join(c.ljust(width) if k < 2 else c.rjust(width) for k, (c, width) in sized)
+
     rule = ["-" * width if k < 2 else "-" * (width - 1) + ":" for k, width in enumerate(widths)]
-    return "\n".join("| " + " | ".join(row) + " |" for row in [padded[0], rule, *padded[1:]])
+    return "\n".join(f"| {line(cells)} |" for cells in (rows[0], rule, *rows[1:]))

@@ -10,17 +10,18 @@ import pandas as pd
 
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout, in_checkout
-from constraint_geodesics.report.blocks import Block, Look, Recorded, runs_link
+from constraint_geodesics.report.page import Links, Recorded, Table, runs_link
 from constraint_geodesics.report.results import markdown_table, read_metrics, short
-from constraint_geodesics.studies.policy_benchmark import (
+from constraint_geodesics.studies.proposals import (
     DESCENT,
+    JOINTS,
+    LEARNED,
     ONE_SEED,
     POLICIES,
     RANDOM,
     SEPARATE,
     STRAIGHT,
 )
-from constraint_geodesics.studies.policy_tasks import JOINTS, LEARNED
 
 POLICY_COLUMNS = (
     *("one cubic, not refined", "feasible", "length / shortest cubic, mean", "median", "p95"),
@@ -34,16 +35,16 @@ METHODS = (STRAIGHT, RANDOM, DESCENT, ONE_SEED, POLICIES, SEPARATE)
 """The order of the proposals, each on the learned manifold first."""
 
 
-def policy_blocks(params: Params, layout: Layout) -> list[Block]:
+def policy_blocks(params: Params, layout: Layout) -> list[Table]:
     """What the policies propose before any refinement, one block a constraint."""
     found = read_metrics(layout.report("benchmark_policies", params.geodesics.searched[0]))
     names = [name for name in (params.studies.constraint, *params.unseen) if name in found]
     named = [f"{method}, {chart}" for method in METHODS for chart in (LEARNED, JOINTS)]
-    look = Look(runs_link("benchmark_policies", params.geodesics.searched[0]))
-    return [_policy_block(name, _ordered(found[name], named), look) for name in names]
+    link = Links(runs_link("benchmark_policies", params.geodesics.searched[0]))
+    return [_policy_block(name, _ordered(found[name], named), link) for name in names]
 
 
-def execution_block(params: Params, layout: Layout) -> Block:
+def execution_block(params: Params, layout: Layout) -> Table:
     """What an open cup keeps of its content on planned paths and on straight joint lines."""
     found = read_metrics(layout.report("execute_paths", params.studies.constraint))
     kinds = {kind: row for kind, row in found.items() if isinstance(row, Mapping)}
@@ -72,8 +73,8 @@ def execution_block(params: Params, layout: Layout) -> Block:
         runs_link("execute_paths", params.studies.constraint),
         _executed(params, layout),
     )
-    looks = [Look(link, recorded.get(kind, ())) for kind in kinds]
-    return Block("Execution", note, EXECUTION_COLUMNS, rows, planners=list(kinds), looks=looks)
+    links = [Links(link, recorded.get(kind, ())) for kind in kinds]
+    return Table("Execution", note, EXECUTION_COLUMNS, rows, planners=list(kinds), links=links)
 
 
 def _executed(params: Params, layout: Layout) -> dict[str, list[Recorded]]:
@@ -107,11 +108,11 @@ def _ordered(
     return {name: rows[name] for name in dict.fromkeys([*names, *rows]) if name in rows}
 
 
-def _markdown(block: Block) -> str:
+def _markdown(block: Table) -> str:
     return f"**{block.title}** ({block.note}):\n\n{markdown_table([block.header, *block.rows])}"
 
 
-def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]], look: Look) -> Block:
+def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]], link: Links) -> Table:
     first = next(iter(rows.values()))
     note = (
         f"{first['queries']} queries, {first['solvable']} of which have a curve of the "
@@ -128,9 +129,9 @@ def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]], look: 
         ]
         for method, row in rows.items()
     ]
-    looks = [look] * len(rows)
-    return Block(
-        f"{constraint}, proposals", note, POLICY_COLUMNS, cells, planners=list(rows), looks=looks
+    links = [link] * len(rows)
+    return Table(
+        f"{constraint}, proposals", note, POLICY_COLUMNS, cells, planners=list(rows), links=links
     )
 
 

@@ -1,9 +1,9 @@
-"""Clearance of a robot's links to boxes and spheres of its workcell, compiled: what keeps curves
-out of a collision.
+"""Clearance of a robot's links to the shapes of its workcell, compiled: what keeps curves out of a
+collision.
 
-Every link is a set of points: the corners of its collision hulls that lie furthest out in evenly
-spread directions, as good as the hull itself against the flat side of a box, and where there are
-spheres points on the hull's faces as well.  A sphere is a box without edges, rounded by its radius.
+Every shape is rounded boxes.  Every link is a set of points: the corners of its collision hulls
+that lie furthest out in evenly spread directions, as good as the hull itself against the flat side
+of a box, and where there are round shapes points on the hull's faces as well.
 PyBullet remains the judge: this model knows neither the contact of the arm with itself nor bodies
 given as meshes.
 """
@@ -20,7 +20,8 @@ from scipy.spatial import ConvexHull
 
 from constraint_geodesics.robot.kernels import frame_of, joint_frame
 from constraint_geodesics.robot.kinematics import SerialRobot
-from constraint_geodesics.scene.world import Box, Solid, Sphere, World, directions
+from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.world import World, directions
 
 DIRECTIONS = 48
 """Directions in which a link's outermost corners are looked for."""
@@ -36,9 +37,9 @@ _COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "no
 class ClearanceArrays(NamedTuple):
     """A clearance model as the compiled kernels take it.
 
-    points (K, 3) [m]; shapes (B, 7 + D): boxes, their rounding and exempt links; groups (G, 7) of
-    neighbouring points, those of one joint together: centre and radius of a ball around them, the
-    first point, the one after the last, the joint.
+    points (K, 3) [m]; shapes (B, 16 + D): centre, half edges, rounding and turn (9) of the boxes,
+    and their exempt links; groups (G, 7) of neighbouring points, those of one joint together:
+    centre and radius of a ball around them, the first point, the one after the last, the joint.
     """
 
     points: np.ndarray
@@ -48,17 +49,16 @@ class ClearanceArrays(NamedTuple):
 
 @dataclass(frozen=True)
 class ClearanceModel:
-    """Points of the links, and the boxes they must keep clear of.
+    """Points of the links, and the rounded boxes they must keep clear of.
 
-    points (K, 3) [m] in the frame that the joint `joints` (K,) carries; boxes (B, 2, 3): centre and
-    half edges [m]; rounding (B,): what they reach out beyond that, all round [m]; exempt (B, D):
-    which of them the links carried by a joint may touch.
+    points (K, 3) [m] in the frame that the joint `joints` (K,) carries; boxes (B, 16): centre, half
+    edges and rounding [m], and turn, of each; exempt (B, D): which of them the links carried by a
+    joint may touch.
     """
 
     points: Float[np.ndarray, "K 3"]
     joints: Int[np.ndarray, "K"]
-    boxes: Float[np.ndarray, "B 2 3"]
-    rounding: Float[np.ndarray, "B"]
+    boxes: Float[np.ndarray, "B 16"]
     exempt: Bool[np.ndarray, "B D"]
 
     @cached_property
@@ -72,9 +72,7 @@ class ClearanceModel:
                 groups.append(np.array([[*centre, radius, first, first + len(rows), joint]], float))
                 order.append(rows)
                 first += len(rows)
-        boxes = np.concatenate(
-            [self.boxes.reshape(-1, 6), self.rounding[:, None], self.exempt], axis=1
-        )
+        boxes = np.concatenate([self.boxes, self.exempt], axis=1)
         points = np.ascontiguousarray(self.points[np.concatenate(order)])
         return ClearanceArrays(points, boxes, np.concatenate(groups))
 
@@ -92,48 +90,30 @@ class ClearanceModel:
 
 def no_clearance(dof: int) -> ClearanceModel:
     """The model of an empty workcell."""
-    return ClearanceModel(
-        np.empty((0, 3)),
-        np.empty(0, np.int64),
-        np.empty((0, 2, 3)),
-        np.empty(0),
-        np.empty((0, dof), bool),
-    )
+    nothing = np.empty((0, dof), bool)
+    return ClearanceModel(np.empty((0, 3)), np.empty(0, np.int64), np.empty((0, 16)), nothing)
 
 
-def clearance_model(robot: SerialRobot, workcell: Sequence[Solid]) -> ClearanceModel:
-    """The model of one robot among boxes and spheres; bodies given by a URDF are left to
-    PyBullet.
-    """
-    solids = [body for body in workcell if isinstance(body, Box | Sphere)]
+def clearance_model(robot: SerialRobot, workcell: Sequence[Shape]) -> ClearanceModel:
+    """The model of one robot among shapes; what is no rounded box is left to PyBullet."""
+    solids = [(shape, box) for shape in workcell for box in shape.rounded_boxes()]
     if not solids:
         return no_clearance(robot.dof)
     with World(robot) as world:
         hulls = [hull for hull in world.hulls() if hull.joint >= 0]
     if not hulls:
         return no_clearance(robot.dof)
-    round_ones = any(isinstance(body, Sphere) for body in solids)
-    kept = [
-        (hull.joint, surface(hull.points) if round_ones else outermost(hull.points))
-        for hull in hulls
-    ]
-    kept.sort(key=lambda link: link[0])
+    points_of = surface if any(box.rounding > 0.0 for _, box in solids) else outermost
+    kept = sorted(((h.joint, points_of(h.points)) for h in hulls), key=lambda link: link[0])
     exempt = np.zeros((len(solids), robot.dof), bool)
-    for b, body in enumerate(solids):
-        for hull in hulls:
-            if hull.link in body.exempt_links:
-                exempt[b, hull.joint] = True
+    for b, (shape, _) in enumerate(solids):
+        exempt[b, [hull.joint for hull in hulls if hull.link in shape.exempt_links]] = True
     return ClearanceModel(
         np.concatenate([points for _, points in kept]),
         np.concatenate([np.full(len(points), joint) for joint, points in kept]),
-        np.array([[body.centre, _half_edges(body)] for body in solids]),
-        np.array([body.radius if isinstance(body, Sphere) else 0.0 for body in solids]),
+        np.array([np.concatenate([np.ravel(part) for part in box]) for _, box in solids]),
         exempt,
     )
-
-
-def _half_edges(body: Box | Sphere) -> tuple[float, ...]:
-    return (0.0, 0.0, 0.0) if isinstance(body, Sphere) else tuple(0.5 * edge for edge in body.size)
 
 
 def outermost(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
@@ -193,13 +173,10 @@ def link_clearances(chain, model, far, q, distances, normals, nearest, joint_ori
             radius, first, last = groups[g, 3], int(groups[g, 4]), int(groups[g, 5])
             g += 1
             for b in range(boxes.shape[0]):
-                if boxes[b, 7 + j] != 0.0:
+                if boxes[b, 16 + j] != 0.0:
                     continue
-                ex, ey, ez = (
-                    abs(x - boxes[b, 0]) - boxes[b, 3],
-                    abs(y - boxes[b, 1]) - boxes[b, 4],
-                    abs(z - boxes[b, 2]) - boxes[b, 5],
-                )
+                dx, dy, dz = _from_centre(boxes[b], x, y, z)
+                ex, ey, ez = abs(dx) - boxes[b, 3], abs(dy) - boxes[b, 4], abs(dz) - boxes[b, 5]
                 bound = max(ex, ey, ez)
                 if bound > 0.0:
                     ex, ey, ez = max(ex, 0.0), max(ey, 0.0), max(ez, 0.0)
@@ -209,21 +186,33 @@ def link_clearances(chain, model, far, q, distances, normals, nearest, joint_ori
                     passed_over = min(passed_over, bound)
                     continue
                 for k in range(first, last):
-                    _nearer(frame, points[k], boxes[b], j, distances, normals, nearest)
+                    _nearer(frame, points[k], boxes[b], j, (distances, normals, nearest))
         if distances[j] > far:
             distances[j] = min(distances[j], passed_over)
 
 
 @njit(inline="always", **_COMPILE)
-def _nearer(frame, point, box, j, distances, normals, nearest):
+def _from_centre(box, x, y, z):
+    """A point of the base frame, from a box's centre and along its edges."""
+    x, y, z = x - box[0], y - box[1], z - box[2]
+    return (
+        x * box[7] + y * box[10] + z * box[13],
+        x * box[8] + y * box[11] + z * box[14],
+        x * box[9] + y * box[12] + z * box[15],
+    )
+
+
+@njit(inline="always", **_COMPILE)
+def _nearer(frame, point, box, j, found):
     """Take a point of the links that joint j carries for the nearest, if it is nearer to the box
-    than all before.
+    than all before; found: distances, normals and nearest points so far.
     """
+    distances, normals, nearest = found
     p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = frame
     x = p0 + r00 * point[0] + r01 * point[1] + r02 * point[2]
     y = p1 + r10 * point[0] + r11 * point[1] + r12 * point[2]
     z = p2 + r20 * point[0] + r21 * point[1] + r22 * point[2]
-    dx, dy, dz = x - box[0], y - box[1], z - box[2]
+    dx, dy, dz = _from_centre(box, x, y, z)
     ex, ey, ez = abs(dx) - box[3], abs(dy) - box[4], abs(dz) - box[5]
     if ex <= 0.0 and ey <= 0.0 and ez <= 0.0:
         distance = max(ex, ey, ez)
@@ -239,7 +228,9 @@ def _nearer(frame, point, box, j, distances, normals, nearest):
     distance -= box[6]
     if distance < distances[j]:
         distances[j] = distance
-        normals[j, 0], normals[j, 1], normals[j, 2] = nx, ny, nz
+        normals[j, 0] = nx * box[7] + ny * box[8] + nz * box[9]
+        normals[j, 1] = nx * box[10] + ny * box[11] + nz * box[12]
+        normals[j, 2] = nx * box[13] + ny * box[14] + nz * box[15]
         nearest[j, 0], nearest[j, 1], nearest[j, 2] = x, y, z
 
 

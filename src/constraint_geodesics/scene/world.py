@@ -1,58 +1,21 @@
-"""PyBullet as the judge: tool poses, self-collision and collision with the workcell of given
-configurations.
+"""PyBullet as the judge: tool poses and collisions of given configurations.
 
-The only importer of pybullet.  Every world is a physics client of its own in DIRECT mode; nothing
-is simulated here.
+The only importer of pybullet.  Every world is a client of its own; nothing is simulated here.
 """
 
-import contextlib
-import os
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import accumulate
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from constraint_geodesics.robot.kinematics import SerialRobot
-
-
-@dataclass(frozen=True)
-class Box:
-    """A fixed box: its centre and edge lengths [m], and the robot's links that may touch it."""
-
-    name: str
-    centre: tuple[float, float, float]
-    size: tuple[float, float, float]
-    exempt_links: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Sphere:
-    """A fixed sphere: its centre and radius [m], and the robot's links that may touch it."""
-
-    name: str
-    centre: tuple[float, float, float]
-    radius: float
-    exempt_links: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Body:
-    """A fixed body read from a URDF at a pose [m, rad], and the robot's links that may touch it."""
-
-    name: str
-    urdf: Path
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    exempt_links: tuple[str, ...] = ()
-
-
-Solid = Box | Sphere | Body
-"""What can stand in a workcell."""
+from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.urdf import quiet
 
 
 @dataclass(frozen=True)
@@ -114,81 +77,80 @@ class LinkHull:
     points: Float[np.ndarray, "n 3"]
 
 
-def data_path() -> Path:
-    """Folder of the robots and meshes that ship with PyBullet."""
-    with _quiet():
-        import pybullet_data
-    return Path(pybullet_data.getDataPath())
+class _Client:
+    """PyBullet's functions and constants, for one physics client of its own."""
+
+    def __init__(self) -> None:
+        with quiet():
+            import pybullet
+        self._module = pybullet
+        self._id = pybullet.connect(pybullet.DIRECT)
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._module, name)
+        if callable(found) and name not in _WITHOUT_CLIENT:
+            found = partial(found, physicsClientId=self._id)
+        setattr(self, name, found)  # so that it is asked for once
+        return found
+
+
+_WITHOUT_CLIENT = [
+    "getEulerFromQuaternion",
+    "getMatrixFromQuaternion",
+    "getQuaternionFromEuler",
+    "invertTransform",
+    "multiplyTransforms",
+]
 
 
 class World:
     """One robot among fixed bodies.  Adjacent links and exempt links may touch; nothing else may.
 
-    Raises FileNotFoundError if a URDF is missing and ValueError if an exempt link is not the
-    robot's.
+    Raises RobotError if a URDF is missing and ValueError if an exempt link is not the robot's.
     """
 
-    def __init__(self, robot: SerialRobot, fixed: Sequence[Solid] = ()) -> None:
-        with _quiet():
-            import pybullet
-        self._bullet = pybullet
+    def __init__(self, robot: SerialRobot, fixed: Sequence[Shape] = ()) -> None:
+        self._bullet = bullet = _Client()
         self.robot = robot
-        self._client = pybullet.connect(pybullet.DIRECT)
-        flags = pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
-        with _quiet():
-            self._body = pybullet.loadURDF(
-                str(robot.urdf), useFixedBase=True, flags=flags, physicsClientId=self._client
-            )
-        info = [
-            pybullet.getJointInfo(self._body, i, physicsClientId=self._client)
-            for i in range(pybullet.getNumJoints(self._body, physicsClientId=self._client))
-        ]
+        flags = bullet.URDF_USE_SELF_COLLISION | bullet.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
+        with quiet():
+            self._body = body = bullet.loadURDF(str(robot.urdf), useFixedBase=True, flags=flags)
+        info = [bullet.getJointInfo(body, i) for i in range(bullet.getNumJoints(body))]
         joint_index = {row[1].decode(): row[0] for row in info}
         self._link_index = {row[12].decode(): row[0] for row in info}
-        self._link_index[
-            pybullet.getBodyInfo(self._body, physicsClientId=self._client)[0].decode()
-        ] = -1
+        self._link_index[bullet.getBodyInfo(body)[0].decode()] = -1
         self._joints = [joint_index[name] for name in robot.joint_names]
         self._tool = self._link_index[robot.tool_link]
-        self._exempt = {self._add(body): self._links(body) for body in fixed}
-        for body, links in self._exempt.items():
+        with quiet():
+            bodies = [shape.add_to(bullet) for shape in fixed]
+        self._exempt = dict(zip(bodies, map(self._links, fixed), strict=True))
+        for other, links in self._exempt.items():
             for link in links:  # a pair that may touch need not be examined again and again
-                pybullet.setCollisionFilterPair(
-                    self._body, body, link, -1, 0, physicsClientId=self._client
-                )
+                bullet.setCollisionFilterPair(body, other, link, -1, 0)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
         """Free the physics client."""
-        if self._bullet.isConnected(self._client):
-            self._bullet.disconnect(self._client)
+        if self._bullet.isConnected():
+            self._bullet.disconnect()
 
     def label(self, q: Float[np.ndarray, "n D"]) -> Labels:
         """Tool pose and collisions of each configuration [rad]."""
         poses, collisions = [], []
         for row in q:
             self._place(row)
-            state = self._bullet.getLinkState(
-                self._body, self._tool, computeForwardKinematics=1, physicsClientId=self._client
-            )
+            state = self._bullet.getLinkState(self._body, self._tool, computeForwardKinematics=1)
             poses.append((*state[4], *state[5]))
             collisions.append(self._collisions())
-        table = np.array(poses).reshape(-1, 7)
-        hits = np.array(collisions, dtype=bool).reshape(-1, 2)
-        rpy = [self._bullet.getEulerFromQuaternion(quaternion) for quaternion in table[:, 3:]]
-        return Labels(
-            table[:, :3], table[:, 3:], np.array(rpy).reshape(-1, 3), hits[:, 0], hits[:, 1]
-        )
+        position, quaternion = np.split(np.array(poses).reshape(-1, 7), [3], axis=1)
+        rpy = [self._bullet.getEulerFromQuaternion(row) for row in quaternion]
+        own, workcell = np.array(collisions, dtype=bool).reshape(-1, 2).T
+        return Labels(position, quaternion, np.array(rpy).reshape(-1, 3), own, workcell)
 
     def is_free(self, q: Float[np.ndarray, "D"]) -> bool:
         """Whether one configuration touches neither itself nor the workcell."""
@@ -201,17 +163,11 @@ class World:
 
     def first_collision(self, q: Float[np.ndarray, "n D"]) -> int | None:
         """Index of the first configuration that is not free; None where all are."""
-        for index, values in enumerate(np.asarray(q, float)[:, :, None].tolist()):
-            self._bullet.resetJointStatesMultiDof(
-                self._body, self._joints, values, physicsClientId=self._client
-            )
-            if any(self._collisions()):
-                return index
-        return None
+        return next((index for index, row in enumerate(q) if not self.is_free(row)), None)
 
     def loaded_chain(self) -> LoadedChain:
         """The chain from the base to the tool, as PyBullet understood the URDF."""
-        bullet, body, client = self._bullet, self._body, self._client
+        bullet, body = self._bullet, self._body
         kinds = {
             bullet.JOINT_REVOLUTE: "revolute",
             bullet.JOINT_PRISMATIC: "prismatic",
@@ -220,43 +176,31 @@ class World:
         links: list[LoadedLink] = []
         link = self._tool
         while link >= 0:
-            info = bullet.getJointInfo(body, link, physicsClientId=client)
-            dynamics = bullet.getDynamicsInfo(body, link, physicsClientId=client)
-            x, y, z, w = info[
-                15
-            ]  # it turns the parent's coordinates into this link's: the inverse is recorded
-            links.append(
-                LoadedLink(
-                    info[12].decode(),
-                    kinds.get(info[2], f"PyBullet's type {info[2]}"),
-                    self._joints.index(link) if link in self._joints else None,
-                    info[13],
-                    info[14],
-                    (-x, -y, -z, w),
-                    dynamics[3],
-                    dynamics[4],
-                )
-            )
+            info = bullet.getJointInfo(body, link)
+            dynamics = bullet.getDynamicsInfo(body, link)
+            x, y, z, w = info[15]  # turns the parent's coordinates into this link's
+            name = info[12].decode()
+            kind = kinds.get(info[2], f"PyBullet's type {info[2]}")
+            column = self._joints.index(link) if link in self._joints else None
+            frame = (info[13], info[14], (-x, -y, -z, w), *dynamics[3:5])
+            links.append(LoadedLink(name, kind, column, *frame))
             link = info[16]
-        position, quaternion = bullet.getBasePositionAndOrientation(body, physicsClientId=client)
+        position, quaternion = bullet.getBasePositionAndOrientation(body)
         return LoadedChain(position, quaternion, tuple(reversed(links)))
 
     def hulls(self) -> list[LinkHull]:
         """The collision shapes of all links that have one."""
-        bullet, body, client = self._bullet, self._body, self._client
+        bullet, body = self._bullet, self._body
         self._place(np.zeros(self.robot.dof))
         frames = _joint_frames(self.robot)
         found = []
         for link, index in sorted(self._link_index.items(), key=lambda item: item[1]):
-            shapes = bullet.getCollisionShapeData(body, index, physicsClientId=client)
-            points = np.concatenate(
-                [np.empty((0, 3)), *(self._corners(index, shape) for shape in shapes)]
-            )
+            shapes = bullet.getCollisionShapeData(body, index)
+            corners = [self._corners(index, shape) for shape in shapes]
+            points = np.concatenate([np.empty((0, 3)), *corners])
             if not len(points) or index < 0:
                 continue
-            state = bullet.getLinkState(
-                body, index, computeForwardKinematics=1, physicsClientId=client
-            )
+            state = bullet.getLinkState(body, index, computeForwardKinematics=1)
             rotation = np.array(bullet.getMatrixFromQuaternion(state[1])).reshape(3, 3)
             joint = self._carrier(index)
             pose = np.linalg.inv(frames[joint]) if joint >= 0 else np.eye(4)
@@ -271,30 +215,21 @@ class World:
         bullet = self._bullet
         kind, size = shape[2], np.array(shape[3])
         if kind == bullet.GEOM_MESH:
-            with _quiet():
-                mesh = bullet.getMeshData(self._body, link, physicsClientId=self._client)[1]
+            with quiet():
+                mesh = bullet.getMeshData(self._body, link)[1]
             if mesh:  # of a link with one shape; it is in the inertial frame already
                 return np.array(mesh).reshape(-1, 3)
             points = _mesh_vertices(Path(shape[4].decode())) * size
         elif kind == bullet.GEOM_BOX:
-            points = (
-                0.5
-                * size
-                * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-            )
+            signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+            points = 0.5 * size * signs
         elif kind == bullet.GEOM_SPHERE:
             points = size[0] * directions(96)
-        elif kind == bullet.GEOM_CYLINDER:
+        elif kind in (bullet.GEOM_CYLINDER, bullet.GEOM_CAPSULE):
             turn = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
-            rim = size[1] * np.stack([np.cos(turn), np.sin(turn), np.zeros(32)], axis=1)
-            points = np.concatenate(
-                [rim + np.array([0.0, 0.0, z]) for z in (-0.5 * size[0], 0.5 * size[0])]
-            )
-        elif kind == bullet.GEOM_CAPSULE:
-            ball = size[1] * directions(96)
-            points = np.concatenate(
-                [ball + np.array([0.0, 0.0, z]) for z in (-0.5 * size[0], 0.5 * size[0])]
-            )
+            rim = np.stack([np.cos(turn), np.sin(turn), np.zeros(32)], axis=1)
+            end = size[1] * (rim if kind == bullet.GEOM_CYLINDER else directions(96))
+            points = np.concatenate([end + np.array([0.0, 0.0, s * size[0]]) for s in (-0.5, 0.5)])
         else:
             return np.empty((0, 3))
         rotation = np.array(bullet.getMatrixFromQuaternion(shape[6])).reshape(3, 3)
@@ -305,20 +240,17 @@ class World:
         while link >= 0:
             if link in self._joints:
                 return self._joints.index(link)
-            link = self._bullet.getJointInfo(self._body, link, physicsClientId=self._client)[16]
+            link = self._bullet.getJointInfo(self._body, link)[16]
         return -1
 
     def _place(self, q: np.ndarray) -> None:
-        self._bullet.resetJointStatesMultiDof(
-            self._body, self._joints, [[float(x)] for x in q], physicsClientId=self._client
-        )
+        values = np.asarray(q, float)[:, None].tolist()
+        self._bullet.resetJointStatesMultiDof(self._body, self._joints, values)
 
     def _collisions(self) -> tuple[bool, bool]:
-        self._bullet.performCollisionDetection(physicsClientId=self._client)
+        self._bullet.performCollisionDetection()
         own = workcell = False
-        for contact in self._bullet.getContactPoints(
-            bodyA=self._body, physicsClientId=self._client
-        ):
+        for contact in self._bullet.getContactPoints(bodyA=self._body):
             if contact[8] >= 0.0:  # a contact is listed from a small positive distance on
                 continue
             if contact[2] == self._body:
@@ -327,39 +259,8 @@ class World:
                 workcell = True
         return own, workcell
 
-    def _add(self, body: Solid) -> int:
-        bullet, client = self._bullet, self._client
-        if isinstance(body, Box):
-            half = [0.5 * edge for edge in body.size]
-            shape = bullet.createCollisionShape(
-                bullet.GEOM_BOX, halfExtents=half, physicsClientId=client
-            )
-            return int(
-                bullet.createMultiBody(0, shape, basePosition=body.centre, physicsClientId=client)
-            )
-        if isinstance(body, Sphere):
-            shape = bullet.createCollisionShape(
-                bullet.GEOM_SPHERE, radius=body.radius, physicsClientId=client
-            )
-            return int(
-                bullet.createMultiBody(0, shape, basePosition=body.centre, physicsClientId=client)
-            )
-        if not body.urdf.is_file():
-            raise FileNotFoundError(f"workcell {body.name!r}: no such URDF file: {body.urdf}")
-        with _quiet():
-            return int(
-                bullet.loadURDF(
-                    str(body.urdf),
-                    basePosition=body.position,
-                    baseOrientation=bullet.getQuaternionFromEuler(body.rpy),
-                    useFixedBase=True,
-                    physicsClientId=client,
-                )
-            )
-
-    def _links(self, body: Solid) -> frozenset[int]:
-        unknown = [name for name in body.exempt_links if name not in self._link_index]
-        if unknown:
+    def _links(self, body: Shape) -> frozenset[int]:
+        if unknown := [name for name in body.exempt_links if name not in self._link_index]:
             raise ValueError(
                 f"workcell {body.name!r}: {unknown} are not links of {self.robot.name}"
             )
@@ -370,11 +271,8 @@ def _mesh_vertices(file: Path) -> Float[np.ndarray, "n 3"]:
     """Vertices of an OBJ file; none of another kind of file."""
     if file.suffix.lower() != ".obj" or not file.is_file():
         return np.empty((0, 3))
-    rows = [
-        line.split()[1:4]
-        for line in file.read_text(errors="replace").splitlines()
-        if line.startswith("v ")
-    ]
+    lines = file.read_text(errors="replace").splitlines()
+    rows = [line.split()[1:4] for line in lines if line.startswith("v ")]
     return np.array(rows, float).reshape(-1, 3)
 
 
@@ -388,20 +286,14 @@ def directions(count: int) -> Float[np.ndarray, "count 3"]:
 
 def _joint_frames(robot: SerialRobot) -> list[Float[np.ndarray, "4 4"]]:
     """The frame of each joint in the base frame, all joints at 0."""
-    frames = [robot.chain.base]
-    for origin in robot.chain.origins:
-        frames.append(frames[-1] @ origin)
-    return frames[1:]
+    return list(accumulate(robot.chain.origins, np.matmul, initial=robot.chain.base))[1:]
 
 
 @dataclass(frozen=True)
 class Physics:
-    """A world's PyBullet module and client, with the indices of its robot, for what simulates
-    instead of judging.
-    """
+    """A world's PyBullet, with the indices of its robot, for what simulates instead of judging."""
 
     bullet: Any
-    client: int
     body: int
     joints: tuple[int, ...]
     tool: int
@@ -413,27 +305,5 @@ def physics(world: World) -> Physics:
     simulation.
     """
     return Physics(
-        world._bullet,
-        world._client,
-        world._body,
-        tuple(world._joints),
-        world._tool,
-        tuple(world._exempt),
+        world._bullet, world._body, tuple(world._joints), world._tool, tuple(world._exempt)
     )
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence the lines that the library writes past Python straight to the process's output."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    saved = [(stream, os.dup(stream)) for stream in (1, 2)]
-    try:
-        with open(os.devnull, "w") as nothing:
-            for stream, _ in saved:
-                os.dup2(nothing.fileno(), stream)
-        yield
-    finally:
-        for stream, copy in saved:
-            os.dup2(copy, stream)
-            os.close(copy)

@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.problem import Status
 from constraint_geodesics.scene.clearance import ClearanceModel, clearance_batch
 from constraint_geodesics.search.band import BandCurve, BandSettings, BandSpace, relax, step_lengths
 from constraint_geodesics.search.roadmap import Joined, Roadmap, join, resample, shortest_way
 from constraint_geodesics.search.tree import tree_way
 
-Status = Literal["not_connected", "not_found"]
 Source = Literal["straight", "policy", "graph", "tree", "bend"]
 
 CHECK_STEP = 0.1
@@ -63,7 +63,9 @@ class Proposals(Protocol):
 
 @dataclass(frozen=True)
 class Parts:
-    """Which parts of the planner are switched on; all of them but for an ablation."""
+    """Which parts of the planner are switched on; all of them but for an ablation.  policy: curves
+    of `Proposals`, where the planner was given any.
+    """
 
     straight: bool = True
     policy: bool = True
@@ -99,6 +101,14 @@ class Task:
     open: tuple = field(init=False, repr=False)
 
 
+class Curve(Protocol):
+    """A curve in joint space from start to goal."""
+
+    def at(self, s: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n D"], float]:
+        """Points at shares from 0 to 1, rising [rad], and what is left of the violation."""
+        ...
+
+
 @dataclass(frozen=True)
 class Candidate:
     """A curve that looks sound: where it came from, its length [rad], and points about CHECK_STEP
@@ -106,7 +116,7 @@ class Candidate:
     """
 
     source: Source
-    curve: BandCurve
+    curve: Curve
     length: float
     shares: Float[np.ndarray, "n"]
     points: Float[np.ndarray, "n D"]
@@ -162,6 +172,7 @@ def candidates(
     if parts.graph:
         answer = yield from _over_graph(task, start, goal, parts.refinement, blocked is not None)
     if blocked is not None and parts.refinement:
+        assert isinstance(blocked.curve, BandCurve)
         pushed = _relaxed(task, "straight", blocked.curve.nodes, task.settings, boxes=True)
         if pushed is not None and _is_clear(task, pushed.points):
             yield pushed

@@ -1,7 +1,7 @@
-"""Paths over a sub-manifold's graph: where a straight start jumps, or goes through the table, the
+"""Paths over a constraint's graph: where a straight start jumps, or goes through the table, the
 graph leads round.
 
-The graph of `constraints/submanifold.py` (eq. 8) with a query's two ends joined to it, searched by
+The graph with a query's two ends joined to it, searched by
 A* [Hart et al. 1968] with the straight joint distance as the bound from below.  Compiled; PyBullet
 checked the graph's own edges when it was made; the edges to a query's ends, and those of the way
 that is found, are checked here for jumps, limits and the workcell's boxes and spheres.
@@ -16,7 +16,6 @@ from jaxtyping import Float, Int
 from numba import njit
 
 from constraint_geodesics.geometry.graph import components, nearest_neighbour_edges
-from constraint_geodesics.learning.submanifold import GraphSubmanifold
 from constraint_geodesics.search.band_kernels import project_node, workspace
 
 _COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
@@ -39,11 +38,6 @@ class Roadmap:
     edges: Int[np.ndarray, "m 2"]
     lengths: Float[np.ndarray, "m"]
     labels: Int[np.ndarray, "n"]
-
-    @classmethod
-    def from_submanifold(cls, graph: GraphSubmanifold) -> "Roadmap":
-        """The same graph without its latent coordinates."""
-        return cls(graph.joints, graph.edges, graph.lengths, graph.labels)
 
     @cached_property
     def neighbours(

@@ -1,11 +1,7 @@
-"""What each choice is worth: the reward as printed, other curve families, the metric without its
-variance term.
-"""
+"""What choices are worth: the printed reward, curve families, the metric's variance term."""
 
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,16 +12,15 @@ from constraint_geodesics.benchmark.judge import Free
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.problem import ChartProblem, Ends, Geodesic, Samples
 from constraint_geodesics.geodesics.solver import geodesics_between
+from constraint_geodesics.geometry.curves import CurveFamily
 from constraint_geodesics.geometry.manifold import pullback_metric
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import GeodesicParams
-from constraint_geodesics.studies.analytic_search import (
-    AnalyticTask,
+from constraint_geodesics.studies.geodesic_search import (
     analytic_problem,
     curve_family,
     unseen_pairs,
 )
-from constraint_geodesics.studies.geodesic_search import SeedLog
 
 PAIRS_SEED = 21
 POINTS = 101
@@ -35,16 +30,12 @@ COARSE, DRAWN_AT_ONCE, MOST_DRAWN = 17, 500, 10_000
 """
 
 
-def policy_variants(params: GeodesicParams) -> dict[str, tuple[GeodesicParams, int]]:
-    """Name of each ablated policy search, its parameters and the segments of its splines (0: the
-    polynomial).
-    """
-    printed = params.model_copy(
-        update={"reward": params.reward.model_copy(update={"form": "printed"})}
-    )
-    return {"printed_reward": (printed, 0)} | {
-        name: (params, n) for name, n in _segments(params).items() if n
-    }
+def policy_variants(params: GeodesicParams) -> dict[str, tuple[CurveFamily, GeodesicParams]]:
+    """Curve family and parameters of each ablated policy search on the analytic manifolds."""
+    reward = params.reward.model_copy(update={"form": "printed"})
+    families = {name: curve_family(2, params, n) for name, n in _segments(params).items()}
+    own = families.pop("polynomial"), params.model_copy(update={"reward": reward})
+    return {"printed_reward": own} | {name: (family, params) for name, family in families.items()}
 
 
 def _segments(params: GeodesicParams) -> dict[str, int]:
@@ -52,24 +43,8 @@ def _segments(params: GeodesicParams) -> dict[str, int]:
     return {"polynomial": 0} | {f"spline_{n}": n for n in params.ablated_segments}
 
 
-def variant_task(
-    name: str,
-    variant: str,
-    params: GeodesicParams,
-    seed: int,
-    scratch: Path,
-    run: AbstractContextManager[SeedLog],
-) -> AnalyticTask:
-    """One seed of one ablated policy search on an analytic manifold."""
-    settings, segments = policy_variants(params)[variant]
-    dim = 2  # of every analytic manifold searched
-    return AnalyticTask(name, curve_family(dim, settings, segments), settings, seed, scratch, run)
-
-
 def family_ratios(name: str, params: GeodesicParams) -> dict[str, float]:
-    """Mean ratio to the exact distance of the best curve of each family, as the gradient finds it:
-    what a search with that family could reach at most.
-    """
+    """Mean ratio to the exact distance of each family's best curve, as the gradient finds it."""
     ratios = {}
     for label, segments in _segments(params).items():
         problem = analytic_problem(name, curve_family(2, params, segments))
@@ -81,9 +56,7 @@ def family_ratios(name: str, params: GeodesicParams) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class MeanManifold:
-    """A learned manifold without the variance term of eq. 5: M = JμᵀJμ.  Implements
-    EmbeddedManifold.
-    """
+    """A learned manifold without the variance term of eq. 5: M = JμᵀJμ."""
 
     chart: LearnedManifold
 
@@ -117,29 +90,20 @@ class LearnedAblation:
     free: Free
 
     def figures(self) -> dict[str, dict[str, float]]:
-        """Curve families between random pairs, and the variance term between pairs whose straight
-        line collides.
-        """
+        """Curve families between random pairs; the variance term where straight lines collide."""
         domain, rng = Samples(self.chart.encode(self.joints)), np.random.default_rng(PAIRS_SEED)
         return self._families(domain, rng) | self._variance(domain, rng)
 
     def _families(self, domain: Samples, rng: np.random.Generator) -> dict[str, dict[str, float]]:
         """Length of the best curve of each family over the shortest of all."""
-        problems = {
-            name: self._problem(segments, domain)
-            for name, segments in _segments(self.params).items()
-        }
-        ends = problems["polynomial"].sample_ends(self.pairs, rng)
-        lengths = np.array(
-            [
-                [found.length for found in self._solved(problem, ends)]
-                for problem in problems.values()
-            ]
-        )
-        ratios = (lengths / lengths.min(axis=0)).mean(axis=1)
+        families = _segments(self.params)
+        problems = [self._problem(segments, domain) for segments in families.values()]
+        ends = problems[0].sample_ends(self.pairs, rng)
+        lengths = np.array([[g.length for g in self._solved(each, ends)] for each in problems])
+        ratios = (lengths / lengths.min(axis=0)).mean(axis=1).tolist()
         return {
-            name: {"mean_ratio_to_best": float(ratio)}
-            for name, ratio in zip(problems, ratios, strict=True)
+            name: {"mean_ratio_to_best": ratio}
+            for name, ratio in zip(families, ratios, strict=True)
         }
 
     def _variance(self, domain: Samples, rng: np.random.Generator) -> dict[str, dict[str, float]]:
@@ -154,15 +118,13 @@ class LearnedAblation:
         straight = [
             Geodesic.nothing("not_found", whole.curve, *pair) for pair in zip(*ends, strict=True)
         ]
-        solved = {"with_variance": whole, "without_variance": mean}
         found = {
-            name: self._solved(problem, Ends(*ends, *ends)) for name, problem in solved.items()
+            "with_variance": self._solved(whole, Ends(*ends, *ends)),
+            "without_variance": self._solved(mean, Ends(*ends, *ends)),
+            "straight_latent_line": straight,
         }
-        found["straight_latent_line"] = straight
-        counts = {
-            "pairs": float(len(straight)),
-            "straight_lines_that_collide": len(straight) / drawn,
-        }
+        count = float(len(straight))
+        counts = {"pairs": count, "straight_lines_that_collide": count / drawn}
         return {
             name: path_figures(self.chart, self._points(curves), self.free) | counts
             for name, curves in found.items()
@@ -171,18 +133,15 @@ class LearnedAblation:
     def _colliding(
         self, problem: ChartProblem, rng: np.random.Generator
     ) -> tuple[tuple[Float[np.ndarray, "P N"], Float[np.ndarray, "P N"]], int]:
-        """Starts and goals of pairs whose straight latent line touches something, and how many
-        pairs were drawn.
-        """
+        """Pairs whose straight latent line touches something, and how many were drawn."""
         starts, goals, drawn, found = [], [], 0, 0
         t = np.linspace(0.0, 1.0, COARSE)[:, None]
         while found < self.pairs and drawn < MOST_DRAWN:
             ends = problem.sample_ends(DRAWN_AT_ONCE, rng)
             line = (1 - t) * ends.z_start[:, None] + t * ends.z_goal[:, None]
             joints = self.chart.decode(line)
-            rows = ~self.free(joints.reshape(-1, joints.shape[-1])).reshape(joints.shape[:2]).all(
-                axis=1
-            )
+            untouched = self.free(joints.reshape(-1, joints.shape[-1]))
+            rows = ~untouched.reshape(joints.shape[:2]).all(axis=1)
             starts.append(ends.z_start[rows])
             goals.append(ends.z_goal[rows])
             drawn, found = drawn + len(ends), found + int(rows.sum())
@@ -192,11 +151,9 @@ class LearnedAblation:
         return ChartProblem(self.chart, curve_family(self.chart.dim, self.params, segments), domain)
 
     def _solved(self, problem: ChartProblem, ends: Ends) -> list[Geodesic]:
-        return (
-            geodesics_between(GradientSolver(starts=1), problem, ends.z_start, ends.z_goal)
-            if len(ends)
-            else []
-        )
+        if not len(ends):
+            return []
+        return geodesics_between(GradientSolver(starts=1), problem, ends.z_start, ends.z_goal)
 
     def _points(self, curves: list[Geodesic]) -> Float[np.ndarray, "P T N"]:
         t = np.linspace(0.0, 1.0, POINTS)
@@ -206,12 +163,11 @@ class LearnedAblation:
 def path_figures(
     chart: LearnedManifold, z: Float[np.ndarray, "P T N"], free: Free
 ) -> dict[str, float]:
-    """What decoded latent curves are like.
+    """What decoded latent curves are like; all nan where there is none.
 
-    length_rad: of the decoded joints, mean.  deviation_rad: largest norm of σ along a curve, mean
-    over the curves; it rises where no data is.  collision_free: share of the curves of which no
-    configuration touches anything.
-    collision_free_points: share of the configurations.  All nan where there is no curve.
+    length_rad: of the decoded joints, mean.  deviation_rad: largest norm of σ along a curve, mean;
+    it rises where no data is.  collision_free: share of curves that touch nothing.
+    collision_free_points: share of configurations.
     """
     if not len(z):
         return dict.fromkeys(

@@ -1,8 +1,5 @@
 """A timed path executed in simulation: position control under gravity, with an open cup of spheres
-at the tool.
-
-What the path promises in joint space is seen here as a person would see it: the cup stays level or
-spills.
+at the tool, which stays level or spills.
 """
 
 from collections.abc import Sequence
@@ -14,7 +11,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.robot.kinematics import SerialRobot
-from constraint_geodesics.scene.world import Physics, Solid, World, physics
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.world import Physics, physics
 
 GRAVITY = 9.81
 """[m/s²], along the negative z axis of the base frame."""
@@ -42,7 +40,7 @@ class CupSettings:
     The cup is a bottom and a ring of `walls` upright boxes, `wall_m` thick.  It sits where a
     gripper would be, its nearest point `gap_m` in front of the tool link's origin along the tool's
     z axis, and it touches the spheres only: the path was planned without it.  Spheres that have
-    left it touch everything.  More of them than fit fall beside.
+    left it touch everything.  More of them than fit fall out.
     seed: of the places the spheres are dropped from.  settle_s: the rest before the path, in which
     they settle, and behind it, before they are counted.
     """
@@ -66,33 +64,20 @@ class CupSettings:
         for name, least in _LEAST.items():
             if not getattr(self, name) >= least:
                 raise ExecutionError(f"{name} = {getattr(self, name)}: must be at least {least}")
-        for name in (
-            "sphere_radius_m",
-            "sphere_mass_kg",
-            "height_m",
-            "wall_m",
-            "mass_kg",
-            "step_s",
-        ):
+        for name in _POSITIVE:
             if not getattr(self, name) > 0:
                 raise ExecutionError(f"{name} = {getattr(self, name)}: must be positive")
         if not self.inner_radius_m >= 2.2 * self.sphere_radius_m:
+            width = f"{2.2 * self.sphere_radius_m:.4g}"
             raise ExecutionError(
-                f"inner_radius_m = {self.inner_radius_m}: must be at least "
-                f"{2.2 * self.sphere_radius_m:.4g}, "
-                "so that two spheres fit beside each other"
+                f"inner_radius_m = {self.inner_radius_m}: must be at least {width}, so that two "
+                "spheres fit next to each other"
             )
 
 
-_LEAST = {
-    "spheres": 1,
-    "walls": 6,
-    "gap_m": 0,
-    "friction": 0,
-    "restitution": 0,
-    "settle_s": 0,
-    "seed": 0,
-}
+_LEAST = dict.fromkeys(("gap_m", "friction", "restitution", "settle_s", "seed"), 0)
+_LEAST |= {"spheres": 1, "walls": 6}
+_POSITIVE = ("sphere_radius_m", "sphere_mass_kg", "height_m", "wall_m", "mass_kg", "step_s")
 
 
 @dataclass(frozen=True)
@@ -127,8 +112,7 @@ class Execution:
 
 
 def execute(
-    robot: SerialRobot,
-    workcell: Sequence[Solid],
+    scene: Scene,
     joints: Float[np.ndarray, "T D"],
     times: Float[np.ndarray, "T"],
     cup_axis_in_tool: Float[np.ndarray, "3"],
@@ -137,16 +121,16 @@ def execute(
     """Follow a timed path [rad, s] with a cup of spheres at the tool, and count the spheres that
     stay in it.
 
-    Between the rows the arm follows the cubics through them.  The motors hold it by position and
-    velocity with no more than the URDF's effort; where that is 0 they are not limited.
+    The arm follows the cubics through the waypoints.  The motors hold it by position and velocity
+    with no more than the URDF's effort; where that is 0 they are not limited.
     cup_axis_in_tool: direction of the cup's opening in the tool frame, of any length.
     The same arguments give the same result, in any process on one machine.
-    Raises ExecutionError on a wrong shape, fewer than two rows, a number that is not finite, times
-    that do not rise or an axis of no length.
+    Raises ExecutionError on a wrong shape, fewer than two waypoints, a number that is not finite,
+    times that do not rise or an axis of no length.
     """
     settings = settings or CupSettings()
-    q, t, axis = _checked(robot, joints, times, cup_axis_in_tool)
-    with World(robot, workcell) as world:
+    q, t, axis = _checked(scene.robot, joints, times, cup_axis_in_tool)
+    with scene.world() as world:
         simulation = _Simulation(physics(world), q[0], _cup_in_tool(axis, settings), settings)
         return _follow(simulation, q, t - t[0], settings)
 
@@ -154,34 +138,28 @@ def execute(
 def _follow(
     simulation: "_Simulation", q: np.ndarray, t: np.ndarray, settings: CupSettings
 ) -> Execution:
-    path = CubicHermiteSpline(t, q, _row_velocities(q, t))
-    rest, moving = (
-        int(np.ceil(seconds / settings.step_s)) for seconds in (settings.settle_s, t[-1])
-    )
+    path = CubicHermiteSpline(t, q, _velocities(q, t))
+    rest, moving = (int(np.ceil(s / settings.step_s)) for s in (settings.settle_s, t[-1]))
     for _ in range(rest):
         simulation.step(q[0], np.zeros_like(q[0]))
-    clock = np.minimum(settings.step_s * np.arange(moving + rest + 1), t[-1])
-    wanted = path(clock)
-    # the velocity that leads from one wanted position to the next one: 0 from the goal on
-    velocities = np.diff(wanted, axis=0) / settings.step_s
+    targets = path(np.minimum(settings.step_s * np.arange(moving + rest + 1), t[-1]))
+    # the velocity that leads from one target to the next one: 0 from the goal on
+    velocities = np.diff(targets, axis=0) / settings.step_s
     every = max(1, round(1.0 / (FRAME_RATE * settings.step_s)))
     frames, frame_times = [simulation.frame()], [0.0]
-    error = 0.0
-    tilt = simulation.tilt()
+    error, tilt = 0.0, simulation.tilt()
     for k in range(moving + rest):
-        simulation.step(wanted[k], velocities[k])
+        simulation.step(targets[k], velocities[k])
         if k < moving:
-            error = max(error, float(np.abs(simulation.joints() - wanted[k + 1]).max()))
+            error = max(error, float(np.abs(simulation.joints() - targets[k + 1]).max()))
             tilt = max(tilt, simulation.tilt())
         if (k + 1) % every == 0 or k + 1 == moving + rest:
             frames.append(simulation.frame())
-            simulation.free_outside(_inside(frames[-1][1], frames[-1][2], settings))
+            inside = _inside(*frames[-1][1:], settings)
+            simulation.free_outside(inside)
             frame_times.append((k + 1) * settings.step_s)
-    kept = int(_inside(frames[-1][1], frames[-1][2], settings).sum())
-    recorded = [np.array(column) for column in zip(*frames, strict=True)]
-    return Execution(
-        settings.spheres, kept, error, tilt, float(t[-1]), np.array(frame_times), *recorded
-    )
+    measured = (settings.spheres, int(inside.sum()), error, tilt, float(t[-1]))
+    return Execution(*measured, np.array(frame_times), *map(np.array, zip(*frames, strict=True)))
 
 
 class _Simulation:
@@ -193,39 +171,25 @@ class _Simulation:
         self, world: Physics, start: np.ndarray, cup_in_tool: _Pose, settings: CupSettings
     ) -> None:
         self._world = world
-        self._bullet, self._client = world.bullet, world.client
-        bullet, client = self._bullet, self._client
-        bullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=client)
+        self._bullet = bullet = world.bullet
+        bullet.setGravity(0.0, 0.0, -GRAVITY)
         bullet.setPhysicsEngineParameter(
-            fixedTimeStep=settings.step_s,
-            numSolverIterations=100,
-            deterministicOverlappingPairs=1,
-            physicsClientId=client,
+            fixedTimeStep=settings.step_s, numSolverIterations=100, deterministicOverlappingPairs=1
         )
         bullet.resetJointStatesMultiDof(
-            world.body,
-            world.joints,
-            start[:, None].tolist(),
-            targetVelocities=[[0.0]] * len(start),
-            physicsClientId=client,
+            world.body, world.joints, start[:, None].tolist(), targetVelocities=[[0.0]] * len(start)
         )
-        efforts = [
-            bullet.getJointInfo(world.body, joint, physicsClientId=client)[10]
-            for joint in world.joints
-        ]
+        efforts = [bullet.getJointInfo(world.body, joint)[10] for joint in world.joints]
         self._efforts = [effort if effort > 0 else UNLIMITED for effort in efforts]
-        state = bullet.getLinkState(
-            world.body, world.tool, computeForwardKinematics=1, physicsClientId=client
-        )
-        self._cup = self._add_cup(
-            cup_in_tool, bullet.multiplyTransforms(*state[4:6], *cup_in_tool), settings
-        )
+        state = bullet.getLinkState(world.body, world.tool, computeForwardKinematics=1)
+        in_base = bullet.multiplyTransforms(*state[4:6], *cup_in_tool)
+        self._cup = self._add_cup(cup_in_tool, in_base, settings)
         centres = _places(settings, np.random.default_rng(settings.seed))
         self._spheres = [self._add_sphere(centre, settings) for centre in centres]
         self._held = set(self._spheres)
 
     def step(self, position: np.ndarray, velocity: np.ndarray) -> None:
-        """Pull the joints towards a position [rad] and velocity [rad/s] for one step."""
+        """Drive the joints towards a position [rad] and velocity [rad/s] for one step."""
         self._bullet.setJointMotorControlArray(
             self._world.body,
             self._world.joints,
@@ -235,15 +199,12 @@ class _Simulation:
             forces=self._efforts,
             positionGains=[POSITION_GAIN] * len(self._efforts),
             velocityGains=[1.0] * len(self._efforts),
-            physicsClientId=self._client,
         )
-        self._bullet.stepSimulation(physicsClientId=self._client)
+        self._bullet.stepSimulation()
 
     def joints(self) -> Float[np.ndarray, "D"]:
         """Where the joints are [rad]."""
-        states = self._bullet.getJointStates(
-            self._world.body, self._world.joints, physicsClientId=self._client
-        )
+        states = self._bullet.getJointStates(self._world.body, self._world.joints)
         return np.array([state[0] for state in states])
 
     def tilt(self) -> float:
@@ -260,68 +221,50 @@ class _Simulation:
 
     def free_outside(self, inside: Bool[np.ndarray, "S"]) -> None:
         """Let the spheres that have left the cup touch the robot and the workcell from now on."""
-        for sphere in sorted(
-            self._held - {s for s, held in zip(self._spheres, inside, strict=True) if held}
-        ):
-            self._set_collisions(sphere, enabled=1)
-            self._held.remove(sphere)
+        for sphere, held in zip(self._spheres, inside, strict=True):
+            if sphere in self._held and not held:
+                self._set_collisions(sphere, enabled=1)
+                self._held.remove(sphere)
 
     def _set_collisions(self, body: int, enabled: int) -> None:
         """Between a body and the robot and workcell."""
         for other in (self._world.body, *self._world.fixed):
-            for link in range(-1, self._bullet.getNumJoints(other, physicsClientId=self._client)):
-                self._bullet.setCollisionFilterPair(
-                    body, other, -1, link, enabled, physicsClientId=self._client
-                )
+            for link in range(-1, self._bullet.getNumJoints(other)):
+                self._bullet.setCollisionFilterPair(body, other, -1, link, enabled)
 
     def _pose(self, body: int) -> _Pose:
-        position, quaternion = self._bullet.getBasePositionAndOrientation(
-            body, physicsClientId=self._client
-        )
+        position, quaternion = self._bullet.getBasePositionAndOrientation(body)
         return position, quaternion
 
     def _add_cup(self, cup_in_tool: _Pose, pose: _Pose, settings: CupSettings) -> int:
-        bullet, client, world = self._bullet, self._client, self._world
+        bullet, world = self._bullet, self._world
         halves, centres, turns = _cup_boxes(settings)
         shape = bullet.createCollisionShapeArray(
             shapeTypes=[bullet.GEOM_BOX] * len(halves),
             halfExtents=halves,
             collisionFramePositions=centres,
             collisionFrameOrientations=turns,
-            physicsClientId=client,
         )
-        cup = bullet.createMultiBody(settings.mass_kg, shape, -1, *pose, physicsClientId=client)
+        cup = bullet.createMultiBody(settings.mass_kg, shape, -1, *pose)
         self._set_collisions(cup, enabled=0)
         self._add_surface(cup, settings)
         # a constraint counts from the centre of mass of the parent link
-        local = bullet.getDynamicsInfo(world.body, world.tool, physicsClientId=client)[3:5]
+        local = bullet.getDynamicsInfo(world.body, world.tool)[3:5]
         place = bullet.multiplyTransforms(*bullet.invertTransform(*local), *cup_in_tool)
+        origin, ends = (0, 0, 0), (world.body, world.tool, cup, -1)
         grip = bullet.createConstraint(
-            world.body,
-            world.tool,
-            cup,
-            -1,
-            bullet.JOINT_FIXED,
-            (0, 0, 0),
-            place[0],
-            (0, 0, 0),
-            place[1],
-            physicsClientId=client,
+            *ends, bullet.JOINT_FIXED, origin, place[0], origin, place[1]
         )
-        bullet.changeConstraint(grip, maxForce=UNLIMITED, erp=0.8, physicsClientId=client)
+        bullet.changeConstraint(grip, maxForce=UNLIMITED, erp=0.8)
         return int(cup)
 
     def _add_sphere(self, centre_in_cup: np.ndarray, settings: CupSettings) -> int:
-        bullet, client = self._bullet, self._client
-        shape = bullet.createCollisionShape(
-            bullet.GEOM_SPHERE, radius=settings.sphere_radius_m, physicsClientId=client
-        )
+        bullet = self._bullet
+        shape = bullet.createCollisionShape(bullet.GEOM_SPHERE, radius=settings.sphere_radius_m)
         position, _ = bullet.multiplyTransforms(
             *self._pose(self._cup), centre_in_cup.tolist(), (0, 0, 0, 1)
         )
-        sphere = bullet.createMultiBody(
-            settings.sphere_mass_kg, shape, -1, position, physicsClientId=client
-        )
+        sphere = bullet.createMultiBody(settings.sphere_mass_kg, shape, -1, position)
         self._set_collisions(sphere, enabled=0)
         self._add_surface(sphere, settings)
         return int(sphere)
@@ -336,7 +279,6 @@ class _Simulation:
             spinningFriction=1e-4,
             linearDamping=0.0,
             angularDamping=0.0,
-            physicsClientId=self._client,
         )
 
 
@@ -345,29 +287,29 @@ def _checked(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     q, t, direction = (np.asarray(values, dtype=np.float64) for values in (joints, times, axis))
     if q.ndim != 2 or len(q) < 2 or q.shape[1] != robot.dof:
-        raise ExecutionError(
-            f"joints has shape {q.shape}: must be (T, {robot.dof}) with at least two rows"
-        )
+        wanted = f"(T, {robot.dof}) with at least two waypoints"
+        raise ExecutionError(f"joints has shape {q.shape}: must be {wanted}")
     if t.shape != q.shape[:1]:
-        raise ExecutionError(f"times has shape {t.shape}: must be ({len(q)},), one for each row")
+        raise ExecutionError(
+            f"times has shape {t.shape}: must be ({len(q)},), one for each waypoint"
+        )
     if direction.shape != (3,):
         raise ExecutionError(f"cup_axis_in_tool has shape {direction.shape}: must be (3,)")
     for name, values in (("joints", q), ("times", t), ("cup_axis_in_tool", direction)):
         if not np.isfinite(values).all():
             raise ExecutionError(f"{name} = {values[~np.isfinite(values)][0]}: must be finite")
     if not (np.diff(t) > 0).all():
-        row = int(np.diff(t).argmin())
-        raise ExecutionError(
-            f"times[{row + 1}] - times[{row}] = {t[row + 1] - t[row]}: must be positive"
-        )
+        k = int(np.diff(t).argmin())
+        rise = t[k + 1] - t[k]
+        raise ExecutionError(f"times[{k + 1}] - times[{k}] = {rise}: must be positive")
     length = float(np.linalg.norm(direction))
     if not length > 0:
         raise ExecutionError(f"cup_axis_in_tool = {direction.tolist()}: must not be zero")
     return q, t, direction / length
 
 
-def _row_velocities(q: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Velocities at the rows of the parabolas through each row and its neighbours, and rest at both
+def _velocities(q: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Velocities at the waypoints, of the parabola through each and its neighbours; rest at both
     ends.
     """
     dt = np.diff(t)[:, None]
@@ -391,9 +333,7 @@ def _cup_in_tool(axis: np.ndarray, settings: CupSettings) -> _Pose:
     return position, tuple(Rotation.from_matrix(rotation).as_quat().tolist())
 
 
-def _cup_boxes(
-    settings: CupSettings,
-) -> tuple[list[list[float]], list[list[float]], list[list[float]]]:
+def _cup_boxes(settings: CupSettings) -> tuple[list[list[float]], ...]:
     """Half edges, centres and quaternions of the bottom and the walls in the cup's frame."""
     half_wall = 0.5 * settings.wall_m
     outer, middle = settings.inner_radius_m + settings.wall_m, settings.inner_radius_m + half_wall

@@ -1,14 +1,13 @@
-"""What a planned path is worth to a robot that carries an open cup: executed in simulation, beside
-a straight line.
+"""What a planned path is worth to a robot that carries an open cup, executed in simulation.
 
-Each query is executed twice: along the planner's path, and along the straight joint line between
-the same ends, both near time-optimal within the same limits.  Only queries are taken whose line
-tips the cup.  Tilt is not all: a fast swing can hold the spheres in a cup that hangs upside down,
-and throw one over the rim of a cup that stays level.
+Each query is executed along the planner's path and along the straight joint line, both near
+time-optimal within the same limits.  Only queries are taken whose line tips the cup.  Tilt is not
+all: a fast swing can hold the spheres upside down, or throw one out of a level cup.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,6 +19,7 @@ from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.learning.dataset import Queries, draw_queries
 from constraint_geodesics.learning.lift import densify
+from constraint_geodesics.params import ExecutionParams
 from constraint_geodesics.pipeline.progress import progress
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.cup import CupSettings, Execution, execute
@@ -36,40 +36,56 @@ few tip the cup.
 """
 
 
+OF_EXECUTION = {"kept": "Int64", "spheres": "Int64"} | dict.fromkeys(
+    ("kept_share", "largest_tilt_rad", "largest_tracking_error_rad", "duration_s"), "float64"
+)
+COLUMNS = {
+    "query": "int64",
+    "kind": "str",
+    "status": "str",
+    **OF_EXECUTION,
+    "length_rad": "float64",
+    "collision": "boolean",
+}
+"""Of the table, with the type of each; empty where there was no path."""
+
+
 class ExecutionCheckError(ValueError):
-    """An experiment that can't be meant; the message names the entry, its value and what is
-    allowed.
-    """
+    """An experiment without meaning; names the entry, its value and what is allowed."""
 
 
-class Solution(Protocol):
-    """What is asked of a planner's answer."""
+class _TimedPath(Protocol):
+    """What is asked of a planner's answer: solved or why not, waypoints [rad], their times [s]."""
 
     @property
-    def status(self) -> str:
-        """Either solved, or why not."""
-        ...
-
+    def status(self) -> str: ...
     @property
-    def joints(self) -> Float[np.ndarray, "T D"]:
-        """Rows [rad]."""
-        ...
-
+    def joints(self) -> Float[np.ndarray, "T D"]: ...
     @property
-    def times(self) -> Float[np.ndarray, "T"]:
-        """Of the rows [s]."""
-        ...
+    def times(self) -> Float[np.ndarray, "T"]: ...
 
 
-Plan = Callable[[Float[np.ndarray, "D"], Float[np.ndarray, "D"]], Solution]
+Plan = Callable[[Float[np.ndarray, "D"], Float[np.ndarray, "D"]], _TimedPath]
 """Plans from a start to a goal [rad] under the constraint that is looked at."""
 
 
 @dataclass(frozen=True)
-class TippingQueries:
-    """Queries whose straight joint line tips the cup, the largest tilt of each, and how many pairs
-    were drawn.
+class Carrying:
+    """A robot that carries an open cup under a constraint.
+
+    acceleration_rad_s2: limit of every joint on straight lines; velocity limits are the robot's.
     """
+
+    name: str
+    scene: Scene
+    manifold: ConstraintManifold
+    acceleration_rad_s2: float
+    cup: CupSettings
+
+
+@dataclass(frozen=True)
+class TippingQueries:
+    """Queries whose straight joint line tips the cup, their largest tilts, and pairs drawn."""
 
     queries: Queries
     tilt_rad: Float[np.ndarray, "n"]
@@ -79,9 +95,7 @@ class TippingQueries:
 
 @dataclass(frozen=True)
 class Executed:
-    """One query executed along one kind of path; without an execution, `status` says why there was
-    no path.
-    """
+    """One query executed along one kind of path; without a path, `status` says why."""
 
     query: int
     kind: str
@@ -94,35 +108,10 @@ class Executed:
     def row(self) -> dict[str, Any]:
         """As columns of a table."""
         about = {"query": self.query, "kind": self.kind, "status": self.status}
-        found = self.execution
-        if found is None:
+        if self.execution is None:
             return about
-        return about | {
-            "kept": found.kept,
-            "spheres": found.spheres,
-            "kept_share": found.kept_share,
-            "largest_tilt_rad": found.largest_tilt_rad,
-            "largest_tracking_error_rad": found.largest_tracking_error_rad,
-            "duration_s": found.duration_s,
-            "length_rad": self.length_rad,
-            "collision": self.collision,
-        }
-
-
-COLUMNS = {
-    "query": "int64",
-    "kind": "str",
-    "status": "str",
-    "kept": "Int64",
-    "spheres": "Int64",
-    "kept_share": "float64",
-    "largest_tilt_rad": "float64",
-    "largest_tracking_error_rad": "float64",
-    "duration_s": "float64",
-    "length_rad": "float64",
-    "collision": "boolean",
-}
-"""Of the table, with the type of each; empty where there was no path."""
+        found = {name: getattr(self.execution, name) for name in OF_EXECUTION}
+        return about | found | {"length_rad": self.length_rad, "collision": self.collision}
 
 
 def cup_axis(manifold: ConstraintManifold) -> Float[np.ndarray, "3"]:
@@ -140,9 +129,7 @@ def cup_axis(manifold: ConstraintManifold) -> Float[np.ndarray, "3"]:
 
 
 def line_tilts(manifold: ConstraintManifold, queries: Queries) -> Float[np.ndarray, "n"]:
-    """Largest tilt [rad] of the cup's axis to the vertical on the straight joint line of each
-    query.
-    """
+    """Largest tilt [rad] of the cup's axis on the straight joint line of each query."""
     t = np.linspace(0.0, 1.0, LINE_POINTS)[:, None]
     lines = (1.0 - t) * queries.starts[:, None] + t * queries.goals[:, None]
     vertical = manifold.robot.forward(lines)[1][..., 2, :] @ cup_axis(manifold)
@@ -150,70 +137,53 @@ def line_tilts(manifold: ConstraintManifold, queries: Queries) -> Float[np.ndarr
 
 
 def tipping_queries(
-    scene: Scene,
-    manifold: ConstraintManifold,
-    name: str,
-    count: int,
-    least_tilt_rad: float,
-    seed: int,
+    scene: Scene, manifold: ConstraintManifold, name: str, settings: ExecutionParams
 ) -> TippingQueries:
-    """The first `count` pairs of `draw_queries` whose straight joint line tilts the cup by
-    `least_tilt_rad` or more.
+    """The first pairs of `draw_queries` whose straight joint line tilts the cup far enough.
 
     Raises ExecutionCheckError if least_tilt_rad is not in (0, π), or too few of the pairs drawn
     tilt the cup so far.
     """
+    count, least_tilt_rad = settings.queries, settings.least_tilt_rad
     if not 0.0 < least_tilt_rad < np.pi:
         raise ExecutionCheckError(f"least_tilt_rad = {least_tilt_rad}: must lie between 0 and π")
     drawn = DRAWN_FIRST * count
     while drawn <= DRAWN_MOST * count:
-        pairs = draw_queries(scene, manifold, name, drawn, seed)
+        pairs = draw_queries(scene, manifold, name, drawn, settings.seed)
         tilts = line_tilts(manifold, pairs)
         kept = np.flatnonzero(tilts >= least_tilt_rad)[:count]
         if len(kept) == count:
-            return TippingQueries(
-                Queries(pairs.starts[kept], pairs.goals[kept]), tilts[kept], int(kept[-1]) + 1
-            )
+            queries = Queries(pairs.starts[kept], pairs.goals[kept])
+            return TippingQueries(queries, tilts[kept], int(kept[-1]) + 1)
         drawn *= 2
     raise ExecutionCheckError(
         f"least_tilt_rad = {least_tilt_rad}: {len(kept)} of {len(pairs)} straight lines under "
-        f"{name!r} tilt the cup "
-        f"so far, {count} are needed"
+        f"{name!r} tilt the cup so far, {count} are needed"
     )
 
 
 def execute_queries(
-    plan: Plan,
-    scene: Scene,
-    manifold: ConstraintManifold,
-    name: str,
-    queries: Queries,
-    acceleration_rad_s2: float,
-    cup: CupSettings,
+    plan: Plan, carrying: Carrying, queries: Queries
 ) -> tuple[pd.DataFrame, list[Executed]]:
     """Execute every query along its planned path and along its straight joint line.
 
-    acceleration_rad_s2: limit of every joint on the straight lines; velocity limits are the
-    robot's.  The planned path comes with times of its own.
     Returns one row a query and kind with `COLUMNS`, and the executions in the same order.
     Raises ExecutionCheckError if the constraint does not hold roll and pitch.
     """
-    axis = cup_axis(manifold)
-    limits = (scene.robot.velocity, np.full(scene.robot.dof, acceleration_rad_s2))
-    executed: list[Executed] = []
-    with scene.world() as world, progress(f"executions {name}", 2 * len(queries)) as advance:
-        for query in range(len(queries)):
-            for kind, status, joints, times in _paths(
-                plan, queries.starts[query], queries.goals[query], limits
-            ):
+    scene, axis = carrying.scene, cup_axis(carrying.manifold)
+    limits = scene.robot.velocity, np.full(scene.robot.dof, carrying.acceleration_rad_s2)
+    label, executed = f"executions {carrying.name}", list[Executed]()
+    with scene.world() as world, progress(label, 2 * len(queries)) as advance:
+        for query, ends in enumerate(zip(queries.starts, queries.goals, strict=True)):
+            for kind, status, joints, times in _paths(plan, *ends, limits):
                 if len(joints) < 2:
                     executed.append(Executed(query, kind, status))
                 else:
-                    found = execute(scene.robot, scene.workcell, joints, times, axis, cup)
+                    cup = carrying.cup
+                    found = execute(scene, joints, times, axis, cup)
                     hit = world.first_collision(joints) is not None
-                    executed.append(
-                        Executed(query, kind, EXECUTED, polyline_length(joints), hit, found)
-                    )
+                    length = polyline_length(joints)
+                    executed.append(Executed(query, kind, EXECUTED, length, hit, found))
                 advance()
     table = pd.DataFrame([one.row() for one in executed], columns=list(COLUMNS)).astype(COLUMNS)
     return table, executed
@@ -233,9 +203,7 @@ def _paths(
 
 
 def execution_figures(table: pd.DataFrame, found: TippingQueries) -> dict[str, Any]:
-    """Number of queries and of pairs drawn for them, and of each kind how much of the cup's content
-    stayed in it.
-    """
+    """Queries and pairs drawn for them, and how much stayed in the cup on each kind of path."""
     figures: dict[str, Any] = {
         "queries": len(found.queries),
         "drawn": found.drawn,
@@ -255,3 +223,15 @@ def execution_figures(table: pd.DataFrame, found: TippingQueries) -> dict[str, A
             "duration_mean_s": float(done["duration_s"].mean()),
         }
     return figures
+
+
+def save_execution(file: Path, execution: Execution) -> None:
+    """What became of a path, for `load_execution`."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(file, **asdict(execution))
+
+
+def load_execution(file: Path) -> Execution:
+    """An execution that was kept in a file."""
+    with np.load(file) as kept:
+        return Execution(**{n: v if v.ndim else v.item() for n, v in kept.items()})

@@ -1,35 +1,54 @@
-"""One seed of policy search, from training to measured paths: the task that the seeds of a stage
-run in parallel.
+"""One seed of policy search, from training to measured paths, as a task to run in parallel.
+
+Under constraints on a learned manifold; and on manifolds with known distances (Fig. 3), which check
+the search against exact answers.
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import pandas as pd
+import torch
 from jaxtyping import Bool, Float
 
-from constraint_geodesics.benchmark.judge import Free, PathMeasures, judge_limits, measure_path
+from constraint_geodesics.benchmark.judge import Free, judge_limits, measure_path
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.pose import ConstraintManifold
+from constraint_geodesics.geodesics.episodes import begin, episode_settings
 from constraint_geodesics.geodesics.policy_search import (
+    PolicySolver,
     TrainedPolicy,
+    follow,
     save_policy,
-    search,
-    search_at_random,
     train_policy,
 )
-from constraint_geodesics.geodesics.problem import Ends, Geodesic, LearnedProblem, ProblemSet
-from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.geodesics.problem import (
+    ChartBox,
+    ChartProblem,
+    Ends,
+    Geodesic,
+    LearnedProblem,
+    ProblemSet,
+    repeated,
+)
+from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
+from constraint_geodesics.geometry.curves import CurveFamily, Curves, PinnedPolynomial, PinnedSpline
+from constraint_geodesics.geometry.manifold import MeasuredManifold
 from constraint_geodesics.learning.dataset import Queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.submanifold import GraphSubmanifold, Submanifold, component_of
+from constraint_geodesics.learning.submanifold import (
+    GraphSubmanifold,
+    Submanifold,
+    Surface,
+    component_of,
+)
 from constraint_geodesics.params import GeodesicParams, JudgeParams, Params, SubmanifoldParams
-from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.scene.scene import Scene
 
 PLANNER, RANDOM, STRAIGHT = "learned_geodesic", "random_curves", "straight_latent_line"
@@ -45,15 +64,13 @@ class SeedLog(Protocol):
 
 @dataclass(frozen=True)
 class SeedTask:
-    """Everything one seed needs; picklable, so that it may run in another process or on another
-    machine.
-    """
+    """Everything one seed needs; picklable, to run elsewhere."""
 
     problem: LearnedProblem
     scene: Scene
     params: GeodesicParams
     judge: JudgeParams
-    chart_name: str
+    manifold_name: str
     queries: Queries
     connected: Bool[np.ndarray, "Q"]
     connection_s: Float[np.ndarray, "Q"]
@@ -69,9 +86,7 @@ class SeedTask:
 
 @dataclass(frozen=True)
 class SeedResult:
-    """A trained policy, rows and joint paths (each query's with the policy, then without), and the
-    coefficients that the policy found (Q, p).
-    """
+    """A trained policy, rows and joint paths (with the policy, then without), and its curves."""
 
     seed: int
     policy: TrainedPolicy
@@ -111,28 +126,25 @@ def train_seed(task: TrainingTask) -> TrainedPolicy:
 
 
 def run_seed(task: SeedTask) -> SeedResult:
-    """Train one policy, search every query's geodesic with it and, as a control, without it;
-    measure what was found.
-    """
+    """Train one policy; search every query with it and, as a control, without it; measure."""
     with task.run as run:
         policy = task.policy or train_policy(
             task.problem, task.params, task.seed, task.scratch, run.log
         )
     rows, paths, coefficients = [], [], []
+    problem, solver = task.problem, PolicySolver(policy.actor, task.params, task.seed)
+    searches = ((PLANNER, solver.search), (RANDOM, solver.search_at_random))
     with Certifier(task.scene, judge_limits(task.judge)) as certifier:
         for query in range(len(task.queries)):
-            ends = query_ends(task.problem, task.queries, query)
-            accept = exact_check(task, ends, certifier)
-            for planner in (PLANNER, RANDOM):
-                if not task.connected[query]:
-                    found = Geodesic.nothing(
-                        "not_connected", task.problem.curve, ends.z_start[0], ends.z_goal[0]
-                    )
-                elif planner == PLANNER:
-                    found = search(task.problem, policy.actor, task.params, ends, task.seed, accept)
+            ends = query_ends(problem, task.queries, query)
+            accept = partial(_accepted, task, ends, certifier)
+            for planner, search in searches:
+                if task.connected[query]:
+                    found = search(problem, ends, accept)
                 else:
-                    found = search_at_random(task.problem, task.params, ends, task.seed, accept)
-                row, path = measured(task, found, ends, certifier)
+                    pair = ends.z_start[0], ends.z_goal[0]
+                    found = Geodesic.nothing("not_connected", problem.curve, *pair)
+                row, path = _measured(task, found, ends, certifier)
                 row["time_s"] += task.connection_s[query]
                 rows.append({"planner": planner, "query": query, "seed": task.seed, **row})
                 paths.append(path)
@@ -142,28 +154,16 @@ def run_seed(task: SeedTask) -> SeedResult:
 
 
 def straight_rows(task: SeedTask) -> tuple[list[dict[str, Any]], list[Float[np.ndarray, "T D"]]]:
-    """The same rows and paths for the straight latent line, no policy: what policy search has to
-    beat.
-    """
+    """The same rows and paths for the straight latent line: what a search has to beat."""
     phi = np.zeros(task.problem.curve.coefficients)
     rows, paths = [], []
     with Certifier(task.scene, judge_limits(task.judge)) as certifier:
         for query in range(len(task.queries)):
             ends = query_ends(task.problem, task.queries, query)
             length = float(task.problem.evaluate(phi[None], ends).length[0])
-            found = Geodesic(
-                "converged",
-                task.problem.curve,
-                phi,
-                ends.z_start[0],
-                ends.z_goal[0],
-                length,
-                length,
-                0,
-                1,
-                np.nan,
-            )
-            row, path = measured(task, found, ends, certifier)
+            line = phi, ends.z_start[0], ends.z_goal[0], length, length
+            found = Geodesic("converged", task.problem.curve, *line, evaluations=1, time_s=np.nan)
+            row, path = _measured(task, found, ends, certifier)
             rows.append({"planner": STRAIGHT, "query": query, "seed": 0, **row})
             paths.append(path)
     return rows, paths
@@ -176,21 +176,18 @@ def connected_queries(
     free: Free,
     params: SubmanifoldParams,
 ) -> tuple[Bool[np.ndarray, "Q"], Float[np.ndarray, "Q"]]:
-    """Which queries have both ends in one component, as far as the sampled graph knows, and the
-    time each took [s].
+    """Which queries have both ends in one component of the sampled graph, and the time it took [s].
 
     A drawn latent plane says nothing about the exact set; an end that no edge reaches counts as
-    connected.
+    joined.
     """
     if not isinstance(submanifold, GraphSubmanifold):
         return np.ones(len(queries), dtype=bool), np.zeros(len(queries))
+    surface = Surface(problem.chart, problem.manifold, free)
     connected, seconds = [], []
     for pair in zip(queries.starts, queries.goals, strict=True):
         began = time.perf_counter()
-        a, b = (
-            component_of(submanifold, problem.chart, problem.manifold, q, free, params)
-            for q in pair
-        )
+        a, b = (component_of(submanifold, surface, q, params) for q in pair)
         connected.append(a == b or min(a, b) < 0)
         seconds.append(time.perf_counter() - began)
     return np.array(connected), np.array(seconds)
@@ -217,16 +214,9 @@ def shared_problem(
     joints: Mapping[str, Float[np.ndarray, "n D"]],
     name: str,
 ) -> ProblemSet:
-    """One problem of all the given constraints on the learned manifold `name`: what a single policy
-    is trained on.
-
-    manifolds, joints: of each constraint, under the same names.
-    """
+    """One problem of all constraints, by name, on the learned manifold `name`: one policy's."""
     return ProblemSet(
-        tuple(
-            geodesic_problem(params, chart, manifolds[each], joints[each], name)
-            for each in manifolds
-        )
+        [geodesic_problem(params, chart, manifolds[key], joints[key], name) for key in manifolds]
     )
 
 
@@ -235,70 +225,48 @@ def query_ends(problem: LearnedProblem, queries: Queries, query: int) -> Ends:
     return problem.ends(queries.starts[query][None], queries.goals[query][None])
 
 
-def exact_check(task: SeedTask, ends: Ends, certifier: Certifier) -> Callable[[np.ndarray], bool]:
-    """The judge itself as the last check of a candidate; the paper's latent curves are taken as
-    they come.
-    """
-
-    def accept(phi: np.ndarray) -> bool:
-        if not task.problem.retract:
-            return True
-        path = task.problem.path(phi, ends, task.judge.row_spacing_rad)
-        return certifier.certify(
-            path, task.problem.manifold.constraint, ends.q_start[0], ends.q_goal[0]
-        ).valid
-
-    return accept
+def _accepted(task: SeedTask, ends: Ends, certifier: Certifier, phi: np.ndarray) -> bool:
+    """The judge as the last check of a candidate; the paper's latent curves are taken as is."""
+    if not task.problem.retract:
+        return True
+    path = task.problem.path(phi, ends, task.judge.row_spacing_rad)
+    constraint = task.problem.manifold.constraint
+    return certifier.certify(path, constraint, ends.q_start[0], ends.q_goal[0]).valid
 
 
-def judged(task: SeedTask, path: np.ndarray, ends: Ends, certifier: Certifier) -> PathMeasures:
-    """The path's measures, with the latent length on the manifold it was searched on."""
-    charts = {task.chart_name: task.problem.chart}
-    return measure_path(
-        path,
-        ends.q_start[0],
-        ends.q_goal[0],
-        task.problem.manifold,
-        charts,
-        certifier,
-        task.judge.spacing_rad,
-    )
-
-
-def measured(
+def _measured(
     task: SeedTask, found: Geodesic, ends: Ends, certifier: Certifier
 ) -> tuple[dict[str, Any], Float[np.ndarray, "T D"]]:
     """A result as a row of the table, and its joint path (empty where nothing was found)."""
-    empty = np.zeros((0, ends.q_start.shape[1]))
-    path = task.problem.path(found.phi, ends, task.judge.row_spacing_rad) if found.found else empty
+    problem, path = task.problem, np.zeros((0, ends.q_start.shape[1]))
+    if found.found:
+        path = problem.path(found.phi, ends, task.judge.row_spacing_rad)
+    measures = measure_path(
+        path,
+        ends.q_start[0],
+        ends.q_goal[0],
+        problem.manifold,
+        {task.manifold_name: problem.chart},
+        certifier,
+        task.judge.spacing_rad,
+    )
     status = "solved" if found.found else found.status
     row = {"status": status, "time_s": found.time_s, "evaluations": found.evaluations}
-    return row | judged(task, path, ends, certifier).row(), path
+    return row | measures.row(), path
 
 
 def save_seeds(
-    results: Sequence[SeedResult],
-    queries: Queries,
-    layout: Layout,
-    stage: str,
-    manifold: str,
-    constraint: str,
+    results: Sequence[SeedResult], queries: Queries, folder: Path, learning: Path
 ) -> None:
-    """Weights and curves under data/, learning curves under reports/."""
-    folder, item = layout.geodesics(manifold, constraint), f"{manifold}-{constraint}"
+    """Weights and curves into a folder, the learning curves into a table."""
     folder.mkdir(parents=True, exist_ok=True)
     for result in results:
         save_policy(result.policy, folder, result.seed)
+    phi, seeds = np.array([r.phi for r in results]), np.array([r.seed for r in results])
     with (folder / "curves.npz").open("wb") as file:
-        np.savez_compressed(
-            file,
-            phi=np.array([result.phi for result in results]),
-            seeds=np.array([r.seed for r in results]),
-            starts=queries.starts,
-            goals=queries.goals,
-        )
-    learning = [{"seed": result.seed, **row} for result in results for row in result.policy.curve]
-    write_table(learning, layout.report(stage, f"{item}-learning", "csv"))
+        np.savez_compressed(file, phi=phi, seeds=seeds, starts=queries.starts, goals=queries.goals)
+    rows = [{"seed": result.seed, **row} for result in results for row in result.policy.curve]
+    write_table(rows, learning)
 
 
 def write_table(rows: Sequence[Mapping[str, Any]], file: Path, **columns: str) -> None:
@@ -312,6 +280,125 @@ def geodesic_figures(
 ) -> dict[str, float]:
     """Means and spreads over the seeds."""
     per_seed = pd.DataFrame([result.figures() for result in results])
-    figures = {f"{name}_mean": float(per_seed[name].mean()) for name in per_seed}
-    figures |= {f"{name}_std": float(per_seed[name].std(ddof=0)) for name in per_seed}
+    means, spreads = per_seed.mean().to_dict(), per_seed.std(ddof=0).to_dict()
+    figures = {f"{name}_mean": float(value) for name, value in means.items()}
+    figures |= {f"{name}_std": float(value) for name, value in spreads.items()}
     return figures | {"queries_connected": float(connected.mean()), "seeds": float(len(results))}
+
+
+PAIRS = 100
+PAIRS_SEED = 11
+DRAWN_ROLLOUTS = 12
+DRAWN = 65
+"""Points of a drawn curve."""
+
+
+@dataclass(frozen=True)
+class Member:
+    """A manifold with a known answer, and the box of its chart that ends are drawn from."""
+
+    manifold: MeasuredManifold
+    box: ChartBox
+    domain: str
+
+
+MANIFOLDS = {
+    "plane": Member(Plane(), ChartBox((-1.5, -1.5), (1.5, 1.5)), "|x|, |y| ≤ 1.5"),
+    "sphere": Member(
+        Sphere(), ChartBox((-1.2, -1.4), (1.2, 1.4)), "|elevation| ≤ 1.2 rad, |azimuth| ≤ 1.4 rad"
+    ),
+    "torus": Member(
+        Torus(),
+        ChartBox((-1.2, -1.2), (1.2, 1.2)),
+        "R = 2, r = 1, |ring angle| ≤ 1.2 rad, |tube angle| ≤ 1.2 rad",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class AnalyticTask:
+    """One seed on one analytic manifold, with one curve family."""
+
+    name: str
+    curve: CurveFamily
+    params: GeodesicParams
+    seed: int
+    scratch: Path
+    run: AbstractContextManager[SeedLog]
+
+
+@dataclass(frozen=True)
+class AnalyticResult:
+    """Length over exact distance for unseen pairs, and curves to draw.
+
+    first_ratio: of a random curve.  ratio: of the shortest one that the policy's mean meets from
+    there.  sampled: curves met while the policy searched the first pair.  learned: the best one.
+    """
+
+    seed: int
+    policy: TrainedPolicy
+    first_ratio: Float[np.ndarray, "P"]
+    ratio: Float[np.ndarray, "P"]
+    sampled: Float[np.ndarray, "n T 2"]
+    learned: Float[np.ndarray, "T 2"]
+
+    def figures(self) -> dict[str, float]:
+        """What is compared between seeds."""
+        return {
+            "mean_ratio": float(self.ratio.mean()),
+            "p95_ratio": float(np.quantile(self.ratio, 0.95)),
+            "first_mean_ratio": float(self.first_ratio.mean()),
+        }
+
+
+def curve_family(dim: int, params: GeodesicParams, segments: int = 0) -> CurveFamily:
+    """The polynomials that params.yaml names, or C² splines of some segments."""
+    return PinnedSpline(dim, segments) if segments else PinnedPolynomial(dim, params.degree)
+
+
+def analytic_problem(name: str, curve: CurveFamily) -> ChartProblem:
+    """Geodesics on an analytic manifold by name."""
+    member = MANIFOLDS[name]
+    return ChartProblem(member.manifold, curve, member.box)
+
+
+def unseen_pairs(name: str, problem: ChartProblem) -> tuple[Ends, Float[np.ndarray, "P"]]:
+    """The pairs that every solver is compared on, and their exact distances."""
+    ends = problem.sample_ends(PAIRS, np.random.default_rng(PAIRS_SEED))
+    start, goal = torch.from_numpy(ends.z_start), torch.from_numpy(ends.z_goal)
+    return ends, MANIFOLDS[name].manifold.distance(start, goal).numpy()
+
+
+def run_analytic(task: AnalyticTask) -> AnalyticResult:
+    """Train a policy, then follow its mean on unseen pairs from curves that are anything but
+    straight.
+
+    The straight line is no start here: in the plane it is the answer.
+    """
+    problem = analytic_problem(task.name, task.curve)
+    with task.run as run:
+        policy = train_policy(problem, task.params, task.seed, task.scratch, run.log)
+    ends, exact = unseen_pairs(task.name, problem)
+    rng = np.random.default_rng(PAIRS_SEED + 1)
+    settings, size = episode_settings(task.params), problem.curve.coefficients
+    first = begin(problem, ends, problem.sample_curves(ends, rng))
+    still = np.zeros((settings.steps, PAIRS, size))
+    visited = follow(problem, policy.actor, settings, first, still)
+    lengths = np.array([states.length for states in visited])
+    best = visited[int(lengths[:, 0].argmin())].phi[:1]
+    pair = repeated(ends, DRAWN_ROLLOUTS)
+    first = begin(problem, pair, problem.sample_curves(pair, rng))
+    noise = rng.normal(size=(settings.steps, DRAWN_ROLLOUTS, size))
+    met = follow(problem, policy.actor, settings, first, noise)
+    sampled = np.concatenate([_points(problem, states.phi, ends) for states in met])
+    ratios = lengths[0] / exact, lengths.min(axis=0) / exact
+    return AnalyticResult(task.seed, policy, *ratios, sampled, _points(problem, best, ends)[0])
+
+
+def _points(
+    problem: ChartProblem, phi: Float[np.ndarray, "n p"], ends: Ends
+) -> Float[np.ndarray, "n T 2"]:
+    """Points of curves between the first pair of ends."""
+    t = torch.linspace(0.0, 1.0, DRAWN, dtype=torch.float64)
+    arrays = (torch.from_numpy(x) for x in (phi, ends.z_start[:1], ends.z_goal[:1]))
+    return Curves(problem.curve, *arrays).at(t)[0].numpy()

@@ -1,8 +1,7 @@
-"""What the geometry core costs and how exact it is: rates against a naive implementation, errors,
-solver times.
+"""What the geometry core costs and how exact it is: rates, errors, solver times.
 
-Everything is timed on one thread.  Rates are medians of several rounds in which the compared sides
-run in turn; a solver's times are those of one warm pass.
+Everything is timed on one thread.  Rates are medians of rounds in which the compared sides run in
+turn; a solver's times are those of one warm pass.
 """
 
 import time
@@ -31,10 +30,9 @@ from constraint_geodesics.geodesics.problem import (
     LearnedProblem,
 )
 from constraint_geodesics.geodesics.solver import geodesics_between
-from constraint_geodesics.geometry.curves import CurveFamily
+from constraint_geodesics.geometry.curves import Curves
 from constraint_geodesics.geometry.length import (
     Collocation,
-    LengthRule,
     Quadrature,
     chord_length,
     curve_length,
@@ -42,11 +40,11 @@ from constraint_geodesics.geometry.length import (
 )
 from constraint_geodesics.geometry.manifold import EmbeddedManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.lift import correct_and_retract
+from constraint_geodesics.learning.lift import corrected, retracted
 from constraint_geodesics.params import GeodesicParams, GeometryParams
 from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.pipeline.progress import progress
-from constraint_geodesics.studies.analytic_search import (
+from constraint_geodesics.studies.geodesic_search import (
     MANIFOLDS,
     PAIRS,
     analytic_problem,
@@ -64,7 +62,7 @@ SINGLE = 10
 NAIVE_CURVES = 40
 """Curves a round of the naive implementation measures, one at a time."""
 RULES = (4, 6, 8, 12, 16, 24, 32, 48)
-"""Points a curve, beside its start, of the rules whose error and cost are compared."""
+"""Points a curve, apart from its start, of the rules whose error and cost are compared."""
 GRID = (60, 60)
 SEED = 5
 LEARNED_ROLLOUTS = 10
@@ -104,24 +102,18 @@ class GeometryBenchmark:
             for name, measure in parts.items():
                 found[name] = measure()
                 advance()
-        figures = {name: value for name, value in found.items() if "/" not in name} | {
-            "machine": machine()
-        }
-        return figures | {
-            "solvers": {name.split("/")[1]: value for name, value in found.items() if "/" in name}
-        }
+        solvers = {name.split("/")[1]: found.pop(name) for name in list(found) if "/" in name}
+        return found | {"machine": machine(), "solvers": solvers}
 
     def curve_length(self) -> dict[str, Any]:
-        """Lengths a second at the default accuracy, the ratio to the naive implementation, and the
-        error.
-        """
+        """Lengths a second at the default accuracy, ratio to the naive way, and the error."""
         curves, _ = random_curves(self.plain, self.settings.batch)
         with torch.no_grad():
             ours = {
-                batch: partial(default_length, self.manifold, curves.first(batch))
+                batch: partial(curve_length, self.manifold, curves[:batch])
                 for batch in self._batches()
             }
-            few = curves.first(NAIVE_CURVES)
+            few = curves[:NAIVE_CURVES]
             usual = {
                 "naive": partial(naive_length, self.manifold, few),
                 "naive_batched": partial(naive_length_batched, self.manifold, few),
@@ -134,16 +126,14 @@ class GeometryBenchmark:
         return rates | {"error": self.length_errors(), "naive_error": _spread(naive_error)}
 
     def curve_length_retracted(self) -> dict[str, Any]:
-        """The same for curves that are decoded, corrected at their ends and retracted onto the
-        constraint.
-        """
+        """The same for curves decoded, corrected at their ends and retracted."""
         curves, ends = random_curves(self.retracted, self.settings.batch)
         phi = curves.phi.numpy()
         ours = {
             batch: partial(self.retracted.evaluate, phi[:batch], ends[np.arange(batch)])
             for batch in self._batches()
         }
-        naive = partial(naive_retracted_length, self.retracted, curves.first(NAIVE_CURVES), ends)
+        naive = partial(naive_retracted_length, self.retracted, curves[:NAIVE_CURVES], ends)
         return self._rates(ours, {"naive": naive}) | {"error": self.retracted_errors()}
 
     def retracted_errors(self) -> dict[str, float]:
@@ -186,9 +176,7 @@ class GeometryBenchmark:
         curves, _ = random_curves(self.plain, self.settings.checked)
         reference = reference_length(self.manifold, curves)
         with torch.no_grad():
-            found = estimate_length(
-                self.manifold, curves.family, curves.phi, curves.start, curves.goal
-            )
+            found = estimate_length(self.manifold, curves)
         error, estimate = _relative(found.length, reference), (found.error / reference).numpy()
         return {
             **_spread(error),
@@ -198,36 +186,27 @@ class GeometryBenchmark:
         }
 
     def quadrature_rows(self) -> list[dict[str, Any]]:
-        """Error and cost of three rules by the number of points: the rows of the figure that chose
-        the default.
-        """
+        """Error and cost of three rules by the number of points: why the default is what it is."""
         curves, _ = random_curves(self.plain, self.settings.checked)
         reference, rows = reference_length(self.manifold, curves), []
         with one_thread(), torch.no_grad():
             for count in RULES:
+                gauss, own = Quadrature.gauss_legendre(count + 1), Collocation.chebyshev(count)
                 measures = {
                     "chords": partial(_chords, self.manifold, curves, count),
-                    "gauss_legendre": partial(
-                        _by_rule, self.manifold, curves, Quadrature.gauss_legendre(count + 1)
-                    ),
-                    "collocation": partial(
-                        _by_rule, self.manifold, curves, Collocation.chebyshev(count)
-                    ),
+                    "gauss_legendre": partial(curve_length, self.manifold, curves, gauss),
+                    "collocation": partial(curve_length, self.manifold, curves, own),
                 }
                 seconds = alternately(measures, self.settings.rounds)
                 for rule, measure in measures.items():
-                    spread = {
-                        f"error_{name}": value
-                        for name, value in _spread(_relative(measure(), reference)).items()
-                    }
+                    errors = _spread(_relative(measure(), reference))
                     cost = 1e6 * seconds[rule] / len(reference)
-                    rows.append({"rule": rule, "points": count + 1, "microseconds": cost, **spread})
+                    row = {"rule": rule, "points": count + 1, "microseconds": cost}
+                    rows.append(row | {f"error_{name}": value for name, value in errors.items()})
         return rows
 
     def environment(self, problem: GeodesicProblem) -> dict[str, float]:
-        """Environment steps a second, PPO's learning included: all curves in one batch, and the
-        usual way, one scalar environment each.  Both learn with the same settings.
-        """
+        """Environment steps a second with PPO's learning: in one batch, and one by one."""
         params, settings = self.geodesics, episode_settings(self.geodesics)
         count, rollout = params.environments, params.environments * params.ppo.rollout_steps
         batched = ppo_model(CurveVecEnv(problem, settings, count, seed=0), params, seed=0)
@@ -267,9 +246,7 @@ class GeometryBenchmark:
         return solver_figures(problem, ends, exact, solvers)
 
     def learned_solvers(self) -> dict[str, dict[str, float]]:
-        """The solvers that need no training on the learned manifold; the graph stands on encoded
-        data.
-        """
+        """The solvers that need no training, on the learned manifold; the graph on its data."""
         rng, problem = np.random.default_rng(SEED), self.plain
         graph = GraphSolver.over_points(
             problem.manifold, problem.domain.sample(self.settings.graph_points, rng)
@@ -286,24 +263,6 @@ SINGLE_PRECISION = 1e-6
 """Relative error that the network's single precision leaves in a length, whatever the rule."""
 
 
-@dataclass(frozen=True)
-class Curves:
-    """Random curves (B, p) of one family between the given ends, as a search meets them."""
-
-    family: CurveFamily
-    phi: Float[Tensor, "B p"]
-    start: Float[Tensor, "B N"]
-    goal: Float[Tensor, "B N"]
-
-    def first(self, count: int) -> "Curves":
-        """The first of them."""
-        return Curves(self.family, self.phi[:count], self.start[:count], self.goal[:count])
-
-    def at(self, t: Float[Tensor, "T"]) -> tuple[Float[Tensor, "B T N"], Float[Tensor, "B T N"]]:
-        """Points and velocities."""
-        return self.family.evaluate(self.phi, self.start, self.goal, t)
-
-
 def random_curves(problem: GeodesicProblem, count: int) -> tuple[Curves, Ends]:
     """Curves as the problem draws them, always the same."""
     rng = np.random.default_rng(SEED)
@@ -314,22 +273,13 @@ def random_curves(problem: GeodesicProblem, count: int) -> tuple[Curves, Ends]:
     ), ends
 
 
-def default_length(manifold: EmbeddedManifold, curves: Curves) -> Float[Tensor, "B"]:
-    """Lengths at the default accuracy."""
-    return curve_length(manifold, curves.family, curves.phi, curves.start, curves.goal)
-
-
 def naive_length(manifold: EmbeddedManifold, curves: Curves) -> Float[Tensor, "B"]:
-    """Eq. 2 as one would write it down: per curve the full Jacobian at 101 points, M = JᵀJ, the
-    trapezium rule.
-    """
+    """Eq. 2 as written: per curve the full Jacobian at 101 points, M = JᵀJ, trapezium rule."""
     t = torch.linspace(0.0, 1.0, NAIVE_POINTS, dtype=curves.phi.dtype)
     jacobian_at = torch.func.vmap(torch.func.jacfwd(manifold.embed))
     lengths = []
     for row in range(len(curves.phi)):
-        z, velocity = curves.family.evaluate(
-            curves.phi[row], curves.start[row], curves.goal[row], t
-        )
+        z, velocity = curves[row].at(t)
         jacobian = jacobian_at(z).to(z)
         metric = jacobian.mT @ jacobian
         speed = (velocity[:, None] @ metric @ velocity[..., None]).squeeze().sqrt()
@@ -363,9 +313,8 @@ def naive_retracted_length(
             problem.latent_points(curves.phi[row : row + 1].numpy(), one, t)
         )
         decoded = embedded[..., :dof].astype(np.float64)
-        lifted = correct_and_retract(
-            problem.manifold, decoded, t, one.q_start, one.q_goal, problem.retraction
-        )
+        line = corrected(decoded, t, one.q_start, one.q_goal)
+        lifted = retracted(problem.manifold, line, problem.retraction)
         path = np.concatenate([lifted.joints, embedded[..., dof:]], axis=-1)
         lengths.append(np.linalg.norm(np.diff(path, axis=1), axis=-1).sum())
     return np.array(lengths)
@@ -381,10 +330,6 @@ def reference_length(manifold: LearnedManifold, curves: Curves) -> Float[Tensor,
 def _chords(manifold: EmbeddedManifold, curves: Curves, count: int) -> Float[Tensor, "B"]:
     t = torch.linspace(0.0, 1.0, count + 1, dtype=torch.float64)
     return chord_length(manifold.embed(curves.at(t)[0]))
-
-
-def _by_rule(manifold: EmbeddedManifold, curves: Curves, rule: LengthRule) -> Float[Tensor, "B"]:
-    return curve_length(manifold, curves.family, curves.phi, curves.start, curves.goal, rule)
 
 
 def _relative(found: Float[Tensor, "B"], reference: Float[Tensor, "B"]) -> Float[np.ndarray, "B"]:
@@ -405,12 +350,10 @@ def solver_figures(
     exact: Float[np.ndarray, "P"] | None,
     solvers: Mapping[str, GeodesicSolver],
 ) -> dict[str, dict[str, float]]:
-    """Length over the exact distance, or over the shortest that any solver found, and what a query
-    costs.
+    """Length over the exact distance, or the shortest found, and the cost of a query, by solver.
 
-    Ratios are over the pairs that every solver found a curve for.  milliseconds: of one query at a
-    time, over the first SINGLE pairs; milliseconds_in_batch: its share where all pairs are asked
-    for at once.
+    Ratios are over the pairs that every solver found a curve for.  milliseconds: one query at a
+    time, the first SINGLE pairs; milliseconds_in_batch: a pair's share of all at once.
     """
     found, single, together = {}, {}, {}
     for name, solver in solvers.items():
@@ -458,22 +401,16 @@ def _seconds(run: Callable[[], Any]) -> float:
 
 def policy_search_figures(metrics: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """What training on the analytic manifolds reported, with the domain of the pairs."""
+    shown = ("mean_ratio", "p95_ratio", "first_mean_ratio")
     return {
-        name: {
-            "mean_ratio": found["mean_ratio"],
-            "p95_ratio": found["p95_ratio"],
-            "first_mean_ratio": found["first_mean_ratio"],
-            "pairs": PAIRS,
-            "domain": MANIFOLDS[name].domain,
-        }
+        name: {key: found[key] for key in shown}
+        | {"pairs": PAIRS, "domain": MANIFOLDS[name].domain}
         for name, found in metrics.items()
     }
 
 
 def alternately(runs: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
-    """Median seconds of each run over several rounds, taken in turn so that a slow spell of the
-    machine hits all.
-    """
+    """Median seconds of each run over several rounds in turn, so that slow spells hit all."""
     times: dict[str, list[float]] = {name: [] for name in runs}
     for turn in range(rounds + 1):
         for name, run in runs.items():
@@ -485,7 +422,7 @@ def alternately(runs: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str,
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Everything on one thread: what is compared must not differ by what runs beside it."""
+    """Everything on one thread: what is compared must not differ by what else runs."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,14 +1,10 @@
-"""How cost grows: seconds of planning, of curve lengths and of training against the size of what is
-asked.
+"""How cost grows: seconds of planning, of curve lengths and of training against the size asked.
 
-Six axes, each a row of sizes with everything else held fixed: joints, held task axes (the
-codimension), obstacles, queries, latent dimension, dataset rows.  Everything runs on one thread,
-compiled code has answered once before it is timed, and what is compared is timed in turn, so that a
-slow spell of the machine hits all.  A query without an answer is timed like any other; `solved`
-says how many have one, by the planner's own word: validity is judged elsewhere.
-
-The growth in each size is summed up as the exponent p of seconds ∝ size^p, the slope of a straight
-line in log-log.
+Six axes, each a row of sizes with all else fixed: joints, held task axes (the codimension),
+obstacles, queries, latent dimension, dataset rows.  One thread; compiled code is warm; what is
+compared is timed in turn.  A query without an answer is timed like any other; `solved` says how
+many have one, by the planner's own word.  The growth is summed up as the exponent p of
+seconds ∝ size^p, the slope of a straight line in log-log.
 """
 
 import time
@@ -17,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -25,21 +21,21 @@ import torch
 from jaxtyping import Float, Int
 
 from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
-from constraint_geodesics.geometry.curves import PinnedPolynomial
+from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
 from constraint_geodesics.geometry.length import Collocation, curve_length
 from constraint_geodesics.learning.dataset import Queries, draw_queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.training import train_manifold
+from constraint_geodesics.learning.training import TrainingRun, train_manifold
 from constraint_geodesics.learning.vae import JointVae
 from constraint_geodesics.params import ManifoldParams, Params
 from constraint_geodesics.peers.elastic_band import free_rows, nothing, settled, task_of
 from constraint_geodesics.pipeline.progress import progress
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
-from constraint_geodesics.report.results import markdown_table
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.world import Sphere, World
+from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.scene.world import World
 from constraint_geodesics.search.band import BandSettings, BandSpace
 from constraint_geodesics.search.candidates import Answer, candidates
 from constraint_geodesics.search.roadmap import build_roadmap
@@ -79,14 +75,13 @@ Batch = Callable[[Float[np.ndarray, "B D"], Float[np.ndarray, "B D"]], Sequence[
 
 @dataclass(frozen=True)
 class GrowthSizes:
-    """What is measured: the sizes along each axis, and how often.
+    """The sizes along each axis, and how often each is measured.
 
-    references: reference poses for the axes `joints` and `codimension`, each with `queries_each`
-    queries.  layouts: of the spheres, each with `obstacle_queries_each`.  batches: of the planner,
-    and peer_batches of its peer, each timed `batch_repeats` times at least, and until
-    `batch_queries` were asked.  curves: measured at once, `length_repeats` times.  rows: trained on
-    for `epochs` that are timed, `training_repeats` times.  nodes: of a roadmap, built
-    `roadmap_repeats` times.
+    references: poses for the axes joints and codimension, with `queries_each`.  layouts: of
+    spheres, with `obstacle_queries_each`.  batches, peer_batches: of the planner and its peer, each
+    timed `batch_repeats` times at least, and until `batch_queries` were asked.  curves: measured at
+    once, `length_repeats` times.  rows: trained on for `epochs`, `training_repeats` times.  nodes:
+    of a roadmap, built `roadmap_repeats` times.
     """
 
     references: int = 8
@@ -128,9 +123,7 @@ class GrowthSizes:
 
 
 class Sample(NamedTuple):
-    """One timing: of what, at which size of which axis, and whether the query was solved, or the
-    share of a batch that was; nan where nothing is asked.
-    """
+    """One timing: of what, at which size of which axis; solved share, nan if nothing is asked."""
 
     axis: str
     value: int
@@ -143,10 +136,10 @@ class Sample(NamedTuple):
 class Subject:
     """What is measured on.
 
-    scene: the robot of params.yaml in its workcell.  other: a robot with another number of joints.
-    planners: asked one query at a time, by name.  batch: answers many queries of `CONSTRAINT`;
-    peer: which of the planners it is compared with.  joints (n, D): configurations to train on
-    [rad].  scratch: where training keeps its checkpoints.
+    scene: params.yaml's robot and workcell.  other: a robot with another number of joints.
+    planners: asked one query at a time.  batch: answers many queries of `CONSTRAINT`; peer: the
+    planner that it is compared with.  joints: to train on [rad].  scratch: for checkpoints of
+    training.
     """
 
     params: Params
@@ -171,17 +164,13 @@ class Subject:
 
 @dataclass(frozen=True)
 class BandAndTrees:
-    """The project's own search without anything learned: the straight line's band, and two trees
-    where that fails.
-    """
+    """The project's own search, nothing learned: the straight line's band, then two trees."""
 
     settings: BandSettings = field(default_factory=BandSettings)
     name: str = "band and trees"
 
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
-        """The first candidate whose rows touch nothing.  The trees have seeds of their own: `seed`
-        is ignored.
-        """
+        """The first candidate that touches nothing; `seed` is ignored, trees have their own."""
         began = time.perf_counter()
         del seed
         early = settled(problem, began)
@@ -204,23 +193,17 @@ def measure_growth(
 ) -> pd.DataFrame:
     """Measure all axes, with progress under `description` (none if it is empty).
 
-    Columns: axis; value, the size; what, whose time it is; seconds, the median, between the
-    quartiles low and high; repeats, how many timings these are of; solved, the share of queries
-    with an answer, nan where none is asked; mean, of the same seconds, which is far above the
-    median where some queries are easy and others take a search. Seconds are of one query on the
-    axes joints, codimension and obstacles; of all queries together on the axis queries, where the
-    median of one query leaves out the slow ones that a large batch holds, so that its slope may
-    exceed 1; of a whole batch of curves on latent dimension; of one training epoch or one roadmap
-    on dataset rows.
+    Columns: axis; value, the size; what is timed; seconds, the median, between the quartiles low
+    and high; repeats; solved, nan where nothing is asked; mean of the seconds, far above the median
+    where some queries take a search.  Seconds are of one query on the axes joints, codimension and
+    obstacles, of all queries together on queries, of a batch of curves on latent dimension, of one
+    training epoch or roadmap on dataset rows.
 
-    joints: a level tool (roll and pitch held), no workcell; codimension: params.yaml's workcell and
-    `HELD`.  What a query costs depends on where the constraint is held and where the spheres stand,
-    so several references are taken, each the tool pose of a random free configuration and the same
-    for all codimensions, and several layouts, of which a larger number of spheres holds the smaller
-    ones.
-    Raises DatasetError if hardly any configuration under such a constraint is free, ValueError if
-    hardly any is without one, if there is no room for the spheres, or if there are fewer
-    configurations than are to be trained on.
+    joints: a level tool, no workcell; codimension: params.yaml's workcell and `HELD`.  Several
+    references are taken, each the tool pose of a random free configuration, the same for all
+    codimensions, and several layouts, where more spheres hold the fewer.
+    Raises DatasetError if hardly any configuration under a constraint is free, ValueError if hardly
+    any is without one, there is no room for the spheres, or too few configurations to train on.
     """
     sizes = sizes or GrowthSizes()
     axes = (_joints, _codimension, _obstacles, _queries, _latent_dimension, _epochs, _roadmaps)
@@ -239,78 +222,45 @@ def measure_growth(
 
 def _summary(samples: Sequence[Sample]) -> pd.DataFrame:
     """The table of `measure_growth`, by axis in their order, then by size, then as they came."""
-    every = pd.DataFrame(samples)
-    rows = []
-    for (axis, value, what), own in every.groupby(["axis", "value", "what"], sort=False):
-        low, median, high = np.quantile(own["seconds"], [0.25, 0.5, 0.75])
-        rows.append(
-            {
-                "axis": axis,
-                "value": value,
-                "what": what,
-                "seconds": median,
-                "low": low,
-                "high": high,
-                "repeats": len(own),
-                "solved": own["solved"].mean(),
-                "mean": own["seconds"].mean(),
-            }
-        )
-    rows.sort(key=lambda row: (AXES.index(row["axis"]), row["value"]))
-    return pd.DataFrame(rows)
+    by = pd.DataFrame(samples).groupby(["axis", "value", "what"], sort=False)
+    low, median, high = (by["seconds"].quantile(q) for q in (0.25, 0.5, 0.75))
+    columns = {"seconds": median, "low": low, "high": high, "repeats": by.size()}
+    columns |= {"solved": by["solved"].mean(), "mean": by["seconds"].mean()}
+    return (
+        pd.DataFrame(columns)
+        .reset_index()
+        .sort_values(["axis", "value"], key=_in_order, kind="stable", ignore_index=True)
+    )
+
+
+def _in_order(column: "pd.Series[Any]") -> "pd.Series[Any]":
+    return column.map(AXES.index) if column.name == "axis" else column
 
 
 def slopes(table: pd.DataFrame) -> pd.DataFrame:
     """Exponents: for each (axis, what) the least-squares line of log seconds over log value.
 
-    Columns: axis, what, slope, its standard_error (nan with two points, which leave no residual),
-    seconds_at_1 (the line at value 1) and points.  A value of 0 (no obstacle, no held axis) has no
-    logarithm and is left out of the fit, as are times that are not positive and finite.  All nan
-    where fewer than 2 distinct positive values remain.
+    Columns: axis, what, slope, standard_error (nan with two points), seconds_at_1 and points.
+    Values of 0 and times that are not positive and finite are left out; all nan where fewer than
+    two distinct values remain.
     """
     rows = []
     for (axis, what), own in table.groupby(["axis", "what"], sort=False):
         value, seconds = own["value"].to_numpy(float), own["seconds"].to_numpy(float)
         used = (value > 0) & (seconds > 0) & np.isfinite(seconds)
-        slope, error, intercept = _line(np.log(value[used]), np.log(seconds[used]))
-        rows.append(
-            {
-                "axis": axis,
-                "what": what,
-                "slope": slope,
-                "standard_error": error,
-                "seconds_at_1": float(np.exp(intercept)),
-                "points": int(used.sum()),
-            }
-        )
-    return pd.DataFrame(
-        rows, columns=["axis", "what", "slope", "standard_error", "seconds_at_1", "points"]
-    )
-
-
-def slopes_markdown(fits: pd.DataFrame) -> str:
-    """The exponents as a table, axis by axis."""
-    rows: list[Sequence[str]] = [("grows with", "what", "exponent", "± standard error", "points")]
-    for row in fits.to_dict("records"):
-        slope, error = (
-            f"{row[name]:.2f}" if np.isfinite(row[name]) else "–"
-            for name in ("slope", "standard_error")
-        )
-        rows.append((row["axis"], row["what"], slope, error, str(row["points"])))
-    return f"{markdown_table(rows)}\n"
+        line = _line(np.log(value[used]), np.log(seconds[used]))
+        rows.append((axis, what, *line, int(used.sum())))
+    columns = ["axis", "what", "slope", "standard_error", "seconds_at_1", "points"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def _line(x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"]) -> tuple[float, float, float]:
-    """Slope, its standard error and the intercept of a least-squares line."""
+    """Slope of a least-squares line, its standard error, and exp of the intercept."""
     if len(np.unique(x)) < 2:
         return np.nan, np.nan, np.nan
-    from_mean = x - x.mean()
-    spread = float(from_mean @ from_mean)
-    slope = float(from_mean @ y) / spread
-    intercept = float(y.mean() - slope * x.mean())
-    residual = y - intercept - slope * x
-    error = np.sqrt(float(residual @ residual) / (len(x) - 2) / spread) if len(x) > 2 else np.nan
-    return slope, float(error), intercept
+    slope, intercept = np.polyfit(x, y, 1)
+    error = np.sqrt(np.polyfit(x, y, 1, cov=True)[1][0, 0]) if len(x) > 2 else np.nan
+    return float(slope), float(error), float(np.exp(intercept))
 
 
 def epoch_seconds(
@@ -320,45 +270,26 @@ def epoch_seconds(
     epochs: int,
     scratch: Path,
 ) -> dict[str, list[float]]:
-    """Seconds of single epochs of both training phases, mean and variance: training, validation,
-    checkpoint.
-
-    Taken between the reports of successive epochs, so that neither what comes before the first
-    epoch nor what comes after the last one is part of them.
-    """
+    """Seconds of single epochs of both training phases, between the reports of successive ones."""
     stamps: list[float] = []
-    longer = {
-        "epochs": epochs + 1,
-        "variance_epochs": epochs + 1,
-        "patience": epochs + 2,
-    }  # the first is not counted
-    train_manifold(
-        joints,
-        robot,
-        settings.model_copy(update=longer),
-        scratch,
-        lambda *_: stamps.append(time.perf_counter()),
-        progress=False,
-    )
+    # one more, since the first is not counted
+    longer = {"epochs": epochs + 1, "variance_epochs": epochs + 1, "patience": epochs + 2}
+    run = TrainingRun(scratch, lambda *_: stamps.append(time.perf_counter()), progress=False)
+    train_manifold(joints, robot, settings.model_copy(update=longer), run)
     phases = np.diff(np.reshape(stamps, (2, epochs + 1)), axis=1)
     return dict(zip(("mean", "variance"), phases.tolist(), strict=True))
 
 
 def place_spheres(
-    scene: Scene,
-    queries: Queries,
-    count: int,
-    radius_m: float,
-    rng: np.random.Generator,
-    tries: int = TRIES,
+    scene: Scene, queries: Queries, count: int, radius_m: float, rng: np.random.Generator
 ) -> list[Sphere]:
     """Spheres around random places that the tool can be at, none within AWAY_M of the arm at an end
     of a query.
 
-    Raises ValueError if `tries` random configurations are not enough.
+    Raises ValueError if TRIES random configurations are not enough.
     """
     ends, kept = np.concatenate([queries.starts, queries.goals]), list[Sphere]()
-    for q in _free_configurations(scene, rng, tries):
+    for q in _free_configurations(scene, rng):
         if len(kept) == count:
             break
         x, y, z = scene.robot.forward(q)[0].tolist()
@@ -367,13 +298,13 @@ def place_spheres(
                 kept.append(Sphere(f"sphere_{len(kept)}", (x, y, z), radius_m))
     if len(kept) < count:
         raise ValueError(
-            f"no room for {count} spheres of {radius_m} m beside the ends of {len(queries)} queries"
+            f"no room for {count} spheres of {radius_m} m near the ends of {len(queries)} queries"
         )
     return kept
 
 
 @dataclass(frozen=True)
-class _Case:
+class _Asked:
     """Some queries of one constraint in one scene."""
 
     scene: Scene
@@ -397,19 +328,19 @@ def _joints(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
     poses = [_references(scene, sizes) for scene in scenes]
     for k in range(sizes.references):
         for scene, own in zip(scenes, poses, strict=True):
-            case = _held(scene, LEVEL, own[k], k, sizes)
+            asked = _held(scene, LEVEL, own[k], k, sizes)
             if k == 0:
-                _warmed(subject, case)
-            yield _planned(subject, "joints", scene.robot.dof, case)
+                _warmed(subject, asked)
+            yield _planned(subject, "joints", scene.robot.dof, asked)
 
 
 def _codimension(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
     for k, pose in enumerate(_references(subject.scene, sizes)):
         for count in sizes.codimensions:
-            case = _held(subject.scene, HELD[count], pose, k, sizes)
+            asked = _held(subject.scene, HELD[count], pose, k, sizes)
             if k == 0:
-                _warmed(subject, case)
-            yield _planned(subject, "codimension", count, case)
+                _warmed(subject, asked)
+            yield _planned(subject, "codimension", count, asked)
 
 
 def _obstacles(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
@@ -420,43 +351,41 @@ def _obstacles(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
         )
         spheres = place_spheres(scene, queries, max(sizes.spheres), sizes.radius_m, rng)
         for count in sizes.spheres:
-            case = _Case(Scene(scene.robot, (*scene.workcell, *spheres[:count])), manifold, queries)
+            asked = _Asked(
+                Scene(scene.robot, (*scene.workcell, *spheres[:count])), manifold, queries
+            )
             if k == 0:
-                _warmed(subject, case)
-            yield _planned(subject, "obstacles", count, case)
+                _warmed(subject, asked)
+            yield _planned(subject, "obstacles", count, asked)
 
 
 def _queries(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
     scene, manifold, peer = subject.scene, subject.manifold, subject.planners[subject.peer]
     pool = draw_queries(scene, manifold, CONSTRAINT, max(sizes.all_batches), sizes.seed)
     with scene.world() as world:
-        problems = _Case(scene, manifold, pool).problems(world)
+        problems = _Asked(scene, manifold, pool).problems(world)
 
         def one_by_one(rows: Int[np.ndarray, "B"]) -> Sequence[bool]:
-            return [
-                peer.plan(replace(problems[row]), seed=int(row)).status == "solved" for row in rows
-            ]
+            answers = [peer.plan(replace(problems[row]), seed=int(row)) for row in rows]
+            return [answer.status == "solved" for answer in answers]
 
         def together(rows: Int[np.ndarray, "B"]) -> Sequence[bool]:
             return subject.batch(pool.starts[rows], pool.goals[rows])
 
-        together(
-            np.arange(len(pool))
-        )  # all of them: some parts are loaded by the first query that needs them
+        # all of them: some parts are loaded by the first query that needs them
+        together(np.arange(len(pool)))
         one_by_one(np.arange(1))
         asked = ((PLANNER, together, sizes.batches), (subject.peer, one_by_one, sizes.peer_batches))
         most = max(map(sizes.turns, sizes.all_batches))
         for turn in range(most):
             found = []
             for count in sizes.all_batches:
-                own, late = divmod(
-                    turn, most // sizes.turns(count)
-                )  # the large ones are spread over the time as well
+                # the large ones are spread over the time as well
+                own, late = divmod(turn, most // sizes.turns(count))
                 if late or own >= sizes.turns(count):
                     continue
-                rows = (own * count + np.arange(count)) % len(
-                    pool
-                )  # other queries, as long as there are any
+                # other queries, as long as there are any
+                rows = (own * count + np.arange(count)) % len(pool)
                 for name, answer, counts in asked:
                     if count in counts:
                         began = time.perf_counter()
@@ -467,28 +396,21 @@ def _queries(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
 
 
 def _latent_dimension(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
-    """Lengths of random cubics by the rule that searches use, on networks with untrained weights:
-    with the rule given, the arithmetic is the same whatever the weights.
-    """
+    """Lengths of random cubics on untrained networks: the arithmetic is the same."""
     settings, dof = subject.learned, subject.scene.robot.dof
     rule = Collocation.chebyshev(subject.params.geodesics.length_degree)
     generator = torch.Generator().manual_seed(sizes.seed)
     runs: dict[int, Callable[[], object]] = {}
     for dim in sizes.latent_dims:
-        vae = (
-            JointVae(dof, dim, settings.hidden, settings.variance_centres)
-            .eval()
-            .requires_grad_(False)
-        )
+        vae = JointVae(dof, dim, settings.hidden, settings.variance_centres)
+        manifold = LearnedManifold(vae.eval().requires_grad_(False))
         family = PinnedPolynomial(dim, CURVE_DEGREE)
-        shapes = (family.coefficients, dim, dim)
         phi, start, goal = (
             torch.randn(sizes.curves, width, generator=generator, dtype=torch.float64)
-            for width in shapes
+            for width in (family.coefficients, dim, dim)
         )
-        runs[dim] = partial(
-            curve_length, LearnedManifold(vae), family, BEND * phi, start, goal, rule
-        )
+        curves = Curves(family, BEND * phi, start, goal)
+        runs[dim] = partial(curve_length, manifold, curves, rule)
     what = f"{sizes.curves} curve lengths"
     with torch.no_grad():
         turns = [
@@ -527,49 +449,45 @@ def _roadmaps(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
 
 
 def _free_configurations(
-    scene: Scene, rng: np.random.Generator, tries: int
+    scene: Scene, rng: np.random.Generator
 ) -> Iterator[Float[np.ndarray, "D"]]:
-    """Those of so many random configurations [rad] that touch nothing."""
+    """Those of TRIES random configurations [rad] that touch nothing."""
     with scene.world() as world:
-        yield from (q for q in scene.robot.sample(tries, rng) if world.is_free(q))
+        yield from (q for q in scene.robot.sample(TRIES, rng) if world.is_free(q))
 
 
 def _references(scene: Scene, sizes: GrowthSizes) -> list[Pose]:
     """Tool poses of random free configurations."""
-    found = list(
-        islice(
-            _free_configurations(scene, np.random.default_rng(sizes.seed), TRIES), sizes.references
-        )
-    )
-    if len(found) < sizes.references:
+    free, count = _free_configurations(scene, np.random.default_rng(sizes.seed)), sizes.references
+    found = list(islice(free, count))
+    if len(found) < count:
         raise ValueError(
-            f"only {len(found)} of {TRIES} random configurations are free: {sizes.references} "
-            f"are needed"
+            f"only {len(found)} of {TRIES} random configurations are free, not {count}"
         )
     return [Pose(*scene.robot.forward(q)) for q in found]
 
 
-def _held(scene: Scene, axes: tuple[int, ...], pose: Pose, k: int, sizes: GrowthSizes) -> _Case:
+def _held(scene: Scene, axes: tuple[int, ...], pose: Pose, k: int, sizes: GrowthSizes) -> _Asked:
     """Queries with some axes held at a pose, the k-th of the references."""
     manifold = ConstraintManifold(scene.robot, Constraint(axes, reference=pose))
-    return _Case(
+    return _Asked(
         scene, manifold, draw_queries(scene, manifold, f"held_{k}", sizes.queries_each, sizes.seed)
     )
 
 
-def _warmed(subject: Subject, case: _Case) -> None:
+def _warmed(subject: Subject, asked: _Asked) -> None:
     """One query that does not count: it loads compiled code."""
-    with case.scene.world() as world:
-        problem = case.problems(world)[0]
+    with asked.scene.world() as world:
+        problem = asked.problems(world)[0]
         for planner in subject.planners.values():
             planner.plan(problem, seed=0)
 
 
-def _planned(subject: Subject, axis: str, value: int, case: _Case) -> list[Sample]:
-    """Every planner on every query of a case, the planners in turn."""
+def _planned(subject: Subject, axis: str, value: int, asked: _Asked) -> list[Sample]:
+    """Every planner on every query, the planners in turn."""
     found = []
-    with case.scene.world() as world:
-        for seed, problem in enumerate(case.problems(world)):
+    with asked.scene.world() as world:
+        for seed, problem in enumerate(asked.problems(world)):
             for name, planner in subject.planners.items():
                 own = replace(problem)  # a planner may remember the very problem that it answered
                 began = time.perf_counter()

@@ -1,65 +1,48 @@
-"""Runs in MLflow: one parent run a stage and matrix item, one child a seed.  The importer of
-mlflow, with registry.py.
+"""Runs in MLflow: one parent run a stage and matrix item, one child a seed.
 
 The JSON and CSV files under reports/ are the truth; MLflow mirrors them.  Only MLflow's low-level
 client is used: it has no active run that could be shared by accident, prints nothing, and sends a
 report in one call.
-
-Runs are in `mlflow.db` at the root of the checkout and their files in `mlartifacts/` beside it, or
-in the store that MLFLOW_TRACKING_URI names.  In an SQLite store a run knows its files as
-`mlflow-artifacts:/…`, an address without a folder, which the dashboard's server looks up in its own
-`mlartifacts/`: no server is needed while a stage runs, and a checkout that was moved keeps its
-figures.  MLflow's client can't download such files without the server; they lie in
-`mlartifacts/<experiment>/<run id>/artifacts/`.
 """
 
-import hashlib
 import json
 import logging
 import math
-import os
 import re
-import shutil
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean, pstdev
-from types import ModuleType, TracebackType
-from typing import TYPE_CHECKING, Any, Self
-from urllib.parse import urlsplit
+from threading import Timer
+from types import TracebackType
+from typing import Any, Self
 
-from filelock import FileLock
 from pydantic import BaseModel
 
 from constraint_geodesics.params import Params, RewardParams
+from constraint_geodesics.tracking.store import (
+    METRICS_A_CALL,
+    TrackingError,
+    client_of,
+    dataset_of,
+    explained,
+    flat,
+    keep_copy,
+    log_params,
+    mlflow_module,
+    open_store,
+    source_tags,
+    stable,
+    stored,
+    tracking_uri,
+)
 
-if TYPE_CHECKING:
-    from mlflow import MlflowClient
-    from mlflow.entities import DatasetInput
-
-LONGEST_VALUE = 6000
-PARAMS_A_CALL = 100
-METRICS_A_CALL = 1000
-"""The most that MLflow takes."""
-DIGITS = 9
-"""Of a reported number: enough to compare runs, too few to show the last bits of another processor.
-"""
-FIRST_ANSWER_S = 5
-SYSTEM_EVERY_S = 5.0
-"""How often processor, memory, disk and network are logged while a stage runs."""
-PLANNER_MODEL = "constraint_geodesics"
-"""The registered planner's name."""
-CHAMPION = "champion"
-"""The alias of the version that people load."""
-
-
-class TrackingError(RuntimeError):
-    """MLflow can't be used; the message is one line with the store's address."""
+SYSTEM_AFTER_S, SYSTEM_EVERY_S = 15.0, 5.0
+"""When processor, memory, disk and network begin to be logged, and how often: a stage that is done
+by then needs no look at the machine, which takes a second to set up."""
 
 
 @dataclass(frozen=True)
@@ -84,24 +67,18 @@ def subject_of(
 
     A reward has no name: its tag is what it is made of, eq. 15.
     """
-    names = {
-        "constraint": constraint,
-        "manifold": manifold,
-        "reward": None if reward is None else _in_short(reward),
-    }
-    values = {
-        "constraint": None if constraint is None else params.constraints[constraint],
-        "manifold": params.manifolds.get(manifold or ""),  # an analytic one is in no file
-    }
-    return Subject(
-        {name: text for name, text in names.items() if text is not None},
-        {name: value for name, value in values.items() if value is not None},
-    )
-
-
-def _in_short(reward: RewardParams) -> str:
-    weights = f"K_L={reward.length_weight:g} K_Δ={reward.reduction_weight:g}"
-    return f"{reward.form} b={reward.b:g} c={reward.c:g} {weights}"
+    tags: dict[str, str] = {}
+    values: dict[str, Any] = {}
+    if constraint is not None:
+        tags["constraint"], values["constraint"] = constraint, params.constraints[constraint]
+    if manifold is not None:
+        tags["manifold"] = manifold
+    if manifold in params.manifolds:  # an analytic one is in no file
+        values["manifold"] = params.manifolds[manifold]
+    if reward is not None:
+        weights = f"K_L={reward.length_weight:g} K_Δ={reward.reduction_weight:g}"
+        tags["reward"] = f"{reward.form} b={reward.b:g} c={reward.c:g} {weights}"
+    return Subject(tags, values)
 
 
 @dataclass(frozen=True)
@@ -151,7 +128,7 @@ class ChildRun:
         with explained(self.tracking_uri):
             client = client_of(self.tracking_uri)
             self.run_id = client.create_run(self.experiment_id, tags=dict(self.tags)).info.run_id
-            _log_params(client, self.run_id, self.params)
+            log_params(client, self.run_id, self.params)
         return self
 
     def __exit__(
@@ -169,7 +146,7 @@ class ChildRun:
 
     def artifact(self, file: Path) -> None:
         """Keep a copy of a file with the run."""
-        _keep_copy(self.tracking_uri, self.run_id, file)
+        keep_copy(self.tracking_uri, self.run_id, file)
 
 
 @dataclass(frozen=True)
@@ -192,22 +169,14 @@ class StageRun:
         digits, one that is not finite becomes null, keys are sorted: equal figures give equal
         bytes.
         """
-        stable = _stable(metrics)
+        plain = stable(metrics)
+        text = json.dumps(plain, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False)
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(
-            json.dumps(stable, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False)
-            + "\n",
-            "utf-8",
-        )
-        flat = _flat(stable, "/").items()
+        file.write_text(text + "\n", "utf-8")
         # MLflow takes no other characters in a metric's name
-        numbers = {
-            re.sub(r"[^\w\-. :/]", "_", k): value
-            for k, value in flat
-            if isinstance(value, int | float)
-        }
-        self.metric_logger()(0, numbers)
-        _keep_copy(self.tracking_uri, self.run_id, file, "reports")
+        named = {re.sub(r"[^\w\-. :/]", "_", name): v for name, v in flat(plain, "/").items()}
+        self.metric_logger()(0, {n: v for n, v in named.items() if isinstance(v, int | float)})
+        keep_copy(self.tracking_uri, self.run_id, file, "reports")
 
     def metric_logger(self) -> MetricLogger:
         """Where a training loop reports."""
@@ -283,54 +252,56 @@ class StageRun:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "recordings.md"
             file.write_text("\n".join(lines) + "\n")
-            _keep_copy(self.tracking_uri, self.run_id, file)
+            keep_copy(self.tracking_uri, self.run_id, file)
 
     def _child_ids(self) -> dict[str, str]:
         return {run.data.tags["child"]: run.info.run_id for run in _children(self)}
 
     def figure(self, file: Path) -> None:
         """Keep a copy of a figure with the run."""
-        _keep_copy(self.tracking_uri, self.run_id, file, "figures")
+        keep_copy(self.tracking_uri, self.run_id, file, "figures")
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a stage does to one matrix item.
+
+    settings: what it was asked, flattened to names joined by ".".  inputs: files and folders it
+    reads, linked by DVC's MD5.  subject: what else to find the run and compare it by, as
+    `subject_of` makes it.
+    """
+
+    stage: str
+    item: str
+    settings: BaseModel | Mapping[str, Any] = field(default_factory=dict)
+    inputs: Sequence[Path] = ()
+    subject: Subject = Subject()
 
 
 @contextmanager
-def tracked_stage(
-    stage: str,
-    item: str,
-    params: BaseModel | Mapping[str, Any],
-    inputs: Sequence[Path],
-    *,
-    experiment: str,
-    root: Path,
-    subject: Subject = Subject(),
-) -> Iterator[StageRun]:
+def tracked_stage(work: Work, experiment: str, root: Path) -> Iterator[StageRun]:
     """A run for the time of the stage: FINISHED, FAILED or KILLED, as the body ends; its children
-    end with it.
+    end with it.  What the machine does in a stage that takes long is logged as `system/...`.
 
-    params: what the stage was asked, flattened to names joined by ".".  inputs: files and folders
-    it reads, linked by DVC's MD5.  subject: what else to find the run and compare it by, as
-    `subject_of` makes it. What the machine does meanwhile is logged as `system/...`, every 5 s.
     Raises TrackingError, one line, before any work: an input is missing, or the store can't be
     reached.
     """
-    uri = tracking_uri(root)
-    own_tags = {"stage": stage, "item": item, **subject.tags, **_source_tags(root)}
-    own_params = {**_stored(params), **_stored(subject.params)}
-    for file in inputs:
+    uri, name = tracking_uri(root), f"{work.stage} {work.item}"
+    tags = {"stage": work.stage, "item": work.item, **work.subject.tags, **source_tags(root)}
+    params = {**stored(work.settings), **stored(work.subject.params)}
+    for file in work.inputs:
         if not file.exists():
-            raise TrackingError(f"{stage} {item}: its input {file} does not exist")
+            raise TrackingError(f"{name}: its input {file} does not exist")
     with explained(uri):
-        client, experiment_id = _open_store(uri, experiment)
-        shown = {
-            "mlflow.runName": _named(f"{stage} {item}", own_tags),
-            "mlflow.note.content": _note(stage, own_tags),
-        }
-        run_id = client.create_run(experiment_id, tags={**own_tags, **shown}).info.run_id
-    run = StageRun(uri, experiment_id, run_id, own_tags, own_params, [])
+        client, experiment_id = open_store(uri, experiment)
+        shown = {"mlflow.runName": _named(name, tags)}
+        shown["mlflow.note.content"] = _note(work.stage, tags)
+        run_id = client.create_run(experiment_id, tags=tags | shown).info.run_id
+    run = StageRun(uri, experiment_id, run_id, tags, params, [])
     try:
         with explained(uri):
-            _log_params(client, run_id, own_params)
-            client.log_inputs(run_id, [_dataset(file, root) for file in inputs])
+            log_params(client, run_id, params)
+            client.log_inputs(run_id, [dataset_of(file, root) for file in work.inputs])
         with _system_metrics(uri, run_id):
             yield run
     except BaseException as error:
@@ -343,18 +314,28 @@ def tracked_stage(
 
 @contextmanager
 def _system_metrics(uri: str, run_id: str) -> Iterator[None]:
-    mlflow_module()
-    from mlflow.system_metrics.system_metrics_monitor import SystemMetricsMonitor
+    monitors = []
 
-    logging.getLogger(SystemMetricsMonitor.__module__).setLevel(
-        logging.WARNING
-    )  # it tells of every start and end
-    monitor = SystemMetricsMonitor(run_id, SYSTEM_EVERY_S, tracking_uri=uri)
-    monitor.start()
+    def begin() -> None:
+        from mlflow.system_metrics.system_metrics_monitor import SystemMetricsMonitor
+
+        # it tells of every start and end
+        logging.getLogger(SystemMetricsMonitor.__module__).setLevel(logging.WARNING)
+        monitor = SystemMetricsMonitor(run_id, SYSTEM_EVERY_S, tracking_uri=uri)
+        monitor.start()
+        monitors.append(monitor)
+
+    timer = Timer(SYSTEM_AFTER_S, begin)
+    timer.daemon = True
+    timer.start()
     try:
         yield
     finally:
-        monitor.finish()
+        timer.cancel()
+        if timer.is_alive():
+            timer.join()
+        for monitor in monitors:
+            monitor.finish()
 
 
 def _named(name: str, tags: Mapping[str, str]) -> str:
@@ -371,305 +352,6 @@ def _note(stage: str, tags: Mapping[str, str]) -> str:
         else f"`stages/{stage}.py`"
     )
     return f"Made by {again}; its figures are under `reports/{stage}/`."
-
-
-def tracking_uri(root: Path) -> str:
-    """MLFLOW_TRACKING_URI, or the SQLite file at the root of the checkout; never relative."""
-    uri = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{root / 'mlflow.db'}"
-    file = _sqlite_file(uri)
-    return uri if file is None or file.is_absolute() else f"sqlite:///{file.resolve()}"
-
-
-def ui_command(root: Path, port: int) -> list[str]:
-    """The command that opens the dashboard, for this machine only.
-
-    Raises TrackingError if the runs are on a server, which has a dashboard of its own.
-    """
-    uri = tracking_uri(root)
-    if uri.startswith("http"):
-        raise TrackingError(
-            f"MLFLOW_TRACKING_URI={_without_password(uri)}: this server shows its runs "
-            f"itself, open it in a browser"
-        )
-    database = _sqlite_file(uri)
-    artifacts = _artifact_folder(database) if database else root.resolve() / "mlartifacts"
-    # the job runner serves language models; without it the dashboard starts and stops in half the
-    # time
-    quiet = ["env", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false"]
-    server = [
-        sys.executable,
-        "-m",
-        "mlflow",
-        "server",
-        "--host",
-        "127.0.0.1",
-        "--port",
-        str(port),
-        "--workers",
-        "1",
-    ]
-    return [*quiet, *server, "--backend-store-uri", uri, "--artifacts-destination", str(artifacts)]
-
-
-@contextmanager
-def fetch_artifacts(address: str, root: Path = Path()) -> Iterator[Path]:
-    """A folder with the files behind an MLflow address (models:/… or runs:/…), gone when the
-    context ends; of a model that holds a planner's files, these.
-
-    Raises TrackingError if there is no such model or run, or the store can't be reached.
-    """
-    mlflow, uri = mlflow_module(), tracking_uri(root)
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            found = _beside_store(uri, address)
-            if found is None:
-                fetched = mlflow.artifacts.download_artifacts(
-                    artifact_uri=address, dst_path=folder, tracking_uri=uri, registry_uri=uri
-                )
-                found = Path(fetched)
-        except (mlflow.exceptions.MlflowException, OSError) as error:
-            raise TrackingError(f"{address}: {' '.join(str(error).split())[:200]}") from None
-        own = found / "artifacts" / "planner"
-        yield own if (found / "MLmodel").is_file() and own.is_dir() else found
-
-
-def _beside_store(uri: str, address: str) -> Path | None:
-    """Where files that only the dashboard's server could send lie beside an SQLite store, or None
-    for all others.
-    """
-    database = _sqlite_file(uri)
-    if database is None:
-        return None
-    source = _stored_at(uri, address)
-    if not source.startswith("mlflow-artifacts:"):
-        return None
-    place = _artifact_folder(database) / urlsplit(source).path.lstrip("/")
-    if not place.exists():
-        raise FileNotFoundError(f"its files are missing in {place}")
-    return place
-
-
-def _stored_at(uri: str, address: str) -> str:
-    client = client_of(uri)
-    if address.startswith("models:"):
-        from mlflow.store.artifact.utils.models import get_model_name_and_version
-
-        return str(
-            client.get_model_version_download_uri(*get_model_name_and_version(client, address))
-        )
-    run_id, _, path = address.removeprefix("runs:/").partition("/")
-    return (
-        f"{client.get_run(run_id).info.artifact_uri}/{path}"
-        if address.startswith("runs:")
-        else address
-    )
-
-
-def mlflow_module() -> ModuleType:
-    """MLflow, imported with the first run (1.3 s): without usage reports to its makers, notes and
-    links.
-    """
-    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
-    os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
-    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
-    import mlflow
-    import mlflow.entities
-
-    return mlflow
-
-
-def client_of(uri: str) -> "MlflowClient":
-    """MLflow's low-level client of a store."""
-    return mlflow_module().MlflowClient(uri)
-
-
-@contextmanager
-def explained(uri: str) -> Iterator[None]:
-    """Every way in which a store fails, as a TrackingError of one line."""
-    from sqlalchemy.exc import SQLAlchemyError
-
-    try:
-        yield
-    except (mlflow_module().MlflowException, SQLAlchemyError, OSError, ImportError) as error:
-        message = f"MLflow store {uri}: {' '.join(str(error).split())[:300]}"
-        raise TrackingError(_without_password(message)) from error
-
-
-def _without_password(text: str) -> str:
-    return re.sub(r"//[^/@]*@", "//", text)
-
-
-def _open_store(uri: str, experiment: str) -> tuple["MlflowClient", str]:
-    """A client whose store exists, and the experiment in it: processes that create one database at
-    once would fail.
-    """
-    database = _sqlite_file(uri)
-    lock: AbstractContextManager[Any] = nullcontext()
-    if database is not None:
-        database.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(f"{database}.lock")
-    with lock, _impatient():
-        if not uri.startswith("http"):
-            _check_database(uri)
-        client = client_of(uri)
-        return client, _experiment(client, experiment, database is not None)
-
-
-def _check_database(uri: str) -> None:
-    """MLflow tries a database that it can't open again and again, for minutes."""
-    import sqlalchemy
-
-    if urlsplit(uri).scheme.partition("+")[0] in ("sqlite", "postgresql", "mysql", "mssql"):
-        engine = sqlalchemy.create_engine(uri)
-        sqlalchemy.inspect(engine)
-        engine.dispose()
-
-
-@contextmanager
-def _impatient() -> Iterator[None]:
-    """For the first call alone: MLflow waits minutes for a server that does not answer."""
-    wanted = {
-        "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
-        "MLFLOW_HTTP_REQUEST_TIMEOUT": str(FIRST_ANSWER_S),
-    }
-    added = {name: value for name, value in wanted.items() if name not in os.environ}
-    os.environ.update(added)
-    try:
-        yield
-    finally:
-        for name in added:
-            del os.environ[name]
-
-
-def _experiment(client: "MlflowClient", name: str, in_sqlite: bool) -> str:
-    found = client.get_experiment_by_name(name)
-    if found is None:
-        location = (
-            f"mlflow-artifacts:/{re.sub(r'[^A-Za-z0-9_-]+', '_', name)}" if in_sqlite else None
-        )
-        return str(client.create_experiment(name, artifact_location=location))
-    return str(found.experiment_id)
-
-
-def _sqlite_file(uri: str) -> Path | None:
-    dialect, _, rest = uri.partition(":///")
-    return Path(rest.partition("?")[0]) if dialect.partition("+")[0] == "sqlite" and rest else None
-
-
-def _artifact_folder(database: Path) -> Path:
-    return database.parent / "mlartifacts"
-
-
-def _keep_copy(uri: str, run_id: str, file: Path, folder: str | None = None) -> None:
-    with explained(uri):
-        client, target = client_of(uri), _own_folder(uri, run_id)
-        if target is None:
-            client.log_artifact(run_id, str(file), folder)
-            return
-        (target / (folder or "")).mkdir(parents=True, exist_ok=True)
-        shutil.copy2(file, target / (folder or ""))
-
-
-def keep_folder(uri: str, run_id: str, folder: Path, name: str) -> str:
-    """Keep a copy of a folder with a run, under a name; returns its address."""
-    with explained(uri):
-        client, target = client_of(uri), _own_folder(uri, run_id)
-        if target is None:
-            client.log_artifacts(run_id, str(folder), name)
-        else:
-            shutil.copytree(folder, target / name, dirs_exist_ok=True)
-        return f"{client.get_run(run_id).info.artifact_uri}/{name}"
-
-
-def _own_folder(uri: str, run_id: str) -> Path | None:
-    """Where the dashboard's server will look for a run's files beside an SQLite store; MLflow
-    itself would need that server now.  None for other stores.
-    """
-    address, database = client_of(uri).get_run(run_id).info.artifact_uri, _sqlite_file(uri)
-    if database is None or not address.startswith("mlflow-artifacts:"):
-        return None
-    return _artifact_folder(database) / urlsplit(address).path.lstrip("/")
-
-
-def _log_params(client: "MlflowClient", run_id: str, params: BaseModel | Mapping[str, Any]) -> None:
-    entity = mlflow_module().entities.Param
-    batch = [entity(name, _text(value)) for name, value in _flat(_stored(params), ".").items()]
-    for first in range(0, len(batch), PARAMS_A_CALL):
-        client.log_batch(run_id, params=batch[first : first + PARAMS_A_CALL])
-
-
-def _stored(params: Any) -> Any:
-    if isinstance(params, BaseModel):
-        return params.model_dump(mode="json")
-    return (
-        {str(name): _stored(value) for name, value in params.items()}
-        if isinstance(params, Mapping)
-        else params
-    )
-
-
-def _text(value: Any) -> str:
-    text = value if isinstance(value, str) else json.dumps(value, default=str)
-    return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 1] + "…"
-
-
-def _dataset(file: Path, root: Path) -> "DatasetInput":
-    """An input under its path in the checkout.
-
-    The digest is computed from what the stage is about to read, by DVC's rule, not looked up in
-    dvc.lock: so it is also right while DVC has not written the lock yet, for a file inside an
-    output folder, and for a stage run by hand.
-    """
-    entities, path = mlflow_module().entities, file.resolve()
-    name = (
-        path.relative_to(root.resolve()).as_posix()
-        if path.is_relative_to(root.resolve())
-        else path.as_posix()
-    )
-    dataset = entities.Dataset(name, dvc_md5(path), "local", json.dumps({"uri": name}))
-    return entities.DatasetInput(dataset, [entities.InputTag("mlflow.data.context", "input")])
-
-
-def dvc_md5(path: Path) -> str:
-    """DVC's name of a file's or folder's content: the MD5 of its bytes, or of its list of files
-    with `.dir` behind.
-    """
-    if path.is_dir():
-        files = sorted(
-            entry.relative_to(path).as_posix() for entry in path.rglob("*") if entry.is_file()
-        )
-        listed = [{"md5": dvc_md5(path / name), "relpath": name} for name in files]
-        return hashlib.md5(json.dumps(listed, sort_keys=True).encode()).hexdigest() + ".dir"
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "md5").hexdigest()
-
-
-def _source_tags(root: Path) -> dict[str, str]:
-    """The commit the stage runs from, whether its sources differ from it, and DVC's names of stage
-    and experiment.
-    """
-    known = {"dvc_stage": "DVC_STAGE", "dvc_experiment": "DVC_EXP_NAME"}
-    tags = {tag: os.environ[name] for tag, name in known.items() if os.environ.get(name)}
-    commit = _git(root, "rev-parse", "HEAD")
-    if commit:
-        # what a pipeline itself writes while it runs makes no commit dirty
-        changed = _git(root, "status", "--porcelain", "--", ".", ":!dvc.lock", ":!reports")
-        tags |= {
-            "git_commit": commit,
-            "mlflow.source.git.commit": commit,
-            "git_dirty": str(bool(changed)).lower(),
-        }
-    return tags
-
-
-def _git(root: Path, *arguments: str) -> str:
-    command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
-    try:
-        result = subprocess.run(command, capture_output=True, text=True, check=False)
-    except OSError:
-        return ""
-    return result.stdout.strip() if result.returncode == 0 else ""
 
 
 def _children(run: StageRun) -> list[Any]:
@@ -719,25 +401,3 @@ def _together(
         (step, [{n: v for n, v in rows[step].items() if n != "steps"} for rows in by_step])
         for step in common
     ]
-
-
-def _flat(values: Mapping[str, Any], joint: str, prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in values.items():
-        nested = isinstance(value, Mapping)
-        flat |= (
-            _flat(value, joint, f"{prefix}{name}{joint}") if nested else {f"{prefix}{name}": value}
-        )
-    return flat
-
-
-def _stable(value: Any) -> Any:
-    """Plain JSON values; arrays and their scalars become lists and numbers."""
-    if isinstance(value, Mapping):
-        return {str(name): _stable(entry) for name, entry in value.items()}
-    plain = value.tolist() if hasattr(value, "tolist") else value
-    if isinstance(plain, list | tuple):
-        return [_stable(entry) for entry in plain]
-    if isinstance(plain, float):
-        return float(f"{plain:.{DIGITS}g}") + 0.0 if math.isfinite(plain) else None
-    return plain

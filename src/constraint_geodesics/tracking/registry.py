@@ -16,10 +16,10 @@ from typing import Any
 
 from packaging.requirements import Requirement
 
-from constraint_geodesics.tracking.experiment import (
+from constraint_geodesics.tracking.experiment import StageRun
+from constraint_geodesics.tracking.store import (
     CHAMPION,
     PLANNER_MODEL,
-    StageRun,
     client_of,
     explained,
     keep_folder,

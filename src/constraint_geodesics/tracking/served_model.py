@@ -16,7 +16,8 @@ import pandas as pd
 
 from constraint_geodesics.constraints.pose import Constraint
 from constraint_geodesics.pipeline.threads import one_thread
-from constraint_geodesics.planner import Path, Planner
+from constraint_geodesics.planner import Planner
+from constraint_geodesics.trajectory import Trajectory
 
 
 class ServedPlanner(mlflow.pyfunc.PythonModel):
@@ -43,7 +44,7 @@ class ServedPlanner(mlflow.pyfunc.PythonModel):
         well.
         """
         try:
-            return with_rows(
+            return with_waypoints(
                 self.planner.plan(row["start"], row["goal"], constraint_of(str(row["constraint"])))
             )
         except ValueError as error:  # one bad row must not cost the others their answers
@@ -65,8 +66,8 @@ def constraint_of(text: str) -> str | Constraint:
         ) from None
 
 
-def with_rows(path: Path) -> dict[str, Any]:
-    """A path as JSON takes it."""
+def with_waypoints(path: Trajectory) -> dict[str, Any]:
+    """A trajectory as JSON takes it."""
     return {**path.summary(), "joints": path.joints.tolist(), "times": path.times.tolist()}
 
 

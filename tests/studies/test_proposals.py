@@ -16,8 +16,8 @@ from constraint_geodesics.geodesics.problem import LearnedProblem
 from constraint_geodesics.geodesics.proposals import MeanPolicy
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.manifold import GeometryError
-from constraint_geodesics.learning.joint_chart import JointChart
-from constraint_geodesics.studies import policy_benchmark as bench
+from constraint_geodesics.learning.learned_manifold import JointManifold
+from constraint_geodesics.studies import proposals as bench
 
 QUERIES, STEPS = 10, 3
 SMALL = bench.OptimumSettings(
@@ -47,7 +47,7 @@ def problems(scene, level, trained) -> dict[str, LearnedProblem]:
     return {
         "trained": level,
         "unseen": constrained(trained.manifold, ConstraintManifold(scene.robot, shelf), trained),
-        "joints": replace(level, chart=JointChart.of(trained.joints)),
+        "joints": replace(level, chart=JointManifold.of(trained.joints)),
     }
 
 
@@ -77,7 +77,7 @@ def measured_rows(problems, settings) -> dict[str, pd.DataFrame]:
         ends = problem.sample_ends(QUERIES, np.random.default_rng(0))
         policies = [untrained(problem, seed) for seed in range(3)]
         rows[name] = bench.policy_rows(
-            problem, policies[:2], policies[2:], settings, ends, 0, optimum=SMALL
+            problem, ends, bench.Compared(policies[:2], policies[2:], settings), SMALL
         )
     return rows
 
@@ -113,7 +113,8 @@ def test_the_same_seed_gives_the_same_rows(problems, measured_rows, settings) ->
     problem = problems["trained"]
     ends = problem.sample_ends(QUERIES, np.random.default_rng(0))
     policies = [untrained(problem, seed) for seed in range(3)]
-    again = bench.policy_rows(problem, policies[:2], policies[2:], settings, ends, 0, optimum=SMALL)
+    compared = bench.Compared(policies[:2], policies[2:], settings)
+    again = bench.policy_rows(problem, ends, compared, SMALL)
     pd.testing.assert_frame_equal(
         again.drop(columns="time_ms"), measured_rows["trained"].drop(columns="time_ms")
     )
@@ -122,13 +123,14 @@ def test_the_same_seed_gives_the_same_rows(problems, measured_rows, settings) ->
 def test_without_policies_their_methods_are_left_out(problems, settings) -> None:
     problem = problems["joints"]
     ends = problem.sample_ends(2, np.random.default_rng(1))
-    rows = bench.policy_rows(problem, [], None, settings, ends, 0, random_curves=5, optimum=SMALL)
+    compared = bench.Compared([], None, settings, random_curves=5)
+    rows = bench.policy_rows(problem, ends, compared, SMALL)
     curves = rows.groupby("method", sort=False)["curves"].max().to_dict()
     assert curves == {"straight latent line": 1, "descent": STEPS + 1, "random curves": 5}
 
 
 def test_the_optimum_without_constraint_is_the_straight_joint_line(scene, params, trained) -> None:
-    chart, free = JointChart.of(trained.joints), scene.manifold(params.constraints["free"])
+    chart, free = JointManifold.of(trained.joints), scene.manifold(params.constraints["free"])
     problem = LearnedProblem(chart, free, PinnedPolynomial(6, 3), trained.joints, 16, True, 1.0)
     rng = np.random.default_rng(2)
     ends = problem.sample_ends(12, rng)
@@ -248,7 +250,7 @@ def test_the_table_compares_over_the_queries_that_all_methods_solve() -> None:
 
 
 def test_charts_side_by_side_have_one_optimum(measured_rows) -> None:
-    both = bench.charts_together(
+    both = bench.spaces_together(
         {"latent": measured_rows["trained"], "joints": measured_rows["joints"]}
     )
     assert len(both) == 2 * len(measured_rows["joints"])
@@ -259,9 +261,10 @@ def test_charts_side_by_side_have_one_optimum(measured_rows) -> None:
 
 def test_misuse_is_refused(level, settings) -> None:
     ends = level.sample_ends(2, np.random.default_rng(6))
+    compared = bench.Compared([], None, settings)
     with pytest.raises(GeometryError, match="retract = False"):
-        bench.policy_rows(replace(level, retract=False), [], None, settings, ends, 0)
+        bench.policy_rows(replace(level, retract=False), ends, compared)
     with pytest.raises(GeometryError, match=r"starts has shape \(2, 12\): must be \(2, K, 12\)"):
         bench.family_optimum(level, ends, np.zeros((2, 12)))
     with pytest.raises(GeometryError, match="no query"):
-        bench.policy_rows(level, [], None, settings, ends[:0], 0)
+        bench.policy_rows(level, ends[:0], compared)

@@ -1,26 +1,32 @@
-"""What policies add: their curves beside the straight line, plain descent, random curves and the
-best of the family.
+"""What policies add to the straight line, plain descent, random curves and the best of the family.
 
 Every method answers one query at a time with the best curve that it met, feasible ones first, then
-the cheapest, at the problem's own accuracy.  Afterwards `measured` judges all answers, whoever gave
-them, and `family_optimum` looks for the shortest curve of the same family.
+the cheapest, at the problem's own accuracy.  Then `measured` judges all answers alike, and
+`family_optimum` looks for the shortest curve of the same family.
 """
 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 
+from constraint_geodesics.constraints.pose import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction
-from constraint_geodesics.geodesics.episodes import EpisodeSettings
-from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, repeated
+from constraint_geodesics.geodesics.episodes import EpisodeSettings, episode_settings
+from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, Phi, repeated
 from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
+from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.manifold import GeometryError
+from constraint_geodesics.learning.dataset import ShardTask, draw_free, draw_queries, seed_of
+from constraint_geodesics.learning.learned_manifold import JointManifold, LearnedManifold
+from constraint_geodesics.params import GeodesicParams
+from constraint_geodesics.scene.scene import Scene
 
 STRAIGHT, ONE_SEED, POLICIES = "straight latent line", "policy, one seed", "policies"
 SEPARATE, DESCENT, RANDOM = "separate policies", "descent", "random curves"
@@ -59,9 +65,9 @@ GAIN = 1e-6
 class OptimumSettings:
     """Work spent on the optimum of each query.
 
-    random_starts: cheapest of `drawn` random curves, beside the given starts.  descent_steps: from
-    every start.
-    polished: different curves that quasi-Newton goes on with, polish_steps: its iterations at most.
+    random_starts: cheapest of `drawn` random curves, added to the given starts.  descent_steps:
+    from every start.  polished: curves that quasi-Newton goes on with.  polish_steps: its
+    iterations at most.
     """
 
     random_starts: int = 32
@@ -81,29 +87,34 @@ class FamilyOptimum:
     feasible: Bool[np.ndarray, "Q"]
 
 
-def policy_rows(
-    problem: LearnedProblem,
-    policies: Sequence[MeanPolicy],
-    separate: Sequence[MeanPolicy] | None,
-    settings: EpisodeSettings,
-    ends: Ends,
-    seed: int,
-    random_curves: int | None = None,
-    optimum: OptimumSettings | None = None,
-) -> pd.DataFrame:
-    """One row a query and method (and seed, for one policy alone): what it answers and what it
-    costs.
+@dataclass(frozen=True)
+class Compared:
+    """Whose proposals are compared.
 
     policies: seeds of one policy; with none, their methods are left out.  separate: policies
-    trained on this constraint alone.  random_curves: as many as `policies` meet unless given.
-    seed: of the random curves.
+    trained on this constraint alone.  settings: of their episodes.  random_curves: as many as
+    `policies` meet unless given.  seed: of the random curves.
+    """
+
+    policies: Sequence[MeanPolicy]
+    separate: Sequence[MeanPolicy] | None
+    settings: EpisodeSettings
+    seed: int = 0
+    random_curves: int | None = None
+
+
+def policy_rows(
+    problem: LearnedProblem, ends: Ends, compared: Compared, optimum: OptimumSettings | None = None
+) -> pd.DataFrame:
+    """One row a query and method (and seed, for one policy alone): its answer and what it costs.
+
     Columns: method, seed, query, feasible, length_rad (nan where not feasible), optimum_rad
     (`family_optimum` or an answer, whichever is shorter; nan where there is neither), curves (met,
     the straight line once), time_ms (of the answer, on a problem that has answered before).
     Raises GeometryError if the problem does not retract or there is no query.
     """
     _require_queries(problem, ends)
-    methods = _methods(problem, policies, separate, settings, seed, random_curves)
+    methods = _methods(problem, compared)
     queries, count = len(ends), len(methods)
     phi, rows = np.empty((queries, count, problem.curve.coefficients)), []
     claimed = np.empty((queries, count), dtype=bool)
@@ -111,79 +122,61 @@ def policy_rows(
         method.answer(ends[np.arange(1)], 0)
     for query in range(queries):
         one = ends[np.array([query])]
-        for k, method in enumerate(
-            methods
-        ):  # in turn, so that what else the machine does disturbs all alike
+        # in turn, so that what else the machine does disturbs all alike
+        for k, method in enumerate(methods):
             began = time.perf_counter()
             phi[query, k], claimed[query, k] = method.answer(one, query)
             spent = 1e3 * (time.perf_counter() - began)
-            rows.append(
-                {
-                    "method": method.name,
-                    "seed": method.seed,
-                    "query": query,
-                    "curves": method.curves,
-                    "time_ms": spent,
-                }
-            )
-    costs = measured(
-        problem, phi.reshape(queries * count, -1), ends[np.repeat(np.arange(queries), count)]
-    )
+            rows.append((method.name, method.seed, query, method.curves, spent))
+    each = ends[np.repeat(np.arange(queries), count)]
+    costs = measured(problem, phi.reshape(queries * count, -1), each)
     feasible = claimed & costs.feasible.reshape(queries, count)
     length = np.where(feasible, costs.length.reshape(queries, count), np.nan)
-    best = np.fmin(
-        family_optimum(problem, ends, phi, optimum).length, np.fmin.reduce(length, axis=1)
-    )
-    table = pd.DataFrame(rows).assign(feasible=feasible.ravel(), length_rad=length.ravel())
-    table["optimum_rad"] = best[table["query"]]
-    return table[
-        ["method", "seed", "query", "feasible", "length_rad", "optimum_rad", "curves", "time_ms"]
-    ]
+    shortest = family_optimum(problem, ends, phi, optimum).length
+    best = np.fmin(shortest, np.fmin.reduce(length, axis=1))
+    table = pd.DataFrame(rows, columns=["method", "seed", "query", "curves", "time_ms"])
+    table.insert(3, "feasible", feasible.ravel())
+    table.insert(4, "length_rad", length.ravel())
+    table.insert(5, "optimum_rad", best[table["query"]])
+    return table
 
 
 def policy_table(rows: pd.DataFrame) -> pd.DataFrame:
-    """One row a method: share of feasible answers, length over the optimum, curves and time; of one
-    constraint's rows.
+    """One row a method of one constraint: feasible share, length over the optimum, curves, time.
 
-    Ratios are over the method's own feasible answers (ratio_*) and over the queries for which every
-    answer of every method is feasible (shared_ratio_*, `shared` of them), the only ones that
-    compare columns of different methods.
-    solvable: queries with an optimum, out of `queries`.
+    ratio_*: over the method's own feasible answers.  shared_ratio_*: over the `shared` queries that
+    every method answers, the only ones that compare methods.  solvable: queries with an optimum.
     """
     rows = rows.reset_index(drop=True)
     solved = rows.groupby("query")["feasible"].all()
     shared = rows["query"].map(solved)
     ratio = rows["length_rad"] / rows["optimum_rad"]
-    table = []
-    for method, group in rows.groupby("method", sort=False):
-        own, common = group["feasible"], group.index[shared[group.index]]
-        table.append(
-            {
-                "method": method,
-                "queries": group["query"].nunique(),
-                "solvable": group.loc[group["optimum_rad"].notna(), "query"].nunique(),
-                "feasible": float(own.mean()),
-                **_spread("ratio", ratio[group.index[own]]),
-                "shared": int(solved.sum()),
-                **_spread("shared_ratio", ratio[common]),
-                "curves": int(group["curves"].max()),
-                "time_median_ms": float(group["time_ms"].median()),
-            }
-        )
-    return pd.DataFrame(table)
-
-
-def charts_together(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Rows of the same queries in several charts, by the charts' names, as one table with one
-    optimum.
-
-    A method becomes "method, chart"; optimum_rad the shortest of any chart's family.
-    """
-    rows = pd.concat(
-        [table.assign(method=table["method"] + f", {chart}") for chart, table in tables.items()]
+    rows = rows.assign(
+        solvable=rows["query"].where(rows["optimum_rad"].notna()),
+        ratio=ratio.where(rows["feasible"]),
+        shared_ratio=ratio.where(shared),
     )
+    groups = rows.groupby("method", sort=False)
+    table = groups.agg(
+        queries=("query", "nunique"),
+        solvable=("solvable", "nunique"),
+        feasible=("feasible", "mean"),
+    )
+    table = table.join(_spread("ratio", groups)).assign(shared=int(solved.sum()))
+    table = table.join(_spread("shared_ratio", groups))
+    table["curves"], table["time_median_ms"] = groups["curves"].max(), groups["time_ms"].median()
+    return table.reset_index()
+
+
+def spaces_together(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Rows of the same queries in several spaces, by their names, as one table with one optimum.
+
+    A method becomes "method, space"; optimum_rad is the shortest of any space's family.
+    """
+    named = [table.assign(method=table["method"] + f", {name}") for name, table in tables.items()]
+    rows = pd.concat(named, ignore_index=True)
     rows["optimum_rad"] = rows.groupby("query")["optimum_rad"].transform("min")
-    return rows.reset_index(drop=True)
+    return rows
 
 
 def family_optimum(
@@ -194,10 +187,9 @@ def family_optimum(
 ) -> FamilyOptimum:
     """The shortest feasible curve of the family for each query, as far as many starts find it.
 
-    From every start the problem's own descent with a step size for each curve, which stands where
-    the mean Jacobian and the projector are no longer exact; from there BFGS on the cost.  All
-    queries and starts go in one batch. Starts and what the descent made of them count as well, so
-    the answer is no longer than a feasible start.
+    From every start the problem's own descent, then BFGS on the cost, all queries in one batch.
+    Starts and what the descent made of them count too, so no feasible start is shorter than the
+    answer.
     Raises GeometryError if the problem does not retract, there is no query, or the starts are not
     (Q, K, p).
     """
@@ -208,10 +200,8 @@ def family_optimum(
         raise GeometryError(f"starts has shape {starts.shape}: must be ({queries}, K, {size})")
     phi = np.concatenate([starts, _random_starts(problem, ends, settings)], axis=1)
     each = ends[np.repeat(np.arange(queries), phi.shape[1])]
-    moved = descended(problem, phi.reshape(-1, size), each, settings.descent_steps).reshape(
-        phi.shape
-    )
-    met = np.concatenate([phi, moved], axis=1)
+    moved = descended(problem, phi.reshape(-1, size), each, settings.descent_steps)
+    met = np.concatenate([phi, moved.reshape(phi.shape)], axis=1)
     finer = replace(problem, degree=POLISH_DEGREE, retraction=EXACT)
     costs = finer.evaluate(met.reshape(-1, size), ends[np.repeat(np.arange(queries), met.shape[1])])
     picked = _picked(problem, met, _lengths(costs).reshape(met.shape[:2]), ends, settings.polished)
@@ -221,10 +211,8 @@ def family_optimum(
     return _shortest(problem, np.concatenate([final, met], axis=1), ends)
 
 
-def measured(problem: LearnedProblem, phi: Float[np.ndarray, "B p"], ends: Ends) -> Costs:
-    """Costs at FINE_DEGREE; a feasible curve's executed path, besides, neither jumps nor leaves
-    what it must keep.
-    """
+def measured(problem: LearnedProblem, phi: Phi, ends: Ends) -> Costs:
+    """Costs at FINE_DEGREE; a feasible curve's executed path is sound besides."""
     costs = _fine(problem).evaluate(phi, ends)
     feasible = costs.feasible.copy()
     for row in np.flatnonzero(feasible):
@@ -245,36 +233,26 @@ def is_sound(problem: LearnedProblem, phi: Float[np.ndarray, "p"], ends: Ends) -
     )
 
 
-def descended(
-    problem: LearnedProblem, phi: Float[np.ndarray, "B p"], ends: Ends, steps: int
-) -> Float[np.ndarray, "B p"]:
-    """Curves after steps along the problem's descent, each with a step size of its own; none gets
-    worse.
-    """
-    now = problem.look(phi, ends)
+def descended(problem: LearnedProblem, phi: Phi, ends: Ends, steps: int) -> Phi:
+    """Curves after steps along the problem's descent, with step sizes of their own; none worse."""
+    now = problem.observed(phi, ends)
     rank, descent, stride = _ranks(now.costs), now.descent, np.ones(len(phi))
     for _ in range(steps):
         moved = phi + stride[:, None] * descent
-        now = problem.look(moved, ends)
+        now = problem.observed(moved, ends)
         new = _ranks(now.costs)
         better = new < rank
-        phi, descent = (
-            np.where(better[:, None], moved, phi),
-            np.where(better[:, None], now.descent, descent),
-        )
+        phi = np.where(better[:, None], moved, phi)
+        descent = np.where(better[:, None], now.descent, descent)
         rank = np.where(better, new, rank)
         stride = np.where(better, np.minimum(1.3 * stride, LONGEST_STRIDE), 0.4 * stride)
     return phi
 
 
-def polished(
-    problem: LearnedProblem, phi: Float[np.ndarray, "B p"], ends: Ends, steps: int
-) -> Float[np.ndarray, "B p"]:
-    """Curves after BFGS on the cost with central differences (Nocedal and Wright, Numerical
-    Optimization, alg. 6.1).
+def polished(problem: LearnedProblem, phi: Phi, ends: Ends, steps: int) -> Phi:
+    """Curves after BFGS on the cost with central differences (Nocedal and Wright, alg. 6.1).
 
-    Every feasible curve has its own inverse Hessian and goes on until a step gains less than GAIN;
-    none gets worse and none becomes infeasible.  The others stay as they are.
+    Every feasible curve goes on until a step gains less than GAIN; none gets worse or infeasible.
     """
     phi, size = phi.copy(), phi.shape[1]
     value = _ranks(problem.evaluate(phi, ends)) if len(phi) else np.empty(0)
@@ -289,13 +267,12 @@ def polished(
         far, length = FIRST_STEP * ends.distance[rows], np.linalg.norm(direction, axis=1)
         direction *= np.minimum(1.0, far / np.maximum(length, 1e-12))[:, None]
         slope = (direction * gradient[rows]).sum(axis=1)
-        moved, new = _line_search(problem, phi[rows], ends[rows], value[rows], direction, slope)
+        line = _Line(phi[rows], ends[rows], value[rows], direction, slope)
+        moved, new = _line_search(problem, line)
         stuck = new >= value[rows]
         going = np.where(stuck, ~fresh[rows], value[rows] - new > GAIN * value[rows])
-        inverse[rows[stuck]], fresh[rows[stuck]] = (
-            np.eye(size),
-            True,
-        )  # a kink spoils the Hessian: once more without
+        # a kink spoils the Hessian: once more without
+        inverse[rows[stuck]], fresh[rows[stuck]] = np.eye(size), True
         on = rows[going & ~stuck]
         change = (moved - phi[rows])[going & ~stuck]
         phi[rows], value[rows] = moved, new
@@ -308,8 +285,7 @@ def polished(
 
 @dataclass(frozen=True)
 class _Method:
-    """A way to answer a query (its ends and its number) with coefficients (p,) and whether they are
-    feasible.
+    """Answers a query (its ends and number) with coefficients (p,) and whether they are feasible.
 
     curves: that it meets for one query.
     """
@@ -320,69 +296,49 @@ class _Method:
     answer: Callable[[Ends, int], tuple[Float[np.ndarray, "p"], bool]]
 
 
-def _methods(
-    problem: LearnedProblem,
-    policies: Sequence[MeanPolicy],
-    separate: Sequence[MeanPolicy] | None,
-    settings: EpisodeSettings,
-    seed: int,
-    random_curves: int | None,
-) -> list[_Method]:
-    met = len(policies) * settings.steps + 1
-    drawn = met if random_curves is None else random_curves
-    methods = [_Method(STRAIGHT, 0, 1, partial(_straight, problem))]
-    methods += [
-        _Method(ONE_SEED, k, settings.steps + 1, partial(_proposed, problem, [policy], settings))
-        for k, policy in enumerate(policies)
+def _methods(problem: LearnedProblem, compared: Compared) -> list[_Method]:
+    steps, policies, separate = compared.settings.steps, compared.policies, compared.separate
+    drawn = compared.random_curves
+    drawn = len(policies) * steps + 1 if drawn is None else drawn
+    asked: list[tuple[str, int, Sequence[MeanPolicy]]] = [
+        (ONE_SEED, k, [policy]) for k, policy in enumerate(policies)
     ]
-    if policies:
-        methods.append(_Method(POLICIES, 0, met, partial(_proposed, problem, policies, settings)))
-    if separate:
-        count = len(separate) * settings.steps + 1
-        methods.append(_Method(SEPARATE, 0, count, partial(_proposed, problem, separate, settings)))
-    methods.append(
-        _Method(DESCENT, 0, settings.steps + 1, partial(_followed, problem, settings.steps))
-    )
-    methods.append(_Method(RANDOM, 0, drawn, partial(_at_random, problem, drawn, seed)))
-    return methods
+    asked += [(POLICIES, 0, policies)] if policies else []
+    asked += [(SEPARATE, 0, separate)] if separate else []
+    return [
+        _Method(STRAIGHT, 0, 1, lambda ends, _: _straight(problem, ends)),
+        *(
+            _Method(name, k, len(own) * steps + 1, partial(_proposed, problem, own, compared))
+            for name, k, own in asked
+        ),
+        _Method(DESCENT, 0, steps + 1, lambda ends, _: _followed(problem, steps, ends)),
+        _Method(RANDOM, 0, drawn, partial(_at_random, problem, drawn, compared.seed)),
+    ]
 
 
-def _straight(
-    problem: LearnedProblem,
-    ends: Ends,
-    query: int,  # noqa: ARG001
-) -> tuple[Float[np.ndarray, "p"], bool]:
+def _straight(problem: LearnedProblem, ends: Ends) -> tuple[Float[np.ndarray, "p"], bool]:
     phi = np.zeros((1, problem.curve.coefficients))
     return phi[0], bool(problem.evaluate(phi, ends).feasible[0])
 
 
 def _proposed(
-    problem: LearnedProblem,
-    policies: Sequence[MeanPolicy],
-    settings: EpisodeSettings,
-    ends: Ends,
-    query: int,  # noqa: ARG001
+    problem: LearnedProblem, policies: Sequence[MeanPolicy], compared: Compared, ends: Ends, _: int
 ) -> tuple[Float[np.ndarray, "p"], bool]:
-    found = propose(problem, policies, settings, ends)
+    found = propose(problem, policies, compared.settings, ends)
     return _best(found.phi[:, 0], found.cost[:, 0], found.feasible[:, 0])
 
 
 def _followed(
-    problem: LearnedProblem,
-    steps: int,
-    ends: Ends,
-    query: int,  # noqa: ARG001
+    problem: LearnedProblem, steps: int, ends: Ends
 ) -> tuple[Float[np.ndarray, "p"], bool]:
     """The problem's descent alone, whole steps from the straight line."""
     phi = np.zeros((steps + 1, problem.curve.coefficients))
-    looks = [problem.look(phi[:1], ends)]
+    looks = [problem.observed(phi[:1], ends)]
     for step in range(1, steps + 1):
         phi[step] = phi[step - 1] + looks[-1].descent[0]
-        looks.append(problem.look(phi[step : step + 1], ends))
-    costs = [look.costs for look in looks]
-    return _best(
-        phi, np.concatenate([c.cost for c in costs]), np.concatenate([c.feasible for c in costs])
-    )
+        looks.append(problem.observed(phi[step : step + 1], ends))
+    cost = np.concatenate([look.costs.cost for look in looks])
+    return _best(phi, cost, np.concatenate([look.costs.feasible for look in looks]))
 
 
 def _at_random(
@@ -397,7 +353,7 @@ def _at_random(
 
 
 def _best(
-    phi: Float[np.ndarray, "B p"], cost: Float[np.ndarray, "B"], feasible: Bool[np.ndarray, "B"]
+    phi: Phi, cost: Float[np.ndarray, "B"], feasible: Bool[np.ndarray, "B"]
 ) -> tuple[Float[np.ndarray, "p"], bool]:
     row = int(np.lexsort((cost, ~feasible))[0])
     return phi[row], bool(feasible[row])
@@ -450,9 +406,7 @@ def _picked(
     ends: Ends,
     count: int,
 ) -> Int[np.ndarray, "Q {count}"]:
-    """Each query's shortest sound curves, no two of them near each other; -1 where there are no
-    more.
-    """
+    """Each query's shortest sound curves, none near another; -1 where there are no more."""
     picked = np.full((len(phi), count), -1)
     for query in range(len(phi)):
         one, near, found = ends[np.array([query])], NEAR * ends.distance[query], 0
@@ -471,9 +425,7 @@ def _lengths(costs: Costs) -> Float[np.ndarray, "B"]:
     return np.where(costs.feasible, costs.length, np.inf)
 
 
-def _gradients(
-    problem: LearnedProblem, phi: Float[np.ndarray, "B p"], ends: Ends, rows: Int[np.ndarray, "b"]
-) -> Float[np.ndarray, "B p"]:
+def _gradients(problem: LearnedProblem, phi: Phi, ends: Ends, rows: Int[np.ndarray, "b"]) -> Phi:
     """Of the cost, by central differences; zero but in the given rows."""
     gradients, count, size = np.zeros_like(phi), len(rows), phi.shape[1]
     if not count:
@@ -486,23 +438,24 @@ def _gradients(
     return gradients
 
 
-def _line_search(
-    problem: LearnedProblem,
-    phi: Float[np.ndarray, "B p"],
-    ends: Ends,
-    value: Float[np.ndarray, "B"],
-    direction: Float[np.ndarray, "B p"],
-    slope: Float[np.ndarray, "B"],
-) -> tuple[Float[np.ndarray, "B p"], Float[np.ndarray, "B"]]:
-    """The first of ever shorter steps whose decrease is sufficient (Armijo), else no step; with its
-    cost.
-    """
-    phi, new, share = phi.copy(), value.copy(), 1.0
+class _Line(NamedTuple):
+    """Curves with their cost, and a direction (B, p) to search along with the cost's slope."""
+
+    phi: Phi
+    ends: Ends
+    value: Float[np.ndarray, "B"]
+    direction: Phi
+    slope: Float[np.ndarray, "B"]
+
+
+def _line_search(problem: LearnedProblem, line: _Line) -> tuple[Phi, Float[np.ndarray, "B"]]:
+    """The first of ever shorter steps whose decrease is sufficient (Armijo), else no step."""
+    phi, new, share = line.phi.copy(), line.value.copy(), 1.0
     rows = np.arange(len(phi))
     for _ in range(HALVINGS):
-        tried = phi[rows] + share * direction[rows]
-        cost = _ranks(problem.evaluate(tried, ends[rows]))
-        enough = cost < value[rows] + SUFFICIENT * share * slope[rows]
+        tried = phi[rows] + share * line.direction[rows]
+        cost = _ranks(problem.evaluate(tried, line.ends[rows]))
+        enough = cost < line.value[rows] + SUFFICIENT * share * line.slope[rows]
         phi[rows[enough]], new[rows[enough]] = tried[enough], cost[enough]
         rows, share = rows[~enough], SHORTENED * share
         if not len(rows):
@@ -534,13 +487,11 @@ def _update(
     fresh[rows] = False
 
 
-def _spread(name: str, values: "pd.Series[float]") -> dict[str, Any]:
-    """Mean, median and 95th percentile; nan where there is no value."""
-    return {
-        f"{name}_mean": float(values.mean()),
-        f"{name}_median": float(values.median()),
-        f"{name}_p95": float(values.quantile(0.95)),
-    }
+def _spread(name: str, groups: Any) -> pd.DataFrame:
+    """Mean, median and 95th percentile of a column by group; nan where there is no value."""
+    column = groups[name]
+    spread = {"mean": column.mean(), "median": column.median(), "p95": column.quantile(0.95)}
+    return pd.DataFrame(spread).add_prefix(f"{name}_")
 
 
 def _require_queries(problem: LearnedProblem, ends: Ends) -> None:
@@ -550,3 +501,56 @@ def _require_queries(problem: LearnedProblem, ends: Ends) -> None:
         )
     if not len(ends):
         raise GeometryError("ends holds no query: must hold one at least")
+
+
+PAST_ROWS = 1000
+"""Configurations of the constraint that random curves are bent past."""
+LEARNED, JOINTS = "learned manifold", "joint space"
+
+
+@dataclass(frozen=True)
+class PolicyTask:
+    """One constraint; picklable.  Folders of the policies for all, and of its own, or None."""
+
+    name: str
+    scene: Scene
+    manifold: ConstraintManifold
+    chart: LearnedManifold
+    settings: GeodesicParams
+    policies: Path
+    separate: Path | None
+    queries: int
+    seed: int
+
+
+def run_policies(task: PolicyTask) -> pd.DataFrame:
+    """Rows of all methods in the learned chart, and of those that need no policy in joint space."""
+    queries = draw_queries(task.scene, task.manifold, task.name, task.queries, task.seed)
+    seed = (*seed_of(task.name, task.seed), 2)
+    past = draw_free(ShardTask(task.scene, task.manifold, PAST_ROWS, seed))
+    shared = [MeanPolicy.load(task.policies, seed) for seed in task.settings.seeds]
+    separate = None
+    if task.separate is not None:
+        separate = [MeanPolicy.load(task.separate, seed) for seed in task.settings.seeds]
+    joint_space = JointManifold.of(task.scene.robot.sample(PAST_ROWS, np.random.default_rng(0)))
+    settings, tables = task.settings, {}
+    episodes = episode_settings(settings)
+    for name, chart in ((LEARNED, task.chart), (JOINTS, joint_space)):
+        curve = PinnedPolynomial(chart.dim, settings.degree)
+        space = chart, task.manifold, curve, past
+        problem = LearnedProblem(*space, settings.length_degree, True, 0.0)
+        policies = (shared, separate) if chart is task.chart else ([], None)
+        drawn = len(shared) * episodes.steps + 1
+        compared = Compared(*policies, episodes, task.seed, drawn)
+        tables[name] = policy_rows(problem, problem.ends(queries.starts, queries.goals), compared)
+    return spaces_together(tables)
+
+
+def policy_figures(table: pd.DataFrame) -> dict[str, Any]:
+    """Constraint → method → figures."""
+    figures: dict[str, Any] = {}
+    for row in table.to_dict("records"):
+        constraint, method = str(row.pop("constraint")), str(row.pop("method"))
+        own = {str(name): None if pd.isna(value) else value for name, value in row.items()}
+        figures.setdefault(constraint, {})[method] = own
+    return figures

@@ -1,0 +1,86 @@
+"""What params.yaml names, looked at before hours of work: the robot's and the workcell's files, and
+what the stages ask of each other's parameters.
+
+`load_params` checks what can be seen in params.yaml alone; this opens the files behind it.
+"""
+
+import math
+from collections.abc import Iterator
+from xml.etree.ElementTree import ParseError
+
+from constraint_geodesics.params import Params, ParamsError
+from constraint_geodesics.peers import registry
+from constraint_geodesics.peers.baseline import BaselineError
+from constraint_geodesics.scene.scene import Scene, robot_from
+from constraint_geodesics.scene.urdf import find_urdf
+
+
+def check_params(params: Params) -> None:
+    """Raises ParamsError, one line with the entry, its value and what is allowed, for the first on
+    which a stage would fail.
+    """
+    _check_robot(params)
+    for problem in _problems(params):
+        raise ParamsError(problem)
+
+
+def _check_robot(params: Params) -> None:
+    """URDF, tool link, joints and limits; then the workcell's bodies and the links they name."""
+    robot = params.robot
+    try:
+        robot_from(robot)
+    except ParseError as error:
+        raise ParamsError(f"robot.urdf: {find_urdf(robot.urdf)}: no URDF: {error}") from None
+    except (ValueError, OSError) as error:
+        raise ParamsError(f"robot: {error}") from None
+    try:
+        with Scene.from_params(params).world():
+            pass
+    except (ValueError, OSError, RuntimeError) as error:
+        raise ParamsError(f"workcell: {error}") from None
+
+
+def _problems(params: Params) -> Iterator[str]:
+    joints, execution = robot_from(params.robot).dof, params.execution
+    for name, manifold in params.manifolds.items():
+        if manifold.latent_dim > joints:
+            yield (
+                f"manifolds.{name}.latent_dim={manifold.latent_dim}: must be at most {joints}, the "
+                f"robot's joints"
+            )
+    for name in params.geodesics.searched:
+        if not params.manifolds[name].retract:
+            yield (
+                f"geodesics.searched={name!r}: manifolds.{name}.retract must be true, policies for "
+                f"all constraints are trained on retracted curves"
+            )
+    for block in ("geodesics", "policies"):
+        settings = getattr(params, block)
+        rows = params.geodesics.environments * settings.ppo.rollout_steps
+        if settings.ppo.batch_size > rows:
+            yield (
+                f"{block}.ppo.batch_size={settings.ppo.batch_size}: must be at most {rows}, "
+                f"geodesics.environments times rollout_steps"
+            )
+    if not execution.least_tilt_rad < math.pi:
+        yield f"execution.least_tilt_rad={execution.least_tilt_rad}: must be below π"
+    carried = params.studies.constraint
+    if not all(params.constraints[carried].axes[3:5]):
+        yield (
+            f"studies.constraint={carried!r}: must hold roll and pitch, or the cup that the stage "
+            f"execute_paths carries need not stay upright"
+        )
+    yield from _planner_problems(params)
+
+
+def _planner_problems(params: Params) -> Iterator[str]:
+    bench = params.benchmark
+    for name, planner in bench.planners.items():
+        try:
+            registry.settings_of(name, planner)
+        except BaselineError as error:
+            yield str(error)
+    for entry in ("recorded", "drawn"):
+        for name in getattr(bench, entry):
+            if name not in bench.planners:
+                yield f"benchmark.{entry}={name!r}: must be one of benchmark.planners"

@@ -1,0 +1,40 @@
+"""A body read from a URDF.  Its meshes are PyBullet's alone: the planner's distances miss it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from constraint_geodesics.fields import Vector3
+from constraint_geodesics.robot.kinematics import rotation_from_rpy
+from constraint_geodesics.scene.shape import PlacedUrdf, Shape
+from constraint_geodesics.scene.urdf import find_urdf
+
+
+@dataclass(frozen=True)
+class Body(Shape):
+    """A URDF at a pose [m, rad]: a path in this checkout, or one in pybullet_data."""
+
+    name: str
+    urdf: str | Path
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    rpy_rad: Vector3 = (0.0, 0.0, 0.0)
+    exempt_links: tuple[str, ...] = ()
+    kind: Literal["urdf"] = "urdf"
+
+    def urdf_model(self) -> PlacedUrdf:
+        """The URDF at its pose."""
+        turn = rotation_from_rpy(np.array(self.rpy_rad))
+        return PlacedUrdf(find_urdf(self.urdf), self.position_m, turn)
+
+    def add_to(self, bullet: Any) -> int:
+        """All of the URDF, its moving joints at 0."""
+        return int(
+            bullet.loadURDF(
+                str(find_urdf(self.urdf)),
+                basePosition=self.position_m,
+                baseOrientation=bullet.getQuaternionFromEuler(self.rpy_rad),
+                useFixedBase=True,
+            )
+        )

@@ -1,0 +1,61 @@
+"""A capsule: a cylinder in any direction with a half sphere on either end, as a pipe or a post."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from constraint_geodesics.fields import Positive, Vector3
+from constraint_geodesics.scene.shape import RoundedBox, Shape, add_body
+
+
+@dataclass(frozen=True)
+class Capsule(Shape):
+    """All points within a radius of the line from one point to another [m]."""
+
+    name: str
+    from_m: Vector3
+    to_m: Vector3
+    radius_m: Positive
+    exempt_links: tuple[str, ...] = ()
+    kind: Literal["capsule"] = "capsule"
+
+    @property
+    def length_m(self) -> float:
+        """Of the line between its ends, without the half spheres."""
+        return float(np.linalg.norm(np.subtract(self.to_m, self.from_m)))
+
+    def rounded_boxes(self) -> tuple[RoundedBox, ...]:
+        """A box with one edge, along the line, rounded by the radius."""
+        x, y, z = (0.5 * (a + b) for a, b in zip(self.from_m, self.to_m, strict=True))
+        half_edges = (0.0, 0.0, 0.5 * self.length_m)
+        return (RoundedBox((x, y, z), half_edges, self.radius_m, self._turn()),)
+
+    def add_to(self, bullet: Any) -> int:
+        """A capsule of PyBullet, which has it along its z axis."""
+        (core,) = self.rounded_boxes()
+        size = {"radius": self.radius_m, "height": self.length_m}
+        kind = bullet.GEOM_CAPSULE
+        return add_body(bullet, core.centre, self._quaternion(), shapeType=kind, **size)
+
+    def drawn(self, rerun: Any, style: Mapping[str, Any]) -> Any:
+        """A capsule of Rerun, which begins at the origin and runs along its z axis."""
+        turn = rerun.Quaternion(xyzw=self._quaternion())
+        size = {"lengths": [self.length_m], "radii": [self.radius_m]}
+        return rerun.Capsules3D(translations=[self.from_m], quaternions=[turn], **size, **style)
+
+    def _turn(self) -> Float[np.ndarray, "3 3"]:
+        """Turns the z axis into the direction of the line."""
+        if not self.length_m > 0.0:
+            return np.eye(3)
+        axis = np.subtract(self.to_m, self.from_m) / self.length_m
+        across = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
+        across /= np.linalg.norm(across)
+        return np.column_stack([across, np.cross(axis, across), axis])
+
+    def _quaternion(self) -> list[float]:
+        quaternion: list[float] = Rotation.from_matrix(self._turn()).as_quat().tolist()
+        return quaternion

@@ -1,0 +1,12 @@
+"""The kinds of shapes that params.yaml may name."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from constraint_geodesics.scene.body import Body
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.capsule import Capsule
+from constraint_geodesics.scene.sphere import Sphere
+
+AnyShape = Annotated[Box | Sphere | Capsule | Body, Field(discriminator="kind")]

@@ -1,0 +1,53 @@
+"""Where URDF files lie: in this checkout, or among those that ship with PyBullet."""
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from constraint_geodesics.robot.kinematics import RobotError
+
+
+def data_path() -> Path:
+    """Folder of the robots and meshes that ship with PyBullet."""
+    with quiet():
+        import pybullet_data
+    return Path(pybullet_data.getDataPath())
+
+
+def find_urdf(name: str | Path) -> Path:
+    """A URDF named by a path in this checkout, or by one in pybullet_data; RobotError if there is
+    neither.
+    """
+    for candidate in (Path(name), data_path() / name):
+        if candidate.is_file():
+            return candidate
+    raise RobotError(f"{name}: no such URDF, neither in this checkout nor in pybullet_data")
+
+
+def urdf_name(urdf: Path) -> str:
+    """A URDF as params.yaml names it: within pybullet_data, within this checkout, or by its whole
+    path.
+    """
+    for folder in (data_path().resolve(), Path.cwd()):
+        if urdf.resolve().is_relative_to(folder):
+            return urdf.resolve().relative_to(folder).as_posix()
+    return urdf.resolve().as_posix()
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Silence the lines that PyBullet writes past Python straight to the process's output."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    saved = [(stream, os.dup(stream)) for stream in (1, 2)]
+    try:
+        with open(os.devnull, "w") as nothing:
+            for stream, _ in saved:
+                os.dup2(nothing.fileno(), stream)
+        yield
+    finally:
+        for stream, copy in saved:
+            os.dup2(copy, stream)
+            os.close(copy)

@@ -1,0 +1,86 @@
+"""Why a query has no path, as a status and one line for people."""
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.projection import retract
+from constraint_geodesics.problem import Status, ends_refused
+from constraint_geodesics.scene.world import World
+from constraint_geodesics.search.candidates import Answer
+from constraint_geodesics.search.preparation import Query
+from constraint_geodesics.search.roadmap import Roadmap, join
+
+ALTERNATIVES = 64
+"""Configurations from which another goal with the same tool pose is looked for."""
+
+
+def refused_ends(query: Query, world: World) -> tuple[Status, str] | None:
+    """Why these ends can't be those of a path; None where they can."""
+    manifold = query.task.manifold
+    ends = {"start": query.start, "goal": query.goal}
+    status = ends_refused(manifold, query.start, query.goal)
+    if status in ("start_violates", "goal_violates"):
+        end = status.removesuffix("_violates")
+        return status, f"the {end} violates {query.name} by {_amount(manifold, ends[end])}"
+    if status is not None:
+        return status, next(line for end, q in ends.items() if (line := _limit(manifold, end, q)))
+    for end, q in ends.items():
+        if not world.is_free(q):
+            own = bool(world.label(q[None]).self_collision[0])
+            return (
+                "in_collision",
+                f"the {end} touches {'the arm itself' if own else 'the workcell'}",
+            )
+    return None
+
+
+def _limit(manifold: ConstraintManifold, end: str, q: Float[np.ndarray, "D"]) -> str:
+    robot = manifold.robot
+    for k in np.flatnonzero((q < robot.lower) | (q > robot.upper)):
+        limits = f"its limits are {robot.lower[k]:.4g} and {robot.upper[k]:.4g} rad"
+        return f"{robot.joint_names[k]} of the {end} is {q[k]:.4g} rad: {limits}"
+    return ""
+
+
+def not_connected(query: Query, answer: Answer, world: World) -> str:
+    """That start and goal are not joined, and the nearest goal that the start can reach instead."""
+    line = f"start and goal lie in different components of {query.name}'s graph"
+    roadmap = query.task.roadmap()
+    if roadmap is None or answer.at_start is None:
+        return line
+    reached = answer.at_start.components(roadmap)
+    nodes = roadmap.joints[np.isin(roadmap.labels, list(reached))]
+    nodes = nodes[np.argsort(np.linalg.norm(nodes - query.goal, axis=1))]
+    seeds = nodes[:: max(len(nodes) // ALTERNATIVES, 1)]
+    for q in _same_pose(query, seeds):
+        if world.is_free(q) and _component(query, roadmap, q) & reached:
+            return f"{line}; the goal's tool pose can be reached from the start as {_listed(q)} rad"
+    away = float(np.linalg.norm(nodes[0] - query.goal))
+    nearest = f"the nearest configuration that the start can reach, {away:.2f} rad away"
+    return f"{line}; {nearest}, is {_listed(nodes[0])}"
+
+
+def _same_pose(query: Query, seeds: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "m D"]:
+    """Other configurations with the goal's tool pose, the nearest first."""
+    robot = query.task.manifold.robot
+    pose = Constraint((1,) * 6, reference=Pose(*robot.forward(query.goal)))
+    result = retract(ConstraintManifold(robot, pose), seeds)
+    found = result.joints[result.converged & (robot.limit_distance(result.joints) >= 0.0)]
+    return found[np.argsort(np.linalg.norm(found - query.goal, axis=1), kind="stable")]
+
+
+def _component(query: Query, roadmap: Roadmap, q: Float[np.ndarray, "D"]) -> set[int]:
+    return join(roadmap, query.task.clear, q).components(roadmap)
+
+
+def _amount(manifold: ConstraintManifold, q: Float[np.ndarray, "D"]) -> str:
+    """Excess of one configuration in the units people use."""
+    excess = manifold.inclusion(q)
+    metres, angle = float(excess[:3].max()), float(np.linalg.norm(excess[3:]))
+    parts = [f"{1e3 * metres:.3g} mm"] * (metres > 0.0)
+    return " and ".join([*parts, *[f"{np.degrees(angle):.3g}°"] * (angle > 0.0)])
+
+
+def _listed(q: Float[np.ndarray, "D"]) -> str:
+    return "[" + ", ".join(f"{x:.9f}" for x in q) + "]"

@@ -1,0 +1,181 @@
+"""What is prepared once for each constraint and kept for the next query: its space and roadmap."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold
+from constraint_geodesics.constraints.projection import Retraction, retract
+from constraint_geodesics.geometry.graph import components
+from constraint_geodesics.params import PlannerParams
+from constraint_geodesics.scene.clearance import clearance_model
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.world import World
+from constraint_geodesics.search.band import BandSettings, project
+from constraint_geodesics.search.candidates import ALL_PARTS, Parts, Task
+from constraint_geodesics.search.roadmap import EDGE_STEP, Roadmap, build_roadmap
+
+KEPT_TASKS = 64
+"""Constraints without a name that are remembered, with their roadmaps."""
+_ROUNDS = 20
+
+Draw = Callable[[int, np.random.Generator], Float[np.ndarray, "n D"]]
+"""Configurations [rad], on the constraint or not."""
+
+
+@dataclass(frozen=True)
+class Query:
+    """One query while it is planned.  began: on `time.perf_counter`."""
+
+    task: Task
+    name: str
+    start: Float[np.ndarray, "D"]
+    goal: Float[np.ndarray, "D"]
+    began: float
+    parts: Parts = ALL_PARTS
+
+
+class Preparation:
+    """The tasks of a scene by constraint, each with its roadmap: given, or made when it is asked
+    for.
+    """
+
+    def __init__(
+        self, scene: Scene, world: World, settings: PlannerParams, draw: Draw | None = None
+    ) -> None:
+        self.scene, self.world, self.settings = scene, world, settings
+        self.draw = draw or scene.robot.sample
+        self.band = band_settings(settings)
+        self._clearance = clearance_model(scene.robot, scene.workcell)
+        self._tasks: dict[tuple, Task] = {}
+        self._roadmaps: dict[tuple, Roadmap | None] = {}
+        self._named: frozenset[tuple] = frozenset()
+        self._supplied: frozenset[tuple] = frozenset()
+
+    def supply(
+        self, constraints: Mapping[str, Constraint], roadmaps: Mapping[str, Roadmap]
+    ) -> None:
+        """Constraints that are never forgotten, and the roadmaps that exist already."""
+        self._named = frozenset(_key(constraint) for constraint in constraints.values())
+        for name, roadmap in roadmaps.items():
+            # the nodes are written in single precision, which may lie beyond a limit
+            inside = np.clip(roadmap.joints, self.scene.robot.lower, self.scene.robot.upper)
+            inside.setflags(write=False)
+            self._roadmaps[_key(constraints[name])] = replace(roadmap, joints=inside)
+        self._supplied = frozenset(self._roadmaps)
+
+    def task(self, constraint: Constraint) -> Task:
+        """The constraint, prepared; its roadmap is made when it is first asked for."""
+        key = _key(constraint)
+        if key not in self._tasks:
+            if len(self._tasks) >= KEPT_TASKS + len(self._named):
+                oldest = next(other for other in self._tasks if other not in self._named)
+                del self._tasks[oldest]
+                self._roadmaps.pop(oldest, None)
+            manifold = ConstraintManifold(self.scene.robot, constraint)
+            roadmap, supplied = partial(self._roadmap, key, manifold), key in self._supplied
+            self._tasks[key] = Task(manifold, self._clearance, roadmap, supplied, self.band)
+        return self._tasks[key]
+
+    def _roadmap(self, key: tuple, manifold: ConstraintManifold) -> Roadmap | None:
+        if key not in self._roadmaps:
+            settings = self.settings
+            rng = np.random.default_rng(settings.seed)
+            nodes = free_configurations(
+                manifold, self.world, self.draw, settings.roadmap_nodes, rng
+            )
+            space = self._tasks[key].clear
+            self._roadmaps[key] = (
+                build_roadmap(space, nodes, settings.roadmap_neighbours) if len(nodes) > 1 else None
+            )
+        return self._roadmaps[key]
+
+
+def named_roadmaps(
+    scene: Scene, constraints: Mapping[str, Constraint], settings: PlannerParams
+) -> dict[str, Roadmap]:
+    """Checked roadmaps of constraints, from uniform samples projected onto each; none for one that
+    hardly any configuration keeps.
+    """
+    found = {}
+    with scene.world() as world:
+        preparation = Preparation(scene, world, settings)
+        for name, constraint in constraints.items():
+            task, rng = preparation.task(constraint), np.random.default_rng(settings.seed)
+            count, draw = settings.roadmap_nodes, scene.robot.sample
+            nodes = free_configurations(task.manifold, world, draw, count, rng)
+            if len(nodes) > 1:
+                found[name] = checked_roadmap(task, world, nodes, settings.roadmap_neighbours)
+    return found
+
+
+def checked_roadmap(
+    task: Task, world: World, nodes: Float[np.ndarray, "n D"], neighbours: int
+) -> Roadmap:
+    """The roadmap over these configurations whose edges PyBullet finds free of collision as well,
+    those of the arm with itself among them.
+    """
+    roadmap = build_roadmap(task.clear, nodes, neighbours)
+    points, edge = edge_points(task.clear, roadmap)
+    touched = np.zeros(len(roadmap.edges), bool)
+    np.logical_or.at(touched, edge, ~world.free(points))
+    edges, lengths = roadmap.edges[~touched], roadmap.lengths[~touched]
+    return Roadmap(nodes, edges, lengths, components(len(nodes), edges))
+
+
+def edge_points(
+    space: tuple, roadmap: Roadmap
+) -> tuple[Float[np.ndarray, "m D"], Int[np.ndarray, "m"]]:
+    """Points on the constraint between the ends of every edge, at most EDGE_STEP apart [rad], and
+    the edge that each belongs to.
+    """
+    first, last = roadmap.joints[roadmap.edges[:, 0]], roadmap.joints[roadmap.edges[:, 1]]
+    pieces = np.ceil(np.linalg.norm(last - first, axis=1) / EDGE_STEP).astype(int) + 1
+    edge = np.repeat(np.arange(len(pieces)), pieces - 1)
+    inner = np.arange(len(edge)) - np.repeat(np.cumsum(pieces - 1) - (pieces - 1), pieces - 1) + 1
+    share = (inner / pieces[edge])[:, None]
+    points = (1.0 - share) * first[edge] + share * last[edge]
+    project(space, points)
+    return points, edge
+
+
+def free_configurations(
+    manifold: ConstraintManifold, world: World, draw: Draw, count: int, rng: np.random.Generator
+) -> Float[np.ndarray, "n D"]:
+    """Configurations on the constraint, within the limits and free of collision: drawn, then
+    projected; fewer than `count` if there are few.
+    """
+    robot = manifold.robot
+    kept, found = [np.empty((0, robot.dof))], 0
+    for _ in range(_ROUNDS):
+        drawn = draw(2 * count, rng)
+        share = rng.uniform(size=len(drawn)) ** (1.0 / max(sum(manifold.constraint.axes), 1))
+        result = retract(manifold, drawn, Retraction(), band=share)
+        good = result.joints[result.converged & (robot.limit_distance(result.joints) >= 0.0)]
+        good = good[: count - found]
+        kept.append(good[world.free(good)])
+        found += len(kept[-1])
+        if found >= count:
+            break
+    return np.concatenate(kept)
+
+
+def band_settings(settings: PlannerParams) -> BandSettings:
+    """The band's part of the planner's settings."""
+    return BandSettings(
+        settings.segments,
+        settings.iterations,
+        settings.accuracy,
+        settings.largest_step_rad,
+        settings.clearance_m,
+    )
+
+
+def _key(constraint: Constraint) -> tuple:
+    """The same for constraints that allow the same configurations."""
+    pose = constraint.reference
+    where = () if pose is None else (pose.position.tobytes(), pose.rotation.tobytes())
+    return (constraint.axes, constraint.tolerance, *where)

@@ -1,0 +1,364 @@
+"""The MLflow store that runs are written to: its address, its client, and files kept with a run.
+
+Runs are in `mlflow.db` at the root of the checkout and their files in `mlartifacts/` beside it, or
+in the store that MLFLOW_TRACKING_URI names.  In an SQLite store a run knows its files as
+`mlflow-artifacts:/…`, an address without a folder, which the dashboard's server looks up in its own
+`mlartifacts/`: no server is needed while a stage runs, and a checkout that was moved keeps its
+figures.  MLflow's client can't download such files without the server; they lie in
+`mlartifacts/<experiment>/<run id>/artifacts/`.
+
+With experiment.py and registry.py the importer of mlflow.
+"""
+
+import hashlib
+import json
+import math
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from filelock import FileLock
+from pydantic import BaseModel
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+    from mlflow.entities import DatasetInput
+
+LONGEST_VALUE, PARAMS_A_CALL, METRICS_A_CALL = 6000, 100, 1000
+"""The most that MLflow takes."""
+DIGITS = 9
+"""Of a reported number: enough to compare runs, too few to show the last bits of another processor.
+"""
+FIRST_ANSWER_S = 5
+PLANNER_MODEL, CHAMPION = "constraint_geodesics", "champion"
+"""The registered planner's name, and the alias of the version that people load."""
+
+
+class TrackingError(RuntimeError):
+    """MLflow can't be used; the message is one line with the store's address."""
+
+
+def tracking_uri(root: Path) -> str:
+    """MLFLOW_TRACKING_URI, or the SQLite file at the root of the checkout; never relative."""
+    uri = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{root / 'mlflow.db'}"
+    file = _sqlite_file(uri)
+    return uri if file is None or file.is_absolute() else f"sqlite:///{file.resolve()}"
+
+
+def ui_command(root: Path, port: int) -> list[str]:
+    """The command that opens the dashboard, for this machine only.
+
+    Raises TrackingError if the runs are on a server, which has a dashboard of its own.
+    """
+    uri = tracking_uri(root)
+    if uri.startswith("http"):
+        raise TrackingError(
+            f"MLFLOW_TRACKING_URI={_without_password(uri)}: this server shows its runs "
+            f"itself, open it in a browser"
+        )
+    database = _sqlite_file(uri)
+    artifacts = _artifact_folder(database) if database else root.resolve() / "mlartifacts"
+    # the job runner serves language models; without it the dashboard starts and stops in half the
+    # time
+    quiet = ["env", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false"]
+    server = [
+        sys.executable,
+        *f"-m mlflow server --host 127.0.0.1 --port {port} --workers 1".split(),
+    ]
+    return [*quiet, *server, "--backend-store-uri", uri, "--artifacts-destination", str(artifacts)]
+
+
+@contextmanager
+def fetch_artifacts(address: str, root: Path = Path()) -> Iterator[Path]:
+    """A folder with the files behind an MLflow address (models:/… or runs:/…), gone when the
+    context ends; of a model that holds a planner's files, these.
+
+    Raises TrackingError if there is no such model or run, or the store can't be reached.
+    """
+    mlflow, uri = mlflow_module(), tracking_uri(root)
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            found = _beside_store(uri, address)
+            if found is None:
+                fetched = mlflow.artifacts.download_artifacts(
+                    artifact_uri=address, dst_path=folder, tracking_uri=uri, registry_uri=uri
+                )
+                found = Path(fetched)
+        except (mlflow.exceptions.MlflowException, OSError) as error:
+            raise TrackingError(f"{address}: {' '.join(str(error).split())[:200]}") from None
+        own = found / "artifacts" / "planner"
+        yield own if (found / "MLmodel").is_file() and own.is_dir() else found
+
+
+def _beside_store(uri: str, address: str) -> Path | None:
+    """Where files that only the dashboard's server could send lie beside an SQLite store, or None
+    for all others.
+    """
+    database = _sqlite_file(uri)
+    if database is None:
+        return None
+    source = _stored_at(uri, address)
+    if not source.startswith("mlflow-artifacts:"):
+        return None
+    place = _artifact_folder(database) / urlsplit(source).path.lstrip("/")
+    if not place.exists():
+        raise FileNotFoundError(f"its files are missing in {place}")
+    return place
+
+
+def _stored_at(uri: str, address: str) -> str:
+    client = client_of(uri)
+    if address.startswith("models:"):
+        from mlflow.store.artifact.utils.models import get_model_name_and_version
+
+        return str(
+            client.get_model_version_download_uri(*get_model_name_and_version(client, address))
+        )
+    run_id, _, path = address.removeprefix("runs:/").partition("/")
+    return (
+        f"{client.get_run(run_id).info.artifact_uri}/{path}"
+        if address.startswith("runs:")
+        else address
+    )
+
+
+def mlflow_module() -> ModuleType:
+    """MLflow, imported with the first run (1.3 s): without usage reports to its makers, notes and
+    links.
+    """
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
+    os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
+    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+    import mlflow
+    import mlflow.entities
+
+    return mlflow
+
+
+def client_of(uri: str) -> "MlflowClient":
+    """MLflow's low-level client of a store."""
+    return mlflow_module().MlflowClient(uri)
+
+
+@contextmanager
+def explained(uri: str) -> Iterator[None]:
+    """Every way in which a store fails, as a TrackingError of one line."""
+    from sqlalchemy.exc import SQLAlchemyError
+
+    try:
+        yield
+    except (mlflow_module().MlflowException, SQLAlchemyError, OSError, ImportError) as error:
+        message = f"MLflow store {uri}: {' '.join(str(error).split())[:300]}"
+        raise TrackingError(_without_password(message)) from error
+
+
+def _without_password(text: str) -> str:
+    return re.sub(r"//[^/@]*@", "//", text)
+
+
+def open_store(uri: str, experiment: str) -> tuple["MlflowClient", str]:
+    """A client whose store exists, and the experiment in it: processes that create one database at
+    once would fail.
+    """
+    database = _sqlite_file(uri)
+    lock: AbstractContextManager[Any] = nullcontext()
+    if database is not None:
+        database.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(f"{database}.lock")
+    with lock, _impatient():
+        if not uri.startswith("http"):
+            _check_database(uri)
+        client = client_of(uri)
+        return client, _experiment(client, experiment, database is not None)
+
+
+def _check_database(uri: str) -> None:
+    """MLflow tries a database that it can't open again and again, for minutes."""
+    import sqlalchemy
+
+    if urlsplit(uri).scheme.partition("+")[0] in ("sqlite", "postgresql", "mysql", "mssql"):
+        engine = sqlalchemy.create_engine(uri)
+        sqlalchemy.inspect(engine)
+        engine.dispose()
+
+
+@contextmanager
+def _impatient() -> Iterator[None]:
+    """For the first call alone: MLflow waits minutes for a server that does not answer."""
+    wanted = {
+        "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
+        "MLFLOW_HTTP_REQUEST_TIMEOUT": str(FIRST_ANSWER_S),
+    }
+    added = {name: value for name, value in wanted.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for name in added:
+            del os.environ[name]
+
+
+def _experiment(client: "MlflowClient", name: str, in_sqlite: bool) -> str:
+    found = client.get_experiment_by_name(name)
+    if found is None:
+        location = (
+            f"mlflow-artifacts:/{re.sub(r'[^A-Za-z0-9_-]+', '_', name)}" if in_sqlite else None
+        )
+        return str(client.create_experiment(name, artifact_location=location))
+    return str(found.experiment_id)
+
+
+def _sqlite_file(uri: str) -> Path | None:
+    dialect, _, rest = uri.partition(":///")
+    return Path(rest.partition("?")[0]) if dialect.partition("+")[0] == "sqlite" and rest else None
+
+
+def _artifact_folder(database: Path) -> Path:
+    return database.parent / "mlartifacts"
+
+
+def keep_copy(uri: str, run_id: str, file: Path, folder: str | None = None) -> None:
+    """Keep a copy of a file with a run."""
+    with explained(uri):
+        client, target = client_of(uri), _own_folder(uri, run_id)
+        if target is None:
+            client.log_artifact(run_id, str(file), folder)
+            return
+        (target / (folder or "")).mkdir(parents=True, exist_ok=True)
+        shutil.copy2(file, target / (folder or ""))
+
+
+def keep_folder(uri: str, run_id: str, folder: Path, name: str) -> str:
+    """Keep a copy of a folder with a run, under a name; returns its address."""
+    with explained(uri):
+        client, target = client_of(uri), _own_folder(uri, run_id)
+        if target is None:
+            client.log_artifacts(run_id, str(folder), name)
+        else:
+            shutil.copytree(folder, target / name, dirs_exist_ok=True)
+        return f"{client.get_run(run_id).info.artifact_uri}/{name}"
+
+
+def _own_folder(uri: str, run_id: str) -> Path | None:
+    """Where the dashboard's server will look for a run's files beside an SQLite store; MLflow
+    itself would need that server now.  None for other stores.
+    """
+    address, database = client_of(uri).get_run(run_id).info.artifact_uri, _sqlite_file(uri)
+    if database is None or not address.startswith("mlflow-artifacts:"):
+        return None
+    return _artifact_folder(database) / urlsplit(address).path.lstrip("/")
+
+
+def log_params(client: "MlflowClient", run_id: str, params: BaseModel | Mapping[str, Any]) -> None:
+    """Parameters under names joined by "."; long texts are cut."""
+    entity = mlflow_module().entities.Param
+    batch = [entity(name, _text(value)) for name, value in flat(stored(params), ".").items()]
+    for first in range(0, len(batch), PARAMS_A_CALL):
+        client.log_batch(run_id, params=batch[first : first + PARAMS_A_CALL])
+
+
+def stored(params: Any) -> Any:
+    """Records as plain mappings."""
+    if isinstance(params, BaseModel):
+        return params.model_dump(mode="json")
+    return (
+        {str(name): stored(value) for name, value in params.items()}
+        if isinstance(params, Mapping)
+        else params
+    )
+
+
+def _text(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value, default=str)
+    return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 1] + "…"
+
+
+def dataset_of(file: Path, root: Path) -> "DatasetInput":
+    """An input under its path in the checkout.
+
+    The digest is computed from what the stage is about to read, by DVC's rule, not looked up in
+    dvc.lock: so it is also right while DVC has not written the lock yet, for a file inside an
+    output folder, and for a stage run by hand.
+    """
+    entities, path = mlflow_module().entities, file.resolve()
+    name = (
+        path.relative_to(root.resolve()).as_posix()
+        if path.is_relative_to(root.resolve())
+        else path.as_posix()
+    )
+    dataset = entities.Dataset(name, dvc_md5(path), "local", json.dumps({"uri": name}))
+    return entities.DatasetInput(dataset, [entities.InputTag("mlflow.data.context", "input")])
+
+
+def dvc_md5(path: Path) -> str:
+    """DVC's name of a file's or folder's content: the MD5 of its bytes, or of its list of files
+    with `.dir` behind.
+    """
+    if path.is_dir():
+        files = sorted(
+            entry.relative_to(path).as_posix() for entry in path.rglob("*") if entry.is_file()
+        )
+        listed = [{"md5": dvc_md5(path / name), "relpath": name} for name in files]
+        return hashlib.md5(json.dumps(listed, sort_keys=True).encode()).hexdigest() + ".dir"
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "md5").hexdigest()
+
+
+def source_tags(root: Path) -> dict[str, str]:
+    """The commit the stage runs from, whether its sources differ from it, and DVC's names of stage
+    and experiment.
+    """
+    known = {"dvc_stage": "DVC_STAGE", "dvc_experiment": "DVC_EXP_NAME"}
+    tags = {tag: os.environ[name] for tag, name in known.items() if os.environ.get(name)}
+    commit = _git(root, "rev-parse", "HEAD")
+    if commit:
+        # what a pipeline itself writes while it runs makes no commit dirty
+        changed = _git(root, "status", "--porcelain", "--", ".", ":!dvc.lock", ":!reports")
+        tags |= {
+            "git_commit": commit,
+            "mlflow.source.git.commit": commit,
+            "git_dirty": str(bool(changed)).lower(),
+        }
+    return tags
+
+
+def _git(root: Path, *arguments: str) -> str:
+    command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError:
+        return ""
+    return result.stdout.strip() if result.returncode == 0 else ""
+
+
+def flat(values: Mapping[str, Any], joint: str) -> dict[str, Any]:
+    """Nested mappings as one, their names joined."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            found |= {f"{name}{joint}{own}": v for own, v in flat(value, joint).items()}
+        else:
+            found[name] = value
+    return found
+
+
+def stable(value: Any) -> Any:
+    """Plain JSON values; arrays and their scalars become lists and numbers."""
+    if isinstance(value, Mapping):
+        return {str(name): stable(entry) for name, entry in value.items()}
+    plain = value.tolist() if hasattr(value, "tolist") else value
+    if isinstance(plain, list | tuple):
+        return [stable(entry) for entry in plain]
+    if isinstance(plain, float):
+        return float(f"{plain:.{DIGITS}g}") + 0.0 if math.isfinite(plain) else None
+    return plain

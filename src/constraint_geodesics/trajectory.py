@@ -1,0 +1,313 @@
+"""What a planner answers: waypoints and times with their certificate, or a status that says why
+not; and the CSV it is written as.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.certification.certifier import Certificate
+from constraint_geodesics.constraints.pose import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.problem import PlannerError, Status
+from constraint_geodesics.scene.clearance import no_clearance
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.search.band import BandSpace, project, step_lengths
+
+CONSTRAINT_LINE = "# constraint: "
+"""What the comment line of a trajectory's CSV begins with."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a query was asked under: the constraint with its reference, its name, and the scene."""
+
+    constraint: Constraint
+    name: str
+    scene: Scene = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """How an answer came about.
+
+    planning_time_s: everything, PyBullet's check included.  method: of the planner.  source: the
+    proposal that the waypoints came from, "" without a path.
+    """
+
+    planning_time_s: float
+    method: str
+    source: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A planner's answer; two of them are equal only if they are the same object.
+
+    status: "solved", or why there is no path.  joints (T, D) [rad]: waypoints, both ends exact,
+    straight lines between them keep the constraint to within `violation_bound_rad`; (0, D) without
+    a path.  times (T,) [s]: within the velocity and acceleration limits, at rest at both ends.
+    explanation: one line for people.  certificate: None without a path.
+    """
+
+    status: Status
+    joints: Float[np.ndarray, "T D"]
+    times: Float[np.ndarray, "T"]
+    explanation: str
+    asked: Asked
+    statistics: Statistics
+    certificate: Certificate | None = field(default=None, repr=False)
+
+    @property
+    def goal(self) -> Float[np.ndarray, "D"] | None:
+        """The configuration that is reached [rad]; None without a path."""
+        return self.joints[-1] if len(self.joints) else None
+
+    @property
+    def constraint(self) -> Constraint:
+        """The constraint, held where the query holds it."""
+        return self.asked.constraint
+
+    @property
+    def constraint_name(self) -> str:
+        """Its name, or its axes in words."""
+        return self.asked.name
+
+    @property
+    def scene(self) -> Scene:
+        """Robot and workcell."""
+        return self.asked.scene
+
+    @property
+    def source(self) -> str:
+        """The proposal that the waypoints came from."""
+        return self.statistics.source
+
+    @property
+    def method(self) -> str:
+        """The planner's method."""
+        return self.statistics.method
+
+    @property
+    def planning_time_s(self) -> float:
+        """Everything, PyBullet's check included, which took `collision_time_s` of it."""
+        return self.statistics.planning_time_s
+
+    @property
+    def length_rad(self) -> float:
+        """In joint space; nan without a path, as the figures below."""
+        return np.nan if self.certificate is None else self.certificate.length_rad
+
+    @property
+    def max_violation_rad(self) -> float:
+        """Largest excess over the tolerance where it was looked at [rad, or m where a held position
+        is worse].
+        """
+        return np.nan if self.certificate is None else self.certificate.max_violation
+
+    @property
+    def violation_bound_rad(self) -> float:
+        """Its bound on the whole path [rad, or m]."""
+        return np.nan if self.certificate is None else self.certificate.violation_bound
+
+    @property
+    def collision_time_s(self) -> float:
+        """What PyBullet's check of the path took."""
+        return np.nan if self.certificate is None else self.certificate.collision_time_s
+
+    def at(self, s: float | Sequence[float] | Float[np.ndarray, "n"]) -> Float[np.ndarray, "*n D"]:
+        """Configurations [rad] at shares s in [0, 1] of the length, each on the constraint: points
+        of the straight lines between the waypoints, projected.
+
+        What is certified are the waypoints and those lines.  The projected points keep the
+        constraint itself, but nothing was asked of their collisions, and near a singular
+        configuration they lie further from the lines than the violation's bound says, since that
+        is no distance of joints.
+
+        Raises PlannerError without a path, or if a share lies outside [0, 1].
+        """
+        self._require_path("use")
+        shares = _shares(s)
+        along = np.concatenate([[0.0], np.cumsum(step_lengths(self.joints))])
+        at = shares * along[-1]
+        points = np.ascontiguousarray(
+            np.stack([np.interp(at, along, joint) for joint in self.joints.T], axis=1)
+        )
+        between = ~np.isin(at, along)
+        moved = points[between]
+        robot = self.scene.robot
+        manifold = ConstraintManifold(robot, self.constraint)
+        project(BandSpace(manifold, no_clearance(robot.dof), 0.0).arrays, moved)
+        points[between] = moved
+        points[shares == 0.0], points[shares == 1.0] = self.joints[0], self.joints[-1]
+        return points[0] if np.ndim(s) == 0 else points
+
+    def save(self, file: str | Path) -> None:
+        """Write it as CSV: a comment line with the constraint, then time_s and the joints [rad], a
+        line a waypoint.
+
+        Raises PlannerError without a path.
+        """
+        self._require_path("save")
+        names = self.scene.robot.joint_names
+        write_trajectory(Path(file), self.joints, self.times, self.constraint, names)
+
+    def record(self, file: str | Path, frames: int = 100) -> None:
+        """Write a Rerun recording.  Raises PlannerError without a path."""
+        from constraint_geodesics.recording.recording import PathRecord, record_path
+
+        self._require_path("record")
+        record = PathRecord("planner", self.constraint_name, 0, 0, self.joints, self._markdown())
+        manifold = ConstraintManifold(self.scene.robot, self.constraint)
+        record_path(Path(file), record, manifold, self.scene.workcell, frames=frames)
+
+    def draw(self, file: str | Path) -> None:
+        """Draw joints and violation over time as PNG.  Raises PlannerError without a path."""
+        from constraint_geodesics.recording.path_figure import DrawnPath, path_figure
+        from constraint_geodesics.recording.png import save_png
+
+        self._require_path("draw")
+        robot = self.scene.robot
+        violation = ConstraintManifold(robot, self.constraint).violation(self.joints)
+        skeletons, bound = robot.skeleton(self.joints), self.violation_bound_rad
+        drawn = DrawnPath(self.times, self.joints, robot.joint_names, skeletons, violation, bound)
+        save_png(path_figure(drawn, f"{self.constraint_name}: {self.explanation}"), Path(file))
+
+    def summary(self) -> dict[str, str | float | int | None]:
+        """The answer without its arrays, as JSON takes it; figures that do not exist are None."""
+        numbers = {
+            "length_rad": self.length_rad,
+            "duration_s": self.times[-1] if len(self.times) else np.nan,
+            "max_violation_rad": self.max_violation_rad,
+            "violation_bound_rad": self.violation_bound_rad,
+            "planning_time_s": self.planning_time_s,
+            "collision_time_s": self.collision_time_s,
+        }
+        return {
+            "status": self.status,
+            "constraint": self.constraint_name,
+            "explanation": self.explanation,
+            "method": self.method,
+            "source": self.source or None,
+            "rows": len(self.joints),
+        } | {name: float(x) if np.isfinite(x) else None for name, x in numbers.items()}
+
+    def _require_path(self, use: str) -> None:
+        if self.status != "solved":
+            raise PlannerError(f"there is no path to {use}: {self.explanation}")
+
+    def _markdown(self) -> str:
+        return (
+            f"**planned path**, constraint `{self.constraint_name}`\n\n- {self.explanation}\n"
+            f"- duration {self.times[-1]:.2f} s\n- proposal: {self.source}"
+        )
+
+
+def _shares(s: Any) -> Float[np.ndarray, "n"]:
+    try:
+        shares = np.atleast_1d(np.asarray(s, float))
+    except (TypeError, ValueError):
+        shares = np.array([np.nan])
+    if shares.ndim != 1 or not ((shares >= 0.0) & (shares <= 1.0)).all():
+        raise PlannerError(f"s = {s}: must be a number or a row of numbers in [0, 1]")
+    return shares
+
+
+def write_trajectory(
+    file: Path,
+    joints: Float[np.ndarray, "T D"],
+    times: Float[np.ndarray, "T"],
+    constraint: Constraint,
+    names: Sequence[str],
+) -> None:
+    """Write waypoints and times as CSV, the constraint in a comment line before the header; numbers
+    to the last bit.
+    """
+    lines = [f"{CONSTRAINT_LINE}{json.dumps(_described(constraint))}", ",".join(("time_s", *names))]
+    for t, row in zip(times, joints, strict=True):
+        lines.append(",".join(repr(float(x)) for x in (t, *row)))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text("\n".join(lines) + "\n")
+
+
+def read_trajectory(
+    file: Path, names: Sequence[str] | None = None
+) -> tuple[Float[np.ndarray, "T D"], Float[np.ndarray, "T"] | None, Constraint | None]:
+    """Waypoints from CSV: lines of joints [rad] under their names, with a column time_s and a
+    constraint's comment line if there are any.  names: of the joints, which the columns must have
+    in this order.
+
+    Raises PlannerError naming the file and the line that can't be read.
+    """
+    try:
+        text = file.read_text("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise PlannerError(f"{file}: can't be read: {error}") from None
+    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
+    constraint, table = None, []
+    for number, line in lines:
+        if line.startswith(CONSTRAINT_LINE):
+            constraint = _constraint_of(file, number, line.removeprefix(CONSTRAINT_LINE))
+        elif line and not line.startswith("#"):
+            table.append((number, line.split(",")))
+    if len(table) < 2:
+        raise PlannerError(f"{file}: a header line and at least one row are needed")
+    header = _header(file, table[0][1], names)
+    array = np.array([_numbers(file, number, cells, len(header)) for number, cells in table[1:]])
+    timed = header[0] == "time_s"
+    return array[:, int(timed) :], array[:, 0] if timed else None, constraint
+
+
+def _header(file: Path, cells: Sequence[str], names: Sequence[str] | None) -> list[str]:
+    header = [name.strip() for name in cells]
+    if any(_is_number(name) for name in header):
+        wanted = "a header line with the joints' names is needed before the rows"
+        raise PlannerError(f"{file}: {wanted}")
+    if names is not None and header[int(header[0] == "time_s") :] != list(names):
+        raise PlannerError(
+            f"{file}: its columns are {', '.join(header)}: must be {', '.join(names)}, after "
+            f"time_s if any"
+        )
+    return header
+
+
+def _numbers(file: Path, number: int, cells: Sequence[str], count: int) -> list[float]:
+    if not all(_is_number(cell) for cell in cells):
+        raise PlannerError(f"{file}, line {number}: not a row of numbers")
+    if len(cells) != count:
+        raise PlannerError(f"{file}, line {number}: {len(cells)} numbers under {count} names")
+    return [float(cell) for cell in cells]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _described(constraint: Constraint) -> dict[str, Any]:
+    pose = constraint.reference
+    where = pose and {"position_m": pose.position.tolist(), "rotation": pose.rotation.tolist()}
+    return {
+        "axes": list(constraint.axes),
+        "tolerance": list(constraint.tolerance),
+        "reference": where,
+    }
+
+
+def _constraint_of(file: Path, number: int, text: str) -> Constraint:
+    try:
+        about = json.loads(text)
+        pose = about["reference"]
+        reference = pose and Pose(
+            np.array(pose["position_m"], float), np.array(pose["rotation"], float)
+        )
+        return Constraint(tuple(about["axes"]), tuple(about["tolerance"]), reference)
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        raise PlannerError(f"{file}, line {number}: not a constraint: {error}") from None

@@ -1,0 +1,93 @@
+"""Stage: Rerun recordings of the paths and executions that other stages kept; it computes none."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
+
+
+@dataclass(frozen=True)
+class Table:
+    """A stage's table of one constraint; an empty manifold: the paths were sampled."""
+
+    params: Params
+    layout: Layout
+    constraint: str
+    manifold: str = ""
+
+
+def main(params: Params, layout: Layout) -> None:
+    """Write data/recordings/<stage>/ of train_geodesics, benchmark_planners and execute_paths."""
+    searched, shown = params.geodesics, params.geodesics.illustrated_constraints
+    pairs = [(m, c) for m in searched.searched for c in params.constraints]
+    pairs += [(m, c) for m in searched.illustrated for c in shown]
+    tables = [Table(params, layout, constraint, manifold) for manifold, constraint in pairs]
+    tables += [Table(params, layout, constraint) for constraint in params.constraints]
+    record_executed(params, layout, params.studies.constraint)
+    parallel_map(record_table, tables, params.compute, description="record")
+
+
+def record_table(table: Table) -> None:
+    """Record the paths that one table names."""
+    from constraint_geodesics.learning.learned_manifold import LearnedManifold
+    from constraint_geodesics.learning.submanifold import load_submanifold
+    from constraint_geodesics.pipeline.paths import read_paths
+    from constraint_geodesics.recording.recorder import RowRecorder
+    from constraint_geodesics.scene.scene import Scene
+
+    params, layout, constraint = table.params, table.layout, table.constraint
+    manifold = table.manifold or params.geodesics.searched[0]
+    if table.manifold:
+        file = layout.report("train_geodesics", f"{manifold}-{constraint}", "csv")
+        folder = layout.geodesics(manifold, constraint)
+    else:
+        file = layout.report("benchmark_planners", constraint, "csv")
+        folder = layout.benchmark(constraint)
+    rows, scene = named_rows(file), Scene.from_params(params)
+    recorder = RowRecorder(
+        constraint,
+        scene.manifold(params.constraints[constraint]),
+        scene.workcell,
+        LearnedManifold.load(layout.manifold(manifold)),
+        load_submanifold(layout.submanifold(manifold, constraint)),
+        params.recording.frames,
+    )
+    recorder.record(rows, read_paths(rows, folder))
+
+
+def record_executed(params: Params, layout: Layout, constraint: str) -> None:
+    """Record what became of executed paths."""
+    from constraint_geodesics.recording.execution_recording import (
+        ExecutionRecord,
+        record_executions,
+    )
+    from constraint_geodesics.scene.scene import Scene
+    from constraint_geodesics.studies.cup import CupSettings
+    from constraint_geodesics.studies.execution import load_execution
+
+    cup, scene = CupSettings(spheres=params.execution.spheres), Scene.from_params(params)
+    records = []
+    for row in named_rows(layout.report("execute_paths", constraint, "csv")):
+        kept = layout.executions(constraint) / f"{Path(row['recording']).stem}.npz"
+        execution = load_execution(kept)
+        records.append(ExecutionRecord(row["kind"], constraint, row["query"], execution, cup))
+    folder = layout.recordings("execute_paths", constraint)
+    record_executions(folder, records, scene.robot, scene.workcell)
+
+
+def named_rows(file: Path) -> list[dict[str, Any]]:
+    """The rows of a table whose paths are to be recorded."""
+    table = pd.read_csv(file, dtype={"recording": str})
+    rows: Any = table[table["recording"].notna()].to_dict("records")
+    return list(rows)
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])

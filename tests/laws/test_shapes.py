@@ -1,0 +1,209 @@
+"""Laws that hold for every shape of the workcell: its distances, its gradient, PyBullet's body."""
+
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
+from constraint_geodesics.scene.body import Body
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.capsule import Capsule
+from constraint_geodesics.scene.clearance import (
+    ClearanceModel,
+    clearance_model,
+    clearance_row,
+    link_clearances,
+)
+from constraint_geodesics.scene.shape import RoundedBox, Shape, add_body
+from constraint_geodesics.scene.shapes import AnyShape
+from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.scene.world import World
+
+ROOM, TIP, SKIN = 0.6, 0.002, 0.004
+"""Half width of the room the shapes stand in, radius of what is moved round in it, and the margin
+of PyBullet's contacts [m].
+"""
+LINK = """<link name="{name}"><inertial><mass value="1"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>{tip}</link>"""
+JOINT = """<joint name="slide_{name}" type="prismatic"><parent link="{parent}"/>
+<child link="{name}"/><axis xyz="{axis}"/>
+<limit lower="-0.6" upper="0.6" velocity="1" effort="1"/></joint>"""
+
+
+@dataclass(frozen=True)
+class Slab(Shape):
+    """A shape that the package knows nothing of: a box at an angle."""
+
+    name: str
+    exempt_links: tuple[str, ...] = ()
+    centre: tuple[float, float, float] = (0.1, -0.05, 0.2)
+    half_edges: tuple[float, float, float] = (0.3, 0.05, 0.12)
+    turn: tuple[float, float, float] = (0.4, -0.3, 1.1)
+
+    def rounded_boxes(self) -> tuple[RoundedBox, ...]:
+        turn = Rotation.from_rotvec(self.turn).as_matrix()
+        return (RoundedBox(self.centre, self.half_edges, 0.0, turn),)
+
+    def add_to(self, bullet: Any) -> int:
+        turn, kind = Rotation.from_rotvec(self.turn).as_quat().tolist(), bullet.GEOM_BOX
+        size = {"shapeType": kind, "halfExtents": self.half_edges}
+        return add_body(bullet, self.centre, turn, **size)
+
+    def drawn(self, rerun: Any, style: Mapping[str, Any]) -> Any:
+        return None
+
+
+SHAPES: dict[str, Shape] = {
+    "box": Box("box", (0.1, 0.0, -0.2), (0.5, 0.2, 0.3)),
+    "sphere": Sphere("sphere", (-0.1, 0.2, 0.1), 0.25),
+    "upright capsule": Capsule("post", (0.2, 0.1, -0.3), (0.2, 0.1, 0.2), 0.15),
+    "capsule that points down": Capsule("post", (0.2, 0.1, 0.2), (0.2, 0.1, -0.3), 0.15),
+    "tilted capsule": Capsule("pipe", (-0.3, 0.1, -0.2), (0.25, -0.2, 0.3), 0.1),
+    "capsule of no length": Capsule("ball", (0.1, 0.2, 0.1), (0.1, 0.2, 0.1), 0.2),
+    "own": Slab("own"),
+}
+POINTS = st.tuples(*[st.floats(-ROOM, ROOM, allow_subnormal=False)] * 3)
+kinds = pytest.mark.parametrize("kind", SHAPES)
+
+
+@cache
+def room() -> SerialRobot:
+    """A small ball that three joints slide to any point: a configuration is its position."""
+    tip = f'<collision><geometry><sphere radius="{TIP}"/></geometry></collision>'
+    names, axes = ("base", "x", "y", "tip"), ("1 0 0", "0 1 0", "0 0 1")
+    links = [LINK.format(name=n, tip=tip if n == "tip" else "") for n in names]
+    pairs = zip(names, names[1:], axes, strict=False)
+    joints = [JOINT.format(parent=a, name=b, axis=axis) for a, b, axis in pairs]
+    folder = Path(mkdtemp())
+    (folder / "room.urdf").write_text(f"<robot name='room'>{''.join(links + joints)}</robot>")
+    return load_robot(folder / "room.urdf", "tip")
+
+
+@cache
+def model_of(kind: str) -> ClearanceModel:
+    """The shape, and a single point that moves."""
+    model = clearance_model(room(), (SHAPES[kind],))
+    return replace(model, points=np.zeros((1, 3)), joints=np.array([2]))
+
+
+def distance(kind: str, points: Any) -> Any:
+    return model_of(kind).clearance(room(), np.asarray(points, float))
+
+
+def closed_form(shape: Shape, point: np.ndarray) -> float:
+    """The distance by a formula of each kind."""
+    if isinstance(shape, Sphere):
+        return float(np.linalg.norm(point - shape.centre_m)) - shape.radius_m
+    if isinstance(shape, Capsule):
+        a, line = np.array(shape.from_m), np.subtract(shape.to_m, shape.from_m)
+        share = np.clip((point - a) @ line / max(line @ line, 1e-12), 0.0, 1.0)
+        return float(np.linalg.norm(point - a - share * line)) - shape.radius_m
+    if isinstance(shape, Box):
+        local, half = point - shape.centre_m, 0.5 * np.array(shape.size_m)
+    else:
+        assert isinstance(shape, Slab)
+        local = Rotation.from_rotvec(shape.turn).inv().apply(point - shape.centre)
+        half = np.array(shape.half_edges)
+    out = np.abs(local) - half
+    return float(np.linalg.norm(np.maximum(out, 0.0)) + min(out.max(), 0.0))
+
+
+@kinds
+@given(point=POINTS)
+@settings(max_examples=200, deadline=None)
+def test_the_distance_is_that_of_the_formula(kind: str, point: tuple[float, ...]) -> None:
+    wanted = closed_form(SHAPES[kind], np.array(point))
+    assert distance(kind, point) == pytest.approx(wanted, abs=1e-12)
+
+
+@kinds
+@given(a=POINTS, b=POINTS)
+@settings(max_examples=200, deadline=None)
+def test_the_distance_changes_no_faster_than_the_point(kind: str, a: Any, b: Any) -> None:
+    apart = np.linalg.norm(np.subtract(a, b))
+    assert abs(distance(kind, a) - distance(kind, b)) <= apart + 1e-12
+
+
+@kinds
+@given(point=POINTS)
+@settings(max_examples=100, deadline=None)
+def test_the_gradient_is_a_unit_vector_that_finite_differences_agree_with(
+    kind: str, point: tuple[float, ...]
+) -> None:
+    q, chain, model = np.array(point), room().chain.arrays, model_of(kind).arrays
+    found = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    link_clearances(chain, model, np.inf, q, *found)
+    row = np.empty(3)
+    clearance_row(room().chain.prismatic, 2, *found[1:], row)
+    steps = 1e-6 * np.eye(3)
+    above, below = distance(kind, q + steps), distance(kind, q - steps)
+    here = found[0][2]
+    if np.abs(above + below - 2.0 * here).max() < 1e-10:  # no kink nearby
+        np.testing.assert_allclose(row, (above - below) / 2e-6, atol=1e-5)
+        assert np.linalg.norm(row) == pytest.approx(1.0, abs=1e-9)
+
+
+@kinds
+def test_its_sign_is_what_pybullet_says(kind: str) -> None:
+    q = np.random.default_rng(0).uniform(-0.4, 0.4, (3000, 3))
+    clearance = distance(kind, q) - TIP
+    with World(room(), (SHAPES[kind],)) as world:
+        hit = world.label(q).workcell_collision
+    assert 0.02 < hit.mean() < 0.6
+    assert not hit[clearance > SKIN].any()
+    assert hit[clearance < -TIP].all()
+    assert (np.abs(clearance) < SKIN).mean() < 0.05
+
+
+@kinds
+def test_links_that_may_touch_it_do_not_count(kind: str) -> None:
+    touching = replace(SHAPES[kind], exempt_links=("tip",))  # type: ignore[type-var]
+    q = np.random.default_rng(1).uniform(-ROOM, ROOM, (200, 3))
+    assert (clearance_model(room(), (touching,)).clearance(room(), q) == np.inf).all()
+    with World(room(), (touching,)) as world:
+        assert world.free(q).all()
+
+
+@kinds
+def test_a_worker_gets_the_same_shape(kind: str) -> None:
+    shape = SHAPES[kind]
+    assert pickle.loads(pickle.dumps(shape)) == shape
+
+
+def test_either_end_of_a_capsule_may_come_first() -> None:
+    q = np.random.default_rng(2).uniform(-ROOM, ROOM, (500, 3))
+    there = distance("upright capsule", q)
+    np.testing.assert_allclose(there, distance("capsule that points down", q), atol=1e-15)
+
+
+def test_several_shapes_leave_the_smallest_distance() -> None:
+    q = np.random.default_rng(3).uniform(-ROOM, ROOM, (500, 3))
+    model = clearance_model(room(), tuple(SHAPES.values()))
+    together = replace(model, points=np.zeros((1, 3)), joints=np.array([2])).clearance(room(), q)
+    np.testing.assert_array_equal(together, np.min([distance(kind, q) for kind in SHAPES], axis=0))
+
+
+def test_a_kind_is_known_in_its_own_file_and_among_the_shapes() -> None:
+    """A new kind takes two files.  The benchmarks choose a sphere as what stands in the way."""
+    package = Path(__file__).resolve().parents[2] / "src" / "constraint_geodesics"
+    chosen = {"benchmark/queries.py", "benchmark/runner.py", "studies/growth.py"}
+    for kind in (Box, Sphere, Capsule, Body):
+        home = kind.__module__.split(".", 1)[1].replace(".", "/") + ".py"
+        named = {
+            file.relative_to(package).as_posix()
+            for file in package.rglob("*.py")
+            if kind.__module__ in file.read_text()
+        }
+        assert named <= {"scene/shapes.py"} | (chosen if kind is Sphere else set())
+        assert f"class {kind.__name__}(Shape)" in (package / home).read_text()
+    assert "Capsule" in str(AnyShape)
