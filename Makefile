@@ -3,10 +3,11 @@ export PATH := $(CURDIR)/.venv/bin:$(PATH)
 export OMP_NUM_THREADS := 1
 PYTHON ?= python3.11
 FILE ?=
+CONSTRAINT ?=
 FIRST_START = 1.329923 -0.584036 -3.766650 -2.008429 0.728803 -2.581396
 FIRST_GOAL = 1.071549 -0.217480 -1.682647 -2.906655 -0.337949 1.348704
 
-.PHONY: help env plan repro pretrained dag smoke bench bench-quick bench-geometry test lint format results readme \
+.PHONY: help env plan repro pretrained dag smoke bench bench-quick draw-queries bench-geometry test lint format results readme \
 	docs notebook plots experiments ui replay clean test-browser screenshots
 
 help:  ## list the targets
@@ -50,8 +51,10 @@ bench: env  ## all planners on all queries, and the studies (two hours; go on af
 	dvc repro --single-item --force report
 
 bench-quick: env  ## the same table on one query of each constraint and scene (minutes), after `make repro`
-	dvc repro stages/dvc.yaml:draw_benchmark_queries
 	geodesics bench
+
+draw-queries: env  ## draw the benchmark's queries of constraints that have none, after `make repro`: CONSTRAINT=... draws those again
+	python stages/draw_benchmark_queries.py $(CONSTRAINT)
 
 bench-geometry: env  ## time the geometry core again, after whatever it needs; writes reports/geometry.json
 	dvc repro label_joints train_manifold train_analytic

@@ -1,54 +1,60 @@
-"""Stage: the sampling-based planners on the queries of one constraint."""
+"""Stage: some planners of the benchmark on the pipeline's queries of one constraint (Table I)."""
 
 import sys
+from pathlib import Path
+from typing import Any
 
-from constraint_geodesics.benchmark.planner_benchmark import (
-    PlannerTask,
-    planner_figures,
-    run_planner,
-)
-from constraint_geodesics.constraints.constraint import constraint_manifold
+import pandas as pd
+
+from constraint_geodesics.benchmark.entries import Run, answered, with_planners
+from constraint_geodesics.benchmark.queries import TABLE, Query
+from constraint_geodesics.benchmark.recorder import PathKeeper
+from constraint_geodesics.benchmark.statistics import comparison_figures
 from constraint_geodesics.learning.dataset import read_queries
-from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
-from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.paths import named_recordings, save_paths
 from constraint_geodesics.pipeline.stage import run_stage
-from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.studies.geodesic_search import write_table
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "benchmark_planners"
 
 
+def asked_of(file: Path, constraint: str) -> list[Query]:
+    """The pipeline's queries as the benchmark asks them."""
+    pairs = read_queries(file)
+    ends = enumerate(zip(pairs.starts, pairs.goals, strict=True))
+    return [Query(constraint, TABLE, number, start, goal) for number, (start, goal) in ends]
+
+
 def main(params: Params, layout: Layout, constraint: str) -> None:
     """Write data/benchmark/<constraint>/, its rows and figures."""
-    source, settings = layout.queries(constraint), params.benchmark
-    scene = Scene.from_params(params)
-    manifold = constraint_manifold(scene.robot, params.constraints[constraint])
-    charts = {name: LearnedManifold.load(layout.manifold(name)) for name in params.manifolds}
-    queries = read_queries(source)
+    source, compared = layout.queries(constraint), params.benchmark.compared
+    queries, scratch = asked_of(source, constraint), layout.scratch(STAGE, constraint)
+    asked = {"queries": len(queries), "seeds": compared.seeds}
+    entries = {
+        name: params.benchmark.planners[name].model_copy(update=asked) for name in compared.planners
+    }
+    dof = len(queries[0].start)
+    own, kept = with_planners(params, entries), PathKeeper(scratch / "paths")
     about = subject_of(params, constraint=constraint)
     with tracked_stage(
-        Work(STAGE, constraint, settings, [source], about), params.tracking.experiment, layout.root
+        Work(STAGE, constraint, compared, [source], about), params.tracking.experiment, layout.root
     ) as run:
-        tasks = [
-            PlannerTask(planner, seed, scene, manifold, charts, queries, settings, params.judge)
-            for planner in settings.planners
-            for seed in settings.seeds
-        ]
-        results = parallel_map(
-            run_planner, tasks, params.compute, description=f"planners {constraint}"
-        )
-        rows = [row for result in results for row in result.rows]
-        paths = [path for result in results for path in result.paths]
+        table = answered(Run(own, layout, queries, scratch, list(params.manifolds), kept))
+        rows: list[Any] = table.to_dict("records")
+        paths = [kept.path(row, dof) for row in rows]
+        # one planner of each kind stands next to the learned geodesics: its kind is its name there
+        rows = [row | {"planner": row["kind"]} for row in rows]
         save_paths(rows, paths, layout.benchmark(constraint))
         folder = layout.recordings(STAGE, constraint)
         rows = named_recordings(rows, paths, folder, params.recording.queries)
         run.recordings(rows)
-        write_table(rows, layout.report(STAGE, constraint, "csv"), constraint=constraint)
-        run.report(planner_figures(results), layout.report(STAGE, constraint))
+        file = layout.report(STAGE, constraint, "csv")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        table = pd.DataFrame(rows)
+        table.to_csv(file, index=False)
+        run.report(comparison_figures(table), layout.report(STAGE, constraint))
 
 
 if __name__ == "__main__":

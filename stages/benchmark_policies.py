@@ -27,8 +27,8 @@ STAGE = "benchmark_policies"
 def main(params: Params, layout: Layout, manifold: str) -> None:
     """Write the rows of each constraint and the figures of all, trained on and not."""
     scene, chart = Scene.from_params(params), LearnedManifold.load(layout.manifold(manifold))
-    seen = [params.plans.constraint]
-    described = {name: params.constraints[name] for name in seen} | params.plans.unseen
+    seen = [params.studies.constraint]
+    described = {name: params.constraints[name] for name in seen} | params.unseen
     shared = [layout.policies(manifold)]
     tasks = [
         PolicyTask(
@@ -39,8 +39,8 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
             params.policy_settings(),
             layout.policies(manifold),
             layout.geodesics(manifold, name) if name in seen else None,
-            params.plans.queries,
-            params.plans.seed,
+            params.studies.queries,
+            params.studies.seed,
         )
         for name, constraint in described.items()
     ]

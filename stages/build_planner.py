@@ -38,7 +38,7 @@ def main(params: Params, layout: Layout) -> None:
     ) as run:
         bundle = planner_files(params)
         bundle.write(layout.planner)
-        shown = params.plans.constraint
+        shown = params.studies.constraint
         roadmap = bundle.roadmaps[shown]
         nodes = roadmap.joints[roadmap.labels == np.bincount(roadmap.labels).argmax()]
         ends = {"start": nodes[0].tolist(), "goal": nodes[-1].tolist()}

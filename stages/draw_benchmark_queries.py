@@ -1,4 +1,7 @@
-"""Stage: the benchmark's queries of one constraint, half of them with a sphere on the way."""
+"""Draw the benchmark's queries of some constraints again: `make draw-queries`.
+
+They are kept in git and every row refers to them, so this is no stage of a pipeline.
+"""
 
 import sys
 
@@ -6,12 +9,16 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.benchmark.judge import judge_limits
-from constraint_geodesics.benchmark.queries import draw_cases
-from constraint_geodesics.benchmark.runner import write_cases
+from constraint_geodesics.benchmark.queries import (
+    QueryError,
+    draw_benchmark,
+    shortest_of,
+    write_queries,
+)
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.params import Params
-from constraint_geodesics.peers.registry import PeerBuilder
+from constraint_geodesics.peers.registry import BaselineBuilder
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.problem import PlanningProblem
@@ -19,17 +26,26 @@ from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
 
 
-def main(params: Params, layout: Layout, constraint: str) -> None:
-    """Write data/benchmark_queries/<constraint>.csv: spheres stand on the shortest path of several
-    planners.
+def main(params: Params, layout: Layout) -> None:
+    """Write data/benchmark_queries/<constraint>.csv of the constraints named, by default of those
+    that have none.
     """
-    settings, scene = params.bench, Scene.from_params(params)
-    manifold = constraint_manifold(scene.robot, params.constraints[constraint])
+    known = list(params.all_constraints)
+    for name in ASKED:
+        if name not in known:
+            raise QueryError(f"there is no constraint {name!r}: must be one of {', '.join(known)}")
+    missing = [name for name in known if not layout.benchmark_queries(name).is_file()]
+    for constraint in ASKED or missing:
+        draw(params, layout, constraint)
+
+
+def draw(params: Params, layout: Layout, constraint: str) -> None:
+    """Spheres stand on the shortest path that some planners find."""
+    settings, scene = params.benchmark, Scene.from_params(params)
+    manifold = constraint_manifold(scene.robot, params.all_constraints[constraint])
+    build = BaselineBuilder(params, layout.root)
     with (
-        PeerBuilder(params, layout.root)(settings.placed_by, scene, constraint, manifold) as (
-            planners,
-            _,
-        ),
+        build(settings.placed_by, scene, constraint, manifold) as (planners, _),
         Certifier(scene, judge_limits(params.judge)) as certifier,
         scene.world() as world,
     ):
@@ -39,21 +55,14 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
             start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]
         ) -> Float[np.ndarray, "T D"]:
             problem = PlanningProblem(start, goal, manifold, world.is_free, clearance)
-            shortest, length = np.empty((0, len(start))), np.inf
-            for planner in planners.values():
-                joints = planner.plan(problem, 0).joints
-                if len(joints) < 2:
-                    continue
-                certificate = certifier.certify(joints, manifold.constraint, start, goal)
-                if certificate.valid and certificate.length_rad < length:
-                    shortest, length = joints, certificate.length_rad
-            return shortest
+            return shortest_of(planners, problem, certifier)
 
-        cases = draw_cases(
-            scene, manifold, constraint, settings.queries, settings.radius_m, plan, settings.seed
-        )
-    write_cases(cases, layout.benchmark_queries(constraint))
+        queries = draw_benchmark(scene, manifold, constraint, settings, plan)
+    file = layout.benchmark_queries(constraint)
+    write_queries(queries, file)
+    print(f"{file}: {len(queries)} queries")
 
 
 if __name__ == "__main__":
-    run_stage(main, sys.argv[1:])
+    ASKED = sys.argv[1:]
+    run_stage(main, [])

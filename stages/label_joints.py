@@ -42,9 +42,7 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
             ShardTask(scene, manifold, rows, seed_of(constraint, labels.seed)), labels.shard_rows
         )
         shards = parallel_map(draw_shard, tasks, params.compute, description=f"label {constraint}")
-        queries = draw_queries(
-            scene, manifold, constraint, params.queries.count, params.queries.seed
-        )
+        queries = draw_queries(scene, manifold, constraint, labels.queries, labels.query_seed)
         card = {
             "constraint": constraint,
             "robot": scene.robot.name,

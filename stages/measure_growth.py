@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.benchmark.runner import write_table
+from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.bundle import read_bundle
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.params import Params
-from constraint_geodesics.peers.registry import PeerBuilder
+from constraint_geodesics.peers.registry import BaselineBuilder
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
@@ -35,9 +35,9 @@ from constraint_geodesics.studies.growth import (
 STAGE = "measure_growth"
 SEVEN_JOINTS = ("kuka_iiwa/model.urdf", "lbr_iiwa_link_7")
 """A robot of pybullet_data: its URDF and its tool's link."""
-PEERS = ("straight + band", "BiRRT, tangent bundle", "BiRRT")
-"""Of params.yaml's bench.planners: those that need nothing learned."""
-IN_BATCHES = PEERS[1]
+BASELINES = ("straight + band", "BiRRT, tangent bundle", "BiRRT")
+"""Of params.yaml's benchmark.planners: those that need nothing learned."""
+IN_BATCHES = BASELINES[1]
 
 
 def configurations(file: Path, robot: SerialRobot, count: int) -> Float[np.ndarray, "n D"]:
@@ -58,7 +58,10 @@ def main(params: Params, layout: Layout) -> None:
     manifold = constraint_manifold(scene.robot, params.constraints[CONSTRAINT])
     with (
         Planner(read_bundle(layout.planner), str(layout.planner)) as planner,
-        PeerBuilder(params, layout.root)(PEERS, scene, CONSTRAINT, manifold) as (peers, _),
+        BaselineBuilder(params, layout.root)(BASELINES, scene, CONSTRAINT, manifold) as (
+            baselines,
+            _,
+        ),
     ):
 
         def batch(starts: Float[np.ndarray, "B D"], goals: Float[np.ndarray, "B D"]) -> list[bool]:
@@ -72,7 +75,7 @@ def main(params: Params, layout: Layout) -> None:
             params,
             scene,
             load_robot(find_urdf(SEVEN_JOINTS[0]), SEVEN_JOINTS[1]),
-            {own.name: own, **peers},
+            {own.name: own, **baselines},
             batch,
             IN_BATCHES,
             configurations(layout.joints("free"), scene.robot, max(sizes.rows)),

@@ -30,7 +30,7 @@ def main(params: Params, layout: Layout) -> None:
     pairs += [(m, c) for m in searched.illustrated for c in shown]
     tables = [Table(params, layout, constraint, manifold) for manifold, constraint in pairs]
     tables += [Table(params, layout, constraint) for constraint in params.constraints]
-    record_executed(params, layout, params.plans.constraint)
+    record_executed(params, layout, params.studies.constraint)
     parallel_map(record_table, tables, params.compute, description="record")
 
 

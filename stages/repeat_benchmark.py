@@ -1,14 +1,13 @@
-"""Stage: part of the benchmark once more, held against the first time: lengths, validity, and
-times.
-"""
+"""Stage: part of the benchmark once more, held against the first time: lengths, validity, times."""
 
 import shutil
 import sys
 
-from constraint_geodesics.benchmark.entries import answered, blocks_of, ends_by_counting
-from constraint_geodesics.benchmark.runner import read_table
+from constraint_geodesics.benchmark.entries import answered, at_most, committed_run, with_planners
+from constraint_geodesics.benchmark.row import read_table
 from constraint_geodesics.benchmark.statistics import repeated
 from constraint_geodesics.params import Params
+from constraint_geodesics.peers.registry import all_settings
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.benchmark_tables import repeated_markdown
@@ -23,18 +22,13 @@ def main(params: Params, layout: Layout) -> None:
     """
     folder, scratch = layout.root / "reports" / "benchmark_repeat", layout.scratch(STAGE, "rows")
     shutil.rmtree(scratch, ignore_errors=True)
+    planners, settings = params.benchmark.planners, all_settings(params)
     again = {
-        name: peer.model_copy(
-            update={
-                "queries": min(peer.queries, params.bench.repeated),
-                "seeds": min(peer.seeds, SEEDS),
-            }
-        )
-        for name, peer in params.bench.planners.items()
-        if ends_by_counting(peer)
+        name: at_most(entry, params.benchmark.repeated, SEEDS)
+        for name, entry in planners.items()
+        if settings[name].ends_by_counting
     }
-    some = params.model_copy(update={"bench": params.bench.model_copy(update={"planners": again})})
-    table = answered(blocks_of(some, layout, scratch, scratch), params.compute)
+    table = answered(committed_run(with_planners(params, again), layout, scratch, scratch))
     first, _ = read_table(layout.benchmark_table)
     compared = repeated(first, table)
     order = {name: k for k, name in enumerate(again)}

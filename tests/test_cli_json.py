@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from constraint_geodesics import bundle
-from constraint_geodesics.benchmark.runner import TABLE, Case, write_cases
+from constraint_geodesics.benchmark.queries import TABLE, Query, write_queries
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.pipeline.layout import Layout
 from tests.planner_fixtures import packaged_learned, pairs_of
@@ -86,21 +86,23 @@ def test_recordings_are_listed_as_json(geodesics, tmp_path) -> None:
 def test_the_benchmarks_summary_is_json(geodesics, tmp_path) -> None:
     """One query, two planners, one of which is given more time than is wanted."""
     parameters = yaml.safe_load((ROOT / "params.yaml").read_text())
-    peers = parameters["bench"]["planners"]
-    few = {"straight + band": peers["straight + band"], "RRT* 10 s": peers["RRT* 10 s"]}
-    parameters["bench"] |= {"planners": few, "recorded": []}
+    known = parameters["benchmark"]["planners"]
+    few = {name: known[name] for name in ("straight + band", "RRT* 10 s")}
+    compared = {"planners": ["straight + band"], "seeds": 1}
+    parameters["benchmark"] |= {"planners": few, "recorded": [], "compared": compared}
+    parameters["benchmark"]["placed_by"] = ["straight + band"]
     parameters["constraints"] = {
         name: parameters["constraints"][name] for name in ("free", "level_cup")
     }
     parameters["geodesics"]["illustrated_constraints"] = ["level_cup"]
-    parameters["plans"]["constraint"] = "level_cup"
+    parameters["studies"]["constraint"] = "level_cup"
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(parameters))
     shutil.copy(ROOT / "requirements.lock", tmp_path)
     layout = Layout(tmp_path)
     shutil.copytree(bundle.PACKAGED, layout.planner)
     LearnedManifold.from_arrays(packaged_learned().manifold).save(layout.manifold("planner"))
     (start, goal), *_ = pairs_of("free", 1, seed=1)
-    write_cases([Case("free", TABLE, 0, start, goal)], layout.benchmark_queries("free"))
+    write_queries([Query("free", TABLE, 0, start, goal)], layout.benchmark_queries("free"))
     code, out, err = geodesics("bench", "--constraint", "free", "--json")
     assert code == 0, err
     answer = strict(out)

@@ -29,7 +29,6 @@ from mlflow.utils.search_utils import SearchUtils
 from constraint_geodesics import cli
 from constraint_geodesics.bundle import PACKAGED
 from constraint_geodesics.params import load_params
-from constraint_geodesics.peers.registry import KINDS
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 from constraint_geodesics.tracking.registry import register_planner
@@ -115,7 +114,6 @@ def test_the_first_path_is_what_its_page_says(monkeypatch, tmp_path) -> None:
 
 
 def test_the_extensions_work(monkeypatch, tmp_path) -> None:
-    monkeypatch.setitem(KINDS, "projected_line", None)  # the page adds this one
     names = run("extend.md", monkeypatch, tmp_path)
     assert names["inside"].mean() > 0.2
     assert names["arm"].dof == 7
@@ -357,7 +355,7 @@ def test_every_experiment_of_its_page_says_what_runs() -> None:
 
 @pytest.mark.parametrize("page", having("bash"))
 def test_every_command_of_dvc_parses_and_its_targets_exist(page, committed) -> None:
-    known = set(committed) | {"draw_benchmark_queries", "label_joints"}
+    known = set(committed) | {"label_joints"}
     for program, *words in commands(page):
         if program != "dvc":
             continue

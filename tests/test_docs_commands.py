@@ -249,7 +249,7 @@ def test_names_are_proposed_where_files_are_missing_or_broken(tmp_path) -> None:
         "those of the package"
     )
     assert complete("geodesics\tbench\t--planner\t", tmp_path) == []
-    (tmp_path / "params.yaml").write_text("bench: [")
+    (tmp_path / "params.yaml").write_text("benchmark: [")
     assert complete("geodesics\tbench\t--planner\t", tmp_path) == []
 
 

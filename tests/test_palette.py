@@ -9,25 +9,19 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from constraint_geodesics.benchmark.plan_benchmark import BAND_AFTER, MULTI_START, PARTS, TANGENT
 from constraint_geodesics.palette import FAMILIES, GREY, planner_colour, planner_family
 from constraint_geodesics.params import load_params
+from constraint_geodesics.peers.registry import all_settings, colours
 from constraint_geodesics.report.benchmark_figures import DASHES, styles_of
 from constraint_geodesics.report.figures import PLANNERS
 from constraint_geodesics.report.growth_figure import FAMILIES as GROWING
-from constraint_geodesics.report.plan_report import METHODS
+from constraint_geodesics.report.study_report import METHODS
 
 PARAMS = load_params(Path(__file__).parents[1] / "params.yaml")
+COLOURS = colours(all_settings(PARAMS))
 SHOWN = {
-    *PARAMS.bench.planners,
     *PARAMS.benchmark.planners,
-    *PARAMS.plans.parts,
-    *PARAMS.plans.peers,
-    *PARTS,
     *METHODS,
-    BAND_AFTER,
-    MULTI_START,
-    TANGENT,
     *PLANNERS,
     *(style.label for style in PLANNERS.values()),
 }
@@ -57,7 +51,7 @@ def seen(colour, without):
 def test_every_planner_is_in_a_family(planner):
     family = planner_family(planner)
     assert family is not None
-    assert planner_colour(planner) == FAMILIES[family][0]
+    assert planner_colour(planner) == FAMILIES[family].colour
 
 
 def test_figures_take_their_colours_from_the_palette():
@@ -65,14 +59,12 @@ def test_figures_take_their_colours_from_the_palette():
         assert style.colour == planner_colour(name) == planner_colour(style.label)
     for begin, colour in GROWING:
         assert colour == planner_colour(begin)
-    styles = styles_of(list(PARAMS.bench.planners))
-    assert {name: style["color"] for name, style in styles.items()} == {
-        name: planner_colour(name) for name in PARAMS.bench.planners
-    }
+    for name, colour in COLOURS.items():
+        assert colour == planner_colour(name), "as its recordings have it"
 
 
 def test_drawn_planners_of_one_family_differ_in_dashes():
-    styles = styles_of(PARAMS.bench.drawn)
+    styles = styles_of(PARAMS.benchmark.drawn, COLOURS)
     for one, two in itertools.combinations(styles.values(), 2):
         assert one["color"] != two["color"] or one["linestyle"] != two["linestyle"]
     assert len({str(dash) for dash in DASHES}) == len(DASHES)
@@ -85,7 +77,7 @@ def test_a_name_of_no_family_is_grey():
 
 @pytest.mark.parametrize("without", ["none", "protan", "deutan"])
 def test_families_are_told_apart_without_red_or_green_cones(without):
-    colours = [colour for colour, _, _ in FAMILIES]
+    colours = [family.colour for family in FAMILIES.values()]
     assert len(set(colours)) == len(colours)
     for one, two in itertools.combinations(colours, 2):
         assert np.abs(seen(one, without) - seen(two, without)).max() > 0.09, (one, two)

@@ -124,12 +124,18 @@ REFUSED: list[tuple[Change, tuple[str, ...]]] = [
         ("policies.ppo.batch_size=5000", "at most 2560"),
     ),
     (lambda p: p["execution"].update(least_tilt_rad=4.0), ("execution.least_tilt_rad=4.0", "π")),
-    (lambda p: p["plans"].update(constraint="free"), ("plans.constraint='free'", "roll and pitch")),
     (
-        lambda p: p["bench"]["planners"]["BiRRT"].update(kind="omple"),
-        ("bench.planners.BiRRT.kind='omple'", "ompl"),
+        lambda p: p["studies"].update(constraint="free"),
+        ("studies.constraint='free'", "roll and pitch"),
     ),
-    (lambda p: p["bench"].update(drawn=["BiRTT"]), ("bench.drawn='BiRTT'", "must be one of")),
+    (
+        lambda p: p["benchmark"]["planners"]["BiRRT"].update(kind="omple"),
+        ("benchmark.planners.BiRRT", "no kind 'omple'", "birrt"),
+    ),
+    (
+        lambda p: p["benchmark"].update(drawn=["BiRTT"]),
+        ("benchmark.drawn='BiRTT'", "must be one of"),
+    ),
 ]
 
 

@@ -256,23 +256,21 @@ def bench(
     """Hold planners against each other on a few of the benchmark's queries; what is done is not
     done again.
     """
-    from constraint_geodesics.benchmark.entries import answered, blocks_of, fewer
-    from constraint_geodesics.benchmark.runner import write_table
+    from constraint_geodesics.benchmark.entries import Wish, answered, committed_run, fewer
+    from constraint_geodesics.benchmark.row import write_table
     from constraint_geodesics.benchmark.statistics import all_constraints, benchmark_summary
+    from constraint_geodesics.peers.registry import all_settings
     from constraint_geodesics.pipeline.machine import run_header
-    from constraint_geodesics.report.benchmark_tables import overview_markdown
+    from constraint_geodesics.report.benchmark_tables import asks_in_python, overview_markdown
 
     params, layout = load_params(), Layout()
-    some, left_out = fewer(params, queries, seeds, constraint, planner, longest)
-    table = answered(blocks_of(some, layout, out / "rows", out / "recordings"), some.compute)
+    some, left_out = fewer(params, Wish(queries, seeds, constraint, planner, longest))
+    table = answered(committed_run(some, layout, out / "rows", out / "recordings"))
     write_table(table, out / "benchmark.csv", run_header(layout.root))
-    order = {name: k for k, name in enumerate(some.bench.planners)}
+    order = {name: k for k, name in enumerate(some.benchmark.planners)}
     table = table.sort_values("planner", key=lambda names: names.map(order), kind="stable")
-    summary = benchmark_summary(all_constraints(table), next(iter(some.bench.planners)))
-    in_python = ("ompl", "decoder_sampling")
-    text = overview_markdown(
-        summary, [name for name, own in some.bench.planners.items() if own.kind in in_python]
-    )
+    summary = benchmark_summary(all_constraints(table), next(iter(some.benchmark.planners)))
+    text = overview_markdown(summary, asks_in_python(all_settings(some)))
     (out / "overview.md").write_text(text)
     rows = out / "benchmark.csv"
     if as_json:

@@ -32,7 +32,7 @@ def listed_constraints(context: Any, parameter: Any, incomplete: str) -> list[An
 def benchmarked_planners(context: Any, parameter: Any, incomplete: str) -> list[Any]:
     """Planners of the benchmark."""
     del context, parameter
-    planners = (_params().get("bench") or {}).get("planners") or {}
+    planners = (_params().get("benchmark") or {}).get("planners") or {}
     kinds = {name: str(entry.get("kind", "")) for name, entry in planners.items()}
     return _items(kinds, incomplete)
 

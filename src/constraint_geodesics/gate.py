@@ -10,6 +10,7 @@ from xml.etree.ElementTree import ParseError
 
 from constraint_geodesics.params import Params, ParamsError
 from constraint_geodesics.peers import registry
+from constraint_geodesics.peers.baseline import BaselineError
 from constraint_geodesics.scene.scene import Scene, robot_from
 from constraint_geodesics.scene.urdf import find_urdf
 
@@ -63,22 +64,23 @@ def _problems(params: Params) -> Iterator[str]:
             )
     if not execution.least_tilt_rad < math.pi:
         yield f"execution.least_tilt_rad={execution.least_tilt_rad}: must be below π"
-    carried = params.plans.constraint
+    carried = params.studies.constraint
     if not params.constraints[carried].keeps_upright:
         yield (
-            f"plans.constraint={carried!r}: must hold roll and pitch, or the cup that the stage "
+            f"studies.constraint={carried!r}: must hold roll and pitch, or the cup that the stage "
             f"execute_paths carries need not stay upright"
         )
     yield from _planner_problems(params)
 
 
 def _planner_problems(params: Params) -> Iterator[str]:
-    bench = params.bench
+    bench = params.benchmark
     for name, planner in bench.planners.items():
-        if planner.kind not in registry.KINDS:
-            kinds = ", ".join(registry.KINDS)
-            yield f"bench.planners.{name}.kind={planner.kind!r}: must be one of {kinds}"
-    for entry in ("placed_by", "recorded", "drawn"):
+        try:
+            registry.settings_of(name, planner)
+        except BaselineError as error:
+            yield str(error)
+    for entry in ("recorded", "drawn"):
         for name in getattr(bench, entry):
             if name not in bench.planners:
-                yield f"bench.{entry}={name!r}: must be one of bench.planners"
+                yield f"benchmark.{entry}={name!r}: must be one of benchmark.planners"

@@ -2,6 +2,8 @@
 everywhere: in the figures, on the report's pages and in Rerun.
 """
 
+from typing import NamedTuple
+
 BLACK, ORANGE, SKY, GREEN = "#222222", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILION, PURPLE, YELLOW = "#0072B2", "#D55E00", "#CC79A7", "#F0E442"
 GREY, LIGHT = "#606060", "#E4E4E4"
@@ -10,54 +12,52 @@ SERIES = (SKY, ORANGE, PURPLE, BLUE, YELLOW, GREEN, VERMILION)
 START, GOAL = GREEN, VERMILION
 """A path's ends."""
 
-FAMILIES = (
-    (
+
+class Family(NamedTuple):
+    """Planners that share a colour: what they are, and the first words of those of their names that
+    stand in recordings and in the pipeline's tables; a baseline names its family itself (peers/).
+    """
+
+    colour: str
+    about: str
+    words: tuple[str, ...]
+
+
+FAMILIES = {
+    "planner": Family(
         ORANGE,
         "this planner, its parts and policies",
         (
-            "planner",
-            "planned",
-            "learned",
-            "without",
-            "nothing learned",
-            "trees + band",
-            "band and trees",
-            "graph",
-            "policy",
-            "policies",
-            "separate policies",
+            *("planner", "planned", "learned", "without", "only", "nothing learned"),
+            *("trees + band", "band and trees", "graph", "policy", "policies", "separate policies"),
         ),
     ),
-    (
+    "latent": Family(
         VERMILION,
         "latent geodesics, graph and grid",
         ("straight latent line", "gradient geodesic", "latent g"),
     ),
-    (GREEN, "straight line and elastic band", ("straight", "band from")),
-    (BLACK, "trajectory optimisation", ("slsqp", "trust-constr")),
-    (BLUE, "BiRRT", ("birrt",)),
-    (PURPLE, "PRM", ("prm",)),
-    (SKY, "RRT*", ("rrt*", "informed rrt*")),
-    (
+    "band": Family(GREEN, "straight line and elastic band", ("straight", "band from")),
+    "optimisation": Family(BLACK, "trajectory optimisation", ("slsqp", "trust-constr")),
+    "birrt": Family(BLUE, "BiRRT", ("birrt",)),
+    "prm": Family(PURPLE, "PRM", ("prm",)),
+    "rrt_star": Family(SKY, "RRT*", ("rrt*", "informed rrt*")),
+    "other": Family(
         GREY,
         "random curves, descent, Bayesian optimisation",
         ("random curves", "descent", "bayesian"),
     ),
-)
-"""Colour, name and first words of the planners of each family; within a family they differ by line
-style or marker.
-"""
+}
+"""The families by name; within one, planners differ by line style or marker."""
 
 
-def planner_family(planner: str) -> int | None:
-    """Place in FAMILIES of a planner, given as a table or a recording names it; None for one that
-    is in none.
-    """
+def planner_family(planner: str) -> str | None:
+    """The family of a planner, given as a table or a recording names it; None for one of none."""
     words = planner.lower().replace("_", " ").replace("rrt star", "rrt*")
-    return next((k for k, (_, _, first) in enumerate(FAMILIES) if words.startswith(first)), None)
+    return next((name for name, own in FAMILIES.items() if words.startswith(own.words)), None)
 
 
 def planner_colour(planner: str) -> str:
     """The colour of a planner; grey for one that is in no family."""
     family = planner_family(planner)
-    return GREY if family is None else FAMILIES[family][0]
+    return GREY if family is None else FAMILIES[family].colour

@@ -93,19 +93,14 @@ class ComputeParams(_Record):
 
 
 class LabelParams(_Record):
-    """How many configurations are drawn and labelled."""
+    """How many configurations are drawn and labelled, and how many start and goal pairs."""
 
     free_rows: Count
     constrained_rows: Count
     shard_rows: Count
     seed: Seed
-
-
-class QueryParams(_Record):
-    """Start and goal pairs of each constraint."""
-
-    count: Count
-    seed: Seed
+    queries: Count
+    query_seed: Seed
 
 
 class PoseParams(_Record):
@@ -316,26 +311,6 @@ class GeometryParams(_Record):
     pairs: Count
 
 
-class BenchmarkParams(_Record):
-    """The sampling-based planners."""
-
-    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
-    planners: Annotated[tuple[Literal["prm", "rrt_star", "birrt"], ...], Field(min_length=1)]
-    space: Literal["projected", "atlas", "tangent_bundle"]
-    budget_s: Positive
-    prm_iterations: Count
-    rrt_star_iterations: Count
-    birrt_iterations: Count
-    delta_rad: Positive
-    range_rad: Positive
-    chart_radius_rad: Positive | None = None
-    """Radius ρ of a chart of the atlas; None, here and below: OMPL's own."""
-    chart_error_rad: Positive | None = None
-    """Distance ε from a chart to the manifold, at most."""
-    exploration: Annotated[float, Field(ge=0.0, lt=1.0)] | None = None
-    """Share of samples drawn beyond the charts that there are."""
-
-
 class PlannerParams(_Record):
     """The planner that users call."""
 
@@ -351,41 +326,71 @@ class PlannerParams(_Record):
     seed: Seed
 
 
-class PlanBenchmarkParams(_Record):
-    """The planner, its parts and its peers on queries that no training saw."""
+class BaselineParams(BaseModel):
+    """One planner of the benchmark: its kind (a file of peers/), and settings that differ from the
+    kind's own, which the kind checks.  queries: of each scene; seeds: where chance plays a part;
+    null: as many as the benchmark has.
+    """
 
-    queries: Count
-    seed: Seed
-    constraint: Name
-    parts: Annotated[tuple[str, ...], Field(min_length=1)]
-    peers: tuple[Literal["prm", "rrt_star", "birrt"], ...]
-    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
-    starts: Count
-    batch: Count
-    unseen: dict[Name, ConstraintParams]
-
-
-class PeerParams(_Record):
-    """One planner of the benchmark."""
+    model_config = ConfigDict(extra="allow", frozen=True)
 
     kind: Name
+    queries: Count | None = None
+    seeds: Count | None = None
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings of the kind."""
+        return self.model_extra or {}
+
+
+class ComparisonParams(_Record):
+    """Planners of the benchmark that answer the pipeline's queries, next to learned geodesics."""
+
+    planners: Annotated[tuple[str, ...], Field(min_length=1)]
+    seeds: Count
+
+
+class BenchmarkParams(_Record):
+    """All planners on the same queries."""
+
     queries: Count
     seeds: Count
-    settings: dict[str, Any] = {}
-
-
-class BenchParams(_Record):
-    """The benchmark of all planners."""
-
-    queries: Count
-    radius_m: Positive
     seed: Seed
-    block: Count
-    recorded: tuple[str, ...]
+    radius_m: Positive
     placed_by: Annotated[tuple[str, ...], Field(min_length=1)]
+    batch: Count
     repeated: Count
+    compared: ComparisonParams
+    recorded: tuple[str, ...]
     drawn: tuple[str, ...]
-    planners: Annotated[dict[str, PeerParams], Field(min_length=1)]
+    planners: Annotated[dict[str, BaselineParams], Field(min_length=1)]
+
+    @property
+    def compared_kinds(self) -> list[str]:
+        """The kinds of the compared planners: under these they stand in the pipeline's tables."""
+        return [self.planners[name].kind for name in self.compared.planners]
+
+    @model_validator(mode="after")
+    def _planners_exist(self) -> "BenchmarkParams":
+        for entry, names in (
+            ("compared.planners", self.compared.planners),
+            ("placed_by", self.placed_by),
+        ):
+            for name in names:
+                if name not in self.planners:
+                    raise ValueError(f"{entry}={name!r}: must be one of {', '.join(self.planners)}")
+        if len(set(self.compared_kinds)) < len(self.compared_kinds):
+            raise ValueError(f"compared.planners={self.compared.planners}: one of each kind only")
+        return self
+
+
+class StudyParams(_Record):
+    """On what the policies' proposals and executed paths are looked at."""
+
+    constraint: Name
+    queries: Count
+    seed: Seed
 
 
 class ExecutionParams(_Record):
@@ -428,7 +433,6 @@ class Params(_Record):
     workcell: WorkcellParams
     compute: ComputeParams
     labels: LabelParams
-    queries: QueryParams
     constraints: Annotated[dict[Name, ConstraintParams], Field(min_length=1)]
     manifolds: Annotated[dict[Name, ManifoldParams], Field(min_length=1)]
     submanifold: SubmanifoldParams
@@ -436,10 +440,10 @@ class Params(_Record):
     geometry: GeometryParams
     policies: PolicyParams
     planner: PlannerParams
-    plans: PlanBenchmarkParams
+    unseen: dict[Name, ConstraintParams]
+    studies: StudyParams
     execution: ExecutionParams
     benchmark: BenchmarkParams
-    bench: BenchParams
     judge: JudgeParams
     recording: RecordingParams
     tracking: TrackingParams
@@ -458,21 +462,26 @@ class Params(_Record):
         }
         return self.geodesics.model_copy(update=changed)
 
+    @property
+    def all_constraints(self) -> dict[str, ConstraintParams]:
+        """Those of the pipeline, then those that it has not seen."""
+        return {**self.constraints, **self.unseen}
+
     @model_validator(mode="after")
     def _names_exist(self) -> "Params":
         if "free" not in self.constraints or not self.constraints["free"].is_free:
             raise ValueError(
                 "constraints.free: must be there with all axes 0, the manifolds are trained on it"
             )
-        if self.plans.constraint not in self.constraints:
+        if self.studies.constraint not in self.constraints:
             raise ValueError(
-                f"plans.constraint={self.plans.constraint!r}: must be one of "
+                f"studies.constraint={self.studies.constraint!r}: must be one of "
                 f"{sorted(self.constraints)}"
             )
-        again = set(self.plans.unseen) & set(self.constraints)
+        again = set(self.unseen) & set(self.constraints)
         if again:
             raise ValueError(
-                f"plans.unseen={sorted(again)}: these are among the constraints that are trained on"
+                f"unseen={sorted(again)}: these are among the constraints that are trained on"
             )
         geodesics = self.geodesics
         for entry, names, known in (
@@ -501,7 +510,7 @@ def load_params(path: Path = Path("params.yaml")) -> Params:
         # in JSON's strict mode lists may become tuples, but neither "5" nor true becomes a number
         return Params.model_validate_json(json.dumps(raw, default=str), strict=True)
     except ValidationError as error:
-        raise ParamsError(f"{path}: {_one_line(error)}") from None
+        raise ParamsError(f"{path}: {one_line(error)}") from None
 
 
 def _yaml(text: str) -> Any:
@@ -511,7 +520,8 @@ def _yaml(text: str) -> Any:
     return YAML(typ="safe", pure=True).load(text)
 
 
-def _one_line(error: ValidationError) -> str:
+def one_line(error: ValidationError) -> str:
+    """What is wrong first: the entry, its value and what is allowed."""
     first = error.errors()[0]
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     where = ".".join(str(part) for part in first["loc"] if not str(part).startswith("<"))

@@ -1,5 +1,7 @@
 """What the benchmark runs: planners by name, fewer of them, and what makes a row out of date."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -7,122 +9,130 @@ import pytest
 from tests.planner_fixtures import manifold_of, packaged_planner, pairs_of
 
 from constraint_geodesics.benchmark.entries import (
-    after,
-    blocks_of,
+    Wish,
     code_digest,
+    committed_run,
     data_digest,
-    ends_by_counting,
     fewer,
+    seeds_of,
     spread,
-    uses_clearance,
+    with_planners,
 )
-from constraint_geodesics.params import Params, PeerParams
-from constraint_geodesics.peers.elastic_band import StraightBand
-from constraint_geodesics.peers.registry import KINDS, PeerBuilder, PeerError, Remembered
+from constraint_geodesics.cli import note_stage_time
+from constraint_geodesics.palette import FAMILIES
+from constraint_geodesics.params import BaselineParams, Params
+from constraint_geodesics.peers.baseline import BaselineError
+from constraint_geodesics.peers.registry import BaselineBuilder, after, all_settings, kind_of, kinds
+from constraint_geodesics.peers.straight_band import StraightBand
+from constraint_geodesics.peers.wrappers import Remembered
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.stage import note_stage_time
 from constraint_geodesics.problem import PlanningProblem
 
 
-def with_planner(params: Params, **peer: object) -> Params:
-    bench = params.bench.model_copy(update={"planners": {"mine": PeerParams.model_validate(peer)}})
-    return params.model_copy(update={"bench": bench})
+def with_planner(params: Params, **entry: object) -> Params:
+    return with_planners(params, {"mine": BaselineParams.model_validate(entry)})
 
 
 def build(params: Params, name: str, root: Path) -> None:
     planner = packaged_planner()
-    with PeerBuilder(params, root)(
+    with BaselineBuilder(params, root)(
         [name], planner.scene, "level_cup", manifold_of(planner, "level_cup")
     ):
         pass
 
 
 @pytest.mark.parametrize(
-    ("peer", "message"),
+    ("entry", "message"),
     [
-        (
-            {"kind": "teleport", "queries": 1, "seeds": 1},
-            "no kind 'teleport': must be one of planner, ompl",
-        ),
-        (
-            {"kind": "straight_band", "queries": 1, "seeds": 1, "settings": {"glue": 2}},
-            "mine.settings: .*glue",
-        ),
-        (
-            {"kind": "ompl", "queries": 1, "seeds": 1, "settings": {"glue": 2}},
-            "there is no setting glue",
-        ),
+        ({"kind": "teleport"}, "mine: no kind 'teleport': must be one of bayesian_optimisation, "),
+        ({"kind": "straight_band", "glue": 2}, "mine.glue=2: there is no such parameter"),
+        ({"kind": "birrt", "budget_s": -1.0}, "mine.budget_s=-1.0: input should be greater than 0"),
+        ({"kind": "birrt", "space": "flat"}, "mine.space='flat': input should be 'projected', "),
     ],
 )
-def test_a_planner_that_can_not_be_made_is_named(params, tmp_path, peer, message) -> None:
-    with pytest.raises(PeerError, match=message):
-        build(with_planner(params, **peer), "mine", tmp_path)
-    with pytest.raises(PeerError, match="has no 'other': must be one of mine"):
-        build(with_planner(params, **peer), "other", tmp_path)
+def test_a_planner_that_can_not_be_made_is_named(params, tmp_path, entry, message) -> None:
+    with pytest.raises(BaselineError, match=message):
+        build(with_planner(params, **entry), "mine", tmp_path)
+    with pytest.raises(BaselineError, match="has no 'other': must be one of mine"):
+        build(with_planner(params, **entry), "other", tmp_path)
 
 
 def test_the_benchmark_asks_for_the_pipeline_first(params, tmp_path) -> None:
-    with pytest.raises(PeerError, match="make repro"):
-        blocks_of(params, Layout(tmp_path), tmp_path, tmp_path)
+    with pytest.raises(BaselineError, match="make repro"):
+        committed_run(params, Layout(tmp_path), tmp_path, tmp_path)
 
 
 def test_every_kind_of_the_parameters_exists_and_every_band_follows_its_planner(params) -> None:
-    planners = params.bench.planners
-    assert {peer.kind for peer in planners.values()} == set(KINDS)
-    assert after("BiRRT + band", planners) == "BiRRT"
-    assert after("BiRRT, decoded samples + band", planners) == "BiRRT, decoded samples"
-    assert (
-        after("BiRRT", planners)
-        == after("BiRRT + band, 1 s", planners)
-        == after("planner", planners)
-        == ""
+    planners, settings = params.benchmark.planners, all_settings(params)
+    assert {entry.kind for entry in planners.values()} == set(kinds())
+    assert after("BiRRT + band", settings) == "BiRRT"
+    assert after("BiRRT, decoded samples + band", settings) == "BiRRT, decoded samples"
+    for name in ("BiRRT", "BiRRT + band, 1 s", "planner"):
+        assert after(name, settings) == ""
+    assert set(params.benchmark.recorded) | set(params.benchmark.drawn) <= set(planners)
+
+
+def test_a_kind_is_loaded_without_the_libraries_of_others() -> None:
+    """A file of peers/ is all there is to know of a kind: nothing lists them."""
+    script = (
+        "import sys; from constraint_geodesics.peers.registry import kind_of, kinds; kinds();"
+        "assert not {'ompl', 'torch', 'bayes_opt'} & set(sys.modules);"
+        "kind_of('birrt'); kind_of('straight_band');"
+        "assert not {'ompl', 'torch', 'bayes_opt'} & set(sys.modules)"
     )
-    assert set(params.bench.recorded) | set(params.bench.placed_by) | set(
-        params.bench.drawn
-    ) <= set(planners)
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr
+
+
+@pytest.mark.parametrize("kind", kinds())
+def test_every_kind_says_what_is_known_of_it(kind) -> None:
+    own = kind_of(kind)
+    assert own.family in FAMILIES
+    assert own() == own.model_validate_json(own().model_dump_json(), strict=True)
+    assert own().given_s >= 0.0
+    assert own(restarts_s=1.0).ends_by_counting is False
+
+
+def test_chance_asks_for_seeds(params) -> None:
+    planners, settings = params.benchmark.planners, all_settings(params)
+    for name, seeds in (("planner", 1), ("BiRRT", 5), ("latent grid", 1), ("SLSQP", 5)):
+        assert seeds_of(planners[name], settings[name], 5) == seeds
+    few = planners["BiRRT"].model_copy(update={"seeds": 2})
+    assert seeds_of(few, settings["BiRRT"], 5) == 2
 
 
 def test_fewer_planners_queries_and_constraints(params) -> None:
-    some, left_out = fewer(params, 2, 1, ["slide"], None, 2.0)
-    assert list(some.constraints) == ["slide"]
+    some, left_out = fewer(params, Wish(2, 1, ["slide"]))
+    assert list(some.all_constraints) == ["slide"]
     assert {"RRT* 10 s", "PRM* 3 s"} <= set(left_out)
-    assert not set(left_out) & set(some.bench.planners)
-    assert set(left_out) | set(some.bench.planners) == set(params.bench.planners)
-    assert all(peer.queries <= 2 and peer.seeds == 1 for peer in some.bench.planners.values())
-    assert fewer(params, 1, 1, None, ["RRT* 10 s"], 20.0)[1] == []
+    kept = some.benchmark.planners
+    assert not set(left_out) & set(kept)
+    assert set(left_out) | set(kept) == set(params.benchmark.planners)
+    assert all(entry.queries <= 2 and entry.seeds == 1 for entry in kept.values())
+    assert fewer(params, Wish(1, 1, None, ["RRT* 10 s"], 20.0))[1] == []
 
 
 @pytest.mark.parametrize(
-    ("constraints", "planners", "longest", "message"),
+    ("wish", "message"),
     [
-        (["upside_down"], None, 2.0, "no constraint 'upside_down': must be one of free, level_cup"),
-        (None, ["RRT"], 2.0, "no planner 'RRT': must be one of planner"),
-        (None, ["RRT* 10 s"], 2.0, "no planner is left"),
+        (
+            Wish(1, 1, ["upside_down"]),
+            "no constraint 'upside_down': must be one of free, level_cup",
+        ),
+        (Wish(1, 1, None, ["RRT"]), "no planner 'RRT': must be one of planner"),
+        (Wish(1, 1, None, ["RRT* 10 s"]), "no planner is left"),
     ],
 )
-def test_what_is_not_there_can_not_be_benchmarked(
-    params, constraints, planners, longest, message
-) -> None:
-    with pytest.raises(PeerError, match=message):
-        fewer(params, 1, 1, constraints, planners, longest)
+def test_what_is_not_there_can_not_be_benchmarked(params, wish, message) -> None:
+    with pytest.raises(BaselineError, match=message):
+        fewer(params, wish)
 
 
 def test_a_row_depends_on_the_code_that_makes_it_and_on_no_other() -> None:
-    """Kinds that share their modules share a digest, the band's are not those of Bayesian
-    optimisation.
-    """
-    digests = {kind: code_digest(*made.modules) for kind, made in KINDS.items()}
-    assert digests["straight_latent"] == digests["gradient_geodesic"]
-    assert (
-        len(
-            {
-                digests[kind]
-                for kind in ("straight_band", "ompl", "bayesian_optimisation", "latent_grid")
-            }
-        )
-        == 4
-    )
-    assert code_digest("planners.elastic_band") == digests["straight_band"]
+    """The band's modules are not those of Bayesian optimisation."""
+    digests = {kind: code_digest(f"peers.{kind}") for kind in kinds()}
+    assert len(set(digests.values())) == len(digests)
+    assert code_digest("peers.straight_band") == digests["straight_band"]
 
 
 def test_data_is_told_apart_by_names_and_content(tmp_path) -> None:
@@ -166,7 +176,8 @@ def test_the_last_time_of_each_stage_is_kept(tmp_path) -> None:
 
 
 def test_planners_that_a_clock_may_stop_are_not_asked_for_the_same_path_twice(params) -> None:
-    counted = {name for name, peer in params.bench.planners.items() if ends_by_counting(peer)}
+    settings = all_settings(params)
+    counted = {name for name, own in settings.items() if own.ends_by_counting}
     assert {
         "planner",
         "without graph",
@@ -183,7 +194,7 @@ def test_planners_that_a_clock_may_stop_are_not_asked_for_the_same_path_twice(pa
         "BiRRT + band, 1 s",
         "band from many starts, 1 s",
     }
-    clearance = {name for name, peer in params.bench.planners.items() if uses_clearance(peer)}
+    clearance = {name for name, own in settings.items() if own.uses_clearance or own.band}
     assert {"straight + band", "BiRRT + band", "SLSQP"} <= clearance
     assert not clearance & {"planner", "BiRRT", "PRM", "BiRRT, decoded samples"}
 

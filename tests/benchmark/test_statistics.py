@@ -8,13 +8,13 @@ import pandas as pd
 import pytest
 
 from constraint_geodesics.benchmark.planner_arena import export_arena
-from constraint_geodesics.benchmark.runner import COLUMNS, read_table, table_of, write_table
+from constraint_geodesics.benchmark.row import COLUMNS, LATENT, read_table, table_of, write_table
 from constraint_geodesics.benchmark.statistics import (
     all_constraints,
     benchmark_summary,
     break_even_table,
     interquartile_mean,
-    ours_against_peers,
+    ours_against_baselines,
     over_budget,
     quantile_with_failures,
     repeated,
@@ -32,10 +32,9 @@ def row(planner, query, seed, length, time, *, status="solved", valid=None):
         "valid": bool(np.isfinite(length)) if valid is None else valid,
         "time_s": time,
         "length_rad": length,
-        "latent_length": length,
+        f"{LATENT}planner": length,
         "tool_length_m": 0.1 * length,
         "max_violation_rad": 1e-9,
-        "energy_j_or_blank": None,
         "peak_memory_mb": 1.0,
         "recording": "",
     }
@@ -58,7 +57,7 @@ def table():
 def test_best_known_is_the_shortest_valid_path_of_all(table) -> None:
     best = table.groupby("query")["best_known_rad"].first()
     np.testing.assert_array_equal(best, [1.0, 2.0, 3.0, 4.0, np.nan])
-    assert list(table.columns) == list(COLUMNS)
+    assert list(table.columns) == [*COLUMNS, f"{LATENT}planner"]
 
 
 def test_every_row_counts_and_claims_are_told(table) -> None:
@@ -119,7 +118,7 @@ def test_the_file_keeps_every_bit_that_matters_and_says_where_it_is_from(table, 
     write_table(table, tmp_path / "benchmark.csv", {"commit": "abc", "processor": "a: b"})
     again, about = read_table(tmp_path / "benchmark.csv")
     assert about == {"commit": "abc", "processor": "a: b"}
-    assert list(again.columns) == list(COLUMNS)
+    assert list(again.columns) == list(table.columns)
     np.testing.assert_allclose(again["length_rad"], table["length_rad"], rtol=1e-11)
     pd.testing.assert_series_equal(again["valid"], table["valid"])
 
@@ -174,10 +173,10 @@ def test_who_is_ahead_within_a_budget() -> None:
     rows += [row("slow", q, 0, 1.0, 0.5) for q in range(4)]
     rows += [row("half", q, 0, 1.0 if q % 2 else np.nan, 0.005) for q in range(4)]
     rows += [row("part", 0, 0, 1.0, 0.002)]
-    table = ours_against_peers(
+    table = ours_against_baselines(
         table_of(rows), {"ours": 0.0, "ours 1 s": 1.0}, ["part"], [0.001, 0.006, 0.02, 0.6, 2.0]
     )
-    verdicts = {(r["budget_s"], r["peer"]): r["verdict"] for r in table.to_dict("records")}
+    verdicts = {(r["budget_s"], r["baseline"]): r["verdict"] for r in table.to_dict("records")}
     assert {peer for _, peer in verdicts} == {"slow", "half"}
     assert verdicts[0.001, "half"] == "neither"
     assert verdicts[0.006, "half"] == "ahead", "some success against none"
@@ -193,7 +192,7 @@ def test_planners_that_were_asked_less_are_compared_on_what_they_were_asked() ->
     rows += [row("peer", q, s, 1.5, 0.01) for q in range(2) for s in range(3)] + [
         row("all", 19, 0, 1.0, 1.0)
     ]
-    table = ours_against_peers(table_of(rows), {"ours": 0.0}, [], [0.1]).set_index("peer")
+    table = ours_against_baselines(table_of(rows), {"ours": 0.0}, [], [0.1]).set_index("baseline")
     assert (table.loc["peer", "queries"], table.loc["peer", "verdict"]) == (2, "behind")
 
 

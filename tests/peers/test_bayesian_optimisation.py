@@ -8,12 +8,12 @@ from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.peers.bayesian_optimisation import BayesianPlanner
+from constraint_geodesics.peers.bayesian_optimisation import BayesianPlanner, BayesianSettings
 from constraint_geodesics.problem import PlanningProblem
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.world import World
 
-QUICK = BayesianPlanner(drawn=256, initial=10, evaluations=6)
+QUICK = BayesianPlanner(BayesianSettings(drawn=256, initial=10, evaluations=6))
 FAR = 4
 """Seed of a query whose straight line is far from the shortest path."""
 
@@ -39,7 +39,10 @@ def test_paths_keep_the_constraint_in_either_chart(world: World, name: str) -> N
     chart = LearnedManifold.from_arrays(packaged_learned().manifold)
     asked, solved = problem(world, name, 1), 0
     with Certifier(planner.scene) as judge:
-        for search in (QUICK, BayesianPlanner(chart, drawn=256, initial=10, evaluations=6)):
+        for search in (
+            QUICK,
+            BayesianPlanner(BayesianSettings(drawn=256, initial=10, evaluations=6), chart),
+        ):
             path = search.plan(asked, 0)
             assert path.status in ("solved", "not_found")
             if path.status == "solved":
@@ -55,7 +58,8 @@ def test_paths_keep_the_constraint_in_either_chart(world: World, name: str) -> N
 def test_the_process_finds_shorter_curves_than_it_was_given(world: World) -> None:
     asked = problem(world, "level_cup", FAR)
     few, many = (
-        BayesianPlanner(drawn=64, kept=5, initial=5, evaluations=n).plan(asked, 0) for n in (1, 25)
+        BayesianPlanner(BayesianSettings(drawn=64, kept=5, initial=5, evaluations=n)).plan(asked, 0)
+        for n in (1, 25)
     )
     assert many.iterations - few.iterations == 24
     assert few.status == many.status == "solved"
@@ -107,5 +111,5 @@ def test_misuse_names_the_value() -> None:
         ("initial", 0),
         ("evaluations", 0),
     ):
-        with pytest.raises(ValueError, match=f"{setting} = {value}"):
-            BayesianPlanner(**{setting: value})
+        with pytest.raises(ValueError, match=setting):
+            BayesianSettings(**{setting: value})

@@ -2,37 +2,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.planner_fixtures import (
-    NAMES,
-    assert_sound,
-    manifold_of,
-    packaged_learned,
-    packaged_planner,
-    problems,
-)
+from tests.planner_fixtures import NAMES, assert_sound, manifold_of, packaged_planner, problems
 
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
-from constraint_geodesics.learning.inference import FrozenManifold
-from constraint_geodesics.params import BenchmarkParams
-from constraint_geodesics.peers.decoder_sampling import BATCH, DecoderSampling, decoded_samples
+from constraint_geodesics.peers.decoder_sampling import (
+    BATCH,
+    DecoderSampling,
+    DecoderSettings,
+    decoded_samples,
+)
 from constraint_geodesics.peers.ompl import SamplingPlanner, birrt_with_sampler
 from constraint_geodesics.problem import PlanningProblem
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
 
-SETTINGS = BenchmarkParams(
-    seeds=(0,),
-    planners=("birrt",),
-    space="projected",
-    budget_s=60.0,
-    prm_iterations=75,
-    rrt_star_iterations=150,
-    birrt_iterations=300,
-    delta_rad=0.05,
-    range_rad=2.0,
-)
-PLANNER = DecoderSampling(FrozenManifold(packaged_learned().manifold), SETTINGS, iterations=200)
+SETTINGS = DecoderSettings(budget_s=60.0, iterations=200)
+PLANNER = DecoderSampling(packaged_planner().chart, SETTINGS)
 
 
 def hard(world: World) -> PlanningProblem:

@@ -7,16 +7,12 @@ from tests.planner_fixtures import NAMES, assert_sound, manifold_of, packaged_pl
 
 from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
-from constraint_geodesics.params import BenchmarkParams
-from constraint_geodesics.peers.elastic_band import (
-    BandAfter,
-    MultiStartBand,
-    StraightBand,
-    band_after,
-    rows_along,
-    uniform_configurations,
-)
+from constraint_geodesics.peers.elastic_band import rows_along, uniform_configurations
+from constraint_geodesics.peers.many_bands import MultiStartBand
 from constraint_geodesics.peers.ompl import SamplingPlanner
+from constraint_geodesics.peers.ompl_settings import OmplSettings
+from constraint_geodesics.peers.straight_band import StraightBand
+from constraint_geodesics.peers.wrappers import BandAfter, band_after
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.clearance import clearance_model
@@ -24,20 +20,7 @@ from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
 from constraint_geodesics.search.band import BandSettings
 
-BIRRT = SamplingPlanner(
-    "birrt",
-    BenchmarkParams(
-        seeds=(0,),
-        planners=("birrt",),
-        space="projected",
-        budget_s=60.0,
-        prm_iterations=75,
-        rrt_star_iterations=150,
-        birrt_iterations=300,
-        delta_rad=0.05,
-        range_rad=2.0,
-    ),
-)
+BIRRT = SamplingPlanner("birrt", OmplSettings(budget_s=60.0, iterations=300))
 PLANNERS: tuple[PathPlanner, ...] = (StraightBand(), MultiStartBand(8), BandAfter(BIRRT))
 PILLAR = Box("pillar", (0.45, 0.0, 0.5), (0.1, 0.1, 1.0))
 

@@ -8,7 +8,9 @@ from tests.planner_fixtures import manifold_of, packaged_learned, packaged_plann
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.peers.latent_geodesic import GradientGeodesic, StraightLatent, executable
+from constraint_geodesics.peers.gradient_geodesic import GradientGeodesic, GradientGeodesicSettings
+from constraint_geodesics.peers.latent_geodesic import executable
+from constraint_geodesics.peers.straight_latent import StraightLatent
 from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.box import Box
@@ -80,7 +82,10 @@ def test_without_a_constraint_the_geodesic_is_the_straight_joint_line(bench: Ben
 
 
 def test_same_seed_same_path_and_another_seed_another_search(bench: Bench) -> None:
-    planner, problem = GradientGeodesic(bench.chart, drawn=64), bench.problem("level_cup", 1)
+    planner, problem = (
+        GradientGeodesic(bench.chart, GradientGeodesicSettings(drawn=64)),
+        bench.problem("level_cup", 1),
+    )
     first, again, other = (planner.plan(problem, seed) for seed in (3, 3, 4))
     assert first.status == "solved"
     np.testing.assert_array_equal(first.joints, again.joints)
@@ -136,7 +141,7 @@ def test_what_collides_everywhere_is_not_found(bench: Bench) -> None:
         return any(np.array_equal(q, end) for end in (problem.start, problem.goal))
 
     walled = PlanningProblem(problem.start, problem.goal, problem.manifold, only_ends)
-    few = GradientGeodesic(bench.chart, drawn=32, starts=4, rounds=1)
+    few = GradientGeodesic(bench.chart, GradientGeodesicSettings(drawn=32, starts=4, rounds=1))
     for planner in (StraightLatent(bench.chart), few):
         assert planner.plan(walled, 0).status == "not_found"
 
@@ -172,7 +177,7 @@ def test_rows_are_drawn_where_lines_would_leave_the_constraint_and_jumps_are_ref
     assert executable(manifold_of(packaged_planner(), "tool_down"), np.stack(apart)) is None
 
 
-def test_misuse_names_the_value(bench: Bench) -> None:
+def test_misuse_names_the_value() -> None:
     for setting in ("starts", "polished", "rounds"):
-        with pytest.raises(ValueError, match=f"{setting} = 0"):
-            GradientGeodesic(bench.chart, **{setting: 0})
+        with pytest.raises(ValueError, match=setting):
+            GradientGeodesicSettings(**{setting: 0})

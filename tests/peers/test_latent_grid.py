@@ -27,16 +27,18 @@ from constraint_geodesics.learning.submanifold import (
 )
 from constraint_geodesics.learning.training import TrainingRun, train_manifold
 from constraint_geodesics.params import Params
+from constraint_geodesics.peers.latent_geodesic import same_constraint, straight_lengths
+from constraint_geodesics.peers.latent_graph import LatentGraphSearch, LatentGraphSettings
 from constraint_geodesics.peers.latent_grid import (
     GridSearch,
-    LatentGraphSearch,
+    LatentGridSettings,
     neighbours_on_grid,
-    same_constraint,
-    straight_lengths,
 )
 from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
+
+FEW, DECODED = LatentGridSettings(rounds=4), LatentGridSettings(retracted=False)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +102,10 @@ def test_graph_paths_keep_the_constraint_and_shortcuts_shorten_them(
     solved = 0
     for seed in range(3):
         asked = problem(world, name, seed)
-        short, plain = search.plan(asked, 0), replace(search, shortcuts=0).plan(asked, 0)
+        short, plain = (
+            search.plan(asked, 0),
+            replace(search, settings=LatentGraphSettings(shortcuts=0)).plan(asked, 0),
+        )
         assert short.status == plain.status
         if short.status == "solved":
             solved += 1
@@ -137,8 +142,8 @@ def test_grid_paths_keep_the_constraint_only_where_they_are_retracted(
     world: World, plane: LearnedManifold, params: Params
 ) -> None:
     constraint = packaged_planner().constraints["level_cup"]
-    search = GridSearch(plane, constraint, grid_of(plane, "level_cup", params), rounds=4)
-    plain = replace(search, retracted=False)
+    search = GridSearch(plane, constraint, grid_of(plane, "level_cup", params), FEW)
+    plain = replace(search, settings=LatentGridSettings(rounds=4, retracted=False))
     statuses = []
     for seed in range(8):
         asked = problem(world, "level_cup", seed)
@@ -158,7 +163,7 @@ def test_grid_without_a_constraint_needs_no_retraction(
     world: World, plane: LearnedManifold, params: Params
 ) -> None:
     constraint = packaged_planner().constraints["free"]
-    search = GridSearch(plane, constraint, grid_of(plane, "free", params), retracted=False)
+    search = GridSearch(plane, constraint, grid_of(plane, "free", params), DECODED)
     paths = [
         (search.plan(asked, 0), asked)
         for asked in (problem(world, "free", seed) for seed in range(4))
@@ -175,7 +180,7 @@ def test_an_infinite_weight_keeps_the_way_inside_the_submanifold(
     constraint = packaged_planner().constraints["level_cup"]
     grid = grid_of(plane, "level_cup", params)
     nowhere = replace(grid, labels=np.full_like(grid.labels, -1))
-    path = GridSearch(plane, constraint, nowhere, inclusion_weight=np.inf).plan(
+    path = GridSearch(plane, constraint, nowhere, LatentGridSettings(inclusion_weight=np.inf)).plan(
         problem(world, "level_cup", 0), 0
     )
     assert (path.status, path.explanation) == ("not_found", "the grid does not join the ends")

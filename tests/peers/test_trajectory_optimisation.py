@@ -13,11 +13,13 @@ from tests.planner_fixtures import (
 
 from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
-from constraint_geodesics.peers.elastic_band import StraightBand, task_of
+from constraint_geodesics.peers.elastic_band import task_of
+from constraint_geodesics.peers.straight_band import StraightBand
 from constraint_geodesics.peers.trajectory_optimisation import (
     Course,
     Demand,
     TrajectoryOptimisation,
+    TrajectoryOptimisationSettings,
     demands_of,
 )
 from constraint_geodesics.problem import PathPlanner, PlanningProblem
@@ -27,8 +29,10 @@ from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
 from constraint_geodesics.search.band import BandSettings
 
-SLSQP = TrajectoryOptimisation(starts=6)
-TRUST = TrajectoryOptimisation("trust-constr", starts=2, iterations=100)
+SLSQP = TrajectoryOptimisation(TrajectoryOptimisationSettings(starts=6))
+TRUST = TrajectoryOptimisation(
+    TrajectoryOptimisationSettings(method="trust-constr", starts=2, iterations=100)
+)
 PILLAR = Box("pillar", (0.45, 0.0, 0.5), (0.1, 0.1, 1.0))
 
 
@@ -60,7 +64,10 @@ def test_the_other_method_finds_the_same_path(world: World, certifier: Certifier
 def test_straight_start_ends_where_the_band_does(world: World) -> None:
     compared = 0
     for asked in problems(world, "level_cup", 4):
-        band, found = StraightBand().plan(asked, 0), TrajectoryOptimisation(starts=1).plan(asked, 0)
+        band, found = (
+            StraightBand().plan(asked, 0),
+            TrajectoryOptimisation(TrajectoryOptimisationSettings(starts=1)).plan(asked, 0),
+        )
         if band.status == found.status == "solved":
             assert length(found.joints) == pytest.approx(length(band.joints), rel=2e-3)
             compared += 1
@@ -79,7 +86,10 @@ def test_free_motion_is_the_straight_line(planner: PathPlanner, world: World) ->
 def test_more_wanted_paths_are_no_longer(world: World) -> None:
     for asked in problems(world, "level_cup", 2):
         first, best = (
-            TrajectoryOptimisation(starts=6, wanted=wanted).plan(asked, 0) for wanted in (1, 6)
+            TrajectoryOptimisation(TrajectoryOptimisationSettings(starts=6, wanted=wanted)).plan(
+                asked, 0
+            )
+            for wanted in (1, 6)
         )
         assert first.status == best.status == "solved"
         assert length(best.joints) <= length(first.joints)
@@ -122,7 +132,7 @@ def test_without_a_way_nothing_is_found(world: World) -> None:
 def test_limits_bend_the_path(world: World) -> None:
     bent = 0
     for asked in problems(world, "level_cup", 12):
-        wide = TrajectoryOptimisation(starts=1).plan(asked, 0)
+        wide = TrajectoryOptimisation(TrajectoryOptimisationSettings(starts=1)).plan(asked, 0)
         if wide.status != "solved":
             continue
         # a limit halfway between the ends and where the path goes beyond them
@@ -136,7 +146,7 @@ def test_limits_bend_the_path(world: World) -> None:
         robot = replace(asked.manifold.robot, lower=lower)
         narrow = replace(asked, manifold=replace(asked.manifold, robot=robot))
         path, band = (
-            TrajectoryOptimisation(starts=1).plan(narrow, 0),
+            TrajectoryOptimisation(TrajectoryOptimisationSettings(starts=1)).plan(narrow, 0),
             StraightBand().plan(narrow, 0),
         )
         assert path.status == band.status
@@ -158,8 +168,10 @@ def test_a_pillar_is_kept_clear_of(scene: Scene) -> None:
             asked = PlanningProblem(start, goal, manifold, loaded.is_free, clearance)
             if not loaded.free(np.stack([start, goal])).all():
                 continue
-            blind = TrajectoryOptimisation(starts=1).plan(replace(asked, clearance=None), 0)
-            path = TrajectoryOptimisation(starts=1).plan(asked, 0)
+            blind = TrajectoryOptimisation(TrajectoryOptimisationSettings(starts=1)).plan(
+                replace(asked, clearance=None), 0
+            )
+            path = TrajectoryOptimisation(TrajectoryOptimisationSettings(starts=1)).plan(asked, 0)
             if blind.status == "not_found" and path.status == "solved":
                 assert_sound(path, asked, judge)
                 judged += 1

@@ -15,8 +15,7 @@ import yaml
 ROOT = Path(__file__).resolve().parents[2]
 
 SMALL: dict[str, Any] = {
-    "labels": {"free_rows": 4000, "constrained_rows": 1000, "shard_rows": 1000},
-    "queries": {"count": 3},
+    "labels": {"queries": 3, "free_rows": 4000, "constrained_rows": 1000, "shard_rows": 1000},
     "manifolds": {
         "paper": {"epochs": 3, "variance_epochs": 1, "variance_centres": 32, "batch_size": 128},
         "planner": {"epochs": 5, "variance_epochs": 1, "variance_centres": 64, "batch_size": 128},
@@ -37,11 +36,10 @@ SMALL: dict[str, Any] = {
     "geometry": {"rounds": 1, "batch": 256, "checked": 32, "graph_points": 200, "pairs": 4},
     "policies": {"steps": 1920, "separate_steps": 1920, "ppo": {"batch_size": 320}},
     "planner": {"roadmap_nodes": 200},
-    "plans": {"queries": 3, "seeds": [0], "peers": ["birrt"], "starts": 4, "batch": 4},
+    "studies": {"queries": 3},
     "execution": {"queries": 1, "spheres": 4},
-    "benchmark": {"seeds": [0], "rrt_star_iterations": 40, "prm_iterations": 50},
+    "benchmark": {"queries": 2, "compared": {"seeds": 1}},
     "recording": {"queries": 2},
-    "bench": {"queries": 2},
 }
 QUICK: dict[str, Any] = {
     "many_bands": {"starts": 4},
@@ -100,10 +98,9 @@ def shrink_params(folder: Path) -> None:
     file = folder / "params.yaml"
     params = yaml.safe_load(file.read_text())
     params["constraints"] = {name: params["constraints"][name] for name in CONSTRAINTS}
-    unseen = params["plans"]["unseen"]
-    params["plans"]["unseen"] = {name: unseen[name] for name in list(unseen)[:1]}
+    params["unseen"] = {}
     _overlay(params, SMALL)
-    params["bench"]["planners"] = _one_of_each_kind(params["bench"]["planners"])
+    params["benchmark"]["planners"] = _one_of_each_kind(params["benchmark"]["planners"])
     file.write_text(yaml.safe_dump(params, sort_keys=False))
 
 
@@ -111,15 +108,15 @@ def _one_of_each_kind(planners: dict[str, Any]) -> dict[str, Any]:
     """Those that the benchmark's parameters name, and of the others the first of its kind, on one
     query each.
     """
-    named = ("BiRRT", "BiRRT + band", "band from many starts")
+    named = ("planner", "BiRRT", "BiRRT + band", "band from many starts", "PRM", "RRT* 1 s")
     first = {planner["kind"]: name for name, planner in reversed(planners.items())}
     kept = {name: planners[name] for name in planners if name in named or name in first.values()}
     return {
         name: {
             **planner,
+            **QUICK.get(planner["kind"], {}),
             "queries": 1,
             "seeds": 2 if name == "BiRRT" else 1,
-            "settings": planner.get("settings", {}) | QUICK.get(planner["kind"], {}),
         }
         for name, planner in kept.items()
     }

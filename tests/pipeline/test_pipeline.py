@@ -16,7 +16,7 @@ import pytest
 import yaml
 from mlflow.tracking import MlflowClient
 
-from constraint_geodesics.benchmark.runner import read_table
+from constraint_geodesics.benchmark.row import read_table
 from constraint_geodesics.recording.recording import read_recording, same_recordings
 from constraint_geodesics.tracking.store import fetch_artifacts
 from tests.pipeline import smoke
@@ -286,7 +286,7 @@ def test_the_benchmark_has_a_row_for_every_planner_and_says_where_it_is_from(
 ) -> None:
     result = smoke.dvc(finished, "repro", BENCHMARK)
     assert result.returncode == 0, result.stderr
-    params = yaml.safe_load((finished / "params.yaml").read_text())["bench"]
+    params = yaml.safe_load((finished / "params.yaml").read_text())["benchmark"]
     table, about = read_table(finished / "reports/benchmark.csv")
     assert set(table["planner"]) == set(params["planners"])
     assert set(table["constraint"]) == set(smoke.CONSTRAINTS)

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from tests.report.pages import check_page
 
-from constraint_geodesics.benchmark.runner import read_table
+from constraint_geodesics.benchmark.row import read_table
 from constraint_geodesics.palette import planner_colour
 from constraint_geodesics.params import load_params
 from constraint_geodesics.pipeline.layout import Layout
@@ -64,7 +64,7 @@ def test_the_overview_says_what_its_csv_says(layout, page, params):
         )
         assert cells[-1] == ("–" if pd.isna(row["beaten"]) else f"{row['beaten']:.0%}")
     drawn = page.rows("Scene table, planners that are drawn")
-    assert {name.removesuffix(" †") for name in drawn} - {"planner"} <= set(params.bench.drawn)
+    assert {name.removesuffix(" †") for name in drawn} - {"planner"} <= set(params.benchmark.drawn)
     parts = page.rows("Scene table, the planner and its parts")
     assert {"without graph", "without policies", "nothing learned"} <= set(parts)
     assert "BiRRT" not in parts
@@ -96,13 +96,13 @@ def test_verdicts_are_counted_from_the_budgets(layout, page):
         ]
         assert int(counts[1]) == int(case.agg(lambda v: "ahead" in set(v)).sum())
         assert sum(map(int, counts)) == int(of) == case.ngroups
-    assert len(page.tables["Peers that are ahead"]) == 1 + int(
+    assert len(page.tables["Baselines that are ahead"]) == 1 + int(
         (budgets["verdict"] == "ahead").sum()
     )
 
 
-def test_a_planner_that_no_peer_is_ahead_of_has_no_table_of_peers():
-    case = {"constraint": "free", "scene": "table", "peer": "a peer", "queries": 2}
+def test_a_planner_that_no_baseline_is_ahead_of_has_no_table_of_baselines():
+    case = {"constraint": "free", "scene": "table", "baseline": "a baseline", "queries": 2}
     table = pd.DataFrame(
         [
             case | {"budget_s": 0.1, "verdict": "behind"},

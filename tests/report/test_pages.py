@@ -13,8 +13,8 @@ import pandas as pd
 import pytest
 import torch
 from mlflow.utils.search_utils import SearchUtils
-from tests.benchmark.plan_fixtures import write_plan_reports
 from tests.report.pages import DASHBOARD, check_page
+from tests.report.study_fixtures import write_study_reports
 
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import (
@@ -140,13 +140,13 @@ def small_params():
         update={"seeds": SEEDS, "illustrated_constraints": ("level_cup",), "analytic": ("plane",)}
     )
     submanifold = params.submanifold.model_copy(update={"grid": 20, "nodes": 30, "neighbours": 4})
-    queries = params.queries.model_copy(update={"count": QUERIES})
+    labels = params.labels.model_copy(update={"queries": QUERIES})
     return params.model_copy(
         update={
             "constraints": constraints,
             "geodesics": geodesics,
             "submanifold": submanifold,
-            "queries": queries,
+            "labels": labels,
         }
     )
 
@@ -295,7 +295,7 @@ def run(tmp_path_factory):
     write_json(layout.root / "reports" / "geometry.json", GEOMETRY)
     write_csv(layout.report("benchmark_geometry", "quadrature", "csv"), QUADRATURE)
     write_csv(layout.report("benchmark_planners", "removed", "csv"), sampled_rows())
-    write_plan_reports(params, layout)
+    write_study_reports(params, layout)
     return params, layout
 
 
@@ -334,7 +334,7 @@ def test_the_pages_tables_say_what_the_csv_says(run, checked):
 
 
 def test_a_planner_has_its_colour_beside_its_name(checked):
-    for title in ("planner, slide", "level_cup", "level_cup, whole and in parts"):
+    for title in ("planner, slide", "level_cup"):
         rows = checked.tables[title]
         named = {rows[place][0]: colour for place, colour in checked.colours[title].items()}
         assert "planner" in named or "learned geodesic" in named
@@ -373,7 +373,6 @@ def test_links_to_runs_are_filters_that_mlflow_takes(checked):
     assert {
         ("train_geodesics", "planner-slide"),
         ("benchmark_planners", "slide"),
-        ("benchmark_plans", "level_cup"),
         ("execute_paths", "level_cup"),
         ("train_manifold", "paper"),
         ("ablate_analytic", "plane"),

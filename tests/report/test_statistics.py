@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from constraint_geodesics.report.statistics import common_queries, summarise
+from constraint_geodesics.benchmark.statistics import common_queries, summarise
 
 NAN = float("nan")
 

@@ -19,8 +19,9 @@ from tests.planner_fixtures import packaged_planner
 from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import draw_queries
-from constraint_geodesics.peers.elastic_band import StraightBand
 from constraint_geodesics.peers.ompl import SamplingPlanner
+from constraint_geodesics.peers.ompl_settings import OmplSettings
+from constraint_geodesics.peers.straight_band import StraightBand
 from constraint_geodesics.problem import PlanningProblem
 from constraint_geodesics.report.figures import save_png
 from constraint_geodesics.report.growth_figure import LABELS, growth_figure, slopes_markdown
@@ -161,7 +162,7 @@ def batches():
 @pytest.fixture(scope="module")
 def measured(params, scene, kuka, batches, tmp_path_factory):
     own = BandAndTrees()
-    birrt = params.benchmark.model_copy(update={"space": "tangent_bundle", "range_rad": 2.0})
+    birrt = OmplSettings(space="tangent_bundle", budget_s=60.0, iterations=300)
     planners = {
         own.name: own,
         "straight + band": StraightBand(),

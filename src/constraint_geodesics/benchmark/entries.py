@@ -1,229 +1,286 @@
-"""What the benchmark runs, from params.yaml: blocks of queries with their planners, and the table
+"""What the benchmark runs: the planners of params.yaml on some queries, in batches, and the table
 of their rows.
 """
 
 import ast
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
+from constraint_geodesics.benchmark.queries import Query, read_queries
+from constraint_geodesics.benchmark.recorder import PathRecorder, first_queries
+from constraint_geodesics.benchmark.row import table_of
 from constraint_geodesics.benchmark.runner import (
-    Block,
-    Entry,
-    block_rows,
+    Baseline,
+    QueryBatch,
+    Recorder,
+    batch_rows,
     fingerprint,
-    read_cases,
     rows_to_do,
-    run_block,
-    table_of,
+    run_batch,
 )
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.params import ComputeParams, Params, PeerParams
-from constraint_geodesics.peers import registry
-from constraint_geodesics.peers.registry import KINDS, PeerBuilder, PeerError
+from constraint_geodesics.params import BaselineParams, Params
+from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings
+from constraint_geodesics.peers.registry import BaselineBuilder, after, all_settings
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
-from constraint_geodesics.recording.benchmark_recording import PathRecorder
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.urdf import find_urdf
 
 JUDGED_BY = "benchmark.runner"
 """The module that asks the planners and judges their answers: every row depends on what it imports.
 """
-BESIDE = ("__init__.py", "params.py", "pipeline", "palette.py", "tracking", "recording", "report")
+NO_RESULT = (
+    *("__init__.py", "params.py", "pipeline", "palette.py", "tracking", "recording", "report"),
+    *("peers/baseline.py", "peers/registry.py"),
+)
 """What no row depends on: parameters are hashed by their values."""
 
 
-def blocks_of(params: Params, layout: Layout, folder: Path, recordings: Path) -> list[Block]:
-    """The benchmark of `params.bench` in blocks of a few queries of one constraint and scene.
+@dataclass(frozen=True)
+class Run:
+    """All planners of `params.benchmark`, each on the first of its queries.
 
-    The first block of each has all planners, the slow ones too: they are spread, so that what is
-    done tells how long the rest will take.
+    queries: in the order they are asked.  rows: folder in which rows are kept as they come.
+    learned: manifolds on which the paths' lengths are measured as well.
+    """
 
-    folder: where the rows are kept.  recordings: where some of the paths are recorded.
-    Raises PeerError if the pipeline has not been run, FileNotFoundError if a stage that this needs
-    has not.
+    params: Params
+    layout: Layout
+    queries: Sequence[Query]
+    rows: Path
+    learned: Sequence[str]
+    record: Recorder | None = None
+
+    @cached_property
+    def settings(self) -> dict[str, BaselineSettings]:
+        """The planners' settings."""
+        return all_settings(self.params)
+
+
+def committed_run(params: Params, layout: Layout, rows: Path, recordings: Path) -> Run:
+    """The benchmark on the queries in git, of the pipeline's constraints and of unseen ones.
+
+    Raises BaselineError if the pipeline has not been run, QueryError if a constraint's queries have
+    not been drawn.
     """
     if not (layout.planner / "planner.json").is_file():
-        raise PeerError(
+        raise BaselineError(
             "data/planner is missing, which the benchmark's planners are made of: run `make "
             "repro` first"
         )
-    settings = params.bench
-    scene, searched = Scene.from_params(params), params.geodesics.searched[0]
-    charts = {searched: LearnedManifold.load(layout.manifold(searched))}
-    common = [
-        params.judge.model_dump(),
-        params.benchmark.model_dump(),
-        params.robot.model_dump(),
-        params.workcell.model_dump(),
-        Path(registry.__file__).read_bytes(),
-        code_digest(JUDGED_BY),
-        machine(),
-        data_digest(layout.planner, *(layout.manifold(name) for name in params.manifolds)),
-        data_digest(layout.submanifold(searched, "free").parent),
-        find_urdf(params.robot.urdf).read_bytes(),
-        (layout.root / "requirements.lock").read_bytes(),
+    queries = [
+        query
+        for constraint in params.all_constraints
+        for query in read_queries(layout.benchmark_queries(constraint))
     ]
-    code = {kind: code_digest(*made.modules) for kind, made in KINDS.items()}
-    found: list[tuple[int, Block]] = []
-    for constraint, described in params.constraints.items():
-        file = layout.benchmark_queries(constraint)
-        cases, own_parts = read_cases(file), [*common, described.model_dump(), file.read_bytes()]
-        scenes = {
-            case.scene: [other for other in cases if other.scene == case.scene] for case in cases
-        }
-        record = PathRecorder(
-            layout.root,
-            recordings.resolve(),
-            settings.recorded,
-            {name: own[0].query for name, own in scenes.items()},
-            params.recording.frames,
-        )
-        for name, own in scenes.items():
-            for first in range(0, min(settings.queries, len(own)), settings.block):
-                entries = tuple(
-                    Entry(
-                        planner,
-                        tuple(range(peer.seeds)),
-                        fingerprint(
-                            planner, peer.kind, peer.settings, code.get(peer.kind), *own_parts
-                        ),
-                        peer.queries - first,
-                        after(planner, settings.planners),
-                        uses_clearance(peer),
-                    )
-                    for planner, peer in settings.planners.items()
-                    if first < peer.queries
-                )
-                chosen = tuple(own[first : first + settings.block])
-                if entries:
-                    block = Block(
-                        scene,
-                        constraint_manifold(scene.robot, described),
-                        charts,
-                        chosen,
-                        entries,
-                        PeerBuilder(params, layout.root),
-                        params.judge,
-                        folder / f"{constraint}-{name}-{first}.jsonl",
-                        record,
-                    )
-                    found.append((first // settings.block, block))
+    record = PathRecorder(
+        layout.root,
+        recordings.resolve(),
+        params.benchmark.recorded,
+        first_queries(queries),
+        params.recording.frames,
+    )
+    return Run(params, layout, queries, rows, params.geodesics.searched[:1], record)
+
+
+def answered(run: Run) -> pd.DataFrame:
+    """The table of all rows, after those that are not there yet have been made."""
+    batches = batches_of(run)
+    left = [batch for batch in batches if rows_to_do(batch)]
+    parallel_map(run_batch, left, run.params.compute, description="benchmark")
+    return table_of([row for batch in batches for row in batch_rows(batch)])
+
+
+def batches_of(run: Run) -> list[QueryBatch]:
+    """The run in batches of a few queries of one constraint and scene.
+
+    The first of each has all planners, the slow ones too: they are spread, so that what is done
+    tells how long the rest will take.
+    """
+    params, settings = run.params, run.params.benchmark
+    learned = {name: LearnedManifold.load(run.layout.manifold(name)) for name in run.learned}
+    scene, build = Scene.from_params(params), BaselineBuilder(params, run.layout.root)
+    shared, found = _shared_parts(run), list[tuple[int, QueryBatch]]()
+    for (constraint, name), own in _by_case(run.queries).items():
+        described = params.all_constraints[constraint]
+        ends = [[q.number, *q.start.tolist(), *q.goal.tolist(), repr(q.obstacle)] for q in own]
+        parts = [*shared, described.model_dump(), ends]
+        for first in range(0, min(settings.queries, len(own)), settings.batch):
+            baselines = _baselines(run, first, parts)
+            if not baselines:
+                continue
+            batch = QueryBatch(
+                scene=scene,
+                manifold=constraint_manifold(scene.robot, described),
+                queries=tuple(own[first : min(first + settings.batch, settings.queries)]),
+                baselines=baselines,
+                build=build,
+                judge=params.judge,
+                file=run.rows / f"{constraint}-{name}-{first}.jsonl",
+                learned=learned,
+                record=run.record,
+            )
+            found.append((first // settings.batch, batch))
     return spread(found)
 
 
-def spread(numbered: Sequence[tuple[int, Block]]) -> list[Block]:
-    """Blocks, each with its number within its constraint and scene, so that equal numbers stand
+def _by_case(queries: Sequence[Query]) -> dict[tuple[str, str], list[Query]]:
+    cases: dict[tuple[str, str], list[Query]] = {}
+    for query in queries:
+        cases.setdefault((query.constraint, query.scene), []).append(query)
+    return cases
+
+
+def _baselines(run: Run, first: int, parts: Sequence[Any]) -> tuple[Baseline, ...]:
+    """The planners that answer queries from the one at `first` on.  parts: of all fingerprints."""
+    bench, found = run.params.benchmark, []
+    for name, own in run.settings.items():
+        entry = bench.planners[name]
+        count = entry.queries or bench.queries
+        if first >= count:
+            continue
+        about = [entry.kind, own.model_dump(mode="json")]
+        made_of = [_code_of(entry.kind, own), _data_of(run, own)]
+        found.append(
+            Baseline(
+                name=name,
+                seeds=tuple(range(seeds_of(entry, own, bench.seeds))),
+                fingerprint=fingerprint(*about, *made_of, *parts),
+                kind=entry.kind,
+                settings=fingerprint(*about)[:8],
+                queries=count - first,
+                after=after(name, run.settings),
+                uses_clearance=own.uses_clearance or own.band,
+            )
+        )
+    return tuple(found)
+
+
+def seeds_of(entry: BaselineParams, settings: BaselineSettings, seeds: int) -> int:
+    """How many seeds a planner is asked with: one where chance plays no part."""
+    return (entry.seeds or seeds) if settings.random else 1
+
+
+def _shared_parts(run: Run) -> list[Any]:
+    """What all rows depend on."""
+    params, layout = run.params, run.layout
+    return [
+        params.judge.model_dump(),
+        params.robot.model_dump(),
+        params.workcell.model_dump(),
+        find_urdf(params.robot.urdf).read_bytes(),
+        (layout.root / "requirements.lock").read_bytes(),
+        code_digest(JUDGED_BY),
+        machine(),
+        data_digest(*(layout.manifold(name) for name in run.learned)),
+    ]
+
+
+def _code_of(kind: str, settings: BaselineSettings) -> str:
+    wrapped = settings.band or settings.restarts_s is not None
+    return code_digest(f"peers.{kind}", *["peers.wrappers"] * wrapped)
+
+
+def _data_of(run: Run, settings: BaselineSettings) -> str:
+    """Of the planner's files and of trained ones, where the planner is made of any."""
+    layout, folders = run.layout, []
+    if settings.uses_bundle:
+        folders.append(layout.planner)
+    if settings.trained:
+        folders += [layout.manifold(name) for name in run.params.manifolds]
+        folders += [layout.submanifolds, layout.learned]
+    return data_digest(*folders)
+
+
+def spread(numbered: Sequence[tuple[int, QueryBatch]]) -> list[QueryBatch]:
+    """Batches, each with its number within its constraint and scene, so that equal numbers stand
     evenly apart.
     """
-    count = 1 + max(number for number, _ in numbered)
+    count = 1 + max((number for number, _ in numbered), default=0)
     starts = [index for index, (number, _) in enumerate(numbered) if number == 0]
     placed = []
-    for index, (number, block) in enumerate(numbered):
+    for index, (number, batch) in enumerate(numbered):
         turn = sum(start <= index for start in starts) - 1
-        placed.append(((number + turn * count // len(starts)) % count, turn, block))
-    return [block for *_, block in sorted(placed, key=lambda entry: entry[:2])]
+        placed.append(((number + turn * count // len(starts)) % count, turn, batch))
+    return [batch for *_, batch in sorted(placed, key=lambda entry: entry[:2])]
 
 
-def after(planner: str, known: Mapping[str, PeerParams]) -> str:
-    """The planner whose path this one shortens by a band: the same kind with the same settings but
-    for the band.
+def with_planners(params: Params, planners: Mapping[str, BaselineParams]) -> Params:
+    """The parameters with these planners in the benchmark."""
+    benchmark = params.benchmark.model_copy(update={"planners": dict(planners)})
+    return params.model_copy(update={"benchmark": benchmark})
+
+
+def at_most(entry: BaselineParams, queries: int, seeds: int) -> BaselineParams:
+    """A planner on fewer queries with fewer seeds."""
+    less = {
+        "queries": min(queries, entry.queries or queries),
+        "seeds": min(seeds, entry.seeds or seeds),
+    }
+    return entry.model_copy(update=less)
+
+
+@dataclass(frozen=True)
+class Wish:
+    """A smaller benchmark: so many queries and seeds, some constraints and planners (None: all),
+    and no planner that is given more than `longest_s` for a query.
     """
-    own = known[planner]
-    if not own.settings.get("band") or own.settings.get("restarts_s") is not None:
-        return ""
-    bare = {name: value for name, value in own.settings.items() if name != "band"}
-    return next(
-        (name for name, peer in known.items() if peer.kind == own.kind and peer.settings == bare),
-        "",
-    )
+
+    queries: int
+    seeds: int
+    constraints: Sequence[str] | None = None
+    planners: Sequence[str] | None = None
+    longest_s: float = 2.0
 
 
-def uses_clearance(peer: PeerParams) -> bool:
-    """Whether a planner asks for distances to the workcell; the project's own makes its model
-    itself.
+def fewer(params: Params, wish: Wish) -> tuple[Params, list[str]]:
+    """The parameters with less to do, and the names of the planners that are left out for their
+    time.
+
+    Raises BaselineError if a constraint or planner does not exist, or none is left.
     """
-    return peer.kind not in ("planner", "ompl", "decoder_sampling") or bool(
-        peer.settings.get("band")
-    )
-
-
-def ends_by_counting(peer: PeerParams) -> bool:
-    """Whether a planner's search ends by counting, so that it gives the same path at any speed of
-    the machine: no restarts, no anytime search; a BiRRT or PRM has a time limit that it reaches
-    only where it fails.
-    """
-    settings = peer.settings
-    if peer.kind == "planner":
-        return "budget_s" not in settings
-    return "restarts_s" not in settings and settings.get("algorithm", "birrt") in ("birrt", "prm")
-
-
-def fewer(
-    params: Params,
-    queries: int,
-    seeds: int,
-    constraints: Sequence[str] | None,
-    planners: Sequence[str] | None,
-    longest_s: float,
-) -> tuple[Params, list[str]]:
-    """The parameters with less to do: so many queries and seeds, some constraints and planners
-    (None: all), and no planner that is given more than `longest_s` for a query; and the names of
-    those left out for that.
-
-    Raises PeerError if a constraint or planner does not exist, or none is left.
-    """
+    known_planners = params.benchmark.planners
     for kind, wanted, known in (
-        ("constraint", constraints, list(params.constraints)),
-        ("planner", planners, list(params.bench.planners)),
+        ("constraint", wish.constraints, list(params.all_constraints)),
+        ("planner", wish.planners, list(known_planners)),
     ):
         for name in wanted or ():
             if name not in known:
-                raise PeerError(f"there is no {kind} {name!r}: must be one of {', '.join(known)}")
-    named = {
-        name: peer
-        for name, peer in params.bench.planners.items()
-        if planners is None or name in planners
-    }
-    slow = [
-        name
-        for name, peer in named.items()
-        if float(peer.settings.get("budget_s", 0.0)) > longest_s
-    ]
+                raise BaselineError(
+                    f"there is no {kind} {name!r}: must be one of {', '.join(known)}"
+                )
+    settings = all_settings(params)
+    named = [name for name in known_planners if wish.planners is None or name in wish.planners]
+    slow = [name for name in named if settings[name].given_s > wish.longest_s]
     kept = {
-        name: peer.model_copy(
-            update={"queries": min(queries, peer.queries), "seeds": min(seeds, peer.seeds)}
-        )
-        for name, peer in named.items()
+        name: at_most(known_planners[name], wish.queries, wish.seeds)
+        for name in named
         if name not in slow
     }
     if not kept:
-        raise PeerError(
-            f"no planner is left: all of them are given more than {longest_s:g} s a query"
+        raise BaselineError(
+            f"no planner is left: all of them are given more than {wish.longest_s:g} s a query"
         )
-    bench = params.bench.model_copy(update={"planners": kept, "queries": queries, "block": 1})
+    less = with_planners(params, kept)
+    benchmark = less.benchmark.model_copy(update={"queries": wish.queries, "batch": 1})
     some = {
-        name: c
-        for name, c in params.constraints.items()
-        if constraints is None or name in constraints
+        block: {
+            name: one
+            for name, one in described.items()
+            if wish.constraints is None or name in wish.constraints
+        }
+        for block, described in (("constraints", params.constraints), ("unseen", params.unseen))
     }
-    return params.model_copy(update={"bench": bench, "constraints": some}), slow
-
-
-def answered(blocks: Sequence[Block], compute: ComputeParams) -> pd.DataFrame:
-    """The table of all rows, after those that are not there yet have been made."""
-    parallel_map(
-        run_block,
-        [block for block in blocks if rows_to_do(block)],
-        compute,
-        description="benchmark",
-    )
-    return table_of([row for block in blocks for row in block_rows(block)])
+    return less.model_copy(update={"benchmark": benchmark, **some}), slow
 
 
 def data_digest(*folders: Path) -> str:
@@ -235,30 +292,27 @@ def data_digest(*folders: Path) -> str:
     return digest.hexdigest()
 
 
+@cache
 def code_digest(*modules: str) -> str:
     """Of these modules of the package, and of all of its modules that they import, those imported
     late too.
     """
     package = Path(__file__).parents[1]
+    left_out = [package / part for part in NO_RESULT]
     found: set[Path] = set()
     left = [_file_of(package, module.split(".")) for module in modules]
     while left:
         file = left.pop()
-        if file is None or file in found:
+        if file is None or file in found or any(p in (file, *file.parents) for p in left_out):
             continue
         found.add(file)
         for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
-                f"{package.name}"
-            ):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(package.name):
                 parts = str(node.module).split(".")[1:]
                 left.append(_file_of(package, parts))
                 left += [_file_of(package, [*parts, name.name]) for name in node.names]
     digest = hashlib.sha256()
-    beside = [package / part for part in BESIDE]
     for file in sorted(found):
-        if any(part in (file, *file.parents) for part in beside):
-            continue
         digest.update(file.relative_to(package).as_posix().encode() + file.read_bytes())
     return digest.hexdigest()
 

@@ -6,9 +6,10 @@ and scene is an experiment.
 """
 
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -63,38 +64,43 @@ def export_arena(
             for name in rows["planner"].unique()
         }
         for (constraint, scene), case in rows.groupby(["constraint", "scene"], sort=False):
-            experiment = {
-                "name": f"{constraint}, {scene}",
-                "totaltime": float(case["time_s"].sum()),
-                "timelimit": 0.0,
-                "memorylimit": 0.0,
-                "runcount": len(case),
-                "version": about.get("commit", ""),
-                "hostname": "",
-                "cpuinfo": about.get("processor", ""),
-                "date": about.get("date", ""),
-                "seed": 0,
-                "setup": f"{case['query'].nunique()} queries; a run is one query and seed",
-            }
+            experiment = _experiment(f"{constraint}, {scene}", case, about)
             number = _insert(database, "experiments", experiment)
             for row in case.to_dict("records"):
-                run = {
-                    "experimentid": number,
-                    "plannerid": planners[str(row["planner"])],
-                    "time": row["time_s"],
-                    "memory": row["peak_memory_mb"],
-                    "solved": int(row["status"] == "solved"),
-                    "correct_solution": int(row["valid"]),
-                    "solution_length": row["length_rad"],
-                    "length_over_best_known": row["length_rad"] / row["best_known_rad"]
-                    if row["valid"]
-                    else None,
-                    "constraint_violation": row["max_violation_rad"],
-                    "query": row["query"],
-                    "seed": row["seed"],
-                    "status": statuses.index(row["status"]),
-                }
-                _insert(database, "runs", run)
+                own = {"experimentid": number, "plannerid": planners[str(row["planner"])]}
+                _insert(database, "runs", own | _run(row, statuses))
+
+
+def _experiment(name: str, case: pd.DataFrame, about: Mapping[str, str]) -> dict[str, object]:
+    return {
+        "name": name,
+        "totaltime": float(case["time_s"].sum()),
+        "timelimit": 0.0,
+        "memorylimit": 0.0,
+        "runcount": len(case),
+        "version": about.get("commit", ""),
+        "hostname": "",
+        "cpuinfo": about.get("processor", ""),
+        "date": about.get("date", ""),
+        "seed": 0,
+        "setup": f"{case['query'].nunique()} queries; a run is one query and seed",
+    }
+
+
+def _run(row: Mapping[Any, Any], statuses: Sequence[str]) -> dict[str, object]:
+    ratio = row["length_rad"] / row["best_known_rad"] if row["valid"] else None
+    return {
+        "time": row["time_s"],
+        "memory": row["peak_memory_mb"],
+        "solved": int(row["status"] == "solved"),
+        "correct_solution": int(row["valid"]),
+        "solution_length": row["length_rad"],
+        "length_over_best_known": ratio,
+        "constraint_violation": row["max_violation_rad"],
+        "query": row["query"],
+        "seed": row["seed"],
+        "status": statuses.index(row["status"]),
+    }
 
 
 def _insert(database: sqlite3.Connection, table: str, record: Mapping[str, object]) -> int:

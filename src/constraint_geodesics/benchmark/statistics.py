@@ -1,5 +1,5 @@
-"""The benchmark's figures, all from its rows: success, lengths with intervals, times, and who beats
-whom.
+"""Figures of tables of paths: success, lengths with intervals, times, and who beats whom.  Every
+row counts, failures too.
 
 Interquartile means with bootstrap intervals and the probability of improvement after Agarwal et
 al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (2021), with queries in
@@ -7,7 +7,7 @@ the place of tasks.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -15,8 +15,18 @@ from jaxtyping import Float
 from scipy import stats
 
 CASE = ["constraint", "scene"]
+Counted = Literal["valid", "found"]
+"""Whose lengths count: those of the paths that the judge accepts, or of all that a planner
+returned.
+"""
+
+STRAIGHT, RANDOM = "straight_latent_line", "random_curves"
+APART = (STRAIGHT, RANDOM)
+"""Shown next to the planners to say what policy search adds: what they can't do must not decide
+which queries are compared.
+"""
 WITHIN = (0.01, 0.05, 0.10)
-"""Excess over the best known length that the time to reach is told of."""
+"""Excess over the best known length for which the time to reach it is given."""
 TIED = 1e-4
 """Relative difference below which two lengths count as one."""
 RESAMPLES = 1000
@@ -50,11 +60,11 @@ def benchmark_summary(rows: pd.DataFrame, reference: str) -> pd.DataFrame:
         for planner, own in case.groupby("planner", sort=False):
             about = {"constraint": constraint, "scene": scene, "planner": planner}
             same = mine[mine.index.isin(own[own["valid"]]["query"])].to_numpy()
-            beside = {
+            compared = {
                 "reference_iqm": interquartile_mean(same)[1],
                 "beaten": _beaten(wanted, _lengths_by_query(own)),
             }
-            table.append(about | _figures(own) | beside)
+            table.append(about | _figures(own) | compared)
     return pd.DataFrame(table)
 
 
@@ -139,27 +149,16 @@ def over_budget(rows: pd.DataFrame, budgets: Sequence[float]) -> pd.DataFrame:
 
     A row counts from its time_s on; before, and where it is not valid, its length is infinite.
     """
-    rows = rows[rows["best_known_rad"].notna()]
-    ratio = (rows["length_rad"].where(rows["valid"]) / rows["best_known_rad"]).to_numpy()
-    table = []
-    for (constraint, scene, planner), own in rows.assign(ratio=ratio).groupby(
-        [*CASE, "planner"], sort=False
-    ):
-        about: Mapping[str, Any] = {"constraint": constraint, "scene": scene, "planner": planner}
+    table: list[dict[str, Any]] = []
+    keys = [*CASE, "planner"]
+    for key, own in _with_ratio(rows).groupby(keys, sort=False):
+        about = dict(zip(keys, key, strict=True))
         for budget in budgets:
             reached = own["ratio"].where(own["time_s"] <= budget).to_numpy()
-            figures = {
-                f"ratio_p{share:.0f}": quantile_with_failures(reached, share / 100)
-                for share in (50.0, 95.0)
-            }
-            table.append(
-                {
-                    **about,
-                    "budget_s": budget,
-                    "success": float(np.isfinite(reached).mean()),
-                    **figures,
-                }
-            )
+            half, most = (quantile_with_failures(reached, share) for share in (0.5, 0.95))
+            success = float(np.isfinite(reached).mean())
+            figures = {"success": success, "ratio_p50": half, "ratio_p95": most}
+            table.append({**about, "budget_s": budget, **figures})
     return pd.DataFrame(table)
 
 
@@ -171,52 +170,48 @@ def all_constraints(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(query=rows["constraint"] + " " + rows["query"].astype(str), constraint="all")
 
 
-def ours_against_peers(
+def ours_against_baselines(
     rows: pd.DataFrame, ours: Mapping[str, float], own: Sequence[str], budgets: Sequence[float]
 ) -> pd.DataFrame:
-    """Where a peer is ahead of the planner on p95 of length over best known within a time budget,
-    failures infinite.
+    """Where a baseline is ahead of the planner on p95 of length over best known within a time
+    budget, failures infinite.
 
     ours: the planner's names with the budget [s] that each is given, 0 for the first answer; within
-    a budget the one with the longest that is shorter counts.  own: names that are no peers, such as
-    the planner without a part.
-    One row a case, budget and peer: success and p95 of both within the budget, over the queries
-    that the peer was asked, and `verdict`: of the peer, "ahead" or "behind" if its p95 is shorter
-    or longer by more than AHEAD, else "tied"; where both are infinite, success decides in the same
-    way, and two without any are "neither".
+    a budget the one with the longest that is shorter counts.  own: names that are no baselines,
+    such as the planner without a part.
+    One row a case, budget and baseline: success and p95 of both within the budget, over the queries
+    that the baseline was asked, and `verdict`: of the baseline, "ahead" or "behind" if its p95 is
+    shorter or longer by more than AHEAD, else "tied"; where both are infinite, success decides in
+    the same way, and two without any are "neither".
     """
-    rows = rows[rows["best_known_rad"].notna()]
-    rows = rows.assign(ratio=rows["length_rad"].where(rows["valid"]) / rows["best_known_rad"])
     table = []
-    for (constraint, scene), case in rows.groupby(CASE, sort=False):
-        groups = dict(list(case.groupby("planner", sort=False)))
+    for case, found in _with_ratio(rows).groupby(CASE, sort=False):
+        groups = dict(list(found.groupby("planner", sort=False)))
         for budget in budgets:
-            chosen = max(
-                (name for name in ours if ours[name] < budget), key=lambda name: ours[name]
-            )
-            for peer, asked in groups.items():
-                if peer in ours or peer in own:
+            chosen = max((name for name in ours if ours[name] < budget), key=ours.__getitem__)
+            for name, theirs in groups.items():
+                if name in ours or name in own:
                     continue
-                mine = groups[chosen][groups[chosen]["query"].isin(asked["query"])]
-                asked = asked[asked["query"].isin(mine["query"])]
-                success, ratio = _within(mine, budget)
-                peer_success, peer_ratio = _within(asked, budget)
-                table.append(
-                    {
-                        "constraint": constraint,
-                        "scene": scene,
-                        "budget_s": budget,
-                        "peer": peer,
-                        "asked": chosen,
-                        "queries": mine["query"].nunique(),
-                        "success": success,
-                        "peer_success": peer_success,
-                        "ratio_p95": ratio,
-                        "peer_ratio_p95": peer_ratio,
-                        "verdict": _verdict(success, ratio, peer_success, peer_ratio),
-                    }
+                mine = groups[chosen][groups[chosen]["query"].isin(theirs["query"])]
+                both = (
+                    _within(mine, budget),
+                    _within(theirs[theirs["query"].isin(mine["query"])], budget),
                 )
+                about = dict(zip(CASE, case, strict=True)) | {"budget_s": budget}
+                figures = {
+                    f"{whose}{figure}": value
+                    for whose, values in zip(("", "baseline_"), both, strict=True)
+                    for figure, value in zip(("success", "ratio_p95"), values, strict=True)
+                }
+                asked = {"baseline": name, "asked": chosen, "queries": mine["query"].nunique()}
+                table.append(about | asked | figures | {"verdict": _verdict(*both)})
     return pd.DataFrame(table)
+
+
+def _with_ratio(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows of solvable queries with their `ratio`, length over best known; nan where not valid."""
+    rows = rows[rows["best_known_rad"].notna()]
+    return rows.assign(ratio=rows["length_rad"].where(rows["valid"]) / rows["best_known_rad"])
 
 
 def _within(rows: pd.DataFrame, budget_s: float) -> tuple[float, float]:
@@ -225,16 +220,18 @@ def _within(rows: pd.DataFrame, budget_s: float) -> tuple[float, float]:
     return float(np.isfinite(reached).mean()), quantile_with_failures(reached, 0.95)
 
 
-def _verdict(success: float, ratio: float, peer_success: float, peer_ratio: float) -> str:
-    if np.isfinite(ratio) or np.isfinite(peer_ratio):
-        mine, other = ratio, peer_ratio
-    elif success == peer_success == 0.0:
+def _verdict(mine: tuple[float, float], theirs: tuple[float, float]) -> str:
+    """Of the other, from success and p95 of both."""
+    (success, ratio), (other_success, other_ratio) = mine, theirs
+    if np.isfinite(ratio) or np.isfinite(other_ratio):
+        own, other = ratio, other_ratio
+    elif success == other_success == 0.0:
         return "neither"
     else:  # the shorter figure is the better one: shares of failures
-        mine, other = 1.0 - success, 1.0 - peer_success
-    if other * (1.0 + AHEAD) < mine:
+        own, other = 1.0 - success, 1.0 - other_success
+    if other * (1.0 + AHEAD) < own:
         return "ahead"
-    return "behind" if mine * (1.0 + AHEAD) < other else "tied"
+    return "behind" if own * (1.0 + AHEAD) < other else "tied"
 
 
 def break_even_table(
@@ -246,38 +243,21 @@ def break_even_table(
     training_s, query_s (mean over all of its rows of the queries that both were asked),
     reference_s, success (valid rows), and break_even, infinite where the other is no slower.
     """
-    mine = rows[rows["planner"] == reference]
-    own_time, spent = float(mine["time_s"].mean()), training_s.get(reference, 0.0)
-    first = {
-        "planner": reference,
-        "training_s": spent,
-        "query_s": own_time,
-        "reference_s": own_time,
-        "success": float(mine["valid"].mean()),
-        "break_even": np.nan,
-    }
-    table = [first]
-    keys = ["constraint", "scene", "query"]
-    for planner, own in rows[rows["status"] != "not_applicable"].groupby("planner", sort=False):
-        both = own.merge(
-            mine[[*keys, "time_s"]].groupby(keys, as_index=False).mean(),
-            on=keys,
-            suffixes=("", "_mine"),
-        )
-        if planner == reference or both.empty:
+    mine, spent = rows[rows["planner"] == reference], training_s.get(reference, 0.0)
+    keys, table = [*CASE, "query"], list[dict[str, Any]]()
+    means = mine[[*keys, "time_s"]].groupby(keys, as_index=False).mean()
+    others = rows[(rows["status"] != "not_applicable") & (rows["planner"] != reference)]
+    for planner, own in [(reference, mine), *others.groupby("planner", sort=False)]:
+        both = own.merge(means, on=keys, suffixes=("", "_mine"))
+        if both.empty:
             continue
-        saved = both["time_s"].mean() - both["time_s_mine"].mean()
-        extra = max(spent - training_s.get(str(planner), 0.0), 0.0)
-        table.append(
-            {
-                "planner": planner,
-                "training_s": training_s.get(str(planner), 0.0),
-                "query_s": both["time_s"].mean(),
-                "reference_s": both["time_s_mine"].mean(),
-                "success": float(both["valid"].mean()),
-                "break_even": extra / saved if saved > 0.0 else np.inf,
-            }
-        )
+        trained, own_s = training_s.get(str(planner), 0.0), float(both["time_s"].mean())
+        reference_s = float(both["time_s_mine"].mean())
+        extra, saved = max(spent - trained, 0.0), own_s - reference_s
+        pays = np.nan if planner == reference else extra / saved if saved > 0.0 else np.inf
+        row = {"planner": planner, "training_s": trained, "query_s": own_s}
+        success = float(both["valid"].mean())
+        table.append(row | {"reference_s": reference_s, "success": success, "break_even": pays})
     return pd.DataFrame(table)
 
 
@@ -293,23 +273,19 @@ def repeated(first: pd.DataFrame, again: pd.DataFrame) -> pd.DataFrame:
     for planner, own in both.groupby("planner", sort=False):
         lengths = own[own["valid"] & own["valid_again"]]
         relative = (lengths["length_rad_again"] / lengths["length_rad"] - 1.0).abs()
-        low, middle, high = _interval(own["time_s"].to_numpy(), np.median)
-        low_again, middle_again, high_again = _interval(own["time_s_again"].to_numpy(), np.median)
-        table.append(
-            {
-                "planner": planner,
-                "rows": len(own),
-                "same_validity": bool((own["valid"] == own["valid_again"]).all()),
-                "length_difference": float(relative.max()) if len(relative) else 0.0,
-                "time_s": middle,
-                "time_low_s": low,
-                "time_high_s": high,
-                "time_again_s": middle_again,
-                "time_again_low_s": low_again,
-                "time_again_high_s": high_again,
-                "overlap": bool(low <= high_again and low_again <= high),
-            }
-        )
+        row: dict[str, Any] = {
+            "planner": planner,
+            "rows": len(own),
+            "same_validity": bool((own["valid"] == own["valid_again"]).all()),
+            "length_difference": float(relative.max()) if len(relative) else 0.0,
+        }
+        for run in ("time", "time_again"):
+            column = "time_s" if run == "time" else "time_s_again"
+            low, middle, high = _interval(own[column].to_numpy(), np.median)
+            row |= {f"{run}_s": middle, f"{run}_low_s": low, f"{run}_high_s": high}
+        overlap = row["time_low_s"] <= row["time_again_high_s"]
+        row["overlap"] = bool(overlap and row["time_again_low_s"] <= row["time_high_s"])
+        table.append(row)
     return pd.DataFrame(table)
 
 
@@ -341,3 +317,116 @@ def _beaten(wanted: Mapping[Any, np.ndarray], other: Mapping[Any, np.ndarray]) -
 def _quantile(values: "pd.Series[float]", share: float) -> float:
     known = values.dropna()
     return float(known.quantile(share)) if len(known) else float("nan")
+
+
+def comparison_figures(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
+    """Success, length and what was claimed but is not valid, of each planner; times stand in the
+    table alone.
+    """
+    return {
+        str(planner): {
+            "rows": len(own),
+            "success": float(own["valid"].mean()),
+            "claimed_but_invalid": int(((own["status"] == "solved") & ~own["valid"]).sum()),
+            "length_median_rad": _quantile(own["length_rad"].where(own["valid"]), 0.5),
+        }
+        for planner, own in rows.groupby("planner", sort=False)
+    }
+
+
+def summarise(paths: pd.DataFrame, latent: str, counted: Counted = "valid") -> pd.DataFrame:
+    """One row a planner, the counterpart of Table I: shortest, average ± std, time, length,
+    violation, success.
+
+    paths: rows of `PathMeasures.row` with planner, query, seed, status and time_s.  latent: the
+    manifold whose latent length is compared.  Success, status, violation and time are over all
+    rows.  Table I is over one query: here each query's shortest path, average and standard
+    deviation over the seeds are taken first, then their mean over the queries (of the variance, for
+    the deviation).  Lengths are over the queries that every planner with any counted path has
+    solved, because an average over easier queries is a shorter one (those of APART over the ones
+    among them that it solves: `compared` counts them); `over_best_*`, the joint length over the
+    shortest counted path of the same query, is over all counted rows.
+    """
+    counts = paths["valid"] if counted == "valid" else paths["length_rad"].notna()
+    kept = paths[counts]
+    common = common_queries(kept[~kept["planner"].isin(APART)])
+    over_best = kept["length_rad"] / kept.groupby("query")["length_rad"].transform("min")
+    rows = []
+    for planner, group in paths.groupby("planner", sort=False):
+        mine = kept[kept["planner"] == planner]
+        shared = mine[mine["query"].isin(common)]
+        rows.append(
+            {
+                "planner": planner,
+                **_answers(group),
+                "compared": shared["query"].nunique(),
+                **_over_seeds(shared, f"latent_length_{latent}"),
+                "length_mean_rad": _figure_of(
+                    shared.groupby("query")["length_rad"].mean(), np.mean
+                ),
+                "over_best_median": _figure_of(over_best[mine.index], np.median),
+                "over_best_p95": _figure_of(over_best[mine.index], _quantile95),
+                **_violations(group),
+                **_times(group),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def common_queries(counted: pd.DataFrame) -> set[int]:
+    """Queries for which every planner of the table has a path; a planner with no row at all does
+    not take part.
+    """
+    solved = [set(group["query"]) for _, group in counted.groupby("planner")]
+    return set.intersection(*solved) if solved else set()
+
+
+def _answers(group: pd.DataFrame) -> dict[str, Any]:
+    return {
+        "rows": len(group),
+        "queries": group["query"].nunique(),
+        "success": float(group["valid"].mean()),
+        "found": float(group["length_rad"].notna().mean()),
+        "not_connected": float((group["status"] == "not_connected").mean()),
+        "refused": float((group["length_rad"].notna() & ~group["valid"]).mean()),
+    }
+
+
+def _over_seeds(shared: pd.DataFrame, column: str) -> dict[str, float]:
+    of_query = shared.groupby("query")[column]
+    variances = of_query.var(ddof=1).dropna()  # one seed alone has no spread
+    return {
+        "latent_shortest": _figure_of(of_query.min(), np.mean),
+        "latent_mean": _figure_of(of_query.mean(), np.mean),
+        "latent_std": float(np.sqrt(_figure_of(variances, np.mean))),
+    }
+
+
+def _violations(group: pd.DataFrame) -> dict[str, float]:
+    degrees = np.degrees(group["max_violation_rad"])
+    return {
+        "violation_median_deg": _figure_of(degrees, np.median),
+        "violation_max_deg": _figure_of(degrees, np.max),
+        "violation_max_mm": 1e3 * _figure_of(group["max_violation_m"], np.max),
+    }
+
+
+def _times(group: pd.DataFrame) -> dict[str, float]:
+    return {
+        "time_mean_s": _figure_of(group["time_s"], np.mean),
+        "time_std_s": float(group["time_s"].std(ddof=1)),
+        "time_median_s": _figure_of(group["time_s"], np.median),
+        "time_p95_s": _figure_of(group["time_s"], _quantile95),
+    }
+
+
+def _figure_of(
+    values: "pd.Series[float]", figure: Callable[[Float[np.ndarray, "n"]], Any]
+) -> float:
+    """A figure of the values that are there; nan if there is none."""
+    present = values.dropna().to_numpy(float)
+    return float(figure(present)) if len(present) else float("nan")
+
+
+def _quantile95(values: Float[np.ndarray, "n"]) -> float:
+    return float(np.quantile(values, 0.95))

@@ -7,16 +7,20 @@ costs its length and what is wrong with it; nothing is known of the cost but its
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Annotated, ClassVar
 
 import numpy as np
 from bayes_opt import BayesianOptimization, SequentialDomainReductionTransformer, acquisition
 from jaxtyping import Float
+from pydantic import Field
 
+from constraint_geodesics.fields import Count, Name, NonNegative, Positive
 from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, repeated
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.learned_manifold import JointManifold, LearnedManifold
+from constraint_geodesics.peers.baseline import MANIFOLD, BaselineSettings, Context
 from constraint_geodesics.peers.latent_geodesic import (
     EXACT,
     answer,
@@ -27,7 +31,7 @@ from constraint_geodesics.peers.latent_geodesic import (
     turned_away,
     without_path,
 )
-from constraint_geodesics.problem import PlanningProblem, Solution
+from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.robot.kinematics import SerialRobot
 
 LIMIT_SAMPLES = 1000
@@ -41,14 +45,10 @@ WINDOW = 0.05
 """Least width of a variable's bounds, in units of the ends' distance."""
 
 
-@dataclass(frozen=True)
-class BayesianPlanner:
-    """A Gaussian process over the coefficients of a curve, and the upper confidence bound of its
-    gain.
-
-    chart: in which the curve is a polynomial; None for joint space itself.  degree: of the
-    polynomial; it has dim (degree - 1) variables, 6 for a parabola of 6 joints: twice as many
-    hardly shorten a path and take several times as long.
+class BayesianSettings(BaselineSettings):
+    """manifold: the learned one in which the curve is a polynomial; null: joint space itself.
+    degree: of the polynomial; it has dim (degree - 1) variables, 6 for a parabola of 6 joints:
+    twice as many hardly shorten a path and take several times as long.
     drawn: curves bent towards random configurations on the constraint, whose costs together take
     less than one question to the process.  The best of the straight line and the `kept` cheapest of
     them is what the process searches around.
@@ -56,43 +56,50 @@ class BayesianPlanner:
     package draws the bounds closer around the best curve.  initial: curves at random within the
     bounds, before the process is asked for `evaluations` more.  exploration: κ of the confidence
     bound.
-    Raises ValueError if degree < 2, bound is not positive, or a number of curves is less than 1.
     """
 
-    chart: LearnedManifold | None = None
-    degree: int = 2
-    drawn: int = 2048
-    kept: int = 40
-    bound: float = 0.5
-    initial: int = 12
-    evaluations: int = 40
-    exploration: float = 2.0
-    name: str = "bayesian optimisation"
+    family: ClassVar = "other"
 
-    def __post_init__(self) -> None:
-        if self.degree < 2 or not self.bound > 0.0:
-            raise ValueError(
-                f"degree = {self.degree}, bound = {self.bound}: must be at least 2 and positive"
-            )
-        for name, value in (
-            ("drawn", self.drawn),
-            ("initial", self.initial),
-            ("evaluations", self.evaluations),
-        ):
-            if value < 1:
-                raise ValueError(f"{name} = {value}: must be at least 1")
+    manifold: Name | None = None
+    degree: Annotated[int, Field(ge=2)] = 2
+    drawn: Count = 2048
+    kept: Count = 40
+    bound: Positive = 0.5
+    initial: Count = 12
+    evaluations: Count = 40
+    exploration: NonNegative = 2.0
+
+    def make(self, context: Context) -> PathPlanner:
+        """On the learned manifold that it names."""
+        return BayesianPlanner(self, context.learned(self.manifold) if self.manifold else None)
+
+    @property
+    def trained(self) -> tuple[str, ...]:
+        """The manifold, if any."""
+        return MANIFOLD if self.manifold else ()
+
+
+@dataclass(frozen=True)
+class BayesianPlanner:
+    """A Gaussian process over the coefficients of a curve, and the upper confidence bound of its
+    gain; learned: the manifold that the curve lies on, None for joint space itself.
+    """
+
+    settings: BayesianSettings = field(default_factory=BayesianSettings)
+    learned: LearnedManifold | None = None
+    name: str = "Bayesian optimisation"
 
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The cheapest curve met that is a path."""
         began = time.perf_counter()
-        chart = self.chart or joint_chart(problem.manifold.robot)
+        chart = self.learned or joint_chart(problem.manifold.robot)
         refused = turned_away(problem, chart)
         if refused is not None:
             return without_path(problem, *refused, began)
         rng = np.random.default_rng(seed)
-        joints = on_constraint(problem.manifold, self.drawn, rng)
+        joints = on_constraint(problem.manifold, self.settings.drawn, rng)
         learned = retracted_problem(
-            chart, problem.manifold, PinnedPolynomial(chart.dim, self.degree), joints
+            chart, problem.manifold, PinnedPolynomial(chart.dim, self.settings.degree), joints
         )
         ends = learned.ends(problem.start[None], problem.goal[None])
         cost = _Cost(problem, learned, ends)
@@ -115,10 +122,10 @@ class BayesianPlanner:
         straight = np.zeros((1, learned.curve.coefficients))
         if not len(learned.joints):
             return straight
-        many = repeated(ends, self.drawn)
+        many = repeated(ends, self.settings.drawn)
         bent = learned.sample_curves(many, rng)
         order = np.argsort(ranks(learned.evaluate(bent, many)), kind="stable")
-        return np.concatenate([straight, bent[order[: self.kept]]])
+        return np.concatenate([straight, bent[order[: self.settings.kept]]])
 
     def _searched(
         self, cost: "_Cost", centre: Float[np.ndarray, "p"], seed: int
@@ -131,15 +138,15 @@ class BayesianPlanner:
 
         search = BayesianOptimization(
             lambda **away: -cost(curve(away)),
-            dict.fromkeys(names, (-self.bound, self.bound)),
+            dict.fromkeys(names, (-self.settings.bound, self.settings.bound)),
             verbose=0,
             random_state=seed,
-            acquisition_function=_FrugalBound(kappa=self.exploration),
+            acquisition_function=_FrugalBound(kappa=self.settings.exploration),
             allow_duplicate_points=True,
             bounds_transformer=SequentialDomainReductionTransformer(minimum_window=WINDOW),
         )
         search.probe(dict.fromkeys(names, 0.0), lazy=False)
-        search.maximize(init_points=self.initial, n_iter=self.evaluations)
+        search.maximize(init_points=self.settings.initial, n_iter=self.settings.evaluations)
         met = search.res
         phi = np.array([curve(entry["params"]) for entry in met])
         return phi, -np.array([entry["target"] for entry in met])
@@ -194,3 +201,6 @@ class _Cost:
 def joint_chart(robot: SerialRobot) -> JointManifold:
     """Joint space in units of its own size: the scale of configurations spread over the limits."""
     return JointManifold.of(robot.sample(LIMIT_SAMPLES, np.random.default_rng(0)))
+
+
+BASELINE = BayesianSettings

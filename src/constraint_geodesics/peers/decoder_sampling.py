@@ -5,14 +5,14 @@ As in learned sampling for RRT-like planners [Ichter and Pavone 2019; Qureshi et
 al. 2023]: a sample is drawn in the latent space, decoded to joints, and moved onto the constraint.
 Decoded samples are spread like the training data, so they are mostly free of collision, and near
 the constraint where the data was.  The trees, the steps along the constraint and the simplification
-are those of RRTConnect in `planners/sampling.py`.
+are those of RRTConnect in `peers/ompl.py`.
 """
 
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -20,10 +20,10 @@ from jaxtyping import Float
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.learning.lift import Chart
-from constraint_geodesics.params import BenchmarkParams
+from constraint_geodesics.peers.baseline import MANIFOLD, Context
 from constraint_geodesics.peers.elastic_band import is_clear, nothing, rows_along, settled
-from constraint_geodesics.peers.ompl import birrt_with_sampler
-from constraint_geodesics.problem import PlanningProblem, Solution
+from constraint_geodesics.peers.ompl_settings import OmplSettings
+from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 
 BATCH = 64
 """Samples that are decoded and projected at once."""
@@ -39,22 +39,37 @@ class LatentChart(Chart, Protocol):
         ...
 
 
+class DecoderSettings(OmplSettings):
+    """RRTConnect's, in the only space that takes samples from elsewhere."""
+
+    family: ClassVar = "birrt"
+
+    space: Literal["projected"] = "projected"
+
+    def make(self, context: Context) -> PathPlanner:
+        """Samples of the planner's own manifold."""
+        from constraint_geodesics.learning.inference import FrozenManifold
+
+        return DecoderSampling(FrozenManifold.load(context.layout.manifold(context.searched)), self)
+
+    @property
+    def trained(self) -> tuple[str, ...]:
+        """The manifold."""
+        return MANIFOLD
+
+
 @dataclass(frozen=True)
 class DecoderSampling:
-    """RRTConnect with samples decoded from a chart of the same robot.
-
-    settings: as `SamplingPlanner`'s, but with these: range_rad, the longest extension of a tree;
-    iterations at most.
-    """
+    """RRTConnect with samples decoded from a chart of the same robot."""
 
     chart: LatentChart
-    settings: BenchmarkParams
-    range_rad: float = 2.0
-    iterations: int = 600
+    settings: DecoderSettings
     name: str = "BiRRT, decoded samples"
 
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """Grow two trees until they meet or the iterations are used up."""
+        from constraint_geodesics.peers.ompl import birrt_with_sampler
+
         began = time.perf_counter()
         early = settled(problem, began)
         if early is not None:
@@ -64,15 +79,9 @@ class DecoderSampling:
         if misfit:
             return replace(nothing(problem, began, 0, misfit), status="not_applicable")
         samples = decoded_samples(self.chart, manifold, np.random.default_rng(seed))
-        settings = self.settings.model_copy(
-            update={
-                "range_rad": self.range_rad,
-                "birrt_iterations": self.iterations,
-                "space": "projected",
-            }
-        )
+        deadline = began + self.settings.budget_s
         joints, iterations = birrt_with_sampler(
-            problem, settings, partial(next, samples), seed, began + settings.budget_s
+            problem, self.settings, partial(next, samples), seed, deadline
         )
         if joints is None:
             return nothing(problem, began, iterations)
@@ -111,3 +120,6 @@ def decoded_samples(
         projected = retract(manifold, drawn, Retraction(), band=share)
         kept = projected.converged & (manifold.robot.limit_distance(projected.joints) >= 0.0)
         yield from projected.joints[kept] if kept.any() else drawn
+
+
+BASELINE = DecoderSettings

@@ -1,5 +1,5 @@
 """OMPL's PRM, PRM*, RRT*, Informed RRT* and BiRRT (RRTConnect) on the constraint manifold: the
-planner's peers.
+baselines' searches.
 
 The only importer of ompl.  Held axes are planned in OMPL's constrained state spaces (projected,
 atlas, tangent bundle), no constraint in the plain space of the joints.  OMPL's random numbers
@@ -11,7 +11,7 @@ path depends on the machine.
 import itertools
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -20,16 +20,14 @@ from jaxtyping import Float
 from ompl import base, geometric, util
 
 from constraint_geodesics.constraints import kernels
-from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract, retract_batch
 from constraint_geodesics.learning.lift import as_executed
-from constraint_geodesics.params import BenchmarkParams
+from constraint_geodesics.peers.ompl_settings import OmplSettings
 from constraint_geodesics.problem import SATISFIED, PlanningProblem, Solution, refusal
 from constraint_geodesics.robot.kinematics import SerialRobot
-from constraint_geodesics.scene.shape import Shape
-from constraint_geodesics.scene.world import World
 
-PlannerName = Literal["prm", "prm_star", "rrt_star", "informed_rrt_star", "birrt"]
+Search = Literal["prm", "prm_star", "rrt_star", "informed_rrt_star", "birrt"]
 
 _STALL = 0.2
 """A step along the constraint that advances by less than this share of itself leads nowhere."""
@@ -50,9 +48,8 @@ class SamplingPlanner:
     OMPL's own rows.
     """
 
-    name: PlannerName
-    settings: BenchmarkParams
-    simplify: bool = True
+    name: Search
+    settings: OmplSettings
     row_spacing_rad: float | None = None
 
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
@@ -98,15 +95,11 @@ class SamplingPlanner:
         return ""
 
     def _as_executed(self, space: "_Space", found: Any) -> Float[np.ndarray, "T D"]:
-        return _simplified(space, found)[0] if self.simplify else space.dense(found)[0]
+        return _simplified(space, found)[0] if self.settings.simplify else space.dense(found)[0]
 
 
 def birrt_with_sampler(
-    problem: PlanningProblem,
-    settings: BenchmarkParams,
-    sampler: Sampler,
-    seed: int,
-    deadline: float,
+    problem: PlanningProblem, settings: OmplSettings, sampler: Sampler, seed: int, deadline: float
 ) -> tuple[Float[np.ndarray, "T D"] | None, int]:
     """RRTConnect in the projected space with samples from elsewhere, simplified as
     `SamplingPlanner`'s paths are.
@@ -121,34 +114,6 @@ def birrt_with_sampler(
         return None, iterations
     joints, sound = _simplified(space, found)
     return (joints if sound else None), iterations
-
-
-def plan_all(
-    planner_name: PlannerName,
-    settings: BenchmarkParams,
-    robot: SerialRobot,
-    constraint: Constraint,
-    workcell: Sequence[Shape],
-    starts: Float[np.ndarray, "n D"],
-    goals: Float[np.ndarray, "n D"],
-    seed: int,
-) -> list[Solution]:
-    """Plan n problems of one constraint with one planner and seed, one after another; a task for
-    any process.
-
-    Loading the world and the compiled kernels is not part of the paths' times.
-    """
-    manifold = ConstraintManifold(robot, constraint)
-    planner = SamplingPlanner(planner_name, settings)
-    with World(robot, workcell) as world:
-        problems = [
-            PlanningProblem(a, b, manifold, world.is_free)
-            for a, b in zip(starts, goals, strict=True)
-        ]
-        for problem in problems[:1]:
-            refusal(problem)
-            retract(manifold, problem.start)
-        return [planner.plan(problem, seed) for problem in problems]
 
 
 class _Single:
@@ -259,7 +224,7 @@ class _Space:
     """
 
     problem: PlanningProblem
-    settings: BenchmarkParams
+    settings: OmplSettings
     sampler: Sampler | None = None
     """Where a tree's samples come from; by default from OMPL.  Only the projected space can take
     one.
@@ -360,7 +325,7 @@ def _joint_space(robot: SerialRobot) -> Any:
     return space
 
 
-def _constrained(joints: Any, kind: str, constraint: _HeldAxes, settings: BenchmarkParams) -> Any:
+def _constrained(joints: Any, kind: str, constraint: _HeldAxes, settings: OmplSettings) -> Any:
     if kind == "projected":
         return base.ConstrainedSpaceInformation(base.ProjectedStateSpace(joints, constraint))
     if kind == "atlas":
@@ -369,11 +334,9 @@ def _constrained(joints: Any, kind: str, constraint: _HeldAxes, settings: Benchm
     else:
         space = base.TangentBundleStateSpace(joints, constraint)
         information = base.TangentBundleSpaceInformation(space)
-    if settings.chart_radius_rad is not None:
+    if settings.own_charts:
         space.setRho(settings.chart_radius_rad)
-    if settings.chart_error_rad is not None:
         space.setEpsilon(settings.chart_error_rad)
-    if settings.exploration is not None:
         space.setExploration(settings.exploration)
     return information
 
@@ -422,18 +385,16 @@ def _shorten(space: _Space, path: Any) -> None:
     simplifier.reduceVertices(path)
 
 
-def _prm(space: _Space, settings: BenchmarkParams, deadline: float) -> tuple[Any, int]:
-    """The first path over a roadmap of at most `prm_iterations` samples."""
+def _prm(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
+    """The first path over a roadmap of at most `iterations` samples."""
     planner = geometric.PRM(space.information)
-    return _grow_roadmap(
-        planner, space, settings.prm_iterations, _MILESTONES_BETWEEN_LOOKS, deadline
-    )
+    return _grow_roadmap(planner, space, settings.iterations, _MILESTONES_BETWEEN_LOOKS, deadline)
 
 
-def _prm_star(space: _Space, settings: BenchmarkParams, deadline: float) -> tuple[Any, int]:
-    """The shortest path over a roadmap of `prm_iterations` samples."""
+def _prm_star(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
+    """The shortest path over a roadmap of `iterations` samples."""
     planner = geometric.PRMstar(space.information)
-    return _grow_roadmap(planner, space, settings.prm_iterations, settings.prm_iterations, deadline)
+    return _grow_roadmap(planner, space, settings.iterations, settings.iterations, deadline)
 
 
 def _grow_roadmap(
@@ -472,15 +433,13 @@ def _grow_roadmap(
         planner.growRoadmapPtc(base.PlannerTerminationCondition(enough))
 
 
-def _rrt_star(space: _Space, settings: BenchmarkParams, deadline: float) -> tuple[Any, int]:
+def _rrt_star(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
     planner = geometric.RRTstar(space.information)
     planner.setRange(settings.range_rad)
-    return _grow_tree(planner, space, settings.rrt_star_iterations, deadline)
+    return _grow_tree(planner, space, settings.iterations, deadline)
 
 
-def _informed_rrt_star(
-    space: _Space, settings: BenchmarkParams, deadline: float
-) -> tuple[Any, int]:
+def _informed_rrt_star(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
     """On a constraint OMPL's sampler of the ellipsoid leaves it, and nearly all of its samples are
     lost: there the tree rejects what lies outside instead, and is pruned.
     """
@@ -492,13 +451,13 @@ def _informed_rrt_star(
         planner.setNewStateRejection(True)
         planner.setTreePruning(True)
     planner.setRange(settings.range_rad)
-    return _grow_tree(planner, space, settings.rrt_star_iterations, deadline)
+    return _grow_tree(planner, space, settings.iterations, deadline)
 
 
-def _birrt(space: _Space, settings: BenchmarkParams, deadline: float) -> tuple[Any, int]:
+def _birrt(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
     planner = geometric.RRTConnect(space.information)
     planner.setRange(settings.range_rad)
-    return _grow_tree(planner, space, settings.birrt_iterations, deadline)
+    return _grow_tree(planner, space, settings.iterations, deadline)
 
 
 def _grow_tree(planner: Any, space: _Space, most: int, deadline: float) -> tuple[Any, int]:
@@ -519,7 +478,7 @@ def _grow_tree(planner: Any, space: _Space, most: int, deadline: float) -> tuple
     return (space.definition.getSolutionPath() if exact else None), iterations
 
 
-_SEARCHES: dict[PlannerName, Callable[[_Space, BenchmarkParams, float], tuple[Any, int]]] = {
+_SEARCHES: dict[Search, Callable[[_Space, OmplSettings, float], tuple[Any, int]]] = {
     "prm": _prm,
     "prm_star": _prm_star,
     "rrt_star": _rrt_star,

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -24,6 +24,8 @@ from scipy.optimize import BFGS, NonlinearConstraint, OptimizeResult, minimize
 
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
+from constraint_geodesics.fields import Count, Positive
+from constraint_geodesics.peers.baseline import BaselineSettings, Context
 from constraint_geodesics.peers.elastic_band import (
     Configurations,
     bent_lines,
@@ -33,7 +35,7 @@ from constraint_geodesics.peers.elastic_band import (
     task_of,
     uniform_configurations,
 )
-from constraint_geodesics.problem import PlanningProblem, Solution
+from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.scene.clearance import clearance_row, link_clearances
 from constraint_geodesics.search.band import BandSettings
 from constraint_geodesics.search.candidates import Task, refined
@@ -122,29 +124,41 @@ class Course:
         return self.transform @ y.reshape(len(self.transform), -1)
 
 
+class TrajectoryOptimisationSettings(BaselineSettings):
+    """method: of SciPy.  starts: lines at most, the first of which is straight.  wanted: sound
+    paths after which no further line is tried; the shortest is the answer.  iterations: of one
+    optimisation at most.  accuracy: relative change of the objective below which it stops.
+    """
+
+    family: ClassVar = "optimisation"
+
+    method: Method = "SLSQP"
+    starts: Count = 16
+    wanted: Count = 1
+    iterations: Count = 50
+    accuracy: Positive = 1e-7
+
+    def make(self, context: Context) -> PathPlanner:
+        """It needs nothing."""
+        return TrajectoryOptimisation(self)
+
+
 @dataclass(frozen=True)
 class TrajectoryOptimisation:
     """Waypoints optimised from the straight joint line, then from lines bent past random
     configurations.
 
-    method: of SciPy.  starts: lines at most, the first of which is straight.  wanted: sound paths
-    after which no further line is tried; the shortest is the answer.  iterations: of one
-    optimisation at most.  accuracy: relative change of the objective below which it stops.
-    settings: their segments and clearance.
+    band: its segments and clearance are those of the waypoints.
     """
 
-    method: Method = "SLSQP"
-    starts: int = 16
-    wanted: int = 1
-    iterations: int = 50
-    accuracy: float = 1e-7
+    settings: TrajectoryOptimisationSettings = field(default_factory=TrajectoryOptimisationSettings)
     configurations: Configurations = field(default_factory=lambda: uniform_configurations)
-    settings: BandSettings = field(default_factory=BandSettings)
+    band: BandSettings = field(default_factory=BandSettings)
 
     @property
     def name(self) -> str:
         """With the method's name."""
-        return f"trajectory optimisation ({self.method})"
+        return f"trajectory optimisation ({self.settings.method})"
 
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The shortest sound path of the first that are found; iterations counts the
@@ -154,7 +168,7 @@ class TrajectoryOptimisation:
         early = settled(problem, began)
         if early is not None:
             return early
-        task = task_of(problem, self.settings)
+        task = task_of(problem, self.band)
         found: list[tuple[float, np.ndarray]] = []
         iterations = 0
         for line in self._lines(problem, seed):
@@ -166,7 +180,7 @@ class TrajectoryOptimisation:
             rows = None if candidate is None else free_rows(problem, task, candidate)
             if candidate is not None and rows is not None:
                 found.append((candidate.length, rows))
-            if len(found) >= self.wanted:
+            if len(found) >= self.settings.wanted:
                 break
         if not found:
             return nothing(problem, began, iterations)
@@ -181,10 +195,12 @@ class TrajectoryOptimisation:
         """The straight start, the bent ones, and at last the straight one with twice the
         waypoints.
         """
-        segments = self.settings.segments
+        segments = self.band.segments
         yield bent_lines(problem, segments, 1, self.configurations, seed)[0]
-        if self.starts > 1:  # most problems need no configurations to bend past
-            yield from bent_lines(problem, segments, self.starts, self.configurations, seed)[1:]
+        if self.settings.starts > 1:  # most problems need no configurations to bend past
+            yield from bent_lines(
+                problem, segments, self.settings.starts, self.configurations, seed
+            )[1:]
         yield bent_lines(problem, 2 * segments, 1, self.configurations, seed)[0]
 
     def _optimised(self, task: Task, line: Nodes) -> tuple[Nodes | None, int]:
@@ -214,9 +230,9 @@ class TrajectoryOptimisation:
         """
         course = Course.through(line)
         asked: dict[str, Any]
-        if self.method == "SLSQP":
+        if self.settings.method == "SLSQP":
             asked = {
-                "options": {"maxiter": self.iterations, "ftol": self.accuracy},
+                "options": {"maxiter": self.settings.iterations, "ftol": self.settings.accuracy},
                 "constraints": [
                     {
                         "type": "eq" if d.equal else "ineq",
@@ -229,10 +245,12 @@ class TrajectoryOptimisation:
         else:
             asked = {
                 "hess": lambda y: np.eye(y.size),
-                "options": {"maxiter": self.iterations, **_TRUST_REGION_ENDS},
+                "options": {"maxiter": self.settings.iterations, **_TRUST_REGION_ENDS},
                 "constraints": [course.nonlinear(d) for d in demands],
             }
-        result = minimize(course.energy, course.start, jac=True, method=self.method, **asked)
+        result = minimize(
+            course.energy, course.start, jac=True, method=self.settings.method, **asked
+        )
         return result, course.nodes(result.x)
 
 
@@ -336,3 +354,6 @@ def _link_clearances(chain, model, q, values, gradients):  # type: ignore[no-unt
                 )
             else:
                 values[b, link], gradients[b, link] = 1.0, 0.0
+
+
+BASELINE = TrajectoryOptimisationSettings

@@ -39,6 +39,11 @@ class Layout:
         """Folder of one constraint's sub-manifold in one latent space (npz and JSON)."""
         return self.root / "data" / "submanifolds" / f"{manifold}-{constraint}"
 
+    @property
+    def submanifolds(self) -> Path:
+        """Folder of all of them."""
+        return self.root / "data" / "submanifolds"
+
     def geodesics(self, manifold: str, constraint: str) -> Path:
         """Folder of the policies and curves found (safetensors, npz, CSV)."""
         return self.root / "data" / "geodesics" / f"{manifold}-{constraint}"
@@ -62,11 +67,6 @@ class Layout:
     def pretrained(self) -> Path:
         """Their copy that travels with the package."""
         return self.root / "src" / "constraint_geodesics" / "pretrained"
-
-    @property
-    def plans(self) -> Path:
-        """Folder of the planner's benchmark: queries (CSV) and paths (npz)."""
-        return self.root / "data" / "plans"
 
     def benchmark_queries(self, constraint: str) -> Path:
         """The benchmark's queries of one constraint, with their obstacles (CSV)."""

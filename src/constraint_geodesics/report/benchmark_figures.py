@@ -1,10 +1,10 @@
 """Figures of the benchmark: what each planner has within a time budget, how its lengths spread, and
 when training pays.
 
-Planners of one family share their colour of palette.py; within it they differ by line style.
+Planners of one family share a colour; within it they differ by line style.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,116 +14,123 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from constraint_geodesics.benchmark.statistics import over_budget
-from constraint_geodesics.palette import LIGHT, planner_colour
+from constraint_geodesics.palette import LIGHT
 
-DASHES: tuple[str | tuple[int, tuple[int, ...]], ...] = (
-    "-",
-    "--",
-    ":",
-    "-.",
-    (0, (5, 1, 1, 1, 1, 1)),
-    (0, (1, 3)),
-)
+DASHES: tuple[str | tuple[int, tuple[int, ...]], ...]
+DASHES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 BUDGETS = np.geomspace(1e-3, 20.0, 60)
 """Time budgets at which curves are drawn [s]."""
+SHORTEST = 1e-5
+"""Excess over the best known length below which all paths are drawn as one."""
+
+Styles = Mapping[str, Mapping[str, Any]]
+"""How the line of each planner is drawn; others are left out."""
 
 
-def styles_of(planners: Sequence[str]) -> dict[str, dict[str, Any]]:
+def styles_of(planners: Sequence[str], colours: Mapping[str, str]) -> Styles:
     """Colour and dashes of every planner: its family's colour, and dashes that no other of this
     family has here.
     """
     met: dict[str, int] = {}
     styles: dict[str, dict[str, Any]] = {}
     for planner in planners:
-        colour = planner_colour(planner)
+        colour = colours[planner]
         k = met.get(colour, 0)
         met[colour] = k + 1
-        styles[planner] = {
-            "color": colour,
-            "linestyle": DASHES[k % len(DASHES)],
-            "linewidth": 2.2 if k == 0 else 1.2,
-        }
+        dashes, width = DASHES[k % len(DASHES)], 2.2 if k == 0 else 1.2
+        styles[planner] = {"color": colour, "linestyle": dashes, "linewidth": width}
     return styles
 
 
-def success_over_budget(rows: pd.DataFrame, planners: Sequence[str]) -> Figure:
+def success_over_budget(rows: pd.DataFrame, styles: Styles) -> Figure:
     """Share of solvable queries with a valid path within a time budget; a panel for each constraint
     and scene.
     """
-    return _over_budget(rows, planners, "success", "solved of solvable", (0.0, 1.02))
+    figure, grid = _cases(rows)
+    for axes, case in grid:
+        _draw_budget(axes, case, "success", styles)
+    return _finished(figure, grid, styles, ("time budget [s]", "solved of solvable"))
 
 
-def length_over_budget(rows: pd.DataFrame, planners: Sequence[str]) -> Figure:
+def length_over_budget(rows: pd.DataFrame, styles: Styles) -> Figure:
     """95th percentile of length over best known within a time budget, failures counted as
     infinite.
     """
-    return _over_budget(rows, planners, "ratio_p95", "length / best known, p95", (0.98, 3.0))
+    figure, grid = _cases(rows)
+    for axes, case in grid:
+        _draw_budget(axes, case, "ratio_p95", styles)
+        axes.set(ylim=(0.98, 3.0))
+    return _finished(figure, grid, styles, ("time budget [s]", "length / best known, p95"))
 
 
-def ratio_distributions(rows: pd.DataFrame, planners: Sequence[str]) -> Figure:
+def ratio_distributions(rows: pd.DataFrame, styles: Styles) -> Figure:
     """How large a share of the solvable rows has a path within some excess over the best known
     length.
     """
-    styles, solvable = styles_of(planners), rows[rows["best_known_rad"].notna()]
-    figure, grid = _grid_of(rows)
-    for axes, (_, case) in zip(
-        grid, solvable.groupby(["constraint", "scene"], sort=False), strict=True
-    ):
-        for planner, values in _excess(case):
-            if planner in planners:
-                share = np.arange(1, len(values) + 1) / len(values)
-                axes.step(
-                    np.maximum(values, 1e-5), share, where="post", label=planner, **styles[planner]
-                )
-        axes.set(xscale="log", xlim=(1e-5, 3.0), ylim=(0.0, 1.02))
-    _finished(figure, grid, rows, planners, "excess over best known", "share of solvable rows")
-    return figure
+    figure, grid = _cases(rows)
+    for axes, case in grid:
+        _draw_excess(axes, case, styles)
+    return _finished(figure, grid, styles, ("excess over best known", "share of solvable rows"))
 
 
-def overview(rows: pd.DataFrame, planners: Sequence[str]) -> Figure:
+def overview(rows: pd.DataFrame, styles: Styles) -> Figure:
     """Success, p95 of the length within a time budget, and the spread of lengths; a line of panels
     for each scene.
     """
-    styles, table = styles_of(planners), over_budget(rows, BUDGETS.tolist())
     scenes = list(dict.fromkeys(rows["scene"]))
     figure = Figure(figsize=(10.0, 1.6 + 2.7 * len(scenes)), layout="constrained")
-    grid = np.atleast_2d(figure.subplots(len(scenes), 3))
-    for line, scene in zip(grid, scenes, strict=True):
-        for planner, own in table[table["scene"] == scene].groupby("planner", sort=False):
-            if planner in planners:
-                line[0].plot(own["budget_s"], own["success"], label=planner, **styles[str(planner)])
-                line[1].plot(own["budget_s"], own["ratio_p95"], **styles[str(planner)])
-        for planner, values in _excess(rows[rows["scene"] == scene]):
-            if planner in planners:
-                share = np.arange(1, len(values) + 1) / len(values)
-                line[2].step(np.maximum(values, 1e-5), share, where="post", **styles[planner])
-        line[0].set(
-            xscale="log",
-            xlim=BUDGETS[[0, -1]],
-            ylim=(0.0, 1.02),
-            ylabel=f"{scene}: solved of solvable",
-            xlabel="time budget [s]",
-        )
-        line[0].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-        line[1].set(
-            xscale="log",
-            xlim=BUDGETS[[0, -1]],
-            ylim=(0.98, 2.5),
-            ylabel="length / best known, p95",
-            xlabel="time budget [s]",
-        )
-        line[2].set(
-            xscale="log",
-            xlim=(1e-5, 3.0),
-            ylim=(0.0, 1.02),
-            ylabel="share of rows",
-            xlabel="excess over best known",
-        )
-        for axes in line:
-            axes.grid(color=LIGHT, linewidth=0.6)
-            axes.tick_params(labelsize=7)
-    _legend(figure, grid[:, 0].tolist(), planners)
+    panels = np.atleast_2d(figure.subplots(len(scenes), 3))
+    for (success, length, excess), scene in zip(panels, scenes, strict=True):
+        case = rows[rows["scene"] == scene]
+        _draw_budget(success, case, "success", styles)
+        _draw_budget(length, case, "ratio_p95", styles)
+        _draw_excess(excess, case, styles)
+        success.set(ylabel=f"{scene}: solved of solvable", xlabel="time budget [s]")
+        length.set(ylabel="length / best known, p95", xlabel="time budget [s]")
+        excess.set(ylabel="share of rows", xlabel="excess over best known")
+        for axes in (success, length, excess):
+            _plain(axes)
+    _legend(figure, panels[:, 0].tolist(), styles)
     return figure
+
+
+def break_even(costs: pd.DataFrame, styles: Styles) -> Figure:
+    """Time spent in all, training included, against the number of queries served.
+
+    costs: planner, training_s, query_s (mean time of a query).
+    """
+    served = np.geomspace(1, 1e7, 200)
+    figure = Figure(figsize=(8.0, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    for row in costs[costs["planner"].isin(list(styles))].to_dict("records"):
+        spent = row["training_s"] + served * row["query_s"]
+        axes.plot(served, spent, label=row["planner"], **styles[row["planner"]])
+    axes.set(xscale="log", yscale="log")
+    axes.set(xlabel="queries served", ylabel="training and planning [s]")
+    axes.grid(color=LIGHT, linewidth=0.6)
+    figure.legend(loc="outside right upper", fontsize=7, frameon=False)
+    return figure
+
+
+def _draw_budget(axes: Axes, case: pd.DataFrame, column: str, styles: Styles) -> None:
+    table = over_budget(case[case["planner"].isin(list(styles))], BUDGETS.tolist())
+    for planner, own in table.groupby("planner", sort=False):
+        axes.plot(own["budget_s"], own[column], label=planner, **styles[str(planner)])
+    axes.set(xscale="log", xlim=BUDGETS[[0, -1]])
+    if column == "success":
+        axes.set(ylim=(0.0, 1.02))
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    else:
+        axes.set(ylim=(0.98, 2.5))
+
+
+def _draw_excess(axes: Axes, case: pd.DataFrame, styles: Styles) -> None:
+    for planner, values in _excess(case):
+        if planner in styles:
+            share = np.arange(1, len(values) + 1) / len(values)
+            place = np.maximum(values, SHORTEST)
+            axes.step(place, share, where="post", label=planner, **styles[planner])
+    axes.set(xscale="log", xlim=(SHORTEST, 3.0), ylim=(0.0, 1.02))
 
 
 def _excess(rows: pd.DataFrame) -> Iterator[tuple[str, np.ndarray]]:
@@ -136,87 +143,46 @@ def _excess(rows: pd.DataFrame) -> Iterator[tuple[str, np.ndarray]]:
         yield str(planner), np.sort(own.to_numpy())
 
 
-def break_even(costs: pd.DataFrame, planners: Sequence[str]) -> Figure:
-    """Time spent in all, training included, against the number of queries served.
-
-    costs: planner, training_s, query_s (mean time of a query).
-    """
-    styles, served = styles_of(planners), np.geomspace(1, 1e7, 200)
-    figure = Figure(figsize=(8.0, 4.2), layout="constrained")
-    axes = figure.add_subplot()
-    for row in costs[costs["planner"].isin(list(planners))].to_dict("records"):
-        axes.plot(
-            served,
-            row["training_s"] + served * row["query_s"],
-            label=row["planner"],
-            **styles[row["planner"]],
-        )
-    axes.set(
-        xscale="log", yscale="log", xlabel="queries served", ylabel="training and planning [s]"
-    )
-    axes.grid(color=LIGHT, linewidth=0.6)
-    figure.legend(loc="outside right upper", fontsize=7, frameon=False)
-    return figure
-
-
-def _over_budget(
-    rows: pd.DataFrame,
-    planners: Sequence[str],
-    column: str,
-    label: str,
-    limits: tuple[float, float],
-) -> Figure:
-    styles, table = styles_of(planners), over_budget(rows, BUDGETS.tolist())
-    figure, grid = _grid_of(rows)
-    for axes, (_, case) in zip(
-        grid, table.groupby(["constraint", "scene"], sort=False), strict=True
-    ):
-        for planner, own in case.groupby("planner", sort=False):
-            if planner in planners:
-                axes.plot(own["budget_s"], own[column], label=planner, **styles[str(planner)])
-        axes.set(xscale="log", xlim=BUDGETS[[0, -1]], ylim=limits)
-        if column == "success":
-            axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-    _finished(figure, grid, rows, planners, "time budget [s]", label)
-    return figure
-
-
-def _grid_of(rows: pd.DataFrame) -> tuple[Figure, list[Axes]]:
-    """A panel for each constraint and scene, scenes side by side."""
+def _cases(rows: pd.DataFrame) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
+    """A panel with the solvable rows of each constraint and scene, scenes side by side."""
     solvable = rows[rows["best_known_rad"].notna()]
-    cases = solvable.groupby(["constraint", "scene"], sort=False).ngroups
+    cases = list(solvable.groupby(["constraint", "scene"], sort=False))
     columns = 2 if rows["scene"].nunique() > 1 else 3
-    lines = -(-cases // columns)
-    figure = Figure(figsize=(9.0, 1.6 + 2.0 * lines), layout="constrained")
-    return figure, [figure.add_subplot(lines, columns, k + 1) for k in range(cases)]
+    lines = -(-len(cases) // columns)
+    figure, grid = Figure(figsize=(9.0, 1.6 + 2.0 * lines), layout="constrained"), []
+    for k, ((constraint, scene), case) in enumerate(cases):
+        axes = figure.add_subplot(lines, columns, k + 1)
+        axes.set_title(f"{constraint}, {scene}", fontsize=9)
+        _plain(axes)
+        grid.append((axes, case))
+    return figure, grid
 
 
 def _finished(
     figure: Figure,
-    grid: Sequence[Axes],
-    rows: pd.DataFrame,
-    planners: Sequence[str],
-    below: str,
-    beside: str,
-) -> None:
-    solvable = rows[rows["best_known_rad"].notna()]
-    names = [f"{c}, {s}" for (c, s), _ in solvable.groupby(["constraint", "scene"], sort=False)]
-    for axes, name in zip(grid, names, strict=True):
-        axes.set_title(name, fontsize=9)
-        axes.grid(color=LIGHT, linewidth=0.6)
-        axes.tick_params(labelsize=7)
-    figure.supxlabel(below, fontsize=9)
-    figure.supylabel(beside, fontsize=9)
-    _legend(figure, grid, planners)
+    grid: Sequence[tuple[Axes, pd.DataFrame]],
+    styles: Styles,
+    labels: tuple[str, str],
+) -> Figure:
+    """Labels below and at the left, and one legend."""
+    figure.supxlabel(labels[0], fontsize=9)
+    figure.supylabel(labels[1], fontsize=9)
+    _legend(figure, [axes for axes, _ in grid], styles)
+    return figure
 
 
-def _legend(figure: Figure, grid: Sequence[Axes], planners: Sequence[str]) -> None:
-    """One legend for all panels, planners in the order of `planners`."""
+def _plain(axes: Axes) -> None:
+    axes.grid(color=LIGHT, linewidth=0.6)
+    axes.tick_params(labelsize=7)
+
+
+def _legend(figure: Figure, panels: Sequence[Axes], styles: Styles) -> None:
+    """One legend for all panels, planners in the order of `styles`."""
     handles: dict[str, Any] = {}
-    for axes in grid:
+    for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(str(label), handle)
-    names = [name for name in planners if name in handles]
+    names = [name for name in styles if name in handles]
     figure.legend(
         [handles[name] for name in names],
         names,

@@ -5,15 +5,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from constraint_geodesics.benchmark.runner import TABLE, read_table
+from constraint_geodesics.benchmark.queries import TABLE
+from constraint_geodesics.benchmark.row import read_table
 from constraint_geodesics.params import Params
+from constraint_geodesics.peers.planner import PlannerSettings
+from constraint_geodesics.peers.registry import all_settings
 from constraint_geodesics.pipeline.layout import Layout, in_checkout
 from constraint_geodesics.report.benchmark_tables import (
     PYTHON_NOTE,
     TABLE_I_NOTE,
     Cells,
     ahead_cells,
-    ahead_told,
+    ahead_text,
     asks_in_python,
     break_even_cells,
     case_cells,
@@ -46,7 +49,7 @@ def write_benchmark_page(params: Params, layout: Layout) -> None:
         layout,
         "benchmark",
         about=about,
-        planners=len(params.bench.planners),
+        planners=rows["planner"].nunique(),
         rows=len(rows),
         sections=sections,
     )
@@ -78,10 +81,11 @@ def benchmark_sections(params: Params, layout: Layout, rows: pd.DataFrame) -> li
 
 
 def _overview_sections(params: Params, layout: Layout, overview: pd.DataFrame) -> list[Section]:
-    in_python = asks_in_python(params.bench.planners)
-    parts = [name for name, peer in params.bench.planners.items() if peer.kind == "planner"]
+    settings = all_settings(params)
+    in_python = asks_in_python(settings)
+    parts = [name for name, one in settings.items() if isinstance(one, PlannerSettings)]
     drawn, own = (
-        overview[overview["planner"].isin(names)] for names in (params.bench.drawn, parts)
+        overview[overview["planner"].isin(names)] for names in (params.benchmark.drawn, parts)
     )
     return [
         Section(
@@ -106,9 +110,9 @@ def _budget_section(layout: Layout, budgets: pd.DataFrame) -> Section:
     note = "a case is a constraint in a scene; from reports/benchmark/budgets.csv"
     cases = Table("Cases by budget", note, *_parted(verdict_cells(budgets)))
     header, rows = _parted(ahead_cells(budgets))
-    behind = Table("Peers that are ahead", note, header, rows)
+    behind = Table("Baselines that are ahead", note, header, rows)
     return Section(
-        "budgets", "Within a time budget", ahead_told(budgets), pictures, [cases], [behind]
+        "budgets", "Within a time budget", ahead_text(budgets), pictures, [cases], [behind]
     )
 
 
@@ -119,7 +123,7 @@ def _published_section(params: Params, rows: pd.DataFrame) -> Section:
         f"Table I and {constraint}, scene {TABLE}", "from reports/benchmark.csv", cells
     )
     return Section(
-        "published", "Beside the paper: Table I", TABLE_I_NOTE.replace("`", ""), tables=[block]
+        "published", "Next to the paper: Table I", TABLE_I_NOTE.replace("`", ""), tables=[block]
     )
 
 

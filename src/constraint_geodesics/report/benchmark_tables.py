@@ -8,63 +8,51 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from constraint_geodesics.params import PeerParams
+from constraint_geodesics.benchmark.row import LATENT
+from constraint_geodesics.peers.baseline import BaselineSettings
 from constraint_geodesics.report.results import markdown_table
 
+Cells = list[Sequence[str]]
+"""A table's header and its rows."""
+
 COLUMNS = (
-    "planner",
-    "queries × seeds",
-    "solved of solvable",
-    "claimed, not valid",
-    "length / best known, median",
-    "p95",
-    "IQM [95 % interval]",
-    "p95, failures as ∞",
-    "time [ms], median",
-    "p95",
-    "to 1 % [ms]",
-    "to 5 %",
-    "to 10 %",
-    "longer than the planner's",
-    "memory [MB]",
+    *("planner", "queries × seeds", "solved of solvable", "claimed, not valid"),
+    *("length / best known, median", "p95", "IQM [95 % interval]", "p95, failures as ∞"),
+    *("time [ms], median", "p95", "to 1 % [ms]", "to 5 %", "to 10 %"),
+    *("longer than the planner's", "memory [MB]"),
 )
 OVERVIEW = (
-    "planner",
-    "queries × seeds",
-    "solved [95 %]",
-    "claimed, not valid",
-    "p95 of length / best known, failures ∞",
-    "IQM of solved [95 %]",
-    "the planner's on these",
-    "time [ms]: median",
-    "p95",
-    "planner shorter",
+    *("planner", "queries × seeds", "solved [95 %]", "claimed, not valid"),
+    *("p95 of length / best known, failures ∞", "IQM of solved [95 %]", "the planner's on these"),
+    *("time [ms]: median", "p95", "planner shorter"),
+)
+REPEAT = (
+    *("planner", "rows", "same validity", "largest relative difference of a length"),
+    *("median time [ms], 95 % interval", "second run", "overlap"),
+)
+BREAK_EVEN = (
+    *("planner", "its training [s]", "mean time of a query [ms]", "the planner's [ms]", "valid"),
+    "pays from",
+)
+AHEAD = (
+    *("constraint", "scene", "budget [s]", "baseline ahead", "its p95", "the planner's"),
+    *("its success", "the planner's"),
+)
+VERDICTS = (
+    *("time budget [s]", "planner first or tied", "a baseline ahead"),
+    *("no path of any planner yet", "of"),
+)
+TABLE_I = (
+    *("method", "paper: shortest", "average ± std", "×", "time [s]"),
+    *("here: shortest", "average ± std", "×", "time [s]", "valid", "rows"),
 )
 FEW = 40
 """Rows below which a 95th percentile says nothing and is not shown."""
 PYTHON_NOTE = (
-    "† asks PyBullet through Python for every state of its search; the others check with "
-    "compiled clearances and ask "
-    "PyBullet about the finished path. Where a planner cannot work under a constraint (OMPL's "
-    "atlas and tangent bundle "
-    "have no tangent space for a tolerance) it has no rows of it here."
-)
-REPEAT = (
-    "planner",
-    "rows",
-    "same validity",
-    "largest relative difference of a length",
-    "median time [ms], 95 % interval",
-    "second run",
-    "overlap",
-)
-BREAK_EVEN = (
-    "planner",
-    "its training [s]",
-    "mean time of a query [ms]",
-    "the planner's [ms]",
-    "valid",
-    "pays from",
+    "† asks PyBullet through Python for every state of its search; the others check with compiled "
+    "clearances and ask PyBullet about the finished path. Where a planner cannot work under a "
+    "constraint (OMPL's atlas and tangent bundle have no tangent space for a tolerance) it has no "
+    "rows of it here."
 )
 PUBLISHED = {
     "PRM": (499.42, 530.89, 24.43, 9.75),
@@ -73,45 +61,52 @@ PUBLISHED = {
     "planner": (70.56, 79.81, 7.64, 3.8),
 }
 """Table I of the paper: shortest path, average, its ±, planning time [s]; its learned geodesic
-beside our planner.
+stands next to our planner.
 """
 TABLE_I_NOTE = (
-    "The paper's lengths have no unit and are of one query, on its own machine with a GPU; "
-    "ours are latent lengths "
-    "(eq. 2, on the `planner` manifold) of valid paths over all queries and seeds of a "
-    "method. So compare the ratios "
-    "×: the average over that of the geodesic, here over that of the planner's paths of the "
-    "same queries."
+    "The paper's lengths have no unit and are of one query, on its own machine with a GPU; ours "
+    "are latent lengths (eq. 2, on the `planner` manifold) of valid paths over all queries and "
+    "seeds of a method. So compare the ratios ×: the average over that of the geodesic, here over "
+    "that of the planner's paths of the same queries."
 )
 
 
-Cells = list[Sequence[str]]
-"""A table's header and its rows."""
-
-
-def asks_in_python(planners: Mapping[str, PeerParams]) -> list[str]:
+def asks_in_python(settings: Mapping[str, BaselineSettings]) -> list[str]:
     """Planners whose search asks PyBullet through Python for every state."""
-    return [name for name, peer in planners.items() if peer.kind in ("ompl", "decoder_sampling")]
+    return [name for name, own in settings.items() if own.asks_in_python]
 
 
 def benchmark_markdown(summary: pd.DataFrame) -> str:
     """A block for each constraint and scene, planners in their order."""
-    parts = []
-    for (constraint, scene), case in summary.groupby(["constraint", "scene"], sort=False):
-        parts.append(
-            f"`{constraint}`, {scene}: {counted(case)}\n\n{markdown_table(case_cells(case))}"
-        )
+    parts = [
+        f"`{constraint}`, {scene}: {counted(case)}\n\n{markdown_table(case_cells(case))}"
+        for (constraint, scene), case in summary.groupby(["constraint", "scene"], sort=False)
+    ]
     return "\n\n".join(parts) + "\n"
-
-
-def case_cells(case: pd.DataFrame) -> Cells:
-    """The planners under one constraint in one scene, from the summary's rows of these."""
-    return [COLUMNS, *(_cells(row) for row in case.to_dict("records"))]
 
 
 def counted(case: pd.DataFrame) -> str:
     """How many queries a case has, and how many of them any planner solved."""
     return f"{int(case['queries'].max())} queries, any planner solved {int(case['solvable'].max())}"
+
+
+def case_cells(case: pd.DataFrame) -> Cells:
+    """The planners under one constraint in one scene, from the summary's rows of these."""
+    return [COLUMNS, *(_case_row(row) for row in case.to_dict("records"))]
+
+
+def _case_row(row: Mapping[Any, Any]) -> tuple[str, ...]:
+    size = f"{row['queries']} × {row['seeds']}"
+    if row["not_applicable"] == row["rows"]:
+        return (str(row["planner"]), size, "not applicable", *("–",) * (len(COLUMNS) - 3))
+    return (
+        *(str(row["planner"]), size, _share(row["success_of_solvable"])),
+        *(str(row["claimed_but_invalid"]), _fixed(row["ratio_median"], 4)),
+        *(_p95(row, "ratio_p95"), _iqm(row, 4), _p95(row, "ratio_p95_all")),
+        *(_milli(row[f"time_{which}_s"]) for which in ("median", "p95")),
+        *(_milli(row[f"within_{share}_s"]) for share in (1, 5, 10)),
+        *(_share(row["beaten"]), _fixed(row["peak_memory_median_mb"], 1)),
+    )
 
 
 def overview_markdown(summary: pd.DataFrame, in_python: Collection[str] = ()) -> str:
@@ -121,145 +116,112 @@ def overview_markdown(summary: pd.DataFrame, in_python: Collection[str] = ()) ->
     """
     parts = []
     for scene, case in summary.groupby("scene", sort=False):
-        rows = overview_cells(case, in_python)
         queries, solvable = int(case["queries"].max()), int(case["solvable"].max())
         head = (
             f"Scene `{scene}`, all constraints: {queries} queries, of which any planner "
             f"solved {solvable}."
         )
-        parts.append(f"{head}\n\n{markdown_table(rows)}")
+        parts.append(f"{head}\n\n{markdown_table(overview_cells(case, in_python))}")
     return "\n\n".join([*parts, *([PYTHON_NOTE] if in_python else [])]) + "\n"
 
 
 def overview_cells(case: pd.DataFrame, in_python: Collection[str] = ()) -> Cells:
     """The planners in one scene, the queries of all constraints together."""
-    return [OVERVIEW, *(_overview_cells(row, in_python) for row in case.to_dict("records"))]
+    return [OVERVIEW, *(_overview_row(row, in_python) for row in case.to_dict("records"))]
+
+
+def _overview_row(row: Mapping[Any, Any], in_python: Collection[str]) -> tuple[str, ...]:
+    low, high = _share(row["success_low"]), _share(row["success_high"])
+    return (
+        f"{row['planner']}{' †' if row['planner'] in in_python else ''}",
+        f"{row['queries']} × {row['seeds']}",
+        f"{_share(row['success_of_solvable'])} [{low}, {high}]",
+        *(str(row["claimed_but_invalid"]), _p95(row, "ratio_p95_all"), _iqm(row, 3)),
+        *(_fixed(row["reference_iqm"], 3), _milli(row["time_median_s"])),
+        *(_milli(row["time_p95_s"]), _share(row["beaten"])),
+    )
 
 
 def table_i_markdown(rows: pd.DataFrame) -> str:
-    """The paper's Table I beside the same planners' rows of one constraint and scene."""
+    """The paper's Table I next to the same planners' rows of one constraint and scene."""
     return f"{markdown_table(table_i_cells(rows))}\n\n{TABLE_I_NOTE}\n"
 
 
 def table_i_cells(rows: pd.DataFrame) -> Cells:
     """The same, its header first."""
-    head = (
-        "method",
-        "paper: shortest",
-        "average ± std",
-        "×",
-        "time [s]",
-        "here: shortest",
-        "average ± std",
-        "×",
-        "time [s]",
-        "valid",
-        "rows",
-    )
-    valid = rows[rows["valid"]]
-    lengths = {name: valid[valid["planner"] == name]["latent_length"] for name in PUBLISHED}
+    valid, column = rows[rows["valid"]], f"{LATENT}planner"
+    lengths = {name: valid[valid["planner"] == name][column] for name in PUBLISHED}
     planner = valid[valid["planner"] == "planner"]
-    cells: Cells = [head]
+    cells: Cells = [TABLE_I]
     for name, (shortest, average, spread, seconds) in PUBLISHED.items():
         own, found = rows[rows["planner"] == name], lengths[name]
         if own.empty:
             continue
-        base = planner[planner["query"].isin(own["query"])]["latent_length"].mean()
-        cells.append(
-            (
-                f"learned geodesic; here `{name}`" if name == "planner" else name,
-                f"{shortest:.2f}",
-                f"{average:.2f} ± {spread:.2f}",
-                f"{average / PUBLISHED['planner'][1]:.2f}",
-                f"{seconds:.2f}",
-                _fixed(found.min(), 2),
-                f"{_fixed(found.mean(), 2)} ± {_fixed(found.std(), 2)}",
-                _fixed(found.mean() / base, 2),
-                f"{own['time_s'].mean():.3g}",
-                _share(own["valid"].mean()),
-                str(len(own)),
-            )
+        base = planner[planner["query"].isin(own["query"])][column].mean()
+        row = (
+            f"learned geodesic; here `{name}`" if name == "planner" else name,
+            *(f"{shortest:.2f}", f"{average:.2f} ± {spread:.2f}"),
+            *(f"{average / PUBLISHED['planner'][1]:.2f}", f"{seconds:.2f}", _fixed(found.min(), 2)),
+            f"{_fixed(found.mean(), 2)} ± {_fixed(found.std(), 2)}",
+            *(_fixed(found.mean() / base, 2), f"{own['time_s'].mean():.3g}"),
+            *(_share(own["valid"].mean()), str(len(own))),
         )
+        cells.append(row)
     return cells
 
 
 def ahead_markdown(table: pd.DataFrame) -> str:
-    """Every case and budget in which a peer is ahead of the planner, or that there is none."""
+    """Every case and budget in which a baseline is ahead of the planner, or that there is none."""
     rows = ahead_cells(table)
-    return f"{ahead_told(table)}\n" + (f"\n{markdown_table(rows)}\n" if len(rows) > 1 else "")
+    return f"{ahead_text(table)}\n" + (f"\n{markdown_table(rows)}\n" if len(rows) > 1 else "")
 
 
-def ahead_told(table: pd.DataFrame) -> str:
+def ahead_text(table: pd.DataFrame) -> str:
     """In how many cases of constraint, scene and budget the planner is first, and in how many a
-    peer.
+    baseline.
     """
-    worst = _verdicts(table)
-    neither = int((worst == {"neither"}).sum())
-    lost = int(worst.map(lambda verdicts: "ahead" in verdicts).sum())
+    first, lost, neither = _counts(_verdicts(table))
     return (
         "Within a time budget the planner is first or tied on p95 of the length (failures "
-        "infinite; where both are, on "
-        f"success) in {len(worst) - neither - lost} of {len(worst)} cases of constraint, "
-        f"scene and budget; in {lost} a "
-        f"peer is ahead, in {neither} no planner has any path yet."
+        f"infinite; where both are, on success) in {first} of {first + lost + neither} cases of "
+        f"constraint, scene and budget; in {lost} a baseline is ahead, in {neither} no planner has "
+        "any path yet."
     )
 
 
 def verdict_cells(table: pd.DataFrame) -> Cells:
     """The same for each budget: how many cases of constraint and scene have which verdict."""
-    rows: Cells = [
-        (
-            "time budget [s]",
-            "planner first or tied",
-            "a peer ahead",
-            "no path of any planner yet",
-            "of",
-        )
+    budgets = _verdicts(table).groupby("budget_s", sort=True)
+    return [
+        VERDICTS,
+        *((f"{budget:g}", *map(str, _counts(own)), str(len(own))) for budget, own in budgets),
     ]
-    for budget, found in _verdicts(table).groupby("budget_s", sort=True):
-        lost, neither = (
-            int(found.map(is_so).sum())
-            for is_so in (lambda v: "ahead" in v, lambda v: v == {"neither"})
-        )
-        rows.append(
-            (f"{budget:g}", *map(str, (len(found) - lost - neither, lost, neither, len(found))))
-        )
-    return rows
 
 
 def _verdicts(table: pd.DataFrame) -> "pd.Series[Any]":
-    """What is said of any peer in each case and budget."""
+    """What is said of any baseline in each case and budget."""
     return table.groupby(["constraint", "scene", "budget_s"], sort=False)["verdict"].agg(set)
 
 
+def _counts(verdicts: "pd.Series[Any]") -> tuple[int, int, int]:
+    """Cases in which the planner is first or tied, a baseline is ahead, none has a path."""
+    lost = int(verdicts.map(lambda found: "ahead" in found).sum())
+    neither = int(verdicts.map(lambda found: found == {"neither"}).sum())
+    return len(verdicts) - lost - neither, lost, neither
+
+
 def ahead_cells(table: pd.DataFrame) -> Cells:
-    """Every peer that is ahead of the planner in a case, within a budget."""
+    """Every baseline that is ahead of the planner in a case, within a budget."""
     rows: Cells = [
         (
-            "constraint",
-            "scene",
-            "budget [s]",
-            "peer ahead",
-            "its p95",
-            "the planner's",
-            "its success",
-            "the planner's",
-        )
-    ]
-    rows += [
-        (
-            f"`{row['constraint']}`",
-            str(row["scene"]),
-            f"{row['budget_s']:g}",
-            f"{row['peer']} ({row['queries']} queries)",
-            _fixed(row["peer_ratio_p95"], 3),
-            _fixed(row["ratio_p95"], 3),
-            _share(row["peer_success"]),
-            _share(row["success"]),
+            *(f"`{row['constraint']}`", str(row["scene"]), f"{row['budget_s']:g}"),
+            f"{row['baseline']} ({row['queries']} queries)",
+            *(_fixed(row["baseline_ratio_p95"], 3), _fixed(row["ratio_p95"], 3)),
+            *(_share(row["baseline_success"]), _share(row["success"])),
         )
         for row in table[table["verdict"] == "ahead"].to_dict("records")
     ]
-    return rows
+    return [AHEAD, *rows]
 
 
 def repeated_markdown(table: pd.DataFrame) -> str:
@@ -272,20 +234,12 @@ def repeated_cells(table: pd.DataFrame) -> Cells:
     rows: Cells = [REPEAT]
     for row in table.to_dict("records"):
         times = [
-            f"{_milli(row[f'{run}_s'])} [{_milli(row[f'{run}_low_s'])}, "
-            f"{_milli(row[f'{run}_high_s'])}]"
+            "{} [{}, {}]".format(*(_milli(row[f"{run}_{end}s"]) for end in ("", "low_", "high_")))
             for run in ("time", "time_again")
         ]
-        rows.append(
-            (
-                str(row["planner"]),
-                str(row["rows"]),
-                "yes" if row["same_validity"] else "no",
-                f"{row['length_difference']:.1e}",
-                *times,
-                "yes" if row["overlap"] else "no",
-            )
-        )
+        same, overlap = ("yes" if row[name] else "no" for name in ("same_validity", "overlap"))
+        difference = f"{row['length_difference']:.1e}"
+        rows.append((str(row["planner"]), str(row["rows"]), same, difference, *times, overlap))
     return rows
 
 
@@ -299,63 +253,15 @@ def break_even_cells(table: pd.DataFrame) -> Cells:
     rows: Cells = [BREAK_EVEN]
     for row in table.to_dict("records"):
         pays = row["break_even"]
-        rows.append(
-            (
-                str(row["planner"]),
-                f"{row['training_s']:.0f}",
-                _milli(row["query_s"]),
-                _milli(row["reference_s"]),
-                _share(row["success"]),
-                "–" if pd.isna(pays) else "never" if pays == np.inf else f"{pays:,.0f} queries",
-            )
-        )
+        known = "never" if pays == np.inf else f"{pays:,.0f} queries"
+        times = (_milli(row["query_s"]), _milli(row["reference_s"]), _share(row["success"]))
+        shown = "–" if pd.isna(pays) else known
+        rows.append((str(row["planner"]), f"{row['training_s']:.0f}", *times, shown))
     return rows
-
-
-def _overview_cells(row: Mapping[Any, Any], in_python: Collection[str]) -> tuple[str, ...]:
-    solved = (
-        f"{_share(row['success_of_solvable'])} [{_share(row['success_low'])}, "
-        f"{_share(row['success_high'])}]"
-    )
-    return (
-        f"{row['planner']}{' †' if row['planner'] in in_python else ''}",
-        f"{row['queries']} × {row['seeds']}",
-        solved,
-        str(row["claimed_but_invalid"]),
-        _p95(row, "ratio_p95_all"),
-        _iqm(row, 3),
-        _fixed(row["reference_iqm"], 3),
-        _milli(row["time_median_s"]),
-        _milli(row["time_p95_s"]),
-        _share(row["beaten"]),
-    )
 
 
 def _p95(row: Mapping[Any, Any], name: str) -> str:
     return "–" if row["rows"] < FEW else _fixed(row[name], 3)
-
-
-def _cells(row: Mapping[Any, Any]) -> tuple[str, ...]:
-    size = f"{row['queries']} × {row['seeds']}"
-    if row["not_applicable"] == row["rows"]:
-        return (str(row["planner"]), size, "not applicable", *("–",) * (len(COLUMNS) - 3))
-    return (
-        str(row["planner"]),
-        size,
-        _share(row["success_of_solvable"]),
-        str(row["claimed_but_invalid"]),
-        _fixed(row["ratio_median"], 4),
-        _p95(row, "ratio_p95"),
-        _iqm(row, 4),
-        _p95(row, "ratio_p95_all"),
-        _milli(row["time_median_s"]),
-        _milli(row["time_p95_s"]),
-        _milli(row["within_1_s"]),
-        _milli(row["within_5_s"]),
-        _milli(row["within_10_s"]),
-        _share(row["beaten"]),
-        _fixed(row["peak_memory_median_mb"], 1),
-    )
 
 
 def _iqm(row: Mapping[Any, Any], digits: int) -> str:

@@ -138,7 +138,7 @@ def write_page(layout: Layout, name: str, **content: Any) -> Path:
     environment.filters["png"] = _embedded
     environment.filters["size"] = _size
     environment.filters["link"] = lambda target: target.relative_to(file.parent).as_posix()
-    page = environment.get_template(f"{name}.html.j2").render(content, families=FAMILIES)
+    page = environment.get_template(f"{name}.html.j2").render(content, families=FAMILIES.values())
     file.write_text(page, encoding="utf-8")
     return file
 

@@ -11,7 +11,7 @@ import pandas as pd
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.report import figures, pipeline_tables, plan_report
+from constraint_geodesics.report import figures, pipeline_tables, study_report
 from constraint_geodesics.report.figures import PLANNERS
 from constraint_geodesics.report.page import Picture, write_page
 from constraint_geodesics.report.pipeline_figures import Drawn, draw_data_cards, draw_figures
@@ -48,10 +48,10 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
     studies = studies_at_hand(params, layout)
     if "geometry" in studies:
         (reports / "geometry.md").write_text(geometry_table(layout))
-    if "plans" in studies:
-        (reports / "plans.md").write_text(plan_report.plans_markdown(params, layout))
+    executed = study_report.execution_markdown(params, layout)
+    (reports / "execution.md").write_text(executed)
     if "policies" in studies:
-        (reports / "policies.md").write_text(plan_report.policies_markdown(params, layout))
+        (reports / "policies.md").write_text(study_report.policies_markdown(params, layout))
     saved = parallel_map(partial(save_figure, layout), [*drawn, *cards], params.compute)
     pictures, described = saved[: len(drawn)], saved[len(drawn) :]
     ablated = [picture for picture in pictures if picture.name == ABLATION]
@@ -72,7 +72,6 @@ def page_content(params: Params, layout: Layout, table: pd.DataFrame) -> dict[st
     metrics = metrics_of(layout, "train_manifold", params.manifolds)
     compared = params.geodesics.illustrated_constraints[:1]
     studies = studies_at_hand(params, layout)
-    plans = plan_report.plan_blocks(params, layout) if "plans" in studies else []
     return {
         "params": params,
         "learned": PLANNERS[LEARNED].label,
@@ -80,8 +79,8 @@ def page_content(params: Params, layout: Layout, table: pd.DataFrame) -> dict[st
         "published": [
             pipeline_tables.published_table(params, layout, table, name) for name in compared
         ],
-        "plans": [*plans, plan_report.execution_block(params, layout)],
-        "proposals": plan_report.policy_blocks(params, layout) if "policies" in studies else [],
+        "executed": [study_report.execution_block(params, layout)],
+        "proposals": study_report.policy_blocks(params, layout) if "policies" in studies else [],
         "results": pipeline_tables.result_tables(params, layout, table),
         "ablations": (
             pipeline_tables.ablation_tables(params, layout) if "ablations" in studies else []

@@ -116,7 +116,7 @@ def _links(
     recorded = recorded_paths(params, layout, manifold, constraint)
     sampled = runs_link("benchmark_planners", constraint)
     searched = runs_link("train_geodesics", f"{manifold}-{constraint}")
-    runs: dict[str, str] = dict.fromkeys(params.benchmark.planners, sampled)
+    runs: dict[str, str] = dict.fromkeys(params.benchmark.compared_kinds, sampled)
     return [Links(runs.get(name, searched), recorded.get(name, ())) for name in planners]
 
 

@@ -13,10 +13,10 @@ import numpy as np
 import pandas as pd
 import pandera.pandas as pandera
 
+from constraint_geodesics.benchmark.statistics import APART, RANDOM, STRAIGHT, Counted, summarise
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.figures import PLANNERS
-from constraint_geodesics.report.statistics import BESIDE, RANDOM, STRAIGHT, Counted, summarise
 
 LEARNED = "learned_geodesic"
 TEXTS = ("reason", "recording")
@@ -72,7 +72,7 @@ def compare_planners(params: Params, layout: Layout) -> pd.DataFrame:
 def read_comparison(params: Params, layout: Layout, manifold: str, constraint: str) -> pd.DataFrame:
     """The rows of all planners under one constraint, sampled first, in the order they are shown."""
     sampled = read_paths(layout.report("benchmark_planners", constraint, "csv"), manifold)
-    sampled = sampled[sampled["planner"].isin(params.benchmark.planners)]
+    sampled = sampled[sampled["planner"].isin(params.benchmark.compared_kinds)]
     file = layout.report("train_geodesics", f"{manifold}-{constraint}", "csv")
     rows = pd.concat([sampled, read_paths(file, manifold)], ignore_index=True)
     order = list(PLANNERS)
@@ -148,7 +148,6 @@ def studies_at_hand(params: Params, layout: Layout) -> frozenset[str]:
             *(layout.report("ablate_manifold", name) for name in params.manifolds),
         ],
         "policies": [layout.report("benchmark_policies", manifold)],
-        "plans": [layout.report("benchmark_plans", "plans")],
     }
     return frozenset(n for n, own in files.items() if all(file.is_file() for file in own))
 
@@ -206,9 +205,9 @@ def findings(
         _found_on(params, str(name), rows, manifolds[str(name)])
         for name, rows in table.groupby("manifold", sort=False)
     ]
-    sampled = table[~table["planner"].isin([LEARNED, *BESIDE])]
+    sampled = table[~table["planner"].isin([LEARNED, *APART])]
     refused = _by_planner(sampled.drop_duplicates(["constraint", "planner"]), "refused")
-    seeds, queries = len(params.geodesics.seeds), params.queries.count
+    seeds, queries = len(params.geodesics.seeds), params.labels.queries
     cautions = [
         f"This is {queries} queries a constraint and {seeds} policies each: enough to see large "
         "differences, not small ones.",
@@ -227,7 +226,7 @@ def _found_on(
         rows[rows["planner"] == name].set_index("constraint")
         for name in (LEARNED, STRAIGHT, RANDOM)
     )
-    others = _by_planner(rows[~rows["planner"].isin([LEARNED, *BESIDE])], "success")
+    others = _by_planner(rows[~rows["planner"].isin([LEARNED, *APART])], "success")
     decoded = "curves decoded and their ends corrected, nothing retracted"
     how = "curves retracted onto the constraint" if settings.retract else decoded
     shares = ", ".join(f"{name} {share:.0%}" for name, share in learned["success"].items())
@@ -258,7 +257,7 @@ def _by_planner(rows: pd.DataFrame, column: str) -> str:
 
 def _shortest_under(rows: pd.DataFrame) -> str:
     """Where the learned geodesic is the shortest, in the mean over the common queries."""
-    comparable = rows[~rows["planner"].isin(BESIDE)].dropna(subset=["latent_mean"])
+    comparable = rows[~rows["planner"].isin(APART)].dropna(subset=["latent_mean"])
     shortest = comparable.loc[comparable.groupby("constraint", sort=False)["latent_mean"].idxmin()]
     won = shortest.loc[shortest["planner"] == LEARNED, "constraint"].tolist()
     others = records(shortest[shortest["planner"] != LEARNED])

@@ -3,14 +3,13 @@
 from pathlib import Path
 
 import pytest
-from tests.benchmark.plan_fixtures import write_plan_reports
+from tests.report.study_fixtures import write_study_reports
 
 from constraint_geodesics.params import load_params
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.report.plan_report import (
+from constraint_geodesics.report.study_report import (
     execution_block,
-    plan_blocks,
-    plans_markdown,
+    execution_markdown,
     policies_markdown,
     policy_blocks,
 )
@@ -22,22 +21,8 @@ def reported(tmp_path_factory):
         load_params(Path(__file__).parents[2] / "params.yaml"),
         Layout(tmp_path_factory.mktemp("run")),
     )
-    write_plan_reports(params, layout)
+    write_study_reports(params, layout)
     return params, layout
-
-
-def test_every_planner_has_its_row_and_failures_count(reported):
-    whole, unseen = plan_blocks(*reported)
-    rows = {row[0]: row[1:] for row in whole.rows}
-    assert rows["planner"] == ["100.0%", "0", "1.0000", "1.0000", "1.0000", "4", "4", "5", "5"]
-    # of lengths 1.1 and 1.0 times the best, and 1.5 and 2; one of three queries is missed
-    assert rows["BiRRT + band"][:5] == ["66.7%", "0", "1.0500", "1.0950", "–"]
-    assert rows["BiRRT"][:4] == ["66.7%", "1", "1.7500", "1.9750"]
-    assert "3 queries, 3 of which" in whole.note
-    assert "300 queries a second, 400 without" in whole.note
-    assert "the straight start (100%), the graph (0%), the policies (0%)" in whole.note
-    assert [row[0] for row in whole.rows] == ["planner", "BiRRT + band", "BiRRT"]
-    assert len(unseen.rows) == 3 * len(reported[0].plans.unseen)
 
 
 def test_policies_are_compared_where_every_method_answers(reported):
@@ -61,7 +46,7 @@ def test_the_cup_on_both_paths(reported):
 
 
 def test_markdown_holds_every_row(reported):
-    text = plans_markdown(*reported)
-    assert text.count("BiRRT + band") == 1 + len(reported[0].plans.unseen)
+    text = execution_markdown(*reported)
+    assert "| straight joint line" in text
     assert "| planned path" in text
     assert "| straight line" in policies_markdown(*reported)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.planner_fixtures import manifold_of, packaged_planner, pairs_of
 
-from constraint_geodesics.peers.restarts import Restarted
+from constraint_geodesics.peers.wrappers import Restarted
 from constraint_geodesics.problem import PlanningProblem, Solution
 
 

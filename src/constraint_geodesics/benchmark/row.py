@@ -1,0 +1,93 @@
+"""The benchmark's table: one row a planner, constraint, scene, query and seed."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+KEY = ("planner", "constraint", "scene", "query", "seed")
+LATENT = "latent_length_"
+"""Before a learned manifold's name: length of the encoded path on it (eq. 2)."""
+TEXTS = ("kind", "settings", "status", "reason", "recording")
+COLUMNS = (
+    *("planner", "kind", "settings", "constraint", "scene", "query", "seed"),
+    *("status", "valid", "reason", "time_s", "iterations", "length_rad", "best_known_rad"),
+    *("tool_length_m", "max_violation_rad", "max_violation_m", "max_step_rad"),
+    *("peak_memory_mb", "scene_s", "recording"),
+)
+"""Of the table, before the latent lengths.  planner: its name in params.yaml; kind: its file in
+peers/; settings: a digest of all its settings, so that two rows with the same one are of the same
+planner.  time_s: from the problem to the path; scene_s: its preparation for the scene.
+"""
+NUMBERS = COLUMNS[COLUMNS.index("time_s") : -1]
+_OLD_NAMES = {"latent_length": f"{LATENT}planner"}
+
+
+def key_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What tells a row from all others."""
+    return tuple(row[name] for name in KEY)
+
+
+def read_rows(file: Path, wanted: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Rows of a file of JSON lines whose planner has the wanted fingerprint, the last of each key;
+    no torn lines.
+    """
+    found: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for line in file.read_text().splitlines() if file.is_file() else ():
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError:  # killed while it was written
+            continue
+        if "started" not in row and wanted.get(row["planner"]) == row["fingerprint"]:
+            found[key_of(row)] = row
+    return list(found.values())
+
+
+def table_of(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """All rows with best_known_rad, the shortest valid path that any planner and seed found for the
+    query.
+    """
+    table = _completed(pd.DataFrame(rows))
+    assert not table.duplicated(list(KEY)).any()
+    best = (
+        table["length_rad"]
+        .where(table["valid"])
+        .groupby([table[k] for k in ("constraint", "scene", "query")])
+    )
+    table["best_known_rad"] = best.transform("min")
+    return table.sort_values(list(KEY), kind="stable", ignore_index=True)
+
+
+def _completed(table: pd.DataFrame) -> pd.DataFrame:
+    """The table's columns in their order, blank where an older file has none."""
+    table = table.rename(columns=_OLD_NAMES)
+    texts = {name: table[name].fillna("") if name in table else "" for name in TEXTS}
+    blank = {name: np.nan for name in COLUMNS if name not in table}
+    latent = [str(name) for name in table if str(name).startswith(LATENT)]
+    table = table.assign(**{**blank, **texts})[[*COLUMNS, *latent]]
+    return table.astype(dict.fromkeys((*NUMBERS, *latent), float))
+
+
+def write_table(table: pd.DataFrame, file: Path, about: Mapping[str, str]) -> None:
+    """Write the rows as CSV, with a comment line for each entry of `about` (commit, lock file,
+    processor) before.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("w") as lines:
+        lines.writelines(f"# {name}: {' '.join(value.split())}\n" for name, value in about.items())
+        table.to_csv(lines, index=False, float_format="%.12g")
+
+
+def read_table(file: Path) -> tuple[pd.DataFrame, dict[str, str]]:
+    """The rows of `write_table`, and what its comment lines say; columns that an older table does
+    not have are blank.
+    """
+    with file.open() as lines:
+        head = [line[2:].split(": ", 1) for line in lines if line.startswith("# ")]
+    table = pd.read_csv(
+        file, comment="#", float_precision="round_trip", dtype=dict.fromkeys(TEXTS, str)
+    )
+    return _completed(table), {name: value.strip() for name, value in head}

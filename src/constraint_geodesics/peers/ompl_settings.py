@@ -1,0 +1,37 @@
+"""What OMPL's planners share: their state space and how they walk in it, without loading ompl."""
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from constraint_geodesics.fields import Count, Positive
+from constraint_geodesics.peers.baseline import BaselineSettings
+
+
+class OmplSettings(BaselineSettings):
+    """space: OMPL's constrained state space.  budget_s: limit of one query [s]; iterations: of the
+    search, at most.  delta_rad: step along the constraint between two validity checks.  range_rad:
+    longest extension of a tree.  simplify: the path is shortened by OMPL.
+
+    Of the charts of atlas and tangent bundle: radius ρ, distance ε to the manifold at most, and the
+    share of samples drawn beyond the charts that there are; own_charts: these, not OMPL's own.
+    """
+
+    uses_clearance: ClassVar = False
+    asks_in_python: ClassVar = True
+
+    space: Literal["projected", "atlas", "tangent_bundle"] = "projected"
+    budget_s: Positive = 2.0
+    iterations: Count = 1_000_000
+    delta_rad: Positive = 0.05
+    range_rad: Positive = 2.0
+    own_charts: bool = True
+    chart_radius_rad: Positive = 1.0
+    chart_error_rad: Positive = 0.1
+    exploration: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.75
+    simplify: bool = True
+
+    @property
+    def given_s(self) -> float:
+        """The budget."""
+        return self.budget_s

@@ -1,0 +1,98 @@
+"""The project's own planner, whole or in parts, asked as its baselines are."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal, get_args
+
+from constraint_geodesics.fields import Positive
+from constraint_geodesics.methods import open_method
+from constraint_geodesics.peers.baseline import GRAPH, BaselineSettings, Context
+from constraint_geodesics.planner import Planner
+from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
+from constraint_geodesics.search.candidates import ALL_PARTS, Parts
+
+Part = Literal["straight", "policy", "graph", "refinement", "tree"]
+
+
+class PlannerSettings(BaselineSettings):
+    """method: how it looks for curves (`Planner.load`).  without: parts that are switched off.
+    only: those that are left, null: all that the planner has by itself.  budget_s: time [s] it goes
+    on shortening its path for.
+    """
+
+    family: ClassVar = "planner"
+    random: ClassVar = False
+    uses_clearance: ClassVar = False  # it makes its own model
+    uses_bundle: ClassVar = True
+
+    method: Literal["planner", "learned", "learned+band"] = "planner"
+    without: tuple[Part, ...] = ()
+    only: tuple[Part, ...] | None = None
+    budget_s: Positive | None = None
+
+    def make(self, context: Context) -> PathPlanner:
+        """Baselines made together share one planner of each method, opened once."""
+        if self.method not in context.shared:
+            context.shared[self.method] = _opened(context, self.method)
+        parts = replace(ALL_PARTS, **dict.fromkeys(self.switched_off, False))
+        return OwnPlanner(context.shared[self.method], parts, self.budget_s)
+
+    @property
+    def switched_off(self) -> set[str]:
+        """Parts that it does without."""
+        left = get_args(Part) if self.only is None else self.only
+        return {*self.without, *(part for part in get_args(Part) if part not in left)}
+
+    @property
+    def trained(self) -> tuple[str, ...]:
+        """The paper's system for the learned methods, nothing else."""
+        if self.method == "planner":
+            return ()
+        return (*GRAPH, "train_policies {searched}", "build_learned")
+
+    @property
+    def ends_by_counting(self) -> bool:
+        """Without a budget."""
+        return super().ends_by_counting and self.budget_s is None
+
+    @property
+    def given_s(self) -> float:
+        """The budget."""
+        return self.budget_s or 0.0
+
+
+@dataclass(frozen=True)
+class OwnPlanner:
+    """The planner that users call, or some of its parts, behind the interface of its baselines."""
+
+    planner: Planner
+    parts: Parts = ALL_PARTS
+    budget_s: float | None = None
+    name: str = "planner"
+
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:  # nothing in it is random
+        """One query under the problem's constraint."""
+        path = self.planner.plan(
+            problem.start,
+            problem.goal,
+            problem.manifold.constraint,
+            parts=self.parts,
+            budget_s=self.budget_s,
+        )
+        explanation = "" if path.status == "solved" else path.explanation
+        return Solution(path.status, path.joints, path.planning_time_s, 1, explanation)
+
+
+def _opened(context: Context, method: str) -> Planner:
+    """The planner in the context's scene, its graph and networks loaded."""
+    within = context.bundle.workcell.including(*context.scene.workcell)
+    bundle = replace(context.bundle, workcell=within)
+    found = open_method(method, context.layout.planner, bundle)
+    planner = context.opened.enter_context(Planner(bundle, "the pipeline's outputs", found))
+    constraint = context.manifold.constraint
+    planner.prepare(constraint)
+    nodes, trees = planner.nodes(constraint), Parts(straight=False, graph=False)
+    planner.plan(nodes[0], nodes[-1], constraint, parts=trees)  # loads the trees' compiled code
+    return planner
+
+
+BASELINE = PlannerSettings

@@ -1,0 +1,158 @@
+"""What turns a baseline into another one: a band after its paths, restarts, and a memory."""
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.peers.elastic_band import (
+    COINCIDENT,
+    FINER,
+    free_rows,
+    rows_along,
+    task_of,
+)
+from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
+from constraint_geodesics.search.band import BandSettings, step_lengths
+from constraint_geodesics.search.candidates import PARTLY_RELAXED, Candidate, Task, refined
+from constraint_geodesics.search.roadmap import resample
+
+KEPT_ANSWERS = 16
+"""Answers that a planner with a band after it is remembered for: more than it has seeds."""
+SEEDS = 100_000
+"""Restarts of one seed draw from their own range of seeds."""
+
+
+@dataclass(frozen=True)
+class Restarted:
+    """The shortest path that a planner finds within `budget_s` [s], each attempt with another seed.
+
+    An attempt that has begun is not interrupted; one that would not end in time by the mean of
+    those before is not begun.  An answer that no other seed can change (a refusal, a misfit) ends
+    the search at once.
+    """
+
+    inner: PathPlanner
+    budget_s: float
+
+    @property
+    def name(self) -> str:
+        """The planner's, and its budget."""
+        return f"{self.inner.name}, restarted for {self.budget_s:g} s"
+
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
+        """The first of the shortest paths, or what the first attempt answered where none found
+        one.
+        """
+        began = time.perf_counter()
+        best, attempts, iterations = None, 0, 0
+        while True:
+            answer = self.inner.plan(problem, SEEDS * seed + attempts)
+            attempts += 1
+            iterations += answer.iterations
+            if best is None or _length(answer) < _length(best):
+                best = answer
+            spent = time.perf_counter() - began
+            if (
+                answer.status not in ("solved", "not_found")
+                or spent * (attempts + 1) / attempts > self.budget_s
+            ):
+                return Solution(best.status, best.joints, spent, iterations, best.explanation)
+
+
+def _length(answer: Solution) -> float:
+    return float(step_lengths(answer.joints).sum()) if answer.status == "solved" else float(np.inf)
+
+
+@dataclass(frozen=True)
+class BandAfter:
+    """Another planner's path, shortened by a band; the path itself where no band is both sound and
+    shorter.
+    """
+
+    inner: PathPlanner
+    settings: BandSettings = field(default_factory=BandSettings)
+
+    @property
+    def name(self) -> str:
+        """The other planner's, and the band."""
+        return f"{self.inner.name} + band"
+
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
+        """What the other planner answers, shortened; its time is part of the answer's."""
+        return band_after(problem, self.inner.plan(problem, seed), self.settings)
+
+
+def band_after(problem: PlanningProblem, planned: Solution, settings: BandSettings) -> Solution:
+    """A planned path shortened by a band, time and iterations added to its own; without a path,
+    what it was.
+    """
+    began = time.perf_counter()
+    if (
+        planned.status != "solved"
+        or len(planned.joints) < 2
+        or step_lengths(planned.joints).sum() <= COINCIDENT
+    ):
+        return planned
+    own = rows_along(problem.manifold, planned.joints)
+    longest = float(step_lengths(own).sum())
+    rows, iterations = own, 0
+    task = task_of(problem, settings)
+    for candidate in _bands_along(task, planned.joints):
+        iterations += candidate.iterations
+        if candidate.length < longest:
+            relaxed = free_rows(problem, task, candidate)
+            if relaxed is not None:
+                rows = relaxed
+                break
+    spent = time.perf_counter() - began
+    return Solution("solved", rows, planned.time_s + spent, planned.iterations + iterations)
+
+
+def _bands_along(task: Task, joints: Float[np.ndarray, "T D"]) -> Iterator[Candidate]:
+    """Sound bands from a path: with more nodes where fewer jump or touch something, then less and
+    less relaxed.
+    """
+    segments = task.settings.segments
+    for pieces in (segments * finer for finer in FINER):
+        candidate = refined(task, "graph", resample(joints, pieces + 1))
+        if candidate is not None:
+            yield candidate
+    for iterations in PARTLY_RELAXED:
+        partly = replace(task, settings=replace(task.settings, iterations=iterations))
+        candidate = refined(partly, "graph", resample(joints, segments * FINER[-1] + 1))
+        if candidate is not None:
+            yield candidate
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """A planner whose last answers are kept, so that a band after it shortens the very path that
+    its own row shows.
+
+    An answer holds the time it took, whoever asks for it again.
+    """
+
+    inner: PathPlanner
+    _last: deque[tuple[PlanningProblem, int, Solution]] = field(
+        default_factory=lambda: deque(maxlen=KEPT_ANSWERS)
+    )
+
+    @property
+    def name(self) -> str:
+        """The planner's."""
+        return self.inner.name
+
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
+        """The planner's answer; for the same problem, as an object, and seed it is not asked
+        again.
+        """
+        for asked, own_seed, answer in self._last:
+            if asked is problem and own_seed == seed:
+                return answer
+        answer = self.inner.plan(problem, seed)
+        self._last.append((problem, seed, answer))
+        return answer

@@ -1,0 +1,139 @@
+"""What the policies propose and what became of executed paths, as tables of the report's page, from
+their stages' JSON.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.layout import Layout, in_checkout
+from constraint_geodesics.report.page import Links, Recorded, Table, runs_link
+from constraint_geodesics.report.results import markdown_table, read_metrics, short
+from constraint_geodesics.studies.proposals import (
+    DESCENT,
+    JOINTS,
+    LEARNED,
+    ONE_SEED,
+    POLICIES,
+    RANDOM,
+    SEPARATE,
+    STRAIGHT,
+)
+
+POLICY_COLUMNS = (
+    *("one cubic, not refined", "feasible", "length / shortest cubic, mean", "median", "p95"),
+    *("curves looked at", "time [ms], next to another process"),
+)
+EXECUTION_COLUMNS = (
+    *("path", "executed", "spheres kept, mean", "worst", "largest tilt [°]", "collisions"),
+    *("tracking error [rad]", "duration [s]"),
+)
+METHODS = (STRAIGHT, RANDOM, DESCENT, ONE_SEED, POLICIES, SEPARATE)
+"""The order of the proposals, each on the learned manifold first."""
+
+
+def policy_blocks(params: Params, layout: Layout) -> list[Table]:
+    """What the policies propose before any refinement, one block a constraint."""
+    found = read_metrics(layout.report("benchmark_policies", params.geodesics.searched[0]))
+    names = [name for name in (params.studies.constraint, *params.unseen) if name in found]
+    named = [f"{method}, {chart}" for method in METHODS for chart in (LEARNED, JOINTS)]
+    link = Links(runs_link("benchmark_policies", params.geodesics.searched[0]))
+    return [_policy_block(name, _ordered(found[name], named), link) for name in names]
+
+
+def execution_block(params: Params, layout: Layout) -> Table:
+    """What an open cup keeps of its content on planned paths and on straight joint lines."""
+    found = read_metrics(layout.report("execute_paths", params.studies.constraint))
+    kinds = {kind: row for kind, row in found.items() if isinstance(row, Mapping)}
+    tilt = np.degrees(found["smallest_line_tilt_rad"])
+    note = (
+        f"{found['queries']} of {found['drawn']} drawn queries of {params.studies.constraint}, "
+        f"whose straight joint line "
+        f"tilts the cup by {tilt:.0f}° or more; followed by PyBullet's position control with "
+        f"gravity, with "
+        f"{params.execution.spheres} spheres in an open cup"
+    )
+    rows = [
+        [
+            kind,
+            str(row["executed"]),
+            f"{row['kept_share_mean']:.0%}",
+            f"{row['kept_share_worst']:.0%}",
+            f"{np.degrees(row['largest_tilt_rad']):.1f}",
+            str(row["collisions"]),
+            short(row["largest_tracking_error_rad"]),
+            f"{row['duration_mean_s']:.2f}",
+        ]
+        for kind, row in kinds.items()
+    ]
+    link, recorded = (
+        runs_link("execute_paths", params.studies.constraint),
+        _executed(params, layout),
+    )
+    links = [Links(link, recorded.get(kind, ())) for kind in kinds]
+    return Table("Execution", note, EXECUTION_COLUMNS, rows, planners=list(kinds), links=links)
+
+
+def _executed(params: Params, layout: Layout) -> dict[str, list[Recorded]]:
+    """The recorded executions of each kind of path."""
+    rows, found = (
+        pd.read_csv(layout.report("execute_paths", params.studies.constraint, "csv")),
+        dict[str, list[Recorded]](),
+    )
+    for row in rows[rows["recording"].notna()].to_dict("records"):
+        told = (
+            f"query {row['query']}: {row['status']}, {row['kept']} of {row['spheres']} spheres kept"
+        )
+        found.setdefault(str(row["kind"]), []).append(Recorded(in_checkout(row["recording"]), told))
+    return found
+
+
+def execution_markdown(params: Params, layout: Layout) -> str:
+    """What became of executed paths, as Markdown."""
+    return _markdown(execution_block(params, layout)) + "\n"
+
+
+def policies_markdown(params: Params, layout: Layout) -> str:
+    """The policies' first table, as Markdown."""
+    return _markdown(policy_blocks(params, layout)[0]) + "\n"
+
+
+def _ordered(
+    rows: Mapping[str, Mapping[str, Any]], names: Iterable[str]
+) -> dict[str, Mapping[str, Any]]:
+    """Rows in the order of these names, any others behind them; JSON has them by the alphabet."""
+    return {name: rows[name] for name in dict.fromkeys([*names, *rows]) if name in rows}
+
+
+def _markdown(block: Table) -> str:
+    return f"**{block.title}** ({block.note}):\n\n{markdown_table([block.header, *block.rows])}"
+
+
+def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]], link: Links) -> Table:
+    first = next(iter(rows.values()))
+    note = (
+        f"{first['queries']} queries, {first['solvable']} of which have a curve of the "
+        f"family; ratios over the "
+        f"{first['shared']} that every method solves"
+    )
+    cells = [
+        [
+            method,
+            _number(row["feasible"], "{:.1%}"),
+            *(_number(row[f"shared_ratio_{what}"], "{:.4f}") for what in ("mean", "median", "p95")),
+            str(row["curves"]),
+            _number(row["time_median_ms"], "{:.3g}"),
+        ]
+        for method, row in rows.items()
+    ]
+    links = [link] * len(rows)
+    return Table(
+        f"{constraint}, proposals", note, POLICY_COLUMNS, cells, planners=list(rows), links=links
+    )
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None or np.isnan(value) else form.format(value)

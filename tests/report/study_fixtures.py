@@ -1,0 +1,93 @@
+"""Reports of the studies' stages, as those stages write them, from a few rows whose figures are
+known.
+"""
+
+import json
+
+import numpy as np
+import pandas as pd
+
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.studies.execution import PLANNED, STRAIGHT
+from constraint_geodesics.studies.proposals import policy_figures, policy_table
+
+
+def policy_rows() -> pd.DataFrame:
+    """Rows of `policy_rows`: the policy solves both queries, the straight line one of them."""
+    return pd.DataFrame(
+        [
+            {
+                "method": method,
+                "query": query,
+                "seed": 0,
+                "feasible": feasible,
+                "length_rad": length,
+                "optimum_rad": 2.0,
+                "curves": 5,
+                "time_ms": 4.0,
+            }
+            for method, query, feasible, length in (
+                ("policy", 0, True, 2.02),
+                ("policy", 1, True, 2.04),
+                ("straight line", 0, True, 2.2),
+                ("straight line", 1, False, np.nan),
+            )
+        ]
+    )
+
+
+def execution_figures() -> dict:
+    """What `execution_figures` returns of two queries."""
+    figures = {
+        "executed": 2,
+        "kept_share_mean": 1.0,
+        "kept_share_worst": 1.0,
+        "spilled": 0,
+        "emptied": 0,
+        "collisions": 0,
+        "largest_tilt_rad": 0.01,
+        "largest_tracking_error_rad": 0.002,
+        "duration_mean_s": 1.5,
+    }
+    spilled = figures | {
+        "kept_share_mean": 0.25,
+        "kept_share_worst": 0.0,
+        "largest_tilt_rad": np.pi / 2,
+    }
+    return {
+        "queries": 2,
+        "drawn": 9,
+        "smallest_line_tilt_rad": 2.0,
+        PLANNED: figures,
+        STRAIGHT: spilled,
+    }
+
+
+def write_study_reports(params: Params, layout: Layout) -> None:
+    """reports/benchmark_policies and execute_paths of this layout."""
+    policies = policy_figures(
+        policy_table(policy_rows()).assign(constraint=params.studies.constraint)
+    )
+    for file, content in (
+        (layout.report("benchmark_policies", params.geodesics.searched[0]), policies),
+        (layout.report("execute_paths", params.studies.constraint), execution_figures()),
+    ):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(content))
+    executed = [
+        {
+            "query": 0,
+            "kind": kind,
+            "status": "executed",
+            "kept": kept,
+            "spheres": 12,
+            "recording": f"data/recordings/execute_paths/{params.studies.constraint}/{k}.rrd"
+            if k == 0
+            else "",
+        }
+        for k, (kind, kept) in enumerate(((PLANNED, 12), (STRAIGHT, 3)))
+    ]
+    pd.DataFrame(executed).to_csv(
+        layout.report("execute_paths", params.studies.constraint, "csv"), index=False
+    )
