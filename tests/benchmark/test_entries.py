@@ -18,7 +18,6 @@ from constraint_geodesics.benchmark.entries import (
     spread,
     with_planners,
 )
-from constraint_geodesics.cli import note_stage_time
 from constraint_geodesics.palette import FAMILIES
 from constraint_geodesics.params import BaselineParams, Params
 from constraint_geodesics.peers.baseline import BaselineError
@@ -26,6 +25,7 @@ from constraint_geodesics.peers.registry import BaselineBuilder, after, all_sett
 from constraint_geodesics.peers.straight_band import StraightBand
 from constraint_geodesics.peers.wrappers import Remembered
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import note_stage_time
 from constraint_geodesics.problem import PlanningProblem
 
 
