@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from tests.planner_fixtures import packaged_planner
 
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.functions import made_by
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.planner import check_path, read_path
-from tests.planner_fixtures import packaged_planner
 
 SPHERE = "constraint_geodesics.constraints.functions:tip_on_sphere"
 CENTRE, RADIUS = np.array([0.35, 0.0, 0.15]), 0.25
