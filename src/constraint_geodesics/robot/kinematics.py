@@ -4,7 +4,7 @@ Nothing here knows how many joints there are; adding a robot adds data only.
 """
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -149,16 +149,50 @@ def load_robot(
     if tool_link not in {link.get("name") for link in root.findall("link")}:
         raise RobotError(f"{urdf}: there is no link {tool_link!r}")
 
+    joints, tool = _movable(_joints_to(tool_link, parent_joint, urdf), urdf)
+    names = tuple(joint.get("name", "") for joint, _ in joints)
+    if not names:
+        raise RobotError(f"{urdf}: no movable joint leads to {tool_link!r}")
+    tighter = dict(tighter_limits or {})
+    unknown = sorted(set(tighter) - set(names))
+    if unknown:
+        raise RobotError(
+            f"{urdf}: limits are given for {unknown}, which are not joints of the chain "
+            f"{list(names)}"
+        )
+    limits = []
+    for name, (joint, _) in zip(names, joints, strict=True):
+        low, high, speed = _limits(joint, urdf)
+        if name in tighter:
+            low, high = _tightened(name, (low, high), tighter[name])
+        limits.append((low, high, speed))
+    lower, upper, velocity = np.array(limits).T.copy()
+    origins = np.array([origin for _, origin in joints])
+    axes = np.array([_axis(joint) for joint, _ in joints])
+    prismatic = np.array([joint.get("type") == "prismatic" for joint, _ in joints])
+    chain = Chain(origins, axes, prismatic, np.eye(4), tool)
+    name = root.get("name", urdf.stem)
+    return SerialRobot(name, urdf, tool_link, names, lower, upper, velocity, chain)
+
+
+def _joints_to(
+    link: str, parent_joint: Mapping[str, ElementTree.Element], urdf: Path
+) -> list[ElementTree.Element]:
+    """The joints from the root to a link."""
     path = []
-    link = tool_link
     while link in parent_joint:
         path.append(parent_joint[link])
         link = _attribute(parent_joint[link], "parent", "link", urdf)
-    path.reverse()
+    return path[::-1]
 
-    tighter = dict(tighter_limits or {})
-    names, origins, axes, prismatic, lower, upper, velocity = [], [], [], [], [], [], []
-    pending = np.eye(4)
+
+def _movable(
+    path: Sequence[ElementTree.Element], urdf: Path
+) -> tuple[list[tuple[ElementTree.Element, np.ndarray]], np.ndarray]:
+    """The joints that move, each with the transform from the one before, and the transform from the
+    last one to the end of the path.
+    """
+    found, pending = [], np.eye(4)
     for joint in path:
         pending = pending @ _origin(joint)
         kind, name = joint.get("type"), joint.get("name", "")
@@ -168,35 +202,9 @@ def load_robot(
             raise RobotError(
                 f"{urdf}: joint {name!r} is of type {kind!r}, which a serial arm can't have"
             )
-        low, high, speed = _limits(joint, urdf)
-        if name in tighter:
-            low, high = _tightened(name, (low, high), tighter.pop(name))
-        names.append(name)
-        origins.append(pending)
-        axes.append(_axis(joint))
-        prismatic.append(kind == "prismatic")
-        lower.append(low)
-        upper.append(high)
-        velocity.append(speed)
+        found.append((joint, pending))
         pending = np.eye(4)
-    if tighter:
-        raise RobotError(
-            f"{urdf}: limits are given for {sorted(tighter)}, which are not joints of the "
-            f"chain {names}"
-        )
-    if not names:
-        raise RobotError(f"{urdf}: no movable joint leads to {tool_link!r}")
-    chain = Chain(np.array(origins), np.array(axes), np.array(prismatic), np.eye(4), pending)
-    return SerialRobot(
-        root.get("name", urdf.stem),
-        urdf,
-        tool_link,
-        tuple(names),
-        np.array(lower),
-        np.array(upper),
-        np.array(velocity),
-        chain,
-    )
+    return found, pending
 
 
 def rotation_from_rpy(rpy: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
