@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from constraint_geodesics import bundle
+from constraint_geodesics import bundle, cli
 from constraint_geodesics.bundle import (
     CARD,
     ROADMAPS,
@@ -21,6 +21,7 @@ from constraint_geodesics.bundle import (
 )
 from constraint_geodesics.geodesics import learned_method
 from constraint_geodesics.geometry.graph import components
+from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.search.roadmap import Roadmap
 from tests.planner_fixtures import packaged_bundle
@@ -205,3 +206,16 @@ def test_a_bundle_says_where_it_came_from(folder, tmp_path, monkeypatch) -> None
     (tmp_path / "checkout" / bundle.PIPELINE / ROADMAPS).unlink()
     with pytest.raises(BundleError, match=ROADMAPS):
         open_bundle()
+
+
+def test_the_package_takes_what_the_pipeline_built(packaged: Bundle, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OSError, match="holds no planner"):
+        cli.package()
+    layout = Layout()
+    packaged.write(layout.planner)
+    layout.learned.mkdir(parents=True)
+    (layout.learned / "learned.json").write_text("{}")
+    cli.package()
+    assert set(read_bundle(layout.pretrained).roadmaps) == set(packaged.roadmaps)
+    assert (layout.pretrained / "learned" / "learned.json").is_file()

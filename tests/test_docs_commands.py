@@ -35,6 +35,7 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "geodesics check": HERE,
     "geodesics params": HERE,
     "geodesics doctor": HERE,
+    "geodesics package": ("tests/test_bundle.py", "package"),
     "geodesics results": HERE,
     "geodesics replay": HERE,
     "geodesics replay FILE": ("tests/recording/test_recording.py", "open_recordings"),

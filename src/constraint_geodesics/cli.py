@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from constraint_geodesics import completion
+from constraint_geodesics.fields import ParamsError
 from constraint_geodesics.kernel_digest import are_compiled
-from constraint_geodesics.params import ParamsError, load_params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
@@ -49,13 +49,17 @@ def main() -> None:
 
 @app.command("package")
 def package() -> None:
-    """Copy the planner that the pipeline built into the package, for those who install it."""
+    """Copy what the pipeline built into the package, for those who install it: the planner, and the
+    learned method where there is one.
+    """
     import shutil
 
     layout = Layout()
     if not (layout.planner / "planner.json").is_file():
         raise OSError(f"{layout.planner}: holds no planner; `dvc repro build_planner` makes it")
     shutil.copytree(layout.planner, layout.pretrained, dirs_exist_ok=True)
+    if layout.learned.is_dir():
+        shutil.copytree(layout.learned, layout.pretrained / "learned", dirs_exist_ok=True)
     print(f"{layout.planner} -> {layout.pretrained}")
 
 
@@ -69,6 +73,7 @@ def check_params(
     Exit code 0: good; 2: bad.
     """
     from constraint_geodesics.gate import check_params as check
+    from constraint_geodesics.params import load_params
 
     try:
         check(load_params(file))
@@ -259,6 +264,7 @@ def bench(
     from constraint_geodesics.benchmark.entries import Wish, answered, committed_run, fewer
     from constraint_geodesics.benchmark.row import write_table
     from constraint_geodesics.benchmark.statistics import all_constraints, benchmark_summary
+    from constraint_geodesics.params import load_params
     from constraint_geodesics.peers.registry import all_settings
     from constraint_geodesics.pipeline.machine import run_header
     from constraint_geodesics.report.benchmark_tables import asks_in_python, overview_markdown

@@ -27,14 +27,9 @@ from constraint_geodesics.fields import (
     Share,
     Vector3,
 )
+from constraint_geodesics.fields import ParamsError as ParamsError
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.shapes import AnyShape
-
-
-class ParamsError(ValueError):
-    """params.yaml can't be used; the message is one line with the entry, its value and what is
-    allowed.
-    """
 
 
 class _Record(BaseModel):

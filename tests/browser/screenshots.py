@@ -366,9 +366,9 @@ def drawn(page: "Page", colour: str) -> bool:
 LEARNED = RECORDINGS / "train_geodesics" / "planner-level_cup" / "query1-learned_geodesic-seed0.rrd"
 EXECUTED = RECORDINGS / "execute_paths" / "level_cup" / "query0-planned-path.rrd"
 BOTH = re.findall(
-    r"^geodesics replay (--constraint .*birrt)$", (ROOT / "README.md").read_text(), re.M
+    r"^geodesics replay (--constraint .*birrt)$", (ROOT / "docs" / "rerun.md").read_text(), re.M
 )[0].split()
-"""What README tells to open."""
+"""What docs/rerun.md tells to open."""
 
 SHOTS = {
     "mlflow_two_rewards": Shot(

@@ -178,13 +178,12 @@ def walk(
 
 def test_it_shares_no_code_with_the_search() -> None:
     allowed = {
-        "constraint_geodesics.certification": {"kernels"},
         "constraint_geodesics.scene.scene": {"Scene"},
-        "constraint_geodesics.constraints.pose": {"Constraint", "Pose"},
+        "constraint_geodesics.constraints.constraint": {"Constraint", "Pose"},
         "constraint_geodesics.scene.world": {"LoadedChain"},
     }
     sources = sorted(Path(package.__file__).parent.glob("*.py"))
-    assert len(sources) == 3
+    assert len(sources) > 3
     for source in sources:
         for node in ast.walk(ast.parse(source.read_text())):
             if isinstance(node, ast.Import):
@@ -192,7 +191,9 @@ def test_it_shares_no_code_with_the_search() -> None:
             if isinstance(node, ast.ImportFrom) and str(node.module).startswith(
                 "constraint_geodesics"
             ):
-                assert {name.name for name in node.names} <= allowed[str(node.module)]
+                own = str(node.module).startswith("constraint_geodesics.certification")
+                names = {name.name for name in node.names}
+                assert own or names <= allowed[str(node.module)]
             if isinstance(node, ast.Attribute):  # of the robot it reads data only
                 assert node.attr not in {
                     "forward",

@@ -7,7 +7,8 @@ from tests.planner_fixtures import packaged_planner
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.functions import made_by
 from constraint_geodesics.constraints.projection import retract
-from constraint_geodesics.planner import check_path, read_path
+from constraint_geodesics.planner import check_trajectory
+from constraint_geodesics.trajectory import read_trajectory
 
 SPHERE = "constraint_geodesics.constraints.functions:tip_on_sphere"
 CENTRE, RADIUS = np.array([0.35, 0.0, 0.15]), 0.25
@@ -48,10 +49,10 @@ def test_it_is_planned_and_certified(path, manifold) -> None:
 def test_its_path_is_read_again(path, manifold, tmp_path) -> None:
     file = tmp_path / "path.csv"
     path.save(file)
-    joints, _, constraint = read_path(file, manifold.robot.joint_names, manifold.robot)
+    joints, _, constraint = read_trajectory(file, manifold.robot.joint_names, manifold.robot)
     np.testing.assert_array_equal(joints, path.joints)
     assert constraint.key == manifold.constraint.key
-    assert check_path(file).valid
+    assert check_trajectory(file).valid
 
 
 def test_its_path_is_recorded(path, tmp_path) -> None:

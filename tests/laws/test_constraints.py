@@ -325,7 +325,7 @@ def test_params_name_a_factory(kuka) -> None:
         kind="functions",
         description="wiping a bowl",
         factory=SPHERE,
-        arguments={"centre_m": [0.35, 0.0, 0.2], "radius_m": 0.25},
+        arguments={"centre_m": [0.35, 0.0, 0.2], "radius_m": 0.25, "tolerance_m": 0.0},
     )
     assert constraint_from(entry, kuka).key == sphere(kuka).key
 

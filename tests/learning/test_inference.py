@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from tests.planner_fixtures import packaged_bundle
+from tests.planner_fixtures import packaged_learned
 
 from constraint_geodesics.learning.inference import SPREAD, FrozenManifold, perceptron
 
@@ -61,7 +61,7 @@ def test_samples_lie_around_the_centres(frozen) -> None:
 
 
 def test_samples_of_the_packaged_manifold_are_configurations_of_the_arm(scene) -> None:
-    chart = FrozenManifold(packaged_bundle().manifold)
+    chart = FrozenManifold(packaged_learned().manifold)
     decoded = chart.decode(chart.sample(1000, np.random.default_rng(2)))
     assert (scene.robot.limit_distance(decoded) > -0.2).mean() > 0.75
     with scene.world() as world:

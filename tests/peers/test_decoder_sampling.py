@@ -2,10 +2,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.planner_fixtures import NAMES, assert_sound, manifold_of, packaged_planner, problems
+from tests.planner_fixtures import (
+    NAMES,
+    assert_sound,
+    manifold_of,
+    packaged_learned,
+    packaged_planner,
+    problems,
+)
 
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.learning.inference import FrozenManifold
 from constraint_geodesics.peers.decoder_sampling import (
     BATCH,
     DecoderSampling,
@@ -18,7 +26,7 @@ from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
 
 SETTINGS = DecoderSettings(budget_s=60.0, iterations=200)
-PLANNER = DecoderSampling(packaged_planner().chart, SETTINGS)
+PLANNER = DecoderSampling(FrozenManifold(packaged_learned().manifold), SETTINGS)
 
 
 def hard(world: World) -> PlanningProblem:

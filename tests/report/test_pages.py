@@ -23,6 +23,7 @@ from constraint_geodesics.learning.dataset import (
     draw_shard,
     read_joints,
     seed_of,
+    shard_tasks,
     write_joints,
 )
 from constraint_geodesics.learning.learned_manifold import LearnedManifold

@@ -161,9 +161,7 @@ def test_constraints_that_let_the_cup_tip_are_refused(
     planner: Planner, scene: Scene, params: Params
 ) -> None:
     free = constraint_manifold(scene.robot, params.constraints["free"])
-    with pytest.raises(
-        ExecutionCheckError, match=r"axes = \(0, 0, 0, 0, 0, 0\): must hold roll and pitch"
-    ):
+    with pytest.raises(ExecutionCheckError, match="no constraint: must hold roll and pitch"):
         run(planner, scene, free, Queries(np.zeros((1, 6)), np.ones((1, 6))))
 
 

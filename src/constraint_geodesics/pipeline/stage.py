@@ -6,11 +6,15 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from constraint_geodesics.params import Params, ParamsError, load_params
+from constraint_geodesics.fields import ParamsError
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.threads import one_thread
+
+if TYPE_CHECKING:
+    from constraint_geodesics.params import Params
 
 WRONG_USAGE = 2
 
@@ -23,6 +27,8 @@ def run_stage(stage: Callable[..., None], arguments: Sequence[str]) -> None:
     arguments: the names after (params, layout), as dvc.yaml passes them; each must be one that
     params.yaml has.
     """
+    from constraint_geodesics.params import load_params
+
     began, name = time.perf_counter(), Path(sys.argv[0]).stem
     try:
         params = load_params()
@@ -56,7 +62,7 @@ def complain(error: Exception, code: int | None = None) -> int:
     return WRONG_USAGE if isinstance(error, ParamsError) else 1
 
 
-def _check_names(params: Params, stage: Callable[..., None], arguments: Sequence[str]) -> None:
+def _check_names(params: "Params", stage: Callable[..., None], arguments: Sequence[str]) -> None:
     """Each argument must be a name of the kind that the stage's own parameter is called after."""
     kinds = list(inspect.signature(stage).parameters)[2:]
     if len(kinds) != len(arguments):
