@@ -6,7 +6,6 @@ compiled for it with `register`: `scratch`, `linearise` and, if it knows one, a 
 search and costs nothing at run time.  Shapes: D joints, m rows of the residual.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,9 +49,9 @@ class ManifoldArrays(NamedTuple):
 
 
 class _Kind(NamedTuple):
-    scratch: Callable
-    linearise: Callable
-    curvature: Callable
+    scratch: Any
+    linearise: Any
+    curvature: Any
 
 
 _KINDS: dict[type, _Kind] = {}
