@@ -6,7 +6,6 @@ compiled for it with `register`: `scratch`, `linearise` and, if it knows one, a 
 search and costs nothing at run time.  Shapes: D joints, m rows of the residual.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,9 +49,9 @@ class ManifoldArrays(NamedTuple):
 
 
 class _Kind(NamedTuple):
-    scratch: Callable
-    linearise: Callable
-    curvature: Callable
+    scratch: Any
+    linearise: Any
+    curvature: Any
 
 
 _KINDS: dict[type, _Kind] = {}
@@ -100,14 +99,9 @@ def _scratch(constraint, dof):
     return lambda constraint, dof: chosen(constraint, dof)
 
 
-@overload(linearise)
+@overload(linearise, inline="always")  # a call counts the references of every array it is given
 def _linearise(manifold, q, own, residual, jacobian):
-    chosen = _kind(_field(manifold, "constraint")).linearise
-
-    def bound(manifold, q, own, residual, jacobian):
-        chosen(manifold, q, own, residual, jacobian)
-
-    return bound
+    return _kind(_field(manifold, "constraint")).linearise.py_func
 
 
 @overload(curvature)
@@ -119,9 +113,10 @@ def _curvature(manifold, weights, own, full):
 @njit(**COMPILE)
 def shared_tolerance(rows):
     """The tolerance of the rows that are bounded together; −1 if there are none."""
-    for i in range(rows.held.shape[0]):
-        if rows.together[i]:
-            return rows.tolerance[i]
+    _, tolerance, together = rows
+    for i in range(together.shape[0]):
+        if together[i]:
+            return tolerance[i]
     return -1.0
 
 
@@ -130,25 +125,26 @@ def excess_of(rows, residual, excess, active):
     """What of the residual (m,) lies outside the tolerance, signed, eq. 7; marks the rows a step
     must correct.  Returns the largest.
     """
+    held, tolerance, together = rows
     worst = 0.0
     common = shared_tolerance(rows)
     square = 0.0
     for i in range(residual.shape[0]):
         excess[i] = 0.0
         active[i] = False
-        if rows.together[i]:
+        if together[i]:
             square += residual[i] * residual[i]
     size = np.sqrt(square)
     for i in range(residual.shape[0]):
-        if not rows.held[i]:
+        if not held[i]:
             continue
-        if rows.together[i]:
+        if together[i]:
             if size > common:
                 excess[i] = residual[i] * (1.0 - common / size)
                 active[i] = True
                 worst = max(worst, size - common)
         else:
-            over = abs(residual[i]) - rows.tolerance[i]
+            over = abs(residual[i]) - tolerance[i]
             if over > 0.0:
                 excess[i] = over if residual[i] > 0.0 else -over
                 active[i] = True

@@ -313,9 +313,10 @@ def _residual(constraint, position, rotation, residual, linear):
 
     Entries of axes that are not held are zero.
     """
-    held, reference = constraint.rows.held, constraint.rotation
+    rows, place, reference = constraint
+    held = rows.held
     for i in range(3):
-        residual[i] = position[i] - constraint.position[i] if held[i] else 0.0
+        residual[i] = position[i] - place[i] if held[i] else 0.0
         residual[3 + i] = 0.0
     linear[:, :] = 0.0
     count = 0
@@ -362,12 +363,14 @@ def _new_scratch(constraint, dof):
 
 @njit(**COMPILE)
 def _linearise(manifold, q, own, residual, jacobian):
-    constraint, geometric, linear = manifold.constraint, own.geometric, own.linear
-    pose_of(manifold.chain, q, own.posture)
-    _residual(constraint, own.posture.position, own.posture.rotation, residual, linear)
-    geometric_jacobian(manifold.chain.prismatic, own.posture, geometric)
+    posture, linear, geometric = own
+    chain, constraint = manifold.chain, manifold.constraint
+    held = constraint.rows.held
+    pose_of(chain, q, posture)
+    _residual(constraint, posture.position, posture.rotation, residual, linear)
+    geometric_jacobian(chain.prismatic, posture, geometric)
     for i in range(6):
-        if not constraint.rows.held[i]:
+        if not held[i]:
             continue
         for d in range(q.shape[0]):
             value = 0.0

@@ -114,13 +114,13 @@ def new_posture(dof):
 @njit(**_COMPILE)
 def pose_of(chain, q, posture):
     """Write the posture of one configuration."""
-    frame = frame_of(chain.base)
+    # taken apart once: a field that is read in a loop counts its array's references each time
+    origins, axes, prismatic, base, tool = chain
+    position, rotation, joint_origins, joint_axes = posture
+    frame = frame_of(base)
     for j in range(q.shape[0]):
-        frame = joint_frame(
-            chain.origins, chain.axes, chain.prismatic, q, j, frame, posture.origins, posture.axes
-        )
-    p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = moved_frame(frame, chain.tool)
-    position, rotation = posture.position, posture.rotation
+        frame = joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes)
+    p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = moved_frame(frame, tool)
     position[0], position[1], position[2] = p0, p1, p2
     rotation[0, 0], rotation[0, 1], rotation[0, 2] = r00, r01, r02
     rotation[1, 0], rotation[1, 1], rotation[1, 2] = r10, r11, r12
@@ -140,15 +140,16 @@ def geometric_jacobian(prismatic, posture, jacobian):
     """Geometric Jacobian (6, D) of one posture in the base frame: linear rows [m], then angular
     rows [rad].
     """
-    for j in range(posture.axes.shape[0]):
-        a0, a1, a2 = posture.axes[j, 0], posture.axes[j, 1], posture.axes[j, 2]
+    position, _, origins, axes = posture
+    for j in range(axes.shape[0]):
+        a0, a1, a2 = axes[j, 0], axes[j, 1], axes[j, 2]
         if prismatic[j]:
             jacobian[0, j], jacobian[1, j], jacobian[2, j] = a0, a1, a2
             jacobian[3, j] = jacobian[4, j] = jacobian[5, j] = 0.0
             continue
-        d0 = posture.position[0] - posture.origins[j, 0]
-        d1 = posture.position[1] - posture.origins[j, 1]
-        d2 = posture.position[2] - posture.origins[j, 2]
+        d0 = position[0] - origins[j, 0]
+        d1 = position[1] - origins[j, 1]
+        d2 = position[2] - origins[j, 2]
         jacobian[0, j] = a1 * d2 - a2 * d1
         jacobian[1, j] = a2 * d0 - a0 * d2
         jacobian[2, j] = a0 * d1 - a1 * d0

@@ -141,15 +141,16 @@ def _broken(space, q, work):
     worst [rad or m].
     """
     dof, limits = q.shape[0], space.limits
-    rows, right = work.rows, work.right
-    linearise(space, q, work.constraint, work.residual, work.jacobian)
-    worst = excess_of(space.constraint.rows, work.residual, work.excess, work.active)
+    rows, right, links = work.rows, work.right, work.links
+    residual, jacobian, excess, active = work.residual, work.jacobian, work.excess, work.active
+    linearise(space, q, work.constraint, residual, jacobian)
+    worst = excess_of(space.constraint.rows, residual, excess, active)
     size = 0
-    for i in range(work.residual.shape[0]):
-        if work.active[i] and size < dof:
-            right[size] = work.excess[i]
+    for i in range(residual.shape[0]):
+        if active[i] and size < dof:
+            right[size] = excess[i]
             for d in range(dof):
-                rows[size, d] = work.jacobian[i, d]
+                rows[size, d] = jacobian[i, d]
             size += 1
     for d in range(dof):
         over = q[d] - limits[1, d] if q[d] > limits[1, d] else min(q[d] - limits[0, d], 0.0)
@@ -161,13 +162,14 @@ def _broken(space, q, work):
                 rows[size, d] = 1.0
                 size += 1
     if space.clearance.points.shape[0] > 0:
-        measure_links(space, q, work.links)
+        measure_links(space, q, links)
+        distances, margin = links.distances, space.margin
         for d in range(dof):
-            short = space.margin - work.links.distances[d]
+            short = margin - distances[d]
             if short > 0.0:
                 worst = max(worst, short)
                 if size < dof:
-                    link_row(space, d, work.links, rows[size])
+                    link_row(space, d, links, rows[size])
                     right[size] = -short
                     size += 1
     return size, worst
@@ -178,18 +180,18 @@ def project_node(space, q, iterations, work):
     """Gauss-Newton of one configuration onto constraint, joint limits and clearance together, in
     place; returns what remains [rad or m].
     """
+    rows, right, normal, squares = work.rows, work.right, work.normal, work.squares
     worst = np.inf
     for iteration in range(iterations + 1):
         size, worst = _broken(space, q, work)
         if worst <= _REACHED or iteration == iterations:
             break
-        trace = normal_matrix(work.rows, size, work.normal)
+        trace = normal_matrix(rows, size, normal)
         for i in range(size):
-            work.normal[i, i] += _RIDGE * trace
-        if not solve_normal(work.normal, size, work.right, _SMALLEST_PIVOT):
+            normal[i, i] += _RIDGE * trace
+        if not solve_normal(normal, size, right, _SMALLEST_PIVOT):
             break
         # stored, so that the sum's last bit does not hang on how the loop is compiled
-        rows, right, squares = work.rows, work.right, work.squares
         for d in range(q.shape[0]):
             value = 0.0
             for i in range(size):
