@@ -89,7 +89,10 @@ def test_trees_grow_towards_the_samples(world: World) -> None:
     assert joints is not None
     assert iterations <= 5
     assert joints[:, 1].min() < -0.9
-    assert birrt_with_sampler(asked, SETTINGS, lambda: asked.start, 0, np.inf) == (None, 300)
+    assert birrt_with_sampler(asked, SETTINGS, lambda: asked.start, 0, np.inf) == (
+        None,
+        SETTINGS.iterations,
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -148,6 +151,7 @@ def test_isolated_points_are_not_applicable(world: World) -> None:
 
 
 def test_search_without_a_way_ends_after_its_iterations(world: World) -> None:
-    path = replace(PLANNER, iterations=40).plan(walled(world, low=-np.inf), seed=0)
+    few = SETTINGS.model_copy(update={"iterations": 40})
+    path = replace(PLANNER, settings=few).plan(walled(world, low=-np.inf), seed=0)
     assert (path.status, path.joints.shape) == ("not_found", (0, 6))
     assert 35 < path.iterations <= 40

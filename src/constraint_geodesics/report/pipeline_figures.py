@@ -318,4 +318,4 @@ def _draw_data_card(layout: Layout, constraint: str) -> Drawn:
 
 
 def _unit(column: str) -> str:
-    return UNITS[column] if column in UNITS else UNITS[column.split("_")[0]]
+    return UNITS.get(column) or UNITS.get(column.split("_")[0], "rad")
