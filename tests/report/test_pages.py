@@ -597,11 +597,12 @@ def test_without_the_studies_of_time_there_is_a_report_all_the_same(run) -> None
     file.rename(aside)
     try:
         write_report(params, layout)
-        assert "curve lengths" not in (layout.root / "reports" / "index.html").read_text()
+        assert "length_rules" not in (layout.root / "reports" / "index.html").read_text()
         assert (figure / "comparison_planner.png").is_file()
     finally:
         aside.rename(file)
         write_report(params, layout)
+    assert "length_rules" in (layout.root / "reports" / "index.html").read_text()
 
 
 @pytest.mark.parametrize(
