@@ -36,7 +36,9 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
         name: params.benchmark.planners[name].model_copy(update=asked) for name in compared.planners
     }
     dof = len(queries[0].start)
-    own, kept = with_planners(params, entries), PathKeeper(scratch / "paths")
+    every = params.benchmark.model_copy(update={"queries": len(queries)})
+    own = with_planners(params.model_copy(update={"benchmark": every}), entries)
+    kept = PathKeeper(scratch / "paths")
     about = subject_of(params, constraint=constraint)
     with tracked_stage(
         Work(STAGE, constraint, compared, [source], about), params.tracking.experiment, layout.root

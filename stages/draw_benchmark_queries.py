@@ -25,6 +25,9 @@ from constraint_geodesics.problem import PlanningProblem
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
 
+ASKED = sys.argv[1:]
+"""Constraints; none: those without queries."""
+
 
 def main(params: Params, layout: Layout) -> None:
     """Write data/benchmark_queries/<constraint>.csv of the constraints named, by default of those
@@ -64,5 +67,4 @@ def draw(params: Params, layout: Layout, constraint: str) -> None:
 
 
 if __name__ == "__main__":
-    ASKED = sys.argv[1:]
     run_stage(main, [])

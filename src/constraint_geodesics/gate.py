@@ -14,6 +14,9 @@ from constraint_geodesics.peers.baseline import BaselineError
 from constraint_geodesics.scene.scene import Scene, robot_from
 from constraint_geodesics.scene.urdf import find_urdf
 
+TABLE_I = ("prm", "rrt_star", "birrt")
+"""Kinds of baselines that the result table has rows of."""
+
 
 def check_params(params: Params) -> None:
     """Raises ParamsError, one line with the entry, its value and what is allowed, for the first on
@@ -80,6 +83,12 @@ def _planner_problems(params: Params) -> Iterator[str]:
             registry.settings_of(name, planner)
         except BaselineError as error:
             yield str(error)
+    for name in bench.compared.planners:
+        if name in bench.planners and bench.planners[name].kind not in TABLE_I:
+            yield (
+                f"benchmark.compared.planners={name!r}: its kind must be one of "
+                f"{', '.join(TABLE_I)}"
+            )
     for entry in ("recorded", "drawn"):
         for name in getattr(bench, entry):
             if name not in bench.planners:

@@ -67,8 +67,7 @@ def test_every_stage_hangs_on_its_script_and_its_own_code() -> None:
             own = f"data/code/{Path(script).stem}.txt"
             if stage != "digest_code":
                 assert {script, own} <= set(entry["deps"]), stage
-                found = {"src/constraint_geodesics/peers"}  # baselines are found by name
-                listed = [d for d in entry["deps"] if d.startswith("src/") and d not in found]
+                listed = [dep for dep in entry["deps"] if dep.startswith("src/")]
                 assert not listed, f"{stage} lists files that its imports name"
 
 
@@ -80,3 +79,16 @@ def test_no_training_hangs_on_what_is_drawn(stage: str) -> None:
     rooms = {name.split("/")[0].removesuffix(".py") for name in found}
     assert {"learning", "geodesics"} & rooms
     assert not rooms & {*DRAWING, "cli", "planner", "search", "peers", "tracking"}
+
+
+@pytest.mark.parametrize(
+    ("stage", "files"),
+    [
+        ("label_joints", ("constraints/pose.py", "constraints/functions.py", "scene/capsule.py")),
+        ("execute_paths", ("certification/pose.py", "planner.py")),
+        ("benchmark_planners", ("peers/birrt.py", "peers/ompl.py")),
+        ("run_benchmark", ("peers/planner.py", "planner.py", "geodesics/learned_method.py")),
+    ],
+)
+def test_kinds_that_are_found_by_name_count(stage: str, files: tuple[str, ...]) -> None:
+    assert set(files) <= set(code_of(ROOT / "stages" / f"{stage}.py", PACKAGE))

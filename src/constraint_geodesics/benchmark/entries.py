@@ -2,8 +2,8 @@
 of their rows.
 """
 
-import ast
 import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -29,6 +29,7 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import BaselineParams, Params
 from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings
 from constraint_geodesics.peers.registry import BaselineBuilder, after, all_settings
+from constraint_geodesics.pipeline.code import code_of, digest
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
@@ -38,11 +39,6 @@ from constraint_geodesics.scene.urdf import find_urdf
 JUDGED_BY = "benchmark.runner"
 """The module that asks the planners and judges their answers: every row depends on what it imports.
 """
-NO_RESULT = (
-    *("__init__.py", "params.py", "pipeline", "palette.py", "tracking", "recording", "report"),
-    *("peers/baseline.py", "peers/registry.py"),
-)
-"""What no row depends on: parameters are hashed by their values."""
 
 
 @dataclass(frozen=True)
@@ -294,29 +290,10 @@ def data_digest(*folders: Path) -> str:
 
 @cache
 def code_digest(*modules: str) -> str:
-    """Of these modules of the package, and of all of its modules that they import, those imported
-    late too.
-    """
+    """Of these modules of the package and of all that their results hang on."""
     package = Path(__file__).parents[1]
-    left_out = [package / part for part in NO_RESULT]
-    found: set[Path] = set()
-    left = [_file_of(package, module.split(".")) for module in modules]
-    while left:
-        file = left.pop()
-        if file is None or file in found or any(p in (file, *file.parents) for p in left_out):
-            continue
-        found.add(file)
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(package.name):
-                parts = str(node.module).split(".")[1:]
-                left.append(_file_of(package, parts))
-                left += [_file_of(package, [*parts, name.name]) for name in node.names]
-    digest = hashlib.sha256()
-    for file in sorted(found):
-        digest.update(file.relative_to(package).as_posix().encode() + file.read_bytes())
-    return digest.hexdigest()
-
-
-def _file_of(package: Path, parts: Sequence[str]) -> Path | None:
-    file = package.joinpath(*parts).with_suffix(".py") if parts else package / "__init__.py"
-    return file if file.is_file() else None
+    files: dict[str, str] = {}
+    for module in modules:
+        file = package.joinpath(*module.split(".")).with_suffix(".py")
+        files |= {module: digest(file)} | code_of(file, package)
+    return hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()

@@ -91,7 +91,8 @@ def _opened(context: Context, method: str) -> Planner:
     constraint = context.manifold.constraint
     planner.prepare(constraint)
     nodes, trees = planner.nodes(constraint), Parts(straight=False, graph=False)
-    planner.plan(nodes[0], nodes[-1], constraint, parts=trees)  # loads the trees' compiled code
+    if len(nodes):  # loads the trees' compiled code
+        planner.plan(nodes[0], nodes[-1], constraint, parts=trees)
     return planner
 
 

@@ -1,4 +1,4 @@
-"""What code a stage's results hang on: the package's modules that its script imports, and theirs.
+"""What code a stage's results hang on: the modules that its script imports, theirs, and kinds.
 
 DVC sees files, not imports, so the stage `digest_code` writes what this finds to one file a stage,
 and the stages depend on those files.  A digest is one of the syntax tree: comments, docstrings and
@@ -14,6 +14,14 @@ from pathlib import Path
 DRAWING = ("palette", "recording", "report")
 """Rooms that change no figure.  They count where a stage's own script imports one of them: such a
 stage draws."""
+FOUND_BY_NAME = {
+    "certification/kept.py": ("certification/*.py",),
+    "constraints/constraint.py": ("constraints/*.py",),
+    "peers/planner.py": ("geodesics/learned_method.py",),
+    "peers/registry.py": ("peers/*.py",),
+    "scene/scene.py": ("scene/*.py",),
+}
+"""What a module reaches without an import statement: kinds that params.yaml names."""
 NO_RESULT = ("__init__", "cli", "params", "pipeline", "tracking")
 """Rooms that change no result: parameters are dependencies by their values."""
 
@@ -34,6 +42,8 @@ def code_of(script: Path, package: Path) -> dict[str, str]:
         if file not in found and _room(file, package) not in left_out:
             found.add(file)
             left += _imported(file, package)
+            for pattern in FOUND_BY_NAME.get(file.relative_to(package).as_posix(), ()):
+                left += package.glob(pattern)
     found |= {page for file in found for page in file.parent.glob("templates/*")}
     return {file.relative_to(package).as_posix(): digest(file) for file in sorted(found)}
 
