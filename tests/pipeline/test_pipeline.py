@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -55,9 +54,7 @@ def stages_to_run(folder: Path) -> set[str]:
 
 def test_a_second_run_has_nothing_to_do(finished: Path) -> None:
     assert stages_to_run(finished) == set()
-    began = time.monotonic()
     result = smoke.dvc(finished, "repro")
-    assert time.monotonic() - began < 10
     assert result.returncode == 0
     assert "Running stage" not in result.stdout
 
