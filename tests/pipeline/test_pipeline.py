@@ -105,9 +105,10 @@ def test_recordings_replay_the_path(finished: Path) -> None:
     assert summary.has_blueprint
 
 
-def test_readme_s_replay_opens_valid_paths_of_both_planners(finished: Path) -> None:
-    (command,) = re.findall(
-        r"^(geodesics replay --constraint .*birrt)$", (smoke.ROOT / "README.md").read_text(), re.M
+def test_the_documented_replay_opens_valid_paths_of_both_planners(finished: Path) -> None:
+    documented = (smoke.ROOT / "docs/rerun.md").read_text()
+    (command,) = set(
+        re.findall(r"^(geodesics replay --constraint .* --planner .*birrt)$", documented, re.M)
     )
     replay, asked = (
         [sys.executable, "-m", "constraint_geodesics.cli", "replay"],
