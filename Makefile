@@ -62,7 +62,7 @@ bench-geometry: env  ## time the geometry core again, after whatever it needs; w
 	dvc repro --single-item --force stages/dvc.yaml:benchmark_geometry
 
 test: env  ## run the tests, the whole pipeline on small parameters among them
-	python -m pytest -n 2 --dist loadgroup
+	python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 
 .venv/browser: tests/browser/requirements.lock .venv/installed
 	.venv/bin/python -m pip install --quiet --disable-pip-version-check -r tests/browser/requirements.lock

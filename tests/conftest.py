@@ -27,9 +27,17 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         compile_kernels()
 
 
+SLOW_FIRST = ("pipeline", "report", "laws", "constraints", "geodesics", "tracking", "studies")
+"""Folders that take longest: what is left for the end is small, and no worker waits for another."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The pipeline's tests first: they stay on one worker and take the longest."""
-    items.sort(key=lambda item: "pipeline" not in item.path.parts)
+    """A file stays on one worker, so that what its tests share is made once."""
+    order = {folder: place for place, folder in enumerate(SLOW_FIRST)}
+    items.sort(key=lambda item: order.get(item.path.parent.name, len(order)))
+    for item in items:
+        if not item.get_closest_marker("xdist_group"):
+            item.add_marker(pytest.mark.xdist_group(item.path.relative_to(ROOT).as_posix()))
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -20,7 +20,7 @@ from constraint_geodesics.recording.recording import read_recording, same_record
 from constraint_geodesics.tracking.store import fetch_artifacts
 from tests.pipeline import smoke
 
-pytestmark = [pytest.mark.xdist_group("pipeline"), pytest.mark.timeout(600)]
+pytestmark = pytest.mark.timeout(1200)
 
 SHARED = {"train_policies@planner", "build_planner", "build_learned", "record_paths", "report"}
 """What is made from all constraints together."""
