@@ -51,11 +51,6 @@ class BestCurves:
     cost: Float[np.ndarray, "A B"]
     feasible: Bool[np.ndarray, "A B"]
 
-    def ranked(self, query: int) -> Float[np.ndarray, "k p"]:
-        """Feasible proposals for one query, cheapest first."""
-        order = np.argsort(self.cost[:, query], kind="stable")
-        return self.phi[order, query][self.feasible[order, query]]
-
 
 def propose(
     problem: GeodesicProblem, policies: Sequence[MeanPolicy], settings: EpisodeSettings, ends: Ends
