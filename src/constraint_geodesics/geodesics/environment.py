@@ -3,7 +3,7 @@
 `CurveVecEnv` only keeps the state, and `CurveEnv` is one copy of it with the usual interface.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -42,13 +42,8 @@ class CurveVecEnv(VecEnv):
         self.episode_returns: list[float] = []
         self._actions = np.zeros((count, problem.curve.coefficients))
 
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed the next reset; one stream serves all curves."""
-        super().seed(seed)
-        return list(self._seeds)
-
     def reset(self) -> np.ndarray:
-        """Fresh episodes everywhere."""
+        """Fresh episodes everywhere; one stream, the first seed's, serves all curves."""
         if self._seeds and self._seeds[0] is not None:
             self.rng = np.random.default_rng(self._seeds[0])
         self._reset_seeds()

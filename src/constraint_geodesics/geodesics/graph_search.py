@@ -6,7 +6,7 @@ to a geodesic.
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -119,10 +119,8 @@ class GraphSolver:
         """
         return _answers(self, problem, ends, None)
 
-    def candidates(
-        self, problem: ChartProblem, ends: Ends
-    ) -> tuple[Candidates, Int[np.ndarray, "B"]]:
-        """Fitted curves of the queries that have a path, and the edges of each (0: none)."""
+    def candidates(self, problem: ChartProblem, ends: Ends) -> Candidates:
+        """Fitted curves of the queries that have a path."""
         paths = [
             self.path(start, goal) for start, goal in zip(ends.z_start, ends.z_goal, strict=True)
         ]
@@ -131,8 +129,7 @@ class GraphSolver:
         phi = np.array([fit[0] for fit in fits]).reshape(-1, problem.curve.coefficients)
         last = np.array([fit[1] for fit in fits]).reshape(-1, problem.curve.dim)
         goals = with_goals_bits(last, ends.z_goal[found])
-        fitted = Candidates(np.array(found, dtype=np.int64), phi, ends.z_start[found], goals)
-        return fitted, np.array([0 if path is None else len(path) - 1 for path in paths])
+        return Candidates(np.array(found, dtype=np.int64), phi, ends.z_start[found], goals)
 
     def path(
         self, start: Float[np.ndarray, "N"], goal: Float[np.ndarray, "N"]
@@ -187,18 +184,15 @@ def _answers(
     graph: GraphSolver, problem: ChartProblem, ends: Ends, gradient: GradientSolver | None
 ) -> list[Geodesic]:
     began = time.perf_counter()
-    fitted, edges = graph.candidates(problem, ends)
+    fitted = graph.candidates(problem, ends)
     results = [
         Geodesic.nothing("not_connected", problem.curve, start, goal)
         for start, goal in zip(ends.z_start, ends.z_goal, strict=True)
     ]
-    joined = np.flatnonzero(edges)
+    joined = fitted.query
     if not len(joined):
         return results
-    place = np.full(len(ends), -1)
-    place[joined] = np.arange(len(joined))
-    own = Candidates(place[fitted.query], fitted.phi, fitted.start, fitted.goal)
-    among = ends[joined]
+    own, among = replace(fitted, query=np.arange(len(joined))), ends[joined]
     if gradient is None:
         work = Work(1, len(joined), time.perf_counter() - began)
         found = shortest_of(problem, among, own, np.ones(len(joined), dtype=bool), work)
