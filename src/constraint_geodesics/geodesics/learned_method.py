@@ -27,7 +27,6 @@ from constraint_geodesics.bundle import (
 )
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction
-from constraint_geodesics.geodesics.episodes import episode_settings
 from constraint_geodesics.geodesics.problem import Ends, LearnedProblem
 from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
 from constraint_geodesics.geometry.curves import PinnedPolynomial
@@ -192,7 +191,7 @@ class LearnedMethod:
         """
         problem, policies = self._problem(manifold), self._networks[1]
         ends = problem.ends(start[None], goal[None])
-        found = propose(problem, policies, episode_settings(self.files.policy), ends)
+        found = propose(problem, policies, self.files.policy, ends)
         order = np.lexsort((found.cost[:, 0], ~found.feasible[:, 0]))
         return [LatentCurve(problem, ends, found.phi[k, 0]) for k in order]
 

@@ -25,10 +25,8 @@ from torch import Tensor, nn
 from constraint_geodesics.geodesics.environment import CurveVecEnv
 from constraint_geodesics.geodesics.episodes import (
     CurveStates,
-    EpisodeSettings,
     advance,
     begin,
-    episode_settings,
     observation_size,
     observe,
 )
@@ -102,7 +100,7 @@ def train_policy(
     report: called with (environment steps, figures) after every rollout.
     """
     torch.manual_seed(seed)
-    environment = CurveVecEnv(problem, episode_settings(params), params.environments, seed)
+    environment = CurveVecEnv(problem, params, params.environments, seed)
     model = ppo_model(environment, params, seed)
     log = _Progress(environment, params, seed, scratch, report)
     log.restore(model)
@@ -156,7 +154,7 @@ class PolicySolver:
         noise = rng.normal(size=(params.episode_steps, count, size))
         noise[:, 0] = 0.0
         first = begin(problem, repeated(ends, count), phi)
-        visited = follow(problem, self.actor, episode_settings(params), first, noise)
+        visited = follow(problem, self.actor, params, first, noise)
         met = [(s.phi, Costs(s.length, s.cost, s.feasible)) for s in visited]
         return _first_accepted(problem, ends, [drawn, *met], accept, began)
 
@@ -180,15 +178,15 @@ def _random_curves(
 def follow(
     problem: GeodesicProblem,
     actor: Actor,
-    settings: EpisodeSettings,
+    params: GeodesicParams,
     states: CurveStates,
     noise: Float[np.ndarray, "I B p"],
 ) -> list[CurveStates]:
     """The I + 1 states of B roll-outs; noise in standard deviations of the policy."""
     visited = [states]
     for step_noise in noise:
-        action = actor.act(observe(settings, visited[-1]), step_noise)
-        visited.append(advance(problem, settings, visited[-1], action)[0])
+        action = actor.act(observe(params, visited[-1]), step_noise)
+        visited.append(advance(problem, params, visited[-1], action)[0])
     return visited
 
 
@@ -343,6 +341,6 @@ class _Progress(BaseCallback):
         environment.states = CurveStates(ends=ends, **arrays)
         environment.returns = content["returns"].numpy()
         model.num_timesteps = self._saved_at = content["steps"]
-        model._last_obs = observe(environment.settings, environment.states)
+        model._last_obs = observe(environment.params, environment.states)
         model._last_episode_starts = environment.states.step == 0
         self.rows = content["rows"]
