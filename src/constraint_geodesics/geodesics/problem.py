@@ -374,10 +374,11 @@ class LearnedProblem:
 
     def _costs(self, lifted: Lifted, decoded: Paths, deviation: Paths) -> Costs:
         rule = _rule(self.degree)
-        shape = np.concatenate(
-            [lifted.joints if self.retract else decoded, deviation], axis=-1, dtype=np.float32
-        )
-        length, error = _length_and_error(rule, shape)
+        assert rule.half is not None
+        mean = lifted.joints if self.retract else decoded
+        shape = torch.from_numpy(np.concatenate([mean, deviation], axis=-1, dtype=np.float32))
+        fine, coarse = rule.length(shape), rule.half.length(shape[:, ::2])
+        length, error = fine.double().numpy(), (fine - coarse).abs().double().numpy()
         outside = -np.minimum(self.manifold.robot.limit_distance(lifted.joints), 0.0).sum(-1)
         if not self.retract:
             factor = 1.0 + self.inclusion_weight * self.manifold.violation(decoded).mean(-1)
@@ -622,13 +623,3 @@ def _content(value: Any) -> Any:
 @cache
 def _rule(degree: int) -> Collocation:
     return Collocation.chebyshev(degree)
-
-
-def _length_and_error(
-    rule: Collocation, values: Float[np.ndarray, "B S A"]
-) -> tuple[Float[np.ndarray, "B"], Float[np.ndarray, "B"]]:
-    """Length by a rule, and its difference to the rule of half the degree."""
-    assert rule.half is not None
-    points = torch.from_numpy(values)
-    length, coarse = rule.length(points), rule.half.length(points[:, ::2])
-    return length.double().numpy(), (length - coarse).abs().double().numpy()
