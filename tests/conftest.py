@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from constraint_geodesics.constraints.constraint import constraint_manifold
-from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
+from constraint_geodesics.learning.dataset import ShardTask, draw_free
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.training import TrainingRun, train_manifold
 from constraint_geodesics.params import Params, load_params
@@ -81,10 +81,8 @@ class Trained:
 
 @pytest.fixture(scope="session")
 def trained(scene: Scene, params: Params, tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    frame = draw_shard(
-        ShardTask(scene, constraint_manifold(scene.robot, params.constraints["free"]), 4000, (1,))
-    ).frame
-    joints = joints_of(frame)[free_rows(frame)]
+    manifold = constraint_manifold(scene.robot, params.constraints["free"])
+    joints = draw_free(ShardTask(scene, manifold, 4000, (1,)))
     small = params.manifolds["planner"].model_copy(
         update={"epochs": 4, "variance_epochs": 2, "variance_centres": 64}
     )

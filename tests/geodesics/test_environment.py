@@ -4,14 +4,7 @@ from gymnasium.utils.env_checker import check_env as check_gymnasium
 from stable_baselines3.common.env_checker import check_env as check_stable_baselines
 
 from constraint_geodesics.geodesics.environment import CurveEnv, CurveVecEnv, scalar_environments
-from constraint_geodesics.geodesics.episodes import (
-    EpisodeSettings,
-    advance,
-    begin,
-    gompertz,
-    observe,
-    rewards,
-)
+from constraint_geodesics.geodesics.episodes import advance, begin, gompertz, observe, rewards
 from constraint_geodesics.geodesics.problem import Ends
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.studies.geodesic_search import analytic_problem, curve_family
@@ -24,7 +17,8 @@ def problem(params):
 
 @pytest.fixture(scope="module")
 def settings(params):
-    return EpisodeSettings(5, 0.25, params.geodesics.reward)
+    ppo = params.geodesics.ppo.model_copy(update={"action_scale": 0.25})
+    return params.geodesics.model_copy(update={"episode_steps": 5, "ppo": ppo})
 
 
 def test_gompertz_rises_from_nought_to_one() -> None:
@@ -84,10 +78,10 @@ def test_episodes_end_by_time_and_restart(problem, settings) -> None:
     environment = CurveVecEnv(problem, settings, 4, seed=0)
     environment.reset()
     zero = np.zeros((4, problem.curve.coefficients))
-    for step in range(settings.steps):
+    for step in range(settings.episode_steps):
         before = environment.states
         observation, _, done, infos = environment.step(zero)
-        assert done.all() == (step == settings.steps - 1)
+        assert done.all() == (step == settings.episode_steps - 1)
     assert all(info["TimeLimit.truncated"] for info in infos)
     last = advance(problem, settings, before, zero)[0]
     np.testing.assert_array_equal(infos[2]["terminal_observation"], observe(settings, last)[2])

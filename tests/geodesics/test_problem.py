@@ -6,14 +6,13 @@ import pytest
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.geodesics.problem import LearnedProblem, repeated
 from constraint_geodesics.geometry.curves import PinnedPolynomial
-from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
+from constraint_geodesics.learning.dataset import ShardTask, draw_free
 
 
 @pytest.fixture(scope="module")
 def problem(scene, params, trained):
     level = constraint_manifold(scene.robot, params.constraints["level_cup"])
-    frame = draw_shard(ShardTask(scene, level, 4000, (1,))).frame
-    joints = joints_of(frame)[free_rows(frame)]
+    joints = draw_free(ShardTask(scene, level, 4000, (1,)))
     return LearnedProblem(trained.manifold, level, PinnedPolynomial(6, 3), joints, 16, True, 1.0)
 
 

@@ -2,12 +2,7 @@ import numpy as np
 import pytest
 
 from constraint_geodesics.constraints.constraint import constraint_manifold
-from constraint_geodesics.geodesics.episodes import (
-    EpisodeSettings,
-    begin,
-    observation_size,
-    observe,
-)
+from constraint_geodesics.geodesics.episodes import begin, observation_size, observe
 from constraint_geodesics.geodesics.policy_search import (
     follow,
     load_policy,
@@ -18,7 +13,7 @@ from constraint_geodesics.geodesics.problem import LearnedProblem, ProblemSet
 from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.manifold import GeometryError
-from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
+from constraint_geodesics.learning.dataset import ShardTask, draw_free
 
 
 def ignore(step, figures) -> None:
@@ -30,18 +25,9 @@ def problems(scene, params, trained):
     members = []
     for name in ("level_cup", "level_cup_relaxed", "free"):
         manifold = constraint_manifold(scene.robot, params.constraints[name])
-        frame = draw_shard(ShardTask(scene, manifold, 1000, (1,))).frame
-        members.append(
-            LearnedProblem(
-                trained.manifold,
-                manifold,
-                PinnedPolynomial(6, 3),
-                joints_of(frame)[free_rows(frame)],
-                16,
-                True,
-                1.0,
-            )
-        )
+        joints = draw_free(ShardTask(scene, manifold, 1000, (1,)))
+        curve = PinnedPolynomial(6, 3)
+        members.append(LearnedProblem(trained.manifold, manifold, curve, joints, 16, True, 1.0))
     return ProblemSet(tuple(members))
 
 
@@ -62,10 +48,6 @@ def small(params):
 @pytest.fixture(scope="module")
 def policy(problems, small, tmp_path_factory):
     return train_policy(problems, small, 0, tmp_path_factory.mktemp("scratch"), ignore)
-
-
-def settings_of(small) -> EpisodeSettings:
-    return EpisodeSettings(small.episode_steps, small.ppo.action_scale, small.reward)
 
 
 def test_a_set_measures_each_row_as_its_member_does(problems) -> None:
@@ -120,7 +102,7 @@ def test_observations_have_the_size_announced_and_are_finite(problems, small) ->
     rng = np.random.default_rng(2)
     ends = problems.sample_ends(40, rng)
     states = begin(problems, ends, 3 * problems.sample_curves(ends, rng))
-    seen = observe(settings_of(small), states)
+    seen = observe(small, states)
     assert (
         seen.shape
         == (40, observation_size(problems))
@@ -134,9 +116,7 @@ def test_numpy_acts_as_the_trained_network_does(problems, policy, small, tmp_pat
     save_policy(policy, tmp_path, 0)
     mean = MeanPolicy.load(tmp_path, 0)
     ends = problems.sample_ends(30, np.random.default_rng(3))
-    seen = observe(
-        settings_of(small), begin(problems, ends, np.zeros((30, problems.curve.coefficients)))
-    )
+    seen = observe(small, begin(problems, ends, np.zeros((30, problems.curve.coefficients))))
     theirs = load_policy(tmp_path, 0).act(seen, np.zeros((30, problems.curve.coefficients)))
     np.testing.assert_allclose(mean.act(seen), theirs, rtol=1e-4, atol=1e-5)
 
@@ -145,19 +125,17 @@ def test_proposals_are_the_best_of_each_policys_own_roll_out(
     problems, policy, small, tmp_path
 ) -> None:
     save_policy(policy, tmp_path, 0)
-    settings, count = settings_of(small), 25
+    count = 25
     ends = problems.sample_ends(count, np.random.default_rng(4))
     first = begin(problems, ends, np.zeros((count, problems.curve.coefficients)))
-    found = propose(problems, [MeanPolicy.load(tmp_path, 0)] * 2, settings, ends)
+    found = propose(problems, [MeanPolicy.load(tmp_path, 0)] * 2, small, ends)
     noise = np.zeros((small.episode_steps, *first.phi.shape))
-    visited = follow(problems, policy.actor, settings, first, noise)
+    visited = follow(problems, policy.actor, small, first, noise)
     assert (found.feasible[0] >= first.feasible).all()
     assert (found.cost[0][first.feasible] <= first.cost[first.feasible] * (1 + 1e-6)).all()
     np.testing.assert_array_equal(found.feasible[0], found.feasible[1])
     feasible = np.array([states.feasible for states in visited]).any(0)
     assert (feasible == found.feasible[0]).mean() > 0.9
-    query = int(np.flatnonzero(found.feasible[0])[0])
-    assert found.ranked(query).shape == (2, problems.curve.coefficients)
     costs = problems.evaluate(found.phi[0], ends)
     np.testing.assert_allclose(costs.cost[costs.feasible], found.cost[0][costs.feasible], rtol=1e-2)
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
-from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
+from constraint_geodesics.learning.dataset import ShardTask, draw_free
 from constraint_geodesics.learning.learned_manifold import LearnedManifold, ManifoldFileError
 from constraint_geodesics.learning.submanifold import Surface, extract, submanifold_figures
 from constraint_geodesics.learning.training import TrainingRun, train_manifold
@@ -13,8 +13,7 @@ from constraint_geodesics.learning.training import TrainingRun, train_manifold
 
 def free_joints(scene, count):
     manifold = ConstraintManifold(scene.robot, Constraint((0, 0, 0, 0, 0, 0)))
-    frame = draw_shard(ShardTask(scene, manifold, count, (5,))).frame
-    return joints_of(frame)[free_rows(frame)]
+    return draw_free(ShardTask(scene, manifold, count, (5,)))
 
 
 def train(scene, params, name, folder, rows=6000, **changes):
@@ -113,8 +112,7 @@ def test_seven_joints_train_and_keep_a_constraint(kuka_scene, params, tmp_path) 
     assert json.loads((tmp_path / "manifold.json").read_text())["dof"] == 7
     pose = Pose.from_rpy([0.4, 0.0, 0.4], [np.pi / 2, 0.0, 0.0])
     level = ConstraintManifold(kuka_scene.robot, Constraint((0, 0, 0, 1, 1, 0), reference=pose))
-    frame = draw_shard(ShardTask(kuka_scene, level, 600, (6,))).frame
-    on_level = joints_of(frame)[free_rows(frame)]
+    on_level = draw_free(ShardTask(kuka_scene, level, 600, (6,)))
     small = params.submanifold.model_copy(update={"nodes": 300})
     with kuka_scene.world() as world:
         surface = Surface(result.manifold, level, world.free)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from constraint_geodesics.constraints.constraint import constraint_manifold
-from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
+from constraint_geodesics.learning.dataset import ShardTask, draw_free
 from constraint_geodesics.learning.submanifold import (
     UNKNOWN,
     GraphSubmanifold,
@@ -52,8 +52,7 @@ def everywhere(q):
 
 
 def configurations(scene, manifold, count):
-    frame = draw_shard(ShardTask(scene, manifold, count, (3,))).frame
-    return joints_of(frame)[free_rows(frame)]
+    return draw_free(ShardTask(scene, manifold, count, (3,)))
 
 
 def test_graph_edges_hold_and_components_are_answers(scene, params, tmp_path) -> None:

@@ -13,7 +13,7 @@ from constraint_geodesics.geodesics.problem import ChartBox, ChartProblem, Learn
 from constraint_geodesics.geometry.analytic import Sphere
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.length import curve_length
-from constraint_geodesics.learning.dataset import ShardTask, draw_shard, free_rows, joints_of
+from constraint_geodesics.learning.dataset import ShardTask, draw_free
 from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.studies.geometry import (
     GeometryBenchmark,
@@ -30,12 +30,10 @@ from constraint_geodesics.studies.geometry import (
 @pytest.fixture(scope="module")
 def benchmark(scene, params, trained):
     level = constraint_manifold(scene.robot, params.constraints["level_cup"])
-    frame = draw_shard(ShardTask(scene, level, 1000, (1,))).frame
+    joints = draw_free(ShardTask(scene, level, 1000, (1,)))
     curve = PinnedPolynomial(6, 3)
     plain = ChartProblem(trained.manifold, curve, Samples(trained.manifold.encode(trained.joints)))
-    retracted = LearnedProblem(
-        trained.manifold, level, curve, joints_of(frame)[free_rows(frame)], 16, True, 1.0
-    )
+    retracted = LearnedProblem(trained.manifold, level, curve, joints, 16, True, 1.0)
     ppo = params.geodesics.ppo.model_copy(update={"batch_size": 40, "epochs": 1})
     geodesics = params.geodesics.model_copy(update={"environments": 8, "ppo": ppo})
     small = params.geometry.model_copy(

@@ -16,12 +16,13 @@ from constraint_geodesics.constraints.constraint import (
     constraint_manifold,
 )
 from constraint_geodesics.constraints.projection import retract
-from constraint_geodesics.geodesics.episodes import EpisodeSettings, observation_size
+from constraint_geodesics.geodesics.episodes import observation_size
 from constraint_geodesics.geodesics.problem import LearnedProblem
 from constraint_geodesics.geodesics.proposals import MeanPolicy
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.manifold import GeometryError
 from constraint_geodesics.learning.learned_manifold import JointManifold
+from constraint_geodesics.params import GeodesicParams
 from constraint_geodesics.studies import proposals as bench
 
 QUERIES, STEPS = 10, 3
@@ -59,8 +60,9 @@ def problems(scene, level, trained) -> dict[str, LearnedProblem]:
 
 
 @pytest.fixture(scope="module")
-def settings(params) -> EpisodeSettings:
-    return EpisodeSettings(STEPS, 0.25, params.geodesics.reward)
+def settings(params) -> GeodesicParams:
+    ppo = params.geodesics.ppo.model_copy(update={"action_scale": 0.25})
+    return params.geodesics.model_copy(update={"episode_steps": STEPS, "ppo": ppo})
 
 
 def untrained(problem, seed: int) -> MeanPolicy:

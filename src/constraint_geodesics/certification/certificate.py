@@ -108,17 +108,14 @@ class Certificate:
 
     def summary(self) -> dict[str, Any]:
         """All of it as JSON takes it; what is not a number is None."""
-        measures = {name: value for name, value in vars(self).items() if name != "violation"}
-        known = {name: None if np.isnan(value) else value for name, value in measures.items()}
-        broken = (
-            None
-            if self.violation is None
-            else {
-                name: None if isinstance(value, float) and np.isnan(value) else value
-                for name, value in vars(self.violation).items()
-            }
-        )
-        return {"valid": self.valid, "violation": broken, **known}
+        broken = None if self.violation is None else _known(self.violation)
+        return {"valid": self.valid, **_known(self), "violation": broken}
+
+
+def _known(record: Violation | Certificate) -> dict[str, Any]:
+    """Its fields, None for what is not a number."""
+    fields = vars(record).items()
+    return {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in fields}
 
 
 def blank(violation: Violation | None, began: float) -> Certificate:

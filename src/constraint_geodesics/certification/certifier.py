@@ -12,7 +12,6 @@ both ends; collisions are examined at points of the path, so they are sampled, n
 import time
 from collections.abc import Callable, Iterator
 from itertools import chain
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -90,12 +89,7 @@ class Certifier:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -10,14 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from constraint_geodesics.certification.kept import (
-    Asked,
-    Broken,
-    Kept,
-    first_at_rows,
-    first_between_rows,
-    nothing_exceeds,
-)
+from constraint_geodesics.certification.kept import Asked, Broken, Kept, nothing_exceeds, summed_up
 from constraint_geodesics.certification.kernels import ROUNDING
 
 _SHARE = 0.05
@@ -56,12 +49,7 @@ def kept(asked: Asked) -> Kept:
             between.append(Broken(row, float(proven[piece]) - tolerance, name, unit, tolerance))
         attained[unit] = max(attained[unit], float(size.max()) - tolerance)
         bound[unit] = max(bound[unit], float(proven.max()) - tolerance)
-    return Kept(
-        attained,
-        bound,
-        first_at_rows(at_rows, asked.limits),
-        first_between_rows(between, asked.limits),
-    )
+    return summed_up(attained, bound, at_rows, between, asked.limits)
 
 
 def _cut(rows: Float[np.ndarray, "T D"], second: float, wanted: float) -> _Pieces:

@@ -70,14 +70,20 @@ def nothing_exceeds() -> tuple[dict[str, float], dict[str, float]]:
     return {"rad": 0.0, "m": 0.0}, {"rad": 0.0, "m": 0.0}
 
 
-def first_at_rows(broken: Sequence[Broken], limits: Limits) -> Violation | None:
-    """The first row where the constraint is left."""
-    return _first("constraint", "in row", "", broken, limits)
-
-
-def first_between_rows(broken: Sequence[Broken], limits: Limits) -> Violation | None:
-    """The first segment on which it is not proven that the constraint is kept."""
-    return _first("constraint_between_rows", "on the line from row", "up to ", broken, limits)
+def summed_up(
+    attained: dict[str, float],
+    bound: dict[str, float],
+    at_rows: Sequence[Broken],
+    between: Sequence[Broken],
+    limits: Limits,
+) -> Kept:
+    """With the first row where the constraint is left, and the first segment on which it is not
+    proven that it is kept.
+    """
+    row = _first("constraint", "in row", "", at_rows, limits)
+    where = "on the line from row"
+    segment = _first("constraint_between_rows", where, "up to ", between, limits)
+    return Kept(attained, bound, row, segment)
 
 
 def _first(

@@ -7,14 +7,7 @@ import numpy as np
 
 from constraint_geodesics.certification import kernels
 from constraint_geodesics.certification.chain import Chain, quaternion_of, rotated
-from constraint_geodesics.certification.kept import (
-    Asked,
-    Broken,
-    Kept,
-    first_at_rows,
-    first_between_rows,
-    nothing_exceeds,
-)
+from constraint_geodesics.certification.kept import Asked, Broken, Kept, nothing_exceeds, summed_up
 
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _MOST_PIECES = 64
@@ -125,12 +118,7 @@ def kept(asked: Asked) -> Kept:
         largest = np.inf if np.isnan(largest) else largest  # joint values that overflow
         attained[channel.unit] = max(attained[channel.unit], float(largest) - channel.tolerance)
         bound[channel.unit] = max(bound[channel.unit], float(highest) - channel.tolerance)
-    return Kept(
-        attained,
-        bound,
-        first_at_rows(at_rows, asked.limits),
-        first_between_rows(between, asked.limits),
-    )
+    return summed_up(attained, bound, at_rows, between, asked.limits)
 
 
 def _cut(asked: Asked) -> _Line:

@@ -17,18 +17,10 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
-from constraint_geodesics.constraints.constraint import (
-    Constraint,
-    ConstraintError,
-    ConstraintManifold,
-    Pose,
-    Series,
-)
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintError, Pose, Series
 from constraint_geodesics.constraints.kernels import COMPILE, Rows, register
 from constraint_geodesics.robot.kernels import Posture, geometric_jacobian, new_posture, pose_of
 from constraint_geodesics.robot.kinematics import SerialRobot
-
-__all__ = ["AXES", "Constraint", "ConstraintError", "ConstraintManifold", "Pose", "PoseConstraint"]
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 SEEN_TOLERANCE = 0.2

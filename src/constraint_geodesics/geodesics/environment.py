@@ -3,7 +3,7 @@
 `CurveVecEnv` only keeps the state, and `CurveEnv` is one copy of it with the usual interface.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -13,13 +13,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from constraint_geodesics.geodesics.episodes import (
     CurveStates,
-    EpisodeSettings,
     advance,
     draw_episodes,
     observation_size,
     observe,
 )
 from constraint_geodesics.geodesics.problem import GeodesicProblem
+from constraint_geodesics.params import GeodesicParams
 
 
 def _spaces(problem: GeodesicProblem) -> tuple[spaces.Box, spaces.Box]:
@@ -31,10 +31,10 @@ class CurveVecEnv(VecEnv):
     """Many curves at once.  Episodes end by time alone (truncation) and restart by themselves."""
 
     def __init__(
-        self, problem: GeodesicProblem, settings: EpisodeSettings, count: int, seed: int
+        self, problem: GeodesicProblem, params: GeodesicParams, count: int, seed: int
     ) -> None:
         super().__init__(count, *_spaces(problem))
-        self.problem, self.settings = problem, settings
+        self.problem, self.params = problem, params
         self.rng = np.random.default_rng(seed)
         self.states = draw_episodes(problem, count, self.rng)
         self.savings: list[float] = []
@@ -42,19 +42,14 @@ class CurveVecEnv(VecEnv):
         self.episode_returns: list[float] = []
         self._actions = np.zeros((count, problem.curve.coefficients))
 
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed the next reset; one stream serves all curves."""
-        super().seed(seed)
-        return list(self._seeds)
-
     def reset(self) -> np.ndarray:
-        """Fresh episodes everywhere."""
+        """Fresh episodes everywhere; one stream, the first seed's, serves all curves."""
         if self._seeds and self._seeds[0] is not None:
             self.rng = np.random.default_rng(self._seeds[0])
         self._reset_seeds()
         self.states = draw_episodes(self.problem, self.num_envs, self.rng)
         self.returns[:] = 0.0
-        return observe(self.settings, self.states)
+        return observe(self.params, self.states)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions for `step_wait`."""
@@ -62,11 +57,11 @@ class CurveVecEnv(VecEnv):
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Advance all curves; finished ones restart, their last observation is in the infos."""
-        self.states, reward = advance(self.problem, self.settings, self.states, self._actions)
+        self.states, reward = advance(self.problem, self.params, self.states, self._actions)
         self.returns += reward
-        done = self.states.step >= self.settings.steps
+        done = self.states.step >= self.params.episode_steps
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        observation = observe(self.settings, self.states)
+        observation = observe(self.params, self.states)
         if done.any():
             rows = np.flatnonzero(done)
             for row in rows:
@@ -82,7 +77,7 @@ class CurveVecEnv(VecEnv):
             self.states = self.states.replaced(
                 rows, draw_episodes(self.problem, len(rows), self.rng)
             )
-            observation = observe(self.settings, self.states)
+            observation = observe(self.params, self.states)
         return observation, reward.astype(np.float32), done, infos
 
     def pop_figures(self) -> dict[str, float]:
@@ -124,8 +119,8 @@ class CurveVecEnv(VecEnv):
 class CurveEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One curve with gymnasium's interface, on the same functions."""
 
-    def __init__(self, problem: GeodesicProblem, settings: EpisodeSettings) -> None:
-        self.problem, self.settings = problem, settings
+    def __init__(self, problem: GeodesicProblem, params: GeodesicParams) -> None:
+        self.problem, self.params = problem, params
         self.observation_space, self.action_space = _spaces(problem)
         self.states: CurveStates | None = None
 
@@ -135,21 +130,21 @@ class CurveEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """A fresh episode."""
         super().reset(seed=seed)
         self.states = draw_episodes(self.problem, 1, self.np_random)
-        return observe(self.settings, self.states)[0], {}
+        return observe(self.params, self.states)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """One change of the curve; episodes are only ever truncated."""
         if self.states is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         self.states, reward = advance(
-            self.problem, self.settings, self.states, np.asarray(action, np.float64)[None]
+            self.problem, self.params, self.states, np.asarray(action, np.float64)[None]
         )
-        observation = observe(self.settings, self.states)[0]
+        observation = observe(self.params, self.states)[0]
         return (
             observation,
             float(reward[0]),
             False,
-            bool(self.states.step[0] >= self.settings.steps),
+            bool(self.states.step[0] >= self.params.episode_steps),
             {},
         )
 

@@ -13,35 +13,10 @@ from jaxtyping import Bool, Float, Int
 from constraint_geodesics.geodesics.problem import Ends, GeodesicProblem, Phi
 from constraint_geodesics.params import GeodesicParams, RewardParams
 
-DESCENT_SCALE = 0.5
-"""Change of a coefficient by an action of 1, in units of the whole step of the problem's descent.
-"""
 LEAST_STRIDE = 1e-3
 """Least change of a coefficient by an action of 1, in units of the ends' distance: at a minimum the
 descent is 0.
 """
-
-
-@dataclass(frozen=True)
-class EpisodeSettings:
-    """Length of an episode, size of an action, reward.
-
-    action_scale: what an action of 1 changes a coefficient by, in units of the ends' distance.
-    descent_scale: the same for a feasible curve whose problem knows a descent, in units of the
-    descent's step.
-    """
-
-    steps: int
-    action_scale: float
-    reward: RewardParams
-    descent_scale: float = DESCENT_SCALE
-
-
-def episode_settings(params: GeodesicParams) -> EpisodeSettings:
-    """How episodes run."""
-    return EpisodeSettings(
-        params.episode_steps, params.ppo.action_scale, params.reward, params.ppo.descent_scale
-    )
 
 
 @dataclass(frozen=True)
@@ -106,7 +81,7 @@ def draw_episodes(problem: GeodesicProblem, count: int, rng: np.random.Generator
 
 
 def advance(
-    problem: GeodesicProblem, settings: EpisodeSettings, states: CurveStates, actions: Phi
+    problem: GeodesicProblem, params: GeodesicParams, states: CurveStates, actions: Phi
 ) -> tuple[CurveStates, Float[np.ndarray, "B"]]:
     """One step of B episodes: new states and rewards (eq. 15).
 
@@ -114,10 +89,10 @@ def advance(
     proportion, as a far one, and a curve near its minimum as small a step, in proportion, as one
     far from it.
     """
-    phi = states.phi + strides(settings, states)[:, None] * np.clip(actions, -1.0, 1.0)
+    phi = states.phi + strides(params, states)[:, None] * np.clip(actions, -1.0, 1.0)
     now = problem.observed(phi, states.ends)
     costs = now.costs
-    reward = rewards(settings.reward, states.cost, costs.cost, states.straight_cost)
+    reward = rewards(params.reward, states.cost, costs.cost, states.straight_cost)
     better = costs.cost < states.best_cost
     moved = replace(
         states,
@@ -134,13 +109,16 @@ def advance(
     return moved, reward
 
 
-def strides(settings: EpisodeSettings, states: CurveStates) -> Float[np.ndarray, "B"]:
-    """What an action of 1 changes a coefficient by, in the chart's unit."""
-    longest = settings.action_scale * states.ends.distance
+def strides(params: GeodesicParams, states: CurveStates) -> Float[np.ndarray, "B"]:
+    """What an action of 1 changes a coefficient by, in the chart's unit: `action_scale` times the
+    ends' distance, for a feasible curve whose problem knows a descent at most `descent_scale` times
+    the descent's step.
+    """
+    longest = params.ppo.action_scale * states.ends.distance
     if not states.descent.shape[1]:
         return longest
     fine = (
-        settings.descent_scale * np.linalg.norm(states.descent, axis=1)
+        params.ppo.descent_scale * np.linalg.norm(states.descent, axis=1)
         + LEAST_STRIDE * states.ends.distance
     )
     return np.where(states.feasible, np.minimum(fine, longest), longest)
@@ -175,7 +153,7 @@ def gompertz(x: Float[np.ndarray, "*batch"], b: float, c: float) -> Float[np.nda
     return np.exp(-b * np.exp(np.clip(-c * x, -50.0, 50.0)))
 
 
-def observe(settings: EpisodeSettings, states: CurveStates) -> Float[np.ndarray, "B o"]:
+def observe(params: GeodesicParams, states: CurveStates) -> Float[np.ndarray, "B o"]:
     """What the policy sees, in this order: coefficients in units of the ends' distance (p), both
     ends in the chart (2 N), cost and best cost over the straight line's, less 1, time left (3);
     where the problem knows a descent, its direction (p) and the logarithm of its size in units of
@@ -189,7 +167,7 @@ def observe(settings: EpisodeSettings, states: CurveStates) -> Float[np.ndarray,
         states.ends.z_goal,
         np.clip(states.cost / scale - 1.0, -2.0, 2.0)[:, None],
         np.clip(states.best_cost / scale - 1.0, -2.0, 2.0)[:, None],
-        1.0 - states.step[:, None] / settings.steps,
+        1.0 - states.step[:, None] / params.episode_steps,
     ]
     if states.descent.shape[1]:
         size = np.linalg.norm(states.descent, axis=1, keepdims=True)

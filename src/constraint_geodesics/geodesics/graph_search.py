@@ -6,7 +6,7 @@ to a geodesic.
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,7 +23,7 @@ from constraint_geodesics.geodesics.solver import (
     shortest_of,
     with_goals_bits,
 )
-from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
+from constraint_geodesics.geometry.curves import CurveFamily, Curves, PinnedPolynomial
 from constraint_geodesics.geometry.graph import nearest_neighbour_edges, shortest_path
 from constraint_geodesics.geometry.length import estimate_length
 from constraint_geodesics.geometry.manifold import (
@@ -93,9 +93,7 @@ class GraphSolver:
             for low, high, count in zip(lower, upper, shape, strict=True)
         ]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-        rows = np.arange(len(points)).reshape(shape)
-        pairs = np.concatenate([_shifted_pairs(rows, *step) for step in KNIGHT])
-        return cls._with_edges(manifold, points, np.sort(pairs, axis=1), 4)
+        return cls._with_edges(manifold, points, neighbours_on_grid(shape), 4)
 
     @classmethod
     def _with_edges(
@@ -119,20 +117,16 @@ class GraphSolver:
         """
         return _answers(self, problem, ends, None)
 
-    def candidates(
-        self, problem: ChartProblem, ends: Ends
-    ) -> tuple[Candidates, Int[np.ndarray, "B"]]:
-        """Fitted curves of the queries that have a path, and the edges of each (0: none)."""
-        paths = [
-            self.path(start, goal) for start, goal in zip(ends.z_start, ends.z_goal, strict=True)
-        ]
-        found = [query for query, path in enumerate(paths) if path is not None]
-        fits = [_fitted(problem, path) for path in paths if path is not None]
-        phi = np.array([fit[0] for fit in fits]).reshape(-1, problem.curve.coefficients)
-        last = np.array([fit[1] for fit in fits]).reshape(-1, problem.curve.dim)
+    def candidates(self, problem: ChartProblem, ends: Ends) -> Candidates:
+        """Fitted curves of the queries that have a path."""
+        paths = map(self.path, ends.z_start, ends.z_goal)
+        ways = {query: path for query, path in enumerate(paths) if path is not None}
+        found = np.array(list(ways), dtype=np.int64)
+        fits = [fitted(problem.curve, w, _sides(problem.manifold, w)) for w in ways.values()]
+        phi = np.reshape(fits, (-1, problem.curve.coefficients))
+        last = np.reshape([way[-1] for way in ways.values()], (-1, problem.curve.dim))
         goals = with_goals_bits(last, ends.z_goal[found])
-        fitted = Candidates(np.array(found, dtype=np.int64), phi, ends.z_start[found], goals)
-        return fitted, np.array([0 if path is None else len(path) - 1 for path in paths])
+        return Candidates(found, phi, ends.z_start[found], goals)
 
     def path(
         self, start: Float[np.ndarray, "N"], goal: Float[np.ndarray, "N"]
@@ -187,18 +181,15 @@ def _answers(
     graph: GraphSolver, problem: ChartProblem, ends: Ends, gradient: GradientSolver | None
 ) -> list[Geodesic]:
     began = time.perf_counter()
-    fitted, edges = graph.candidates(problem, ends)
+    fitted = graph.candidates(problem, ends)
     results = [
         Geodesic.nothing("not_connected", problem.curve, start, goal)
         for start, goal in zip(ends.z_start, ends.z_goal, strict=True)
     ]
-    joined = np.flatnonzero(edges)
+    joined = fitted.query
     if not len(joined):
         return results
-    place = np.full(len(ends), -1)
-    place[joined] = np.arange(len(joined))
-    own = Candidates(place[fitted.query], fitted.phi, fitted.start, fitted.goal)
-    among = ends[joined]
+    own, among = replace(fitted, query=np.arange(len(joined))), ends[joined]
     if gradient is None:
         work = Work(1, len(joined), time.perf_counter() - began)
         found = shortest_of(problem, among, own, np.ones(len(joined), dtype=bool), work)
@@ -210,16 +201,36 @@ def _answers(
     return results
 
 
-def _fitted(
-    problem: ChartProblem, corners: Float[np.ndarray, "k N"]
-) -> tuple[Float[np.ndarray, "p"], np.ndarray]:
-    """Coefficients of the curve nearest to a polygon at constant speed; the polygon's end."""
-    lengths = _straight_lengths(problem.manifold, corners[:-1], np.diff(corners, axis=0))
-    passed = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(lengths), lengths, 0.0))])
+def neighbours_on_grid(shape: tuple[int, int]) -> Int[np.ndarray, "m 2"]:
+    """Every node of a grid, numbered row by row, and those of the 16 around it that come after
+    it.
+    """
+    numbers = np.arange(shape[0] * shape[1]).reshape(shape)
+    pairs = []
+    for down, right in KNIGHT:
+        near = numbers[: shape[0] - down, max(0, -right) : shape[1] - max(0, right)]
+        far = numbers[down:, max(0, right) : shape[1] + min(0, right)]
+        pairs.append(np.stack([near.ravel(), far.ravel()], axis=-1))
+    return np.sort(np.concatenate(pairs), axis=1)
+
+
+def fitted(
+    curve: CurveFamily, corners: Float[np.ndarray, "k N"], lengths: Float[np.ndarray, "k-1"]
+) -> Float[np.ndarray, "p"]:
+    """Coefficients of the curve nearest to a polygon with sides of these lengths at constant
+    speed.
+    """
+    passed = np.concatenate([[0.0], np.cumsum(lengths)])
     t = np.linspace(0.0, 1.0, FITTED)
     points = np.stack([np.interp(t * passed[-1], passed, column) for column in corners.T], axis=-1)
     points[0], points[-1] = corners[0], corners[-1]
-    return problem.curve.fit(torch.from_numpy(points), torch.from_numpy(t)).numpy(), corners[-1]
+    return curve.fit(torch.from_numpy(points), torch.from_numpy(t)).numpy()
+
+
+def _sides(manifold: Manifold, corners: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "k-1"]:
+    """Lengths of a polygon's sides; 0 where one leaves the manifold."""
+    lengths = _straight_lengths(manifold, corners[:-1], np.diff(corners, axis=0))
+    return np.where(np.isfinite(lengths), lengths, 0.0)
 
 
 def _straight_lengths(
@@ -244,11 +255,3 @@ def _position(manifold: Manifold, points: Float[np.ndarray, "n N"]) -> Float[np.
         return points
     with torch.no_grad():
         return manifold.embed(torch.from_numpy(points)).double().numpy()
-
-
-def _shifted_pairs(rows: Int[np.ndarray, "r c"], down: int, right: int) -> Int[np.ndarray, "k 2"]:
-    """Node numbers of a grid and of the nodes `down` rows and `right` columns further."""
-    height, width = rows.shape
-    near = rows[: height - down, max(0, -right) : width - max(0, right)]
-    far = rows[down:, max(0, right) : width + min(0, right)]
-    return np.stack([near.ravel(), far.ravel()], axis=-1)

@@ -25,8 +25,13 @@ from constraint_geodesics.bundle import (
     roadmaps_of,
     write_files,
 )
-from constraint_geodesics.geodesics.policy_proposals import LatentCurve, PolicyProposals
+from constraint_geodesics.constraints.constraint import ConstraintManifold
+from constraint_geodesics.constraints.projection import Retraction
+from constraint_geodesics.geodesics.problem import Ends, LearnedProblem
+from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
+from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.inference import FrozenManifold
+from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import jump_excess
 from constraint_geodesics.params import GeodesicParams, RobotParams
 from constraint_geodesics.search.band import ACCURACY, step_lengths
@@ -49,6 +54,8 @@ CARD, MANIFOLD, POLICIES, SUBMANIFOLDS = (
     "policies.safetensors",
     "submanifolds.safetensors",
 )
+KEPT = 32
+"""Constraints whose problem is kept for the next query."""
 _FIRST_POINTS = 65
 _SLACK_RAD = 1e-9
 
@@ -96,6 +103,35 @@ def read_learned(folder: Path) -> LearnedFiles:
     return LearnedFiles(robot, policy, manifold, policies, roadmaps_of(graphs))
 
 
+@dataclass(frozen=True)
+class LatentCurve:
+    """One curve between two ends on the learned manifold (eqs. 9-11) as a curve in joint space.
+
+    phi (p,): its free coefficients.
+    """
+
+    problem: LearnedProblem
+    ends: Ends
+    phi: Float[np.ndarray, "p"]
+
+    def decoded(self, t: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T D"]:
+        """Points at times from 0 to 1, both among them, decoded with their ends corrected, not
+        projected [rad].
+        """
+        return self.problem.lifted_at(self.phi[None], self.ends, t, None).joints[0]
+
+    def at(self, s: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n D"], float]:
+        """Points at any times, projected [rad], and what is left of the violation; the ends are the
+        query's, to the bit.
+        """
+        t = np.concatenate([[0.0], s, [1.0]])
+        lifted = self.problem.lifted_at(self.phi[None], self.ends, t, Retraction())
+        points = lifted.joints[0, 1:-1]
+        points[s == 0.0], points[s == 1.0] = self.ends.q_start[0], self.ends.q_goal[0]
+        inner = lifted.violation[0, 1:-1][(s > 0.0) & (s < 1.0)]
+        return points, float(inner.max(initial=0.0))
+
+
 class LearnedMethod:
     """The policies' curves as they are."""
 
@@ -106,6 +142,7 @@ class LearnedMethod:
         self.roadmaps: Mapping[str, Roadmap] | None = files.submanifolds
         learned = FrozenManifold(files.manifold)
         self.draw = lambda count, rng: learned.decode(learned.sample(count, rng))
+        self._problems: dict[int, LearnedProblem] = {}
 
     @classmethod
     def open(cls, source: str | Path | None, bundle: Bundle) -> Self:
@@ -122,9 +159,41 @@ class LearnedMethod:
         return cls(files)
 
     @cached_property
-    def _proposals(self) -> PolicyProposals:
-        files = self.files
-        return PolicyProposals.from_arrays(files.manifold, files.policies, files.policy)
+    def _networks(self) -> tuple[LearnedManifold, list[MeanPolicy]]:
+        by_seed: dict[int, dict[str, np.ndarray]] = {}
+        for address, values in self.files.policies.items():
+            seed, name = address.split("/")
+            by_seed.setdefault(int(seed), {})[name] = values
+        policies = [MeanPolicy.from_arrays(by_seed[seed]) for seed in sorted(by_seed)]
+        return LearnedManifold.from_arrays(self.files.manifold), policies
+
+    def _problem(self, manifold: ConstraintManifold) -> LearnedProblem:
+        key = id(manifold)  # the problem holds the manifold, so that its id stays its own
+        if key not in self._problems:
+            while len(self._problems) >= KEPT:
+                self._problems.pop(next(iter(self._problems)))
+            learned, settings = self._networks[0], self.files.policy
+            curve = PinnedPolynomial(learned.dim, settings.degree)
+            nobody, degree = np.empty((0, manifold.robot.dof)), settings.length_degree
+            self._problems[key] = LearnedProblem(
+                learned, manifold, curve, nobody, degree, True, 0.0
+            )
+        return self._problems[key]
+
+    def curves(
+        self,
+        manifold: ConstraintManifold,
+        start: Float[np.ndarray, "D"],
+        goal: Float[np.ndarray, "D"],
+    ) -> list[LatentCurve]:
+        """The best curve that each policy meets on its way from the straight latent line, feasible
+        ones first; under any constraint, seen in training or not.
+        """
+        problem, policies = self._problem(manifold), self._networks[1]
+        ends = problem.ends(start[None], goal[None])
+        found = propose(problem, policies, self.files.policy, ends)
+        order = np.lexsort((found.cost[:, 0], ~found.feasible[:, 0]))
+        return [LatentCurve(problem, ends, found.phi[k, 0]) for k in order]
 
     def candidates(
         self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts
@@ -134,8 +203,7 @@ class LearnedMethod:
         """
         answer = _connection(task, start, goal)
         if answer.status != "not_connected":
-            curves = self._proposals.curves(task.manifold, start, goal)
-            yield from self.sound(task, curves)
+            yield from self.sound(task, self.curves(task.manifold, start, goal))
         yield answer
 
     def sound(self, task: Task, curves: Sequence[LatentCurve]) -> list[Candidate]:
@@ -186,7 +254,7 @@ def sampled(curve: LatentCurve) -> Candidate | None:
         pieces = int(np.ceil((_FIRST_POINTS - 1) * longest / CHECK_STEP))
         shares = np.linspace(0.0, 1.0, min(pieces, 8 * _FIRST_POINTS) + 1)
         points, left = curve.at(shares)
-    robot = curve.manifold.robot
+    robot = curve.problem.manifold.robot
     inside = robot.limit_distance(points).min() >= -_SLACK_RAD
     if not (left <= 1e3 * ACCURACY and inside and jump_excess(points, shares) == 0.0):
         return None

@@ -25,10 +25,8 @@ from torch import Tensor, nn
 from constraint_geodesics.geodesics.environment import CurveVecEnv
 from constraint_geodesics.geodesics.episodes import (
     CurveStates,
-    EpisodeSettings,
     advance,
     begin,
-    episode_settings,
     observation_size,
     observe,
 )
@@ -54,12 +52,14 @@ MOST_CHECKED = 40
 
 Report = Callable[[int, dict[str, float]], None]
 Accept = Callable[[Float[np.ndarray, "p"]], bool]
+_Measured = tuple[Phi, Costs]
+"""Candidates of one query that were measured together: one step of the search."""
 
 
 class Actor(nn.Module):
     """The policy alone: observation → mean action, with one standard deviation an action."""
 
-    def __init__(self, observation: int, hidden: tuple[int, ...], actions: int) -> None:
+    def __init__(self, observation: int, hidden: Sequence[int], actions: int) -> None:
         super().__init__()
         layers: list[nn.Module] = []
         width = observation
@@ -69,6 +69,7 @@ class Actor(nn.Module):
         self.body = nn.Sequential(*layers)
         self.mean = nn.Linear(width, actions)
         self.log_std = nn.Parameter(torch.zeros(actions))
+        self.sizes = {"observation": observation, "hidden": list(hidden), "actions": actions}
 
     def forward(self, observation: Float[Tensor, "B o"]) -> Float[Tensor, "B p"]:
         """Mean actions."""
@@ -99,7 +100,7 @@ def train_policy(
     report: called with (environment steps, figures) after every rollout.
     """
     torch.manual_seed(seed)
-    environment = CurveVecEnv(problem, episode_settings(params), params.environments, seed)
+    environment = CurveVecEnv(problem, params, params.environments, seed)
     model = ppo_model(environment, params, seed)
     log = _Progress(environment, params, seed, scratch, report)
     log.restore(model)
@@ -148,13 +149,13 @@ class PolicySolver:
         began, rng, params = time.perf_counter(), np.random.default_rng(self.seed), self.params
         count, size = params.rollouts, problem.curve.coefficients
         drawn = _random_curves(problem, ends, DRAWN_A_START * (count // 2), rng)
-        starts = drawn.phi[np.argsort(drawn.costs.cost, kind="stable")[: count // 2]]
+        starts = drawn[0][np.argsort(drawn[1].cost, kind="stable")[: count // 2]]
         phi = np.concatenate([np.zeros((count - len(starts), size)), starts])
         noise = rng.normal(size=(params.episode_steps, count, size))
         noise[:, 0] = 0.0
         first = begin(problem, repeated(ends, count), phi)
-        visited = follow(problem, self.actor, episode_settings(params), first, noise)
-        met = [_Curves(s.phi, Costs(s.length, s.cost, s.feasible)) for s in visited]
+        visited = follow(problem, self.actor, params, first, noise)
+        met = [(s.phi, Costs(s.length, s.cost, s.feasible)) for s in visited]
         return _first_accepted(problem, ends, [drawn, *met], accept, began)
 
     def search_at_random(self, problem: GeodesicProblem, ends: Ends, accept: Accept) -> Geodesic:
@@ -165,40 +166,32 @@ class PolicySolver:
         return _first_accepted(problem, ends, [drawn], accept, began)
 
 
-@dataclass(frozen=True)
-class _Curves:
-    """Candidates of one query that were measured together: one step of the search."""
-
-    phi: Phi
-    costs: Costs
-
-
 def _random_curves(
     problem: GeodesicProblem, ends: Ends, count: int, rng: np.random.Generator
-) -> _Curves:
+) -> _Measured:
     """Many random curves and their costs: in one batch they cost next to nothing."""
     many = repeated(ends, count)
     drawn = problem.sample_curves(many, rng)
-    return _Curves(drawn, problem.evaluate(drawn, many))
+    return drawn, problem.evaluate(drawn, many)
 
 
 def follow(
     problem: GeodesicProblem,
     actor: Actor,
-    settings: EpisodeSettings,
+    params: GeodesicParams,
     states: CurveStates,
     noise: Float[np.ndarray, "I B p"],
 ) -> list[CurveStates]:
     """The I + 1 states of B roll-outs; noise in standard deviations of the policy."""
     visited = [states]
     for step_noise in noise:
-        action = actor.act(observe(settings, visited[-1]), step_noise)
-        visited.append(advance(problem, settings, visited[-1], action)[0])
+        action = actor.act(observe(params, visited[-1]), step_noise)
+        visited.append(advance(problem, params, visited[-1], action)[0])
     return visited
 
 
 def _first_accepted(
-    problem: GeodesicProblem, ends: Ends, steps: Sequence[_Curves], accept: Accept, began: float
+    problem: GeodesicProblem, ends: Ends, steps: Sequence[_Measured], accept: Accept, began: float
 ) -> Geodesic:
     """The cheapest feasible candidate that passes the exact check, the straight line among them.
 
@@ -206,9 +199,9 @@ def _first_accepted(
     """
     zero = np.zeros((1, problem.curve.coefficients))
     straight = problem.evaluate(zero, ends)
-    phi = np.concatenate([zero, *(step.phi for step in steps)])
-    cost = np.concatenate([straight.cost, *(step.costs.cost for step in steps)])
-    feasible = np.concatenate([straight.feasible, *(step.costs.feasible for step in steps)])
+    phi = np.concatenate([zero, *(phi for phi, _ in steps)])
+    cost = np.concatenate([straight.cost, *(costs.cost for _, costs in steps)])
+    feasible = np.concatenate([straight.feasible, *(costs.feasible for _, costs in steps)])
     order = np.argsort(cost, kind="stable")
     candidates = order[feasible[order]][:MOST_CHECKED]
     if feasible[0] and 0 not in candidates:
@@ -218,7 +211,7 @@ def _first_accepted(
         status: SearchStatus = "not_found"
         row, length = int(order[0]), float("nan")
     else:
-        late = len(steps) > 1 and row >= len(phi) - len(steps[-1].phi)
+        late = len(steps) > 1 and row >= len(phi) - len(steps[-1][0])
         status = "iteration_limit" if late else "converged"
         length = float(problem.evaluate(phi[row][None], ends).length[0])
     found = status, problem.curve, phi[row], ends.z_start[0], ends.z_goal[0], length
@@ -229,20 +222,14 @@ def _first_accepted(
 def save_policy(policy: TrainedPolicy, folder: Path, seed: int) -> None:
     """Weights (safetensors) and layer sizes (JSON) of one seed."""
     folder.mkdir(parents=True, exist_ok=True)
-    actor = policy.actor
-    save_file(actor.state_dict(), folder / f"policy-{seed}.safetensors")
-    sizes = {
-        "observation": actor.body[0].in_features if len(actor.body) else actor.mean.in_features,
-        "hidden": [layer.out_features for layer in actor.body if isinstance(layer, nn.Linear)],
-        "actions": actor.mean.out_features,
-    }
-    (folder / f"policy-{seed}.json").write_text(json.dumps(sizes, sort_keys=True) + "\n")
+    save_file(policy.actor.state_dict(), folder / f"policy-{seed}.safetensors")
+    sizes = json.dumps(policy.actor.sizes, sort_keys=True)
+    (folder / f"policy-{seed}.json").write_text(sizes + "\n")
 
 
 def load_policy(folder: Path, seed: int) -> Actor:
     """Read what `save_policy` wrote."""
-    sizes = json.loads((folder / f"policy-{seed}.json").read_text())
-    actor = Actor(sizes["observation"], tuple(sizes["hidden"]), sizes["actions"])
+    actor = Actor(**json.loads((folder / f"policy-{seed}.json").read_text()))
     actor.load_state_dict(load_file(folder / f"policy-{seed}.safetensors"))
     return actor.eval().requires_grad_(False)
 
@@ -354,6 +341,6 @@ class _Progress(BaseCallback):
         environment.states = CurveStates(ends=ends, **arrays)
         environment.returns = content["returns"].numpy()
         model.num_timesteps = self._saved_at = content["steps"]
-        model._last_obs = observe(environment.settings, environment.states)
+        model._last_obs = observe(environment.params, environment.states)
         model._last_episode_starts = environment.states.step == 0
         self.rows = content["rows"]

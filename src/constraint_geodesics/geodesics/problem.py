@@ -14,7 +14,7 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.geodesics.pull_kernels import Bounds, tangential_gradient
 from constraint_geodesics.geometry.curves import CurveFamily, Curves, PinnedPolynomial
-from constraint_geodesics.geometry.length import Collocation, Quadrature, estimate_length
+from constraint_geodesics.geometry.length import TOLERANCE, Collocation, Quadrature, estimate_length
 from constraint_geodesics.geometry.manifold import (
     BoundedManifold,
     GeometryError,
@@ -247,23 +247,25 @@ class ChartProblem:
 
     def evaluate(self, phi: Phi, ends: Ends) -> Costs:
         """The cost is the length; a curve that leaves the manifold is not feasible."""
-        free, start, goal = _tensors(phi, ends.z_start, ends.z_goal)
-        with torch.no_grad():
-            curves = Curves(self.curve, free, start, goal)
-            length = estimate_length(self.manifold, curves).length.numpy()
+        length = self.lengths(phi, ends)
         return Costs(length, length, np.isfinite(length) & self.stays_inside(phi, ends))
 
     def observed(self, phi: Phi, ends: Ends) -> Observed:
         """Costs alone."""
         return Observed.alone(self.evaluate(phi, ends))
 
+    def lengths(self, phi: Phi, ends: Ends, tolerance: float = TOLERANCE) -> Float[np.ndarray, "B"]:
+        """Lengths on the manifold, to a relative tolerance (`estimate_length`)."""
+        with torch.no_grad():
+            curves = _curves(self.curve, phi, ends)
+            return estimate_length(self.manifold, curves, tolerance).length.numpy()
+
     def stays_inside(self, phi: Phi, ends: Ends) -> Bool[np.ndarray, "B"]:
         """Whether all of INSIDE_POINTS points of each curve belong to the manifold."""
         if not isinstance(self.manifold, BoundedManifold):
             return np.ones(len(phi), dtype=bool)
         t = torch.linspace(0.0, 1.0, INSIDE_POINTS, dtype=torch.float64)
-        free, start, goal = _tensors(phi, ends.z_start, ends.z_goal)
-        points, _ = self.curve.evaluate(free, start, goal, t)
+        points, _ = _curves(self.curve, phi, ends).at(t)
         return self.manifold.contains(points).all(-1).numpy()
 
     def ends(self, start: Float[np.ndarray, "B N"], goal: Float[np.ndarray, "B N"]) -> Ends:
@@ -298,8 +300,7 @@ class ChartProblem:
         if self.curve == cubic:
             return phi
         t = torch.linspace(0.0, 1.0, FITTED, dtype=torch.float64)
-        free, start, goal = _tensors(phi, ends.z_start, ends.z_goal)
-        points, _ = cubic.evaluate(free, start, goal, t)
+        points, _ = _curves(cubic, phi, ends).at(t)
         return self.curve.fit(points, t).numpy()
 
     def fingerprint(self) -> str:
@@ -373,10 +374,11 @@ class LearnedProblem:
 
     def _costs(self, lifted: Lifted, decoded: Paths, deviation: Paths) -> Costs:
         rule = _rule(self.degree)
-        shape = np.concatenate(
-            [lifted.joints if self.retract else decoded, deviation], axis=-1, dtype=np.float32
-        )
-        length, error = _length_and_error(rule, shape)
+        assert rule.half is not None
+        mean = lifted.joints if self.retract else decoded
+        shape = torch.from_numpy(np.concatenate([mean, deviation], axis=-1, dtype=np.float32))
+        fine, coarse = rule.length(shape), rule.half.length(shape[:, ::2])
+        length, error = fine.double().numpy(), (fine - coarse).abs().double().numpy()
         outside = -np.minimum(self.manifold.robot.limit_distance(lifted.joints), 0.0).sum(-1)
         if not self.retract:
             factor = 1.0 + self.inclusion_weight * self.manifold.violation(decoded).mean(-1)
@@ -463,8 +465,17 @@ class LearnedProblem:
         self, phi: Phi, ends: Ends, t: Float[np.ndarray, "T"]
     ) -> Float[np.ndarray, "B T N"]:
         """γ_φ(t) in the latent space, eqs. 9-11."""
-        free, start, goal, times = _tensors(phi, ends.z_start, ends.z_goal, t)
-        return self.curve.evaluate(free, start, goal, times)[0].numpy()
+        return _curves(self.curve, phi, ends).at(*_tensors(t))[0].numpy()
+
+    def lifted_at(
+        self, phi: Phi, ends: Ends, t: Float[np.ndarray, "T"], retraction: Retraction | None
+    ) -> Lifted:
+        """The curves in joint space at rising times, 0 and 1 among them: decoded, their ends
+        corrected and, unless `retraction` is None, retracted.
+        """
+        decoded = self.chart.decode(self.latent_points(phi, ends, t))
+        line = corrected(decoded, t, ends.q_start, ends.q_goal)
+        return retracted(self.manifold, line, retraction)
 
     def path(
         self, phi: Float[np.ndarray, "p"], ends: Ends, spacing: float
@@ -479,9 +490,7 @@ class LearnedProblem:
         points = 65
         while True:
             t = np.linspace(0.0, 1.0, points)
-            decoded = self.chart.decode(self.latent_points(phi[None], ends, t))
-            line = corrected(decoded, t, ends.q_start, ends.q_goal)
-            joints = retracted(self.manifold, line, exact).joints[0]
+            joints = self.lifted_at(phi[None], ends, t, exact).joints[0]
             if np.linalg.norm(np.diff(joints, axis=0), axis=-1).max() <= 0.1 or points > 1000:
                 if self.retract:
                     return as_executed(self.manifold, joints, spacing)
@@ -596,6 +605,10 @@ def bent_halfway(curve: CurveFamily, bend: Float[np.ndarray, "B N"]) -> Phi:
     return curve.fit(height * torch.from_numpy(np.asarray(bend, np.float64))[:, None, :], t).numpy()
 
 
+def _curves(family: CurveFamily, phi: Phi, ends: Ends) -> Curves:
+    return Curves(family, *_tensors(phi, ends.z_start, ends.z_goal))
+
+
 def _tensors(*arrays: np.ndarray) -> tuple[torch.Tensor, ...]:
     return tuple(torch.from_numpy(np.asarray(values, np.float64)) for values in arrays)
 
@@ -610,13 +623,3 @@ def _content(value: Any) -> Any:
 @cache
 def _rule(degree: int) -> Collocation:
     return Collocation.chebyshev(degree)
-
-
-def _length_and_error(
-    rule: Collocation, values: Float[np.ndarray, "B S A"]
-) -> tuple[Float[np.ndarray, "B"], Float[np.ndarray, "B"]]:
-    """Length by a rule, and its difference to the rule of half the degree."""
-    assert rule.half is not None
-    points = torch.from_numpy(values)
-    length, coarse = rule.length(points), rule.half.length(points[:, ::2])
-    return length.double().numpy(), (length - coarse).abs().double().numpy()

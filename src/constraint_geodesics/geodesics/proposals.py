@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from safetensors.numpy import load_file
 
-from constraint_geodesics.geodesics.episodes import EpisodeSettings, advance, begin, observe
+from constraint_geodesics.geodesics.episodes import advance, begin, observe
 from constraint_geodesics.geodesics.problem import Ends, GeodesicProblem
+from constraint_geodesics.params import GeodesicParams
 
 
 @dataclass(frozen=True)
@@ -51,14 +52,9 @@ class BestCurves:
     cost: Float[np.ndarray, "A B"]
     feasible: Bool[np.ndarray, "A B"]
 
-    def ranked(self, query: int) -> Float[np.ndarray, "k p"]:
-        """Feasible proposals for one query, cheapest first."""
-        order = np.argsort(self.cost[:, query], kind="stable")
-        return self.phi[order, query][self.feasible[order, query]]
-
 
 def propose(
-    problem: GeodesicProblem, policies: Sequence[MeanPolicy], settings: EpisodeSettings, ends: Ends
+    problem: GeodesicProblem, policies: Sequence[MeanPolicy], params: GeodesicParams, ends: Ends
 ) -> BestCurves:
     """Follow every policy's mean from the straight line, which counts too, for one episode."""
     count, queries = len(policies), len(ends)
@@ -68,12 +64,12 @@ def propose(
         np.zeros((count * queries, problem.curve.coefficients)),
     )
     phi, cost, feasible = states.phi, states.cost, states.feasible
-    for _ in range(settings.steps):
-        seen = observe(settings, states).reshape(count, queries, -1)
+    for _ in range(params.episode_steps):
+        seen = observe(params, states).reshape(count, queries, -1)
         actions = np.concatenate(
             [policy.act(rows) for policy, rows in zip(policies, seen, strict=True)]
         )
-        states, _ = advance(problem, settings, states, actions)
+        states, _ = advance(problem, params, states, actions)
         better = (states.feasible & ~feasible) | (
             (states.feasible == feasible) & (states.cost < cost)
         )

@@ -6,7 +6,6 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 
 from constraint_geodesics.geodesics.problem import (
@@ -16,8 +15,6 @@ from constraint_geodesics.geodesics.problem import (
     GeodesicSolver,
     SearchStatus,
 )
-from constraint_geodesics.geometry.curves import Curves
-from constraint_geodesics.geometry.length import estimate_length
 from constraint_geodesics.geometry.manifold import Manifold, PeriodicManifold
 
 LENGTH_TOLERANCE = 1e-6
@@ -122,10 +119,11 @@ def shortest_of(
 
     work: of the whole batch; each record carries its query's share of the evaluations and time.
     """
-    length = _lengths(problem, candidates.phi, candidates.ends())
-    length = np.where(problem.stays_inside(candidates.phi, candidates.ends()), length, np.inf)
+    curves = candidates.phi, candidates.ends()
+    length = problem.lengths(*curves, LENGTH_TOLERANCE)
+    length = np.where(problem.stays_inside(*curves), length, np.inf)
     lines = np.zeros((len(ends), problem.curve.coefficients))
-    straight = _lengths(problem, lines, to_nearest_images(problem, ends))
+    straight = problem.lengths(lines, to_nearest_images(problem, ends), LENGTH_TOLERANCE)
     # of curves that are alike to within their accuracy one that has converged is the answer
     rank = length * np.where(converged, 1.0, 1.0 + LENGTH_TOLERANCE)
     results = []
@@ -142,15 +140,6 @@ def shortest_of(
         line = float(straight[query])
         results.append(Geodesic(status, problem.curve, *found, own, line, *spent))
     return results
-
-
-def _lengths(
-    problem: ChartProblem, phi: Float[np.ndarray, "C p"], ends: Ends
-) -> Float[np.ndarray, "C"]:
-    arrays = (torch.from_numpy(values) for values in (phi, ends.z_start, ends.z_goal))
-    with torch.no_grad():
-        curves = Curves(problem.curve, *arrays)
-        return estimate_length(problem.manifold, curves, LENGTH_TOLERANCE).length.numpy()
 
 
 def _periods(manifold: Manifold) -> Float[np.ndarray, "N"]:

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.numpy import load_file
+from safetensors.torch import save_file
 from torch import Tensor
 
 from constraint_geodesics.geometry.manifold import pullback_metric
@@ -128,13 +129,9 @@ class LearnedManifold:
                 raise ManifoldFileError(
                     f"{folder / WEIGHTS}: altered since it was written (its checksum differs)"
                 )
-            vae = JointVae(
-                card["dof"], card["latent_dim"], card["hidden"], card["variance_centres"]
-            )
-            vae.load_state_dict(load_file(folder / WEIGHTS))
+            return cls.from_arrays(load_file(folder / WEIGHTS))
         except (OSError, KeyError, json.JSONDecodeError, SafetensorError, RuntimeError) as error:
             raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None
-        return cls(vae.eval().requires_grad_(False))
 
 
 PRECISION = 1e12

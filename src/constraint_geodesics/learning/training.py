@@ -53,27 +53,19 @@ class TrainingRun:
 
 
 class _Phase(lightning.LightningModule):
-    """One phase of the training: its name, and its epochs at most."""
-
-    def __init__(self, vae: JointVae, params: ManifoldParams) -> None:
-        super().__init__()
-        self.vae, self.params = vae, params
+    """One phase of the training, of so many epochs at most."""
 
     name: str
 
-    @property
-    def epochs(self) -> int:
-        raise NotImplementedError
+    def __init__(self, vae: JointVae, params: ManifoldParams, epochs: int) -> None:
+        super().__init__()
+        self.vae, self.params, self.epochs = vae, params, epochs
 
 
 class _MeanPhase(_Phase):
     """Encoder and decoder mean."""
 
     name = "mean"
-
-    @property
-    def epochs(self) -> int:
-        return self.params.epochs
 
     def training_step(self, batch: list[Tensor]) -> Tensor:
         (q,) = batch
@@ -96,7 +88,7 @@ class _MeanPhase(_Phase):
             self.params.learning_rate,
         )
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-            optimiser, self.params.epochs, 0.01 * self.params.learning_rate
+            optimiser, self.epochs, 0.01 * self.params.learning_rate
         )
         return {"optimizer": optimiser, "lr_scheduler": schedule}
 
@@ -105,10 +97,6 @@ class _VariancePhase(_Phase):
     """Precision network, everything else frozen."""
 
     name = "variance"
-
-    @property
-    def epochs(self) -> int:
-        return self.params.variance_epochs
 
     def training_step(self, batch: list[Tensor]) -> Tensor:
         loss = variance_loss(self.vae, batch[0])
@@ -153,11 +141,12 @@ def train_manifold(
     vae = JointVae(robot.dof, params.latent_dim, params.hidden, params.variance_centres)
     vae.centre.copy_(torch.as_tensor(0.5 * (robot.lower + robot.upper)))
     vae.scale.copy_(torch.as_tensor(0.5 * (robot.upper - robot.lower)))
-    history = _fit(_MeanPhase(vae, params), rows, held_out, run, 0)
+    history = _fit(_MeanPhase(vae, params, params.epochs), rows, held_out, run, 0)
     _place_variance(vae, rows, params)
     vae.encoder.requires_grad_(False)
     vae.decoder.requires_grad_(False)
-    history += _fit(_VariancePhase(vae, params), rows, held_out, run, len(history))
+    variance = _VariancePhase(vae, params, params.variance_epochs)
+    history += _fit(variance, rows, held_out, run, len(history))
     manifold = LearnedManifold(vae.eval().requires_grad_(False))
     return TrainedManifold(manifold, held_out_figures(manifold, robot, held_out.numpy()), history)
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from pydantic import Field
 from scipy.spatial import KDTree
@@ -20,7 +19,7 @@ from scipy.spatial import KDTree
 from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.fields import Count, Name
-from constraint_geodesics.geodesics.graph_search import KNIGHT
+from constraint_geodesics.geodesics.graph_search import fitted, neighbours_on_grid
 from constraint_geodesics.geodesics.problem import Ends, LearnedProblem
 from constraint_geodesics.geometry.curves import PinnedSpline
 from constraint_geodesics.geometry.errors import GeometryError
@@ -168,7 +167,8 @@ class GridSearch:
             corners = self._way(ends, open_nodes, costs)
             if corners is None:
                 return None, searched, why
-            phi = fitted(learned, corners)
+            sides = straight_lengths(self.chart, corners[:-1], corners[1:])
+            phi = fitted(learned.curve, corners, sides)
             rows = self._rows(problem, learned, phi, ends)
             if not isinstance(rows, str):
                 return rows, searched, ""
@@ -238,31 +238,6 @@ class GridSearch:
             wrong = np.array([not problem.is_free(q) for q in joints[0]])
         places = np.flatnonzero(wrong[1:-1]) + 1
         return z[0, places[0] if len(places) else LOOKED_AT // 2]
-
-
-def neighbours_on_grid(shape: tuple[int, int]) -> Int[np.ndarray, "m 2"]:
-    """Every node of a grid, numbered row by row, and those of the 16 around it that come after
-    it.
-    """
-    numbers = np.arange(shape[0] * shape[1]).reshape(shape)
-    pairs = []
-    for down, right in KNIGHT:
-        near = numbers[: shape[0] - down, max(0, -right) : shape[1] - max(0, right)]
-        far = numbers[down:, max(0, right) : shape[1] + min(0, right)]
-        pairs.append(np.stack([near.ravel(), far.ravel()], axis=-1))
-    return np.sort(np.concatenate(pairs), axis=1)
-
-
-def fitted(learned: LearnedProblem, corners: Float[np.ndarray, "k N"]) -> Float[np.ndarray, "p"]:
-    """Coefficients of the curve nearest to a polygon that is run through at the manifold's constant
-    speed.
-    """
-    passed = np.concatenate(
-        [[0.0], np.cumsum(straight_lengths(learned.chart, corners[:-1], corners[1:]))]
-    )
-    t = np.linspace(0.0, 1.0, LOOKED_AT)
-    points = np.stack([np.interp(t * passed[-1], passed, column) for column in corners.T], axis=-1)
-    return learned.curve.fit(torch.from_numpy(points), torch.from_numpy(t)).numpy()
 
 
 def _links(

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from constraint_geodesics.benchmark.judge import Free, judge_limits, measure_path
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.geodesics.episodes import begin, episode_settings
+from constraint_geodesics.geodesics.episodes import begin
 from constraint_geodesics.geodesics.policy_search import (
     PolicySolver,
     TrainedPolicy,
@@ -380,16 +380,16 @@ def run_analytic(task: AnalyticTask) -> AnalyticResult:
         policy = train_policy(problem, task.params, task.seed, task.scratch, run.log)
     ends, exact = unseen_pairs(task.name, problem)
     rng = np.random.default_rng(PAIRS_SEED + 1)
-    settings, size = episode_settings(task.params), problem.curve.coefficients
+    params, size = task.params, problem.curve.coefficients
     first = begin(problem, ends, problem.sample_curves(ends, rng))
-    still = np.zeros((settings.steps, PAIRS, size))
-    visited = follow(problem, policy.actor, settings, first, still)
+    still = np.zeros((params.episode_steps, PAIRS, size))
+    visited = follow(problem, policy.actor, params, first, still)
     lengths = np.array([states.length for states in visited])
     best = visited[int(lengths[:, 0].argmin())].phi[:1]
     pair = repeated(ends, DRAWN_ROLLOUTS)
     first = begin(problem, pair, problem.sample_curves(pair, rng))
-    noise = rng.normal(size=(settings.steps, DRAWN_ROLLOUTS, size))
-    met = follow(problem, policy.actor, settings, first, noise)
+    noise = rng.normal(size=(params.episode_steps, DRAWN_ROLLOUTS, size))
+    met = follow(problem, policy.actor, params, first, noise)
     sampled = np.concatenate([_points(problem, states.phi, ends) for states in met])
     ratios = lengths[0] / exact, lengths.min(axis=0) / exact
     return AnalyticResult(task.seed, policy, *ratios, sampled, _points(problem, best, ends)[0])

@@ -18,7 +18,6 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from constraint_geodesics.geodesics.environment import CurveEnv, CurveVecEnv, scalar_environments
-from constraint_geodesics.geodesics.episodes import episode_settings
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.graph_search import CombinedSolver, GraphSolver
 from constraint_geodesics.geodesics.policy_search import Actor, PolicySolver, ppo_model
@@ -207,11 +206,11 @@ class GeometryBenchmark:
 
     def environment(self, problem: GeodesicProblem) -> dict[str, float]:
         """Environment steps a second with PPO's learning: in one batch, and one by one."""
-        params, settings = self.geodesics, episode_settings(self.geodesics)
+        params = self.geodesics
         count, rollout = params.environments, params.environments * params.ppo.rollout_steps
-        batched = ppo_model(CurveVecEnv(problem, settings, count, seed=0), params, seed=0)
+        batched = ppo_model(CurveVecEnv(problem, params, count, seed=0), params, seed=0)
         scalar = ppo_model(
-            scalar_environments(lambda: CurveEnv(problem, settings), count), params, seed=0
+            scalar_environments(lambda: CurveEnv(problem, params), count), params, seed=0
         )
         learn = {
             # going on where the last round stopped: a reset would cost the scalar side one more

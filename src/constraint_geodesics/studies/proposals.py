@@ -18,7 +18,6 @@ from jaxtyping import Bool, Float, Int
 
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction
-from constraint_geodesics.geodesics.episodes import EpisodeSettings, episode_settings
 from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, Phi, repeated
 from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
 from constraint_geodesics.geometry.curves import PinnedPolynomial
@@ -98,7 +97,7 @@ class Compared:
 
     policies: Sequence[MeanPolicy]
     separate: Sequence[MeanPolicy] | None
-    settings: EpisodeSettings
+    settings: GeodesicParams
     seed: int = 0
     random_curves: int | None = None
 
@@ -297,8 +296,8 @@ class _Method:
 
 
 def _methods(problem: LearnedProblem, compared: Compared) -> list[_Method]:
-    steps, policies, separate = compared.settings.steps, compared.policies, compared.separate
-    drawn = compared.random_curves
+    steps, drawn = compared.settings.episode_steps, compared.random_curves
+    policies, separate = compared.policies, compared.separate
     drawn = len(policies) * steps + 1 if drawn is None else drawn
     asked: list[tuple[str, int, Sequence[MeanPolicy]]] = [
         (ONE_SEED, k, [policy]) for k, policy in enumerate(policies)
@@ -534,14 +533,13 @@ def run_policies(task: PolicyTask) -> pd.DataFrame:
         separate = [MeanPolicy.load(task.separate, seed) for seed in task.settings.seeds]
     joint_space = JointManifold.of(task.scene.robot.sample(PAST_ROWS, np.random.default_rng(0)))
     settings, tables = task.settings, {}
-    episodes = episode_settings(settings)
     for name, chart in ((LEARNED, task.chart), (JOINTS, joint_space)):
         curve = PinnedPolynomial(chart.dim, settings.degree)
         space = chart, task.manifold, curve, past
         problem = LearnedProblem(*space, settings.length_degree, True, 0.0)
         policies = (shared, separate) if chart is task.chart else ([], None)
-        drawn = len(shared) * episodes.steps + 1
-        compared = Compared(*policies, episodes, task.seed, drawn)
+        drawn = len(shared) * settings.episode_steps + 1
+        compared = Compared(*policies, settings, task.seed, drawn)
         tables[name] = policy_rows(problem, problem.ends(queries.starts, queries.goals), compared)
     return spaces_together(tables)
 
