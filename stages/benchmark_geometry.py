@@ -13,7 +13,7 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import robot_from
-from constraint_geodesics.studies.geodesic_search import geodesic_problem, write_table
+from constraint_geodesics.studies.geodesic_search import geodesic_problem, write_rows
 from constraint_geodesics.studies.geometry import GeometryBenchmark, policy_search_figures
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
@@ -45,7 +45,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
             name: json.loads(layout.report("train_analytic", name).read_text()) for name in names
         }
         figures["policy_search"] = policy_search_figures(trained)
-        write_table(benchmark.quadrature_rows(), layout.report(STAGE, "quadrature", "csv"))
+        write_rows(benchmark.quadrature_rows(), layout.report(STAGE, "quadrature", "csv"))
         run.report(
             {"manifold": manifold, "constraint": constraint, **figures},
             layout.root / "reports/geometry.json",

@@ -12,7 +12,7 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.studies.cup import CupSettings
+from constraint_geodesics.studies.cup import CupSettings, execution_name
 from constraint_geodesics.studies.execution import (
     Carrying,
     execute_queries,
@@ -47,7 +47,7 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
             table, executed = execute_queries(plan, carrying, found.queries)
         files = []
         for one in executed:
-            name = f"query{one.query}-{one.kind.replace(' ', '-')}"
+            name = execution_name(one.query, one.kind)
             recorded = one.execution is not None and one.query < settings.recorded
             if one.execution is not None and recorded:
                 save_execution(layout.executions(constraint) / f"{name}.npz", one.execution)

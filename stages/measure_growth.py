@@ -18,7 +18,7 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.planner import Planner
-from constraint_geodesics.report.figures import save_png
+from constraint_geodesics.recording.png import save_png
 from constraint_geodesics.report.growth_figure import growth_figure, slopes_markdown
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
 from constraint_geodesics.scene.scene import Scene

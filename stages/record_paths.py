@@ -14,7 +14,7 @@ from constraint_geodesics.pipeline.stage import run_stage
 
 
 @dataclass(frozen=True)
-class Table:
+class Recordable:
     """A stage's table of one constraint; an empty manifold: the paths were sampled."""
 
     params: Params
@@ -28,13 +28,13 @@ def main(params: Params, layout: Layout) -> None:
     searched, shown = params.geodesics, params.geodesics.illustrated_constraints
     pairs = [(m, c) for m in searched.searched for c in params.constraints]
     pairs += [(m, c) for m in searched.illustrated for c in shown]
-    tables = [Table(params, layout, constraint, manifold) for manifold, constraint in pairs]
-    tables += [Table(params, layout, constraint) for constraint in params.constraints]
+    tables = [Recordable(params, layout, constraint, manifold) for manifold, constraint in pairs]
+    tables += [Recordable(params, layout, constraint) for constraint in params.constraints]
     record_executed(params, layout, params.studies.constraint)
     parallel_map(record_table, tables, params.compute, description="record")
 
 
-def record_table(table: Table) -> None:
+def record_table(table: Recordable) -> None:
     """Record the paths that one table names."""
     from constraint_geodesics.constraints.constraint import constraint_manifold
     from constraint_geodesics.learning.learned_manifold import LearnedManifold
@@ -59,28 +59,24 @@ def record_table(table: Table) -> None:
         LearnedManifold.load(layout.manifold(manifold)),
         load_submanifold(layout.submanifold(manifold, constraint)),
         params.recording.frames,
+        params.judge.violation_tolerance,
     )
     recorder.record(rows, read_paths(rows, folder))
 
 
 def record_executed(params: Params, layout: Layout, constraint: str) -> None:
     """Record what became of executed paths."""
-    from constraint_geodesics.recording.execution_recording import (
-        ExecutionRecord,
-        record_executions,
-    )
+    from constraint_geodesics.recording.execution_recording import ExecutionRecord, record_execution
     from constraint_geodesics.scene.scene import Scene
     from constraint_geodesics.studies.cup import CupSettings
     from constraint_geodesics.studies.execution import load_execution
 
     cup, scene = CupSettings(spheres=params.execution.spheres), Scene.from_params(params)
-    records = []
     for row in named_rows(layout.report("execute_paths", constraint, "csv")):
-        kept = layout.executions(constraint) / f"{Path(row['recording']).stem}.npz"
-        execution = load_execution(kept)
-        records.append(ExecutionRecord(row["kind"], constraint, row["query"], execution, cup))
-    folder = layout.recordings("execute_paths", constraint)
-    record_executions(folder, records, scene.robot, scene.workcell)
+        file = Path(row["recording"])
+        execution = load_execution(layout.executions(constraint) / f"{file.stem}.npz")
+        record = ExecutionRecord(row["kind"], constraint, row["query"], execution, cup)
+        record_execution(file, record, scene.robot, scene.workcell, meshes=False)
 
 
 def named_rows(file: Path) -> list[dict[str, Any]]:

@@ -10,7 +10,8 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.peers.registry import all_settings
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
-from constraint_geodesics.report.benchmark_tables import repeated_markdown
+from constraint_geodesics.report.benchmark_tables import repeated_cells
+from constraint_geodesics.report.cells import markdown_table
 
 STAGE = "repeat_benchmark"
 SEEDS = 2
@@ -35,7 +36,7 @@ def main(params: Params, layout: Layout) -> None:
     compared = compared.sort_values("planner", key=lambda names: names.map(order))
     folder.mkdir(parents=True, exist_ok=True)
     compared.to_csv(folder / "repeat.csv", index=False, float_format="%.6g")
-    (folder / "repeat.md").write_text(repeated_markdown(compared))
+    (folder / "repeat.md").write_text(f"{markdown_table(repeated_cells(compared))}\n")
 
 
 if __name__ == "__main__":

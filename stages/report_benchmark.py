@@ -21,9 +21,10 @@ from constraint_geodesics.peers.planner import PlannerSettings
 from constraint_geodesics.peers.registry import all_settings, colours
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.recording.png import save_png
 from constraint_geodesics.report import benchmark_figures as figures
 from constraint_geodesics.report import benchmark_tables as tables
-from constraint_geodesics.report.figures import save_png
+from constraint_geodesics.report.cells import markdown_table
 
 BUDGETS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 20.0)
 """Time budgets at which the planner is held against its baselines [s]."""
@@ -82,9 +83,13 @@ def write_tables(
         ("summary", summary, tables.benchmark_markdown(summary)),
         ("overview", overview, tables.overview_markdown(overview, in_python)),
         ("drawn", None, tables.overview_markdown(shown, in_python)),
-        ("table_i", None, tables.table_i_markdown(case)),
+        (
+            "table_i",
+            None,
+            f"{markdown_table(tables.table_i_cells(case))}\n\n{tables.TABLE_I_NOTE}\n",
+        ),
         ("budgets", ahead, tables.ahead_markdown(ahead)),
-        ("break_even", costs, tables.break_even_markdown(costs)),
+        ("break_even", costs, f"{markdown_table(tables.break_even_cells(costs))}\n"),
     ):
         (folder / f"{name}.md").write_text(text)
         if table is not None:

@@ -15,7 +15,7 @@ from constraint_geodesics.studies.geodesic_search import (
     AnalyticTask,
     curve_family,
     run_analytic,
-    write_table,
+    write_rows,
 )
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
@@ -56,7 +56,7 @@ def main(params: Params, layout: Layout, analytic: str) -> None:
         learning = [
             {"seed": result.seed, **row} for result in results for row in result.policy.curve
         ]
-        write_table(learning, layout.report(STAGE, f"{analytic}-learning", "csv"))
+        write_rows(learning, layout.report(STAGE, f"{analytic}-learning", "csv"))
         figures = {name: [result.figures()[name] for result in results] for name in first.figures()}
         means = {
             f"{name}_mean": float(np.mean(values)) for name, values in figures.items()

@@ -24,7 +24,7 @@ from constraint_geodesics.studies.geodesic_search import (
     run_seed,
     save_seeds,
     straight_rows,
-    write_table,
+    write_rows,
 )
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
@@ -85,7 +85,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         folder = layout.recordings(STAGE, item)
         rows = named_recordings(rows, paths, folder, params.recording.queries)
         run.recordings(rows, shown=PLANNER)
-        write_table(
+        write_rows(
             rows, layout.report(STAGE, item, "csv"), manifold=manifold, constraint=constraint
         )
         run.report(geodesic_figures(results, connected), layout.report(STAGE, item))

@@ -16,7 +16,7 @@ from constraint_geodesics.studies.geodesic_search import (
     TrainingTask,
     shared_problem,
     train_seed,
-    write_table,
+    write_rows,
 )
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
@@ -61,7 +61,7 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
         ]
         for task, policy in zip(tasks, policies, strict=True):
             save_policy(policy, layout.policies(manifold), task.seed)
-        write_table(learning, layout.report(STAGE, f"{manifold}-learning", "csv"))
+        write_rows(learning, layout.report(STAGE, f"{manifold}-learning", "csv"))
         figures = [{"final_saving": policy.curve[-1]["saving"]} for policy in policies]
         run.summarise(figures, [policy.curve for policy in policies])
         run.report(

@@ -14,7 +14,6 @@ from constraint_geodesics.params import load_params
 from constraint_geodesics.peers.registry import all_settings, colours
 from constraint_geodesics.report.benchmark_figures import DASHES, styles_of
 from constraint_geodesics.report.figures import PLANNERS
-from constraint_geodesics.report.growth_figure import FAMILIES as GROWING
 from constraint_geodesics.report.study_report import METHODS
 
 PARAMS = load_params(Path(__file__).parents[1] / "params.yaml")
@@ -57,8 +56,6 @@ def test_every_planner_is_in_a_family(planner):
 def test_figures_take_their_colours_from_the_palette():
     for name, style in PLANNERS.items():
         assert style.colour == planner_colour(name) == planner_colour(style.label)
-    for begin, colour in GROWING:
-        assert colour == planner_colour(begin)
     for name, colour in COLOURS.items():
         assert colour == planner_colour(name), "as its recordings have it"
 

@@ -3,11 +3,10 @@
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
+from tests.recording.files import column, columns, same_recordings, timelines
 
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.constraints.projection import retract
@@ -17,17 +16,11 @@ from constraint_geodesics.recording.execution_recording import (
     ExecutionRecord,
     in_cup,
     record_execution,
-    record_executions,
     tilt,
 )
-from constraint_geodesics.recording.recording import (
-    About,
-    RecordingError,
-    read_recording,
-    same_recordings,
-)
+from constraint_geodesics.recording.recording import About, read_recording
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.studies.cup import CupSettings, execute
+from constraint_geodesics.studies.cup import CupSettings, execute, execution_name
 
 CUP = CupSettings(spheres=4, settle_s=0.2)
 AXIS = np.array([0.0, 1.0, 0.0])
@@ -49,18 +42,6 @@ def file(record: ExecutionRecord, scene: Scene, tmp_path_factory: pytest.TempPat
     file = tmp_path_factory.mktemp("recordings") / "folder" / "execution.rrd"
     record_execution(file, record, scene.robot, scene.workcell)
     return file
-
-
-def column(file: Path, entity: str, component: str) -> tuple[list[Any], list[Any] | None]:
-    """Rows of one component of one entity, and its times [s], straight from the file."""
-    for chunk in RrdReader(file).stream():
-        batch = chunk.to_record_batch()
-        if chunk.entity_path == entity and component in batch.schema.names:
-            times = None
-            if not chunk.is_static:
-                times = [value.total_seconds() for value in batch.column("time").to_pylist()]
-            return batch.column(component).to_pylist(), times
-    raise AssertionError(f"{entity} has no {component}")
 
 
 def test_recording_reads_back_as_the_execution(
@@ -92,7 +73,7 @@ def test_recording_reads_back_as_the_execution(
 def test_everything_moves_over_the_seconds_of_the_execution(
     file: Path, record: ExecutionRecord
 ) -> None:
-    assert {name for chunk in RrdReader(file).stream() for name in chunk.timeline_names} == {"time"}
+    assert timelines(file) == {"time"}
     for entity, component in (
         ("/transforms/joint6", "Transform3D:quaternion"),
         ("/spheres", "Points3D:positions"),
@@ -101,36 +82,38 @@ def test_everything_moves_over_the_seconds_of_the_execution(
         ("/cup_spheres", "Scalars:scalars"),
         ("/joints", "Scalars:scalars"),
     ):
-        _, times = column(file, entity, component)
-        assert times == pytest.approx(record.execution.times.tolist(), abs=1e-6)
+        times = columns(file, entity, component).column("time").to_pylist()
+        assert [time.total_seconds() for time in times] == pytest.approx(
+            record.execution.times.tolist(), abs=1e-6
+        )
 
 
 def test_spheres_and_cup_are_where_the_simulation_had_them(
     file: Path, record: ExecutionRecord
 ) -> None:
     execution = record.execution
-    positions = np.array(column(file, "/spheres", "Points3D:positions")[0])
+    positions = np.array(column(file, "/spheres", "Points3D:positions"))
     np.testing.assert_allclose(positions, execution.sphere_positions, atol=1e-6)
-    assert len(set(column(file, "/spheres", "Points3D:colors")[0][0])) == CUP.spheres
-    assert column(file, "/spheres", "Points3D:radii")[0][0] == pytest.approx([CUP.sphere_radius_m])
-    centres = np.array(column(file, "/cup", "Transform3D:translation")[0])[:, 0]
+    assert len(set(column(file, "/spheres", "Points3D:colors")[0])) == CUP.spheres
+    assert column(file, "/spheres", "Points3D:radii")[0] == pytest.approx([CUP.sphere_radius_m])
+    centres = np.array(column(file, "/cup", "Transform3D:translation"))[:, 0]
     np.testing.assert_allclose(centres, execution.cup_pose[:, :3], atol=1e-6)
-    quaternions = np.array(column(file, "/cup/wall", "Transform3D:quaternion")[0])[:, 0]
+    quaternions = np.array(column(file, "/cup/wall", "Transform3D:quaternion"))[:, 0]
     np.testing.assert_allclose(quaternions, execution.cup_pose[:, 3:], atol=1e-6)
-    assert column(file, "/cup/wall", "Cylinders3D:lengths")[0][0] == pytest.approx([CUP.height_m])
-    assert column(file, "/cup/wall", "Cylinders3D:radii")[0][0] == pytest.approx([0.035])
+    assert column(file, "/cup/wall", "Cylinders3D:lengths")[0] == pytest.approx([CUP.height_m])
+    assert column(file, "/cup/wall", "Cylinders3D:radii")[0] == pytest.approx([0.035])
 
 
 def test_the_series_say_what_the_execution_found(file: Path, record: ExecutionRecord) -> None:
     execution = record.execution
-    counted = np.array(column(file, "/cup_spheres", "Scalars:scalars")[0])[:, 0]
+    counted = np.array(column(file, "/cup_spheres", "Scalars:scalars"))[:, 0]
     np.testing.assert_array_equal(counted, in_cup(execution, CUP))
     assert (counted[0], counted[-1]) == (4, 0) == (execution.spheres, execution.kept)
-    tilts = np.array(column(file, "/cup_tilt", "Scalars:scalars")[0])[:, 0]
+    tilts = np.array(column(file, "/cup_tilt", "Scalars:scalars"))[:, 0]
     np.testing.assert_allclose(tilts, np.degrees(tilt(execution)))
     assert tilts[0] < 0.1
     assert tilts.max() == pytest.approx(np.degrees(execution.largest_tilt_rad), abs=0.5)
-    (text,), _ = column(file, "/status", "TextDocument:text")
+    (text,) = column(file, "/status", "TextDocument:text")
     assert "0 of 4 spheres stayed in the cup" in text[0]
     assert "**straight joint line**, constraint `level_cup`, query 2" in text[0]
 
@@ -145,28 +128,14 @@ def test_equal_executions_give_equal_recordings(
     assert not same_recordings(file, other)
 
 
-def test_each_record_gets_a_file_of_its_name(
+def test_without_meshes_a_recording_is_small(
     record: ExecutionRecord, scene: Scene, tmp_path: Path
 ) -> None:
-    files = record_executions(tmp_path / "new", [None, record], scene.robot, scene.workcell)
-    assert files == ["", (tmp_path / "new" / "query2-straight-joint-line.rrd").as_posix()]
-    assert [path.as_posix() for path in (tmp_path / "new").iterdir()] == files[1:]
-    assert read_recording(Path(files[1])).meshes == 0
-    assert Path(files[1]).stat().st_size < 0.3e6
+    file = tmp_path / "new" / "execution.rrd"
+    record_execution(file, record, scene.robot, scene.workcell, meshes=False)
+    assert read_recording(file).meshes == 0
+    assert file.stat().st_size < 0.3e6
 
 
-def test_what_does_not_fit_together_is_refused(
-    record: ExecutionRecord, scene: Scene, kuka_scene: Scene, tmp_path: Path
-) -> None:
-    frames = len(record.execution.times)
-    for wrong, robot, message in (
-        (record, kuka_scene.robot, rf"joints of shape \({frames}, 6\): must be \({frames}, 7\)"),
-        (
-            replace(record, cup=CupSettings(spheres=5)),
-            scene.robot,
-            rf"query2-.*: sphere_positions of shape \({frames}, 4, 3\): must be \({frames}, 5, 3\)",
-        ),
-    ):
-        with pytest.raises(RecordingError, match=message):
-            record_execution(tmp_path / "execution.rrd", wrong, robot, scene.workcell)
-    assert not (tmp_path / "execution.rrd").exists()
+def test_files_are_named_by_query_and_kind() -> None:
+    assert execution_name(2, "straight joint line") == "query2-straight-joint-line"

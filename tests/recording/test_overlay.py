@@ -4,13 +4,13 @@ read from the file.
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
+from tests.recording.files import CHANGE, HELD_AT, START, TABLE, TRAY, batches, column
 
-from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.palette import planner_colour
 from constraint_geodesics.recording.overlay import (
@@ -32,27 +32,16 @@ from constraint_geodesics.recording.recording import (
 )
 from constraint_geodesics.recording.viewer import prepared, save_recordings
 from constraint_geodesics.robot.kinematics import load_robot
-from constraint_geodesics.scene.body import Body
-from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.scene.urdf import data_path
 
 FRAMES = 10
-TABLE = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1))
-TRAY = Body("tray", data_path() / "tray" / "traybox.urdf", (0.6, 0.3, 0.1), (0.1, -0.2, 0.5))
 BALL = Sphere("keep_out", (0.3, 0.3, 0.6), 0.1)
 PIPE = Capsule("pipe", (-0.4, 0.2, 0.5), (-0.4, 0.5, 0.8), 0.05)
-LEVEL = Constraint(
-    (0, 0, 0, 1, 1, 0),
-    (0, 0, 0, 0.1, 0.1, 0),
-    Pose.from_rpy((0.4, 0.0, 0.3), (np.pi / 2, 0.0, 0.0)),
-)
-START, CHANGES = (
-    np.array([0.3, -0.5, -1.0, 0.4, 0.5, 0.2]),
-    np.array([[0.8, 0.3, -0.2, 0.4, 0.2, 0.4], [0.8, -0.2, 0.1, 0, 0, 0]]),
-)
+LEVEL = Constraint((0, 0, 0, 1, 1, 0), (0, 0, 0, 0.1, 0.1, 0), HELD_AT)
+CHANGES = CHANGE, np.array([0.8, -0.2, 0.1, 0, 0, 0])
 VISUAL = ("link_base", *(f"link{k}" for k in range(1, 7)))
 
 
@@ -105,18 +94,8 @@ def together(tmp_path: Path, *files: Path, apart: bool = False) -> Path:
     return file
 
 
-def column(file: Path, entity: str, component: str) -> list[Any]:
-    """Rows of one component of one entity, straight from the file."""
-    for chunk in RrdReader(file).stream():
-        batch = chunk.to_record_batch()
-        if chunk.entity_path == entity and component in batch.schema.names:
-            rows: list[Any] = batch.column(component).to_pylist()
-            return rows
-    raise AssertionError(f"{entity} has no {component}")
-
-
 def entities(file: Path) -> set[str]:
-    return {chunk.entity_path for chunk in RrdReader(file).stream()}
+    return {chunk.entity_path for chunk, _ in batches(file)}
 
 
 def test_two_planners_are_two_robots_in_their_colours(write: Writer, tmp_path: Path) -> None:
@@ -143,8 +122,7 @@ def test_frames_of_the_robots_are_apart_and_hang_together(write: Writer, tmp_pat
     )
     parents: dict[str, str] = {}
     drawn = set()
-    for chunk in RrdReader(file).stream():
-        batch = chunk.to_record_batch()
+    for _, batch in batches(file):
         if "Transform3D:child_frame" in batch.schema.names:
             child, parent = (
                 batch.column(f"Transform3D:{end}_frame")[0].as_py()[0]

@@ -11,7 +11,6 @@ from tests.report.pages import check_page
 
 from constraint_geodesics.benchmark.row import read_table
 from constraint_geodesics.palette import planner_colour
-from constraint_geodesics.params import load_params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.benchmark_page import write_benchmark_page
 from constraint_geodesics.report.benchmark_tables import ahead_markdown, verdict_cells
@@ -28,11 +27,6 @@ def layout(tmp_path_factory):
         shutil.copytree(ROOT / "reports" / name, root / "reports" / name)
     shutil.copy(ROOT / "reports" / "benchmark.csv", root / "reports")
     return Layout(root)
-
-
-@pytest.fixture(scope="module")
-def params():
-    return load_params(ROOT / "params.yaml")
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,10 @@ from constraint_geodesics.geometry.graph import components_on_grid
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import GraphSubmanifold, GridSubmanifold
 from constraint_geodesics.learning.vae import JointVae
+from constraint_geodesics.palette import GREY, LIGHT, ORANGE
+from constraint_geodesics.recording.png import save_png
 from constraint_geodesics.report import figures
-from constraint_geodesics.report.figures import LIGHT, PLANNERS, LatentCurves
+from constraint_geodesics.report.figures import PLANNERS, LatentCurves
 
 SCALES = (3.0, 0.5)
 
@@ -74,7 +76,7 @@ def learning(scale=1.0):
 
 def test_files_are_small_palettes_without_metadata_and_equal_for_equal_figures(tmp_path):
     for name in ("one", "two"):
-        figures.save_png(
+        save_png(
             figures.latent_metric(chart(), np.random.default_rng(1).normal(size=(500, 2)), 40),
             tmp_path / name,
         )
@@ -92,7 +94,7 @@ def test_the_sphere_has_one_component_and_the_torus_two(tmp_path):
     titles = [axes.get_title() for axes in figure.axes]
     assert "sphere, elevation = 30°: 1 component" in titles
     assert "torus, tube angle = ±30°: 2 components" in titles
-    figures.save_png(figure, tmp_path / "fig2.png")
+    save_png(figure, tmp_path / "fig2.png")
     with Image.open(tmp_path / "fig2.png") as image:
         drawn = np.asarray(image.convert("RGB")).astype(float)
     # both of the torus' circles can be seen from where it is looked at, in their colours
@@ -111,11 +113,11 @@ def test_the_plane_search_shows_samples_grey_and_the_learned_path_orange():
     axes = figures.plane_search(sampled, learned).axes[0]
     lines = {line.get_label(): line for line in axes.lines}
     np.testing.assert_array_equal(lines["learned path"].get_xydata(), learned)
-    assert lines["learned path"].get_color() == figures.ORANGE
+    assert lines["learned path"].get_color() == ORANGE
     np.testing.assert_array_equal(lines["exact geodesic"].get_xydata(), learned[[0, -1]])
     grey = next(c for c in axes.collections if c.get_label() == "sampled paths")
     assert len(grey.get_segments()) == 3
-    assert to_hex(grey.get_colors()[0]) == figures.GREY.lower()
+    assert to_hex(grey.get_colors()[0]) == GREY.lower()
 
 
 def test_metric_figures_of_a_known_metric():
@@ -188,7 +190,7 @@ def test_geodesics_run_from_start_to_goal():
     learned = np.stack([straight + k * t * (1 - t) for k in (1.0, -1.0)])
     axes = figures.geodesics_in_plane({"cup": (plane(), LatentCurves(learned, straight))}).axes[0]
     assert axes.get_title() == "cup: 2 geodesics found"
-    orange = [line for line in axes.lines if line.get_color() == figures.ORANGE]
+    orange = [line for line in axes.lines if line.get_color() == ORANGE]
     for line, curve in zip(orange, learned, strict=True):
         np.testing.assert_array_equal(line.get_xydata(), curve)
     none = figures.geodesics_in_plane({"cup": (plane(), LatentCurves(learned[:0], straight))}).axes[

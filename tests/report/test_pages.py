@@ -37,6 +37,7 @@ from constraint_geodesics.learning.vae import JointVae
 from constraint_geodesics.palette import planner_colour
 from constraint_geodesics.params import load_params
 from constraint_geodesics.pipeline.layout import Layout, in_checkout
+from constraint_geodesics.report.cells import plus_minus, short
 from constraint_geodesics.report.figures import PLANNERS
 from constraint_geodesics.report.page import Recorded
 from constraint_geodesics.report.pipeline_figures import latent_curves
@@ -46,11 +47,9 @@ from constraint_geodesics.report.results import (
     ReportError,
     compare_planners,
     findings,
-    plus_minus,
     read_paths,
     result_table,
     searched_items,
-    short,
 )
 from constraint_geodesics.scene.scene import Scene
 

@@ -1,11 +1,8 @@
 """Tables of the planner that users call: exact figures from rows that are known."""
 
-from pathlib import Path
-
 import pytest
 from tests.report.study_fixtures import write_study_reports
 
-from constraint_geodesics.params import load_params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.study_report import (
     execution_block,
@@ -16,11 +13,8 @@ from constraint_geodesics.report.study_report import (
 
 
 @pytest.fixture(scope="module")
-def reported(tmp_path_factory):
-    params, layout = (
-        load_params(Path(__file__).parents[2] / "params.yaml"),
-        Layout(tmp_path_factory.mktemp("run")),
-    )
+def reported(params, tmp_path_factory):
+    layout = Layout(tmp_path_factory.mktemp("run"))
     write_study_reports(params, layout)
     return params, layout
 

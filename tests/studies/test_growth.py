@@ -23,7 +23,7 @@ from constraint_geodesics.peers.ompl import SamplingPlanner
 from constraint_geodesics.peers.ompl_settings import OmplSettings
 from constraint_geodesics.peers.straight_band import StraightBand
 from constraint_geodesics.problem import PlanningProblem
-from constraint_geodesics.report.figures import save_png
+from constraint_geodesics.recording.png import save_png
 from constraint_geodesics.report.growth_figure import LABELS, growth_figure, slopes_markdown
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.sphere import Sphere
@@ -208,12 +208,6 @@ def test_progress_comes_to_its_end_and_not_further(measured):
 def test_axes_and_sizes_are_in_order(measured):
     for _, own in measured.groupby("axis"):
         assert own["value"].is_monotonic_increasing
-
-
-def test_fewer_configurations_than_rows_are_an_error(params, scene, kuka, tmp_path):
-    few = Subject(params, scene, kuka, {}, lambda *_: [], PEER, np.zeros((10, 6)), tmp_path)
-    with pytest.raises(ValueError, match="10 configurations: training on 1200 needs as many"):
-        measure_growth(few, SIZES, "")
 
 
 def test_a_planner_never_meets_the_same_problem_twice(params, scene, kuka, tmp_path):

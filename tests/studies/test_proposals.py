@@ -20,7 +20,6 @@ from constraint_geodesics.geodesics.episodes import observation_size
 from constraint_geodesics.geodesics.problem import LearnedProblem
 from constraint_geodesics.geodesics.proposals import MeanPolicy
 from constraint_geodesics.geometry.curves import PinnedPolynomial
-from constraint_geodesics.geometry.manifold import GeometryError
 from constraint_geodesics.learning.learned_manifold import JointManifold
 from constraint_geodesics.params import GeodesicParams
 from constraint_geodesics.studies import proposals as bench
@@ -267,14 +266,3 @@ def test_charts_side_by_side_have_one_optimum(measured_rows) -> None:
     assert {"descent, latent", "descent, joints"} <= set(both["method"])
     assert (both.groupby("query")["optimum_rad"].nunique(dropna=False) == 1).all()
     assert (both["optimum_rad"] <= both["length_rad"])[both["feasible"]].all()
-
-
-def test_misuse_is_refused(level, settings) -> None:
-    ends = level.sample_ends(2, np.random.default_rng(6))
-    compared = bench.Compared([], None, settings)
-    with pytest.raises(GeometryError, match="retract = False"):
-        bench.policy_rows(replace(level, retract=False), ends, compared)
-    with pytest.raises(GeometryError, match=r"starts has shape \(2, 12\): must be \(2, K, 12\)"):
-        bench.family_optimum(level, ends, np.zeros((2, 12)))
-    with pytest.raises(GeometryError, match="no query"):
-        bench.policy_rows(level, ends[:0], compared)

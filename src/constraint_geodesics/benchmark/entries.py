@@ -84,6 +84,7 @@ def committed_run(params: Params, layout: Layout, rows: Path, recordings: Path) 
         params.benchmark.recorded,
         first_queries(queries),
         params.recording.frames,
+        params.judge.violation_tolerance,
     )
     return Run(params, layout, queries, rows, params.geodesics.searched[:1], record)
 

@@ -30,7 +30,8 @@ class PathRecorder:
     """Records the first seed's path of the named planners and queries; picklable.
 
     root: the checkout, which the file names are relative to.  queries: constraint, scene and
-    number of each.  frames: of a recording.
+    number of each.  frames: of a recording.  tolerance: what the judge grants a violation
+    [rad or m].
     """
 
     root: Path
@@ -38,6 +39,7 @@ class PathRecorder:
     planners: tuple[str, ...]
     queries: frozenset[tuple[str, str, int]]
     frames: int
+    tolerance: float
 
     def __call__(self, answer: Answer) -> str:
         """The file, relative to the root if it lies there, or "" where the path is not recorded."""
@@ -48,7 +50,8 @@ class PathRecorder:
         plain = re.sub(r"[^a-z0-9]+", "_", planner.lower()).strip("_")
         name = f"{query.scene}-query{query.number}-{plain}.rrd"
         row = {"planner": planner, "query": query.number, "seed": answer.seed}
-        text = status_text({**asdict(answer.measures), **row}, query.constraint)
+        measured = {**asdict(answer.measures), **row}
+        text = status_text(measured, query.constraint, self.tolerance)
         record = PathRecord(
             planner,
             query.constraint,
@@ -57,6 +60,7 @@ class PathRecorder:
             answer.joints,
             f"{text}\n- scene `{query.scene}`",
             scene=query.scene,
+            tolerance=self.tolerance,
             meshes=False,
         )
         file = (self.folder / query.constraint / name).resolve()

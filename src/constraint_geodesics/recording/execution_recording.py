@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.palette import BLUE, SKY, VERMILION, planner_colour
 from constraint_geodesics.recording import recording
-from constraint_geodesics.recording.recording import About, Frames, RecordingError, moving, static
+from constraint_geodesics.recording.recording import About, Frames, moving, static
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.shape import Shape
-from constraint_geodesics.studies.cup import CupSettings, Execution
+from constraint_geodesics.studies.cup import CupSettings, Execution, execution_name, inside
 
 TIME = "time"
 """The timeline, in seconds from the start of the path."""
@@ -45,11 +45,6 @@ class ExecutionRecord:
     cup: CupSettings
     """What it was executed with."""
 
-    @property
-    def name(self) -> str:
-        """Of its file among those of one constraint."""
-        return f"query{self.query}-{self.kind.replace(' ', '-')}"
-
 
 def record_execution(
     file: Path,
@@ -62,10 +57,9 @@ def record_execution(
     """Write the recording of one execution, its blueprint inside.
 
     meshes: as for `record_path`.
-    Raises RecordingError if the execution is not one of this robot and cup, or a mesh that is to be
-    written is missing.
+    Raises RecordingError if a mesh that is to be written is missing.
     """
-    execution, cup = _checked(record, robot), record.cup
+    execution, cup = record.execution, record.cup
     time = rr.TimeColumn(TIME, duration=execution.times)
     frames = Frames(execution.joints, robot.forward(execution.joints)[0], None, time)
     chunks = [
@@ -81,59 +75,21 @@ def record_execution(
         *recording.text_chunks(_status(record)),
     ]
     name = f"{record.constraint}, query {record.query}: {record.kind}, executed"
-    own = f"{record.constraint}-{record.name}-executed-{recording.digest(frames)}"
-    recording.write_recording(file, own, name, chunks, _blueprint(frames, execution.spheres))
-
-
-def record_executions(
-    folder: Path,
-    records: Sequence[ExecutionRecord | None],
-    robot: SerialRobot,
-    workcell: Sequence[Shape],
-) -> list[str]:
-    """Record executions, one file each without meshes; returns the file of each, or "" where there
-    is None.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    files = []
-    for record in records:
-        file = "" if record is None else (folder / f"{record.name}.rrd").as_posix()
-        if record is not None:
-            record_execution(Path(file), record, robot, workcell, meshes=False)
-        files.append(file)
-    return files
+    own = f"{record.constraint}-{execution_name(record.query, record.kind)}-executed"
+    blueprint = _blueprint(frames, execution.spheres)
+    recording.write_recording(file, f"{own}-{recording.digest(frames)}", name, chunks, blueprint)
 
 
 def in_cup(execution: Execution, cup: CupSettings) -> Float[np.ndarray, "F"]:
     """How many spheres have their centre in the cup, below its rim, at each frame."""
-    from_centre = execution.sphere_positions - execution.cup_pose[:, None, :3]
-    local = np.einsum("fji,fsj->fsi", _cup_rotations(execution), from_centre)
-    within = np.hypot(local[..., 0], local[..., 1]) < cup.inner_radius_m + cup.wall_m
-    below = np.abs(local[..., 2]) < 0.5 * cup.height_m
-    return np.asarray((within & below).sum(axis=1), dtype=float)
+    frames = zip(execution.sphere_positions, execution.cup_pose, strict=True)
+    return np.array([inside(centres, pose, cup).sum() for centres, pose in frames], dtype=float)
 
 
 def tilt(execution: Execution) -> Float[np.ndarray, "F"]:
     """Angle of the cup's axis to the vertical [rad] at each frame."""
-    axis = _cup_rotations(execution)[:, :, 2]
+    axis = Rotation.from_quat(execution.cup_pose[:, 3:]).as_matrix()[:, :, 2]
     return np.asarray(np.arctan2(np.hypot(axis[:, 0], axis[:, 1]), axis[:, 2]))
-
-
-def _cup_rotations(execution: Execution) -> Float[np.ndarray, "F 3 3"]:
-    return np.asarray(Rotation.from_quat(execution.cup_pose[:, 3:]).as_matrix())
-
-
-def _checked(record: ExecutionRecord, robot: SerialRobot) -> Execution:
-    execution, name = record.execution, f"{record.constraint}-{record.name}"
-    frames, spheres = len(execution.times), record.cup.spheres
-    for what, values, shape in (
-        ("joints", execution.joints, (frames, robot.dof)),
-        ("sphere_positions", execution.sphere_positions, (frames, spheres, 3)),
-        ("cup_pose", execution.cup_pose, (frames, 7)),
-    ):
-        if values.shape != shape:
-            raise RecordingError(f"{name}: {what} of shape {values.shape}: must be {shape}")
-    return execution
 
 
 def _cup_chunks(execution: Execution, cup: CupSettings, time: rr.TimeColumn) -> Iterator[Chunk]:

@@ -10,11 +10,23 @@ from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from constraint_geodesics.palette import BLUE, GOAL, GREY, LIGHT, ORANGE, START, VERMILION
+from constraint_geodesics.palette import (
+    BLACK,
+    BLUE,
+    GOAL,
+    GREEN,
+    GREY,
+    LIGHT,
+    ORANGE,
+    PURPLE,
+    SKY,
+    START,
+    VERMILION,
+)
 
 SHOWN = 9
 """Configurations of the arm that are drawn."""
-_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#222222")
+_COLOURS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK)
 
 
 class DrawnPath(NamedTuple):

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.certification.certifier import Limits
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import GridSubmanifold, Submanifold
@@ -31,17 +30,19 @@ class RowRecorder:
     learned: LearnedManifold
     submanifold: Submanifold
     frames: int
+    tolerance: float
+    """What the judge grants a violation [rad or m]."""
 
     def record(
         self, rows: Sequence[Mapping[str, Any]], paths: Sequence[Float[np.ndarray, "T D"]]
     ) -> None:
         """Record the path of each row in the file that its `recording` names."""
         for row, joints in zip(rows, paths, strict=True):
-            text, latent = status_text(row, self.constraint), self._latent_view(joints)
+            text = status_text(row, self.constraint, self.tolerance)
             key = row["planner"], self.constraint, row["query"], row["seed"]
-            path = PathRecord(*key, joints, text, latent, meshes=False)
+            latent, allowed = self._latent_view(joints), self.tolerance
+            path = PathRecord(*key, joints, text, latent, tolerance=allowed, meshes=False)
             file = Path(row["recording"])
-            file.parent.mkdir(parents=True, exist_ok=True)
             record_path(file, path, self.manifold, self.workcell, frames=self.frames)
 
     def _latent_view(self, joints: Float[np.ndarray, "T D"]) -> LatentView:
@@ -70,9 +71,8 @@ def principal_plane(
     return centre, axes * np.sign(axes[np.arange(len(axes)), largest])[:, None]
 
 
-def status_text(row: Mapping[str, Any], constraint: str) -> str:
-    """What a viewer reads of the path."""
-    allowed = Limits.violation_tolerance
+def status_text(row: Mapping[str, Any], constraint: str, allowed: float) -> str:
+    """What a viewer reads of the path.  allowed: the violation that the judge grants [rad or m]."""
     verdict = "valid" if row["valid"] else f"not valid: {row['reason']}"
     degrees = (f"{np.degrees(angle):.4f}°" for angle in (row["max_violation_rad"], allowed))
     lengths = (f"{1e3 * length:.4f} mm" for length in (row["max_violation_m"], allowed))

@@ -11,7 +11,6 @@ import hashlib
 import math
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -266,15 +265,6 @@ def about_of(recording_id: str, chunks: Sequence[Chunk]) -> About:
         executed = found["executed"] is not None
         return About(found["planner"], found["constraint"], "", query, seed, executed)
     return About()
-
-
-def same_recordings(a: Path, b: Path) -> bool:
-    """Whether two recordings hold the same data, in whatever order.
-
-    Raises RecordingError if a file is missing.
-    """
-    command = rerun_command("rrd", "compare", "--unordered", str(existing(a)), str(existing(b)))
-    return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
 def sample(path: PathRecord, manifold: ConstraintManifold, frames: int) -> Frames:

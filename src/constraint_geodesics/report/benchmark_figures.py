@@ -4,7 +4,8 @@ when training pays.
 Planners of one family share a colour; within it they differ by line style.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,31 +47,24 @@ def success_over_budget(rows: pd.DataFrame, styles: Styles) -> Figure:
     """Share of solvable queries with a valid path within a time budget; a panel for each constraint
     and scene.
     """
-    figure, grid = _cases(rows)
-    for axes, case in grid:
-        _draw_budget(axes, case, "success", styles)
-    return _finished(figure, grid, styles, ("time budget [s]", "solved of solvable"))
+    draw = partial(_draw_budget, column="success")
+    return _by_case(rows, styles, draw, ("time budget [s]", "solved of solvable"))
 
 
 def length_over_budget(rows: pd.DataFrame, styles: Styles) -> Figure:
     """95th percentile of length over best known within a time budget, failures counted as
     infinite.
     """
-    figure, grid = _cases(rows)
-    for axes, case in grid:
-        _draw_budget(axes, case, "ratio_p95", styles)
-        axes.set(ylim=(0.98, 3.0))
-    return _finished(figure, grid, styles, ("time budget [s]", "length / best known, p95"))
+    draw = partial(_draw_budget, column="ratio_p95", top=3.0)
+    return _by_case(rows, styles, draw, ("time budget [s]", "length / best known, p95"))
 
 
 def ratio_distributions(rows: pd.DataFrame, styles: Styles) -> Figure:
     """How large a share of the solvable rows has a path within some excess over the best known
     length.
     """
-    figure, grid = _cases(rows)
-    for axes, case in grid:
-        _draw_excess(axes, case, styles)
-    return _finished(figure, grid, styles, ("excess over best known", "share of solvable rows"))
+    labels = ("excess over best known", "share of solvable rows")
+    return _by_case(rows, styles, _draw_excess, labels)
 
 
 def overview(rows: pd.DataFrame, styles: Styles) -> Figure:
@@ -82,8 +76,8 @@ def overview(rows: pd.DataFrame, styles: Styles) -> Figure:
     panels = np.atleast_2d(figure.subplots(len(scenes), 3))
     for (success, length, excess), scene in zip(panels, scenes, strict=True):
         case = rows[rows["scene"] == scene]
-        _draw_budget(success, case, "success", styles)
-        _draw_budget(length, case, "ratio_p95", styles)
+        _draw_budget(success, case, styles, "success")
+        _draw_budget(length, case, styles, "ratio_p95")
         _draw_excess(excess, case, styles)
         success.set(ylabel=f"{scene}: solved of solvable", xlabel="time budget [s]")
         length.set(ylabel="length / best known, p95", xlabel="time budget [s]")
@@ -112,7 +106,9 @@ def break_even(costs: pd.DataFrame, styles: Styles) -> Figure:
     return figure
 
 
-def _draw_budget(axes: Axes, case: pd.DataFrame, column: str, styles: Styles) -> None:
+def _draw_budget(
+    axes: Axes, case: pd.DataFrame, styles: Styles, column: str, top: float = 2.5
+) -> None:
     table = over_budget(case[case["planner"].isin(list(styles))], BUDGETS.tolist())
     for planner, own in table.groupby("planner", sort=False):
         axes.plot(own["budget_s"], own[column], label=planner, **styles[str(planner)])
@@ -121,7 +117,7 @@ def _draw_budget(axes: Axes, case: pd.DataFrame, column: str, styles: Styles) ->
         axes.set(ylim=(0.0, 1.02))
         axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     else:
-        axes.set(ylim=(0.98, 2.5))
+        axes.set(ylim=(0.98, top))
 
 
 def _draw_excess(axes: Axes, case: pd.DataFrame, styles: Styles) -> None:
@@ -143,31 +139,28 @@ def _excess(rows: pd.DataFrame) -> Iterator[tuple[str, np.ndarray]]:
         yield str(planner), np.sort(own.to_numpy())
 
 
-def _cases(rows: pd.DataFrame) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
-    """A panel with the solvable rows of each constraint and scene, scenes side by side."""
+def _by_case(
+    rows: pd.DataFrame,
+    styles: Styles,
+    draw: Callable[[Axes, pd.DataFrame, Styles], None],
+    labels: tuple[str, str],
+) -> Figure:
+    """A panel with the solvable rows of each constraint and scene, scenes side by side; labels
+    below and at the left, and one legend.
+    """
     solvable = rows[rows["best_known_rad"].notna()]
     cases = list(solvable.groupby(["constraint", "scene"], sort=False))
     columns = 2 if rows["scene"].nunique() > 1 else 3
     lines = -(-len(cases) // columns)
-    figure, grid = Figure(figsize=(9.0, 1.6 + 2.0 * lines), layout="constrained"), []
+    figure = Figure(figsize=(9.0, 1.6 + 2.0 * lines), layout="constrained")
     for k, ((constraint, scene), case) in enumerate(cases):
         axes = figure.add_subplot(lines, columns, k + 1)
         axes.set_title(f"{constraint}, {scene}", fontsize=9)
         _plain(axes)
-        grid.append((axes, case))
-    return figure, grid
-
-
-def _finished(
-    figure: Figure,
-    grid: Sequence[tuple[Axes, pd.DataFrame]],
-    styles: Styles,
-    labels: tuple[str, str],
-) -> Figure:
-    """Labels below and at the left, and one legend."""
+        draw(axes, case, styles)
     figure.supxlabel(labels[0], fontsize=9)
     figure.supylabel(labels[1], fontsize=9)
-    _legend(figure, [axes for axes, _ in grid], styles)
+    _legend(figure, figure.axes, styles)
     return figure
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 import pandas as pd
 
 from constraint_geodesics.benchmark.queries import TABLE
@@ -14,7 +13,6 @@ from constraint_geodesics.pipeline.layout import Layout, in_checkout
 from constraint_geodesics.report.benchmark_tables import (
     PYTHON_NOTE,
     TABLE_I_NOTE,
-    Cells,
     ahead_cells,
     ahead_text,
     asks_in_python,
@@ -26,8 +24,9 @@ from constraint_geodesics.report.benchmark_tables import (
     table_i_cells,
     verdict_cells,
 )
+from constraint_geodesics.report.cells import Cells, fixed
 from constraint_geodesics.report.page import Links, Picture, Recorded, Section, Table, write_page
-from constraint_geodesics.report.results import ReportError, fixed
+from constraint_geodesics.report.results import ReportError
 
 Case = tuple[str, str, str]
 """Constraint, scene and planner."""
@@ -109,8 +108,7 @@ def _budget_section(layout: Layout, budgets: pd.DataFrame) -> Section:
     pictures = [_picture(layout, name) for name in ("success_over_budget", "length_over_budget")]
     note = "a case is a constraint in a scene; from reports/benchmark/budgets.csv"
     cases = Table("Cases by budget", note, *_parted(verdict_cells(budgets)))
-    header, rows = _parted(ahead_cells(budgets))
-    behind = Table("Baselines that are ahead", note, header, rows)
+    behind = Table("Baselines that are ahead", note, *_parted(ahead_cells(budgets)))
     return Section(
         "budgets", "Within a time budget", ahead_text(budgets), pictures, [cases], [behind]
     )
@@ -143,13 +141,7 @@ def _growth_section(layout: Layout) -> Section:
         "rows, on one thread."
     )
     note = "of seconds over size, in log-log; from reports/growth/slopes.csv"
-    block = Table(
-        "Exponents",
-        note,
-        GROWTH,
-        growth_cells(slopes),
-        planners=slopes["what"].astype(str).tolist(),
-    )
+    block = Table("Exponents", note, GROWTH, growth_cells(slopes), planners=list(slopes["what"]))
     return Section("growth", "How cost grows", told, [_picture(layout, "growth")], [block])
 
 
@@ -172,9 +164,8 @@ def _case_section(summary: pd.DataFrame, recorded: Mapping[Case, Sequence[Record
         note = f"{counted(case)}; from reports/benchmark/summary.csv"
         blocks.append(_of_planners(f"{constraint}, scene {scene}", note, case_cells(case), links))
     told = (
-        "Recorded paths stand below the table that they belong to. The benchmark makes no "
-        "MLflow runs: its rows are in "
-        "reports/benchmark.csv, and in data/benchmark.db for Planner Arena."
+        "Recorded paths stand below the table that they belong to. The benchmark makes no MLflow "
+        "runs: its rows are in reports/benchmark.csv, and in data/benchmark.db for Planner Arena."
     )
     return Section("cases", "Every constraint and scene", told, folded=blocks)
 
@@ -192,21 +183,16 @@ def benchmark_recordings(rows: pd.DataFrame) -> dict[Case, list[Recorded]]:
     return found
 
 
-def growth_cells(slopes: pd.DataFrame) -> list[Sequence[str]]:
+def growth_cells(slopes: pd.DataFrame) -> Cells:
     """Exponents of time over size, one row an axis and what grows."""
     return [
         (
             f"{row['what']}: {row['axis']}",
-            _two(row["slope"]),
-            _two(row["standard_error"]),
+            *(fixed(row[name]) for name in ("slope", "standard_error")),
             str(row["points"]),
         )
         for row in slopes.to_dict("records")
     ]
-
-
-def _two(value: float) -> str:
-    return f"{value:.2f}" if np.isfinite(value) else "–"
 
 
 def _overview_blocks(summary: pd.DataFrame, in_python: Sequence[str], which: str) -> list[Table]:
@@ -242,9 +228,9 @@ CAPTIONS: Mapping[str, tuple[str, str, str]] = {
     "overview": (
         "benchmark",
         "Success, length and spread, all constraints together",
-        "Left: share of the queries that any planner solved. Middle: 95th percentile of "
-        "length over best known, "
-        "failures infinite. Right: share of rows within some excess over the best known length.",
+        "Left: share of the queries that any planner solved. Middle: 95th percentile of length "
+        "over best known, failures infinite. Right: share of rows within some excess over the "
+        "best known length.",
     ),
     "success_over_budget": (
         "benchmark",
@@ -261,8 +247,8 @@ CAPTIONS: Mapping[str, tuple[str, str, str]] = {
     "ratio_distributions": (
         "benchmark",
         "Excess over the best known length",
-        "Share of the rows of solvable queries whose path is within some excess; failures "
-        "never are.",
+        "Share of the rows of solvable queries whose path is within some excess; failures never "
+        "are.",
     ),
     "break_even": (
         "benchmark",

@@ -2,7 +2,7 @@
 the same cells.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,14 @@ import pandas as pd
 
 from constraint_geodesics.benchmark.row import LATENT
 from constraint_geodesics.peers.baseline import BaselineSettings
-from constraint_geodesics.report.results import markdown_table
-
-Cells = list[Sequence[str]]
-"""A table's header and its rows."""
+from constraint_geodesics.report.cells import (
+    PUBLISHED,
+    Cells,
+    fixed,
+    markdown_table,
+    milliseconds,
+    share,
+)
 
 COLUMNS = (
     *("planner", "queries × seeds", "solved of solvable", "claimed, not valid"),
@@ -54,15 +58,6 @@ PYTHON_NOTE = (
     "constraint (OMPL's atlas and tangent bundle have no tangent space for a tolerance) it has no "
     "rows of it here."
 )
-PUBLISHED = {
-    "PRM": (499.42, 530.89, 24.43, 9.75),
-    "RRT* 10 s": (134.80, 155.28, 17.84, 5.21),
-    "BiRRT": (53.00, 84.65, 25.52, 2.903),
-    "planner": (70.56, 79.81, 7.64, 3.8),
-}
-"""Table I of the paper: shortest path, average, its ±, planning time [s]; its learned geodesic
-stands next to our planner.
-"""
 TABLE_I_NOTE = (
     "The paper's lengths have no unit and are of one query, on its own machine with a GPU; ours "
     "are latent lengths (eq. 2, on the `planner` manifold) of valid paths over all queries and "
@@ -100,12 +95,12 @@ def _case_row(row: Mapping[Any, Any]) -> tuple[str, ...]:
     if row["not_applicable"] == row["rows"]:
         return (str(row["planner"]), size, "not applicable", *("–",) * (len(COLUMNS) - 3))
     return (
-        *(str(row["planner"]), size, _share(row["success_of_solvable"])),
-        *(str(row["claimed_but_invalid"]), _fixed(row["ratio_median"], 4)),
+        *(str(row["planner"]), size, share(row["success_of_solvable"])),
+        *(str(row["claimed_but_invalid"]), fixed(row["ratio_median"], 4)),
         *(_p95(row, "ratio_p95"), _iqm(row, 4), _p95(row, "ratio_p95_all")),
-        *(_milli(row[f"time_{which}_s"]) for which in ("median", "p95")),
-        *(_milli(row[f"within_{share}_s"]) for share in (1, 5, 10)),
-        *(_share(row["beaten"]), _fixed(row["peak_memory_median_mb"], 1)),
+        *(milliseconds(row[f"time_{which}_s"]) for which in ("median", "p95")),
+        *(milliseconds(row[f"within_{within}_s"]) for within in (1, 5, 10)),
+        *(share(row["beaten"]), fixed(row["peak_memory_median_mb"], 1)),
     )
 
 
@@ -131,29 +126,24 @@ def overview_cells(case: pd.DataFrame, in_python: Collection[str] = ()) -> Cells
 
 
 def _overview_row(row: Mapping[Any, Any], in_python: Collection[str]) -> tuple[str, ...]:
-    low, high = _share(row["success_low"]), _share(row["success_high"])
+    low, high = share(row["success_low"]), share(row["success_high"])
     return (
         f"{row['planner']}{' †' if row['planner'] in in_python else ''}",
         f"{row['queries']} × {row['seeds']}",
-        f"{_share(row['success_of_solvable'])} [{low}, {high}]",
+        f"{share(row['success_of_solvable'])} [{low}, {high}]",
         *(str(row["claimed_but_invalid"]), _p95(row, "ratio_p95_all"), _iqm(row, 3)),
-        *(_fixed(row["reference_iqm"], 3), _milli(row["time_median_s"])),
-        *(_milli(row["time_p95_s"]), _share(row["beaten"])),
+        *(fixed(row["reference_iqm"], 3), milliseconds(row["time_median_s"])),
+        *(milliseconds(row["time_p95_s"]), share(row["beaten"])),
     )
 
 
-def table_i_markdown(rows: pd.DataFrame) -> str:
-    """The paper's Table I next to the same planners' rows of one constraint and scene."""
-    return f"{markdown_table(table_i_cells(rows))}\n\n{TABLE_I_NOTE}\n"
-
-
 def table_i_cells(rows: pd.DataFrame) -> Cells:
-    """The same, its header first."""
+    """The paper's Table I next to the same planners' rows of one constraint and scene."""
     valid, column = rows[rows["valid"]], f"{LATENT}planner"
     lengths = {name: valid[valid["planner"] == name][column] for name in PUBLISHED}
     planner = valid[valid["planner"] == "planner"]
     cells: Cells = [TABLE_I]
-    for name, (shortest, average, spread, seconds) in PUBLISHED.items():
+    for name, (shortest, average, spread, seconds, _) in PUBLISHED.items():
         own, found = rows[rows["planner"] == name], lengths[name]
         if own.empty:
             continue
@@ -161,10 +151,10 @@ def table_i_cells(rows: pd.DataFrame) -> Cells:
         row = (
             f"learned geodesic; here `{name}`" if name == "planner" else name,
             *(f"{shortest:.2f}", f"{average:.2f} ± {spread:.2f}"),
-            *(f"{average / PUBLISHED['planner'][1]:.2f}", f"{seconds:.2f}", _fixed(found.min(), 2)),
-            f"{_fixed(found.mean(), 2)} ± {_fixed(found.std(), 2)}",
-            *(_fixed(found.mean() / base, 2), f"{own['time_s'].mean():.3g}"),
-            *(_share(own["valid"].mean()), str(len(own))),
+            *(f"{average / PUBLISHED['planner'][1]:.2f}", f"{seconds:.2f}", fixed(found.min(), 2)),
+            f"{fixed(found.mean(), 2)} ± {fixed(found.std(), 2)}",
+            *(fixed(found.mean() / base, 2), f"{own['time_s'].mean():.3g}"),
+            *(share(own["valid"].mean()), str(len(own))),
         )
         cells.append(row)
     return cells
@@ -216,25 +206,22 @@ def ahead_cells(table: pd.DataFrame) -> Cells:
         (
             *(f"`{row['constraint']}`", str(row["scene"]), f"{row['budget_s']:g}"),
             f"{row['baseline']} ({row['queries']} queries)",
-            *(_fixed(row["baseline_ratio_p95"], 3), _fixed(row["ratio_p95"], 3)),
-            *(_share(row["baseline_success"]), _share(row["success"])),
+            *(fixed(row["baseline_ratio_p95"], 3), fixed(row["ratio_p95"], 3)),
+            *(share(row["baseline_success"]), share(row["success"])),
         )
         for row in table[table["verdict"] == "ahead"].to_dict("records")
     ]
     return [AHEAD, *rows]
 
 
-def repeated_markdown(table: pd.DataFrame) -> str:
-    """Two runs of the same rows, planner by planner."""
-    return f"{markdown_table(repeated_cells(table))}\n"
-
-
 def repeated_cells(table: pd.DataFrame) -> Cells:
-    """The same, its header first."""
+    """Two runs of the same rows, planner by planner."""
     rows: Cells = [REPEAT]
     for row in table.to_dict("records"):
         times = [
-            "{} [{}, {}]".format(*(_milli(row[f"{run}_{end}s"]) for end in ("", "low_", "high_")))
+            "{} [{}, {}]".format(
+                *(milliseconds(row[f"{run}_{end}s"]) for end in ("", "low_", "high_"))
+            )
             for run in ("time", "time_again")
         ]
         same, overlap = ("yes" if row[name] else "no" for name in ("same_validity", "overlap"))
@@ -243,44 +230,26 @@ def repeated_cells(table: pd.DataFrame) -> Cells:
     return rows
 
 
-def break_even_markdown(table: pd.DataFrame) -> str:
-    """From how many queries on training pays against each planner."""
-    return f"{markdown_table(break_even_cells(table))}\n"
-
-
 def break_even_cells(table: pd.DataFrame) -> Cells:
-    """The same, its header first."""
+    """From how many queries on training pays against each planner."""
     rows: Cells = [BREAK_EVEN]
     for row in table.to_dict("records"):
         pays = row["break_even"]
         known = "never" if pays == np.inf else f"{pays:,.0f} queries"
-        times = (_milli(row["query_s"]), _milli(row["reference_s"]), _share(row["success"]))
+        times = (
+            milliseconds(row["query_s"]),
+            milliseconds(row["reference_s"]),
+            share(row["success"]),
+        )
         shown = "–" if pd.isna(pays) else known
         rows.append((str(row["planner"]), f"{row['training_s']:.0f}", *times, shown))
     return rows
 
 
 def _p95(row: Mapping[Any, Any], name: str) -> str:
-    return "–" if row["rows"] < FEW else _fixed(row[name], 3)
+    return "–" if row["rows"] < FEW else fixed(row[name], 3)
 
 
 def _iqm(row: Mapping[Any, Any], digits: int) -> str:
-    low, middle, high = (_fixed(row[f"ratio_iqm{end}"], digits) for end in ("_low", "", "_high"))
+    low, middle, high = (fixed(row[f"ratio_iqm{end}"], digits) for end in ("_low", "", "_high"))
     return f"{middle} [{low}, {high}]"
-
-
-def _fixed(value: float, digits: int) -> str:
-    return "–" if pd.isna(value) else ("∞" if value == float("inf") else f"{value:.{digits}f}")
-
-
-def _milli(value: float) -> str:
-    """Seconds in milliseconds: three digits, or all of a larger number's."""
-    if pd.isna(value):
-        return "–"
-    if value == float("inf"):
-        return "∞"
-    return f"{1e3 * value:,.0f}" if value >= 0.1 else f"{1e3 * value:.3g}"
-
-
-def _share(value: float) -> str:
-    return "–" if pd.isna(value) else f"{value:.0%}"

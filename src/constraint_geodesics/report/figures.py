@@ -24,18 +24,22 @@ from constraint_geodesics.geometry.analytic import LevelSet, Sphere, Torus
 from constraint_geodesics.geometry.manifold import pullback_metric
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import GraphSubmanifold, GridSubmanifold
-from constraint_geodesics.palette import BLACK as BLACK
-from constraint_geodesics.palette import BLUE as BLUE
-from constraint_geodesics.palette import GOAL as GOAL
-from constraint_geodesics.palette import GREEN as GREEN
-from constraint_geodesics.palette import GREY as GREY
-from constraint_geodesics.palette import LIGHT as LIGHT
-from constraint_geodesics.palette import ORANGE as ORANGE
-from constraint_geodesics.palette import PURPLE as PURPLE
-from constraint_geodesics.palette import SKY, YELLOW, planner_colour
-from constraint_geodesics.palette import START as START
-from constraint_geodesics.palette import VERMILION as VERMILION
-from constraint_geodesics.recording.png import save_png as save_png
+from constraint_geodesics.palette import (
+    BLACK,
+    BLUE,
+    GOAL,
+    GREEN,
+    GREY,
+    LIGHT,
+    ORANGE,
+    PURPLE,
+    SKY,
+    START,
+    VERMILION,
+    YELLOW,
+    planner_colour,
+)
+from constraint_geodesics.recording.recorder import principal_plane
 
 COMPONENTS = (SKY, PURPLE, BLUE, YELLOW, GREEN)
 """Colours of a sub-manifold's components, the largest first; the smaller ones share REST."""
@@ -199,9 +203,7 @@ def components_in_principal_axes(
     All panels show the same plane, the first two principal axes of `data`: one learned manifold,
     many constraints.
     """
-    centre = data.mean(axis=0)
-    principal = np.linalg.svd(data - centre, full_matrices=False)[2][:2]
-    principal *= np.sign(principal[range(2), np.abs(principal).argmax(axis=1)])[:, None]
+    centre, principal = principal_plane(data)
     figure, grid = _panels(len(panels), (3.0, 2.6))
     for axes, (name, graph) in zip(grid, panels.items(), strict=True):
         nodes = (graph.latent - centre) @ principal.T

@@ -1,6 +1,6 @@
 """How cost grows: a figure with a log-log panel an axis, and a table of the exponents."""
 
-from collections.abc import Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -10,15 +10,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, NullLocator
 
-from constraint_geodesics.palette import BLACK, BLUE, GREEN, LIGHT, ORANGE, PURPLE, VERMILION
-from constraint_geodesics.report.results import fixed, markdown_table
+from constraint_geodesics.palette import (
+    BLACK,
+    LIGHT,
+    PURPLE,
+    VERMILION,
+    planner_colour,
+    planner_family,
+)
+from constraint_geodesics.report.benchmark_figures import Styles, styles_of
+from constraint_geodesics.report.cells import Cells, fixed, markdown_table
 
 COLUMNS = 3
-FAMILIES = (("planner", ORANGE), ("band and trees", ORANGE), ("straight", GREEN), ("BiRRT", BLUE))
-"""How a family's names begin, and its colour; others take the next of OTHERS."""
 OTHERS = (VERMILION, PURPLE, BLACK)
-DASHES = ("-", "--", ":", "-.")
-"""Tell members of one family apart."""
+"""Colours of what is of no family of planners, one after another."""
 LABELS = {
     "joints": "joints (one query)",
     "codimension": "held task axes (one query)",
@@ -38,7 +43,7 @@ LEGEND_ROOM = 0.27
 
 def slopes_markdown(fits: pd.DataFrame) -> str:
     """The exponents as a table, axis by axis.  fits: `growth.slopes`."""
-    rows: list[Sequence[str]] = [("grows with", "what", "exponent", "± standard error", "points")]
+    rows: Cells = [("grows with", "what", "exponent", "± standard error", "points")]
     for row in fits.to_dict("records"):
         slope, error = (fixed(row[name]) for name in ("slope", "standard_error"))
         rows.append((row["axis"], row["what"], slope, error, str(row["points"])))
@@ -69,7 +74,7 @@ def _draw_panel(panel: Axes, table: pd.DataFrame, fits: pd.DataFrame) -> None:
         own, style = rows.sort_values("value"), styles[str(what)]
         value, colour = own["value"].to_numpy(float), style["color"]
         fit = fits[fits["what"] == what].iloc[0]
-        panel.plot(value, own["seconds"], label=f"{what}: {_slope(fit)}", linewidth=1.3, **style)
+        panel.plot(value, own["seconds"], label=f"{what}: {_slope(fit)}", **style)
         panel.fill_between(value, own["low"], own["high"], color=colour, alpha=0.12, linewidth=0)
         # nan, no query, is filled
         inside = ["white" if share < 0.5 else colour for share in own["solved"]]
@@ -113,13 +118,8 @@ def _slope(fit: pd.Series) -> str:
     return f"slope {fit['slope']:.2f}" + (f" ± {error:.2f}" if np.isfinite(error) else "")
 
 
-def _styles(names: list[str]) -> dict[str, dict[str, Any]]:
+def _styles(names: list[str]) -> Styles:
     """Colour and dashes of each name of a panel."""
-    met: dict[str, int] = {}
-    styles, others = {}, iter(OTHERS * len(names))
-    for name in names:
-        own = (colour for begin, colour in FAMILIES if name.startswith(begin))
-        colour = next(own, None) or next(others)
-        met[colour] = met.get(colour, -1) + 1
-        styles[name] = {"color": colour, "linestyle": DASHES[met[colour] % len(DASHES)]}
-    return styles
+    others = cycle(OTHERS)
+    colours = {n: planner_colour(n) if planner_family(n) else next(others) for n in names}
+    return {name: {**own, "linewidth": 1.3} for name, own in styles_of(names, colours).items()}

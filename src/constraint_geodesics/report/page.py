@@ -69,11 +69,8 @@ class Table:
     @property
     def shown(self) -> Iterator[Row]:
         """The rows with their colours and links."""
-        families = [planner_family(name) for name in self.planners]
-        colours = [
-            "" if family is None else planner_colour(name)
-            for name, family in zip(self.planners, families, strict=True)
-        ] or [""] * len(self.rows)
+        none = [""] * len(self.rows)
+        colours = [planner_colour(n) if planner_family(n) else "" for n in self.planners] or none
         links = self.links or [Links()] * len(self.rows)
         return (Row(*row) for row in zip(self.rows, colours, links, strict=True))
 
@@ -92,10 +89,9 @@ def runs_link(stage: str, item: str) -> str:
     """Address of a stage's runs in the dashboard: by their tags, as a run's own number is another
     one each time.
 
-    item: of the stage's matrix; a % in it stands for anything.
+    item: of the stage's matrix.
     """
-    compared = "LIKE" if "%" in item else "="
-    query = f"tags.stage = '{stage}' and tags.item {compared} '{item}'"
+    query = f"tags.stage = '{stage}' and tags.item = '{item}'"
     return f"{DASHBOARD}/#/experiments/{EXPERIMENT}/runs?searchFilter={quote(query, safe='')}"
 
 

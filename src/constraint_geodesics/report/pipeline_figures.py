@@ -21,6 +21,7 @@ from constraint_geodesics.learning.submanifold import (
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report import figures
+from constraint_geodesics.report.cells import short
 from constraint_geodesics.report.figures import LatentCurves
 from constraint_geodesics.report.results import (
     LEARNED,
@@ -28,7 +29,6 @@ from constraint_geodesics.report.results import (
     read_metrics,
     read_paths,
     searched_items,
-    short,
     studies_at_hand,
 )
 

@@ -11,7 +11,8 @@ import pandas as pd
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.report import figures, pipeline_tables, study_report
+from constraint_geodesics.recording.png import save_png
+from constraint_geodesics.report import pipeline_tables, study_report
 from constraint_geodesics.report.figures import PLANNERS
 from constraint_geodesics.report.page import Picture, write_page
 from constraint_geodesics.report.pipeline_figures import Drawn, draw_data_cards, draw_figures
@@ -63,7 +64,7 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
 def save_figure(layout: Layout, entry: Drawn) -> Picture:
     """Write a figure where it belongs; returns it as the page shows it."""
     file = layout.root / "reports" / "figures" / f"{entry.name}.png"
-    figures.save_png(entry.figure, file)
+    save_png(entry.figure, file)
     return Picture(entry.name, entry.title, entry.caption, entry.alt or entry.title, file)
 
 

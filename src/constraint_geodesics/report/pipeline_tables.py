@@ -9,31 +9,23 @@ import pandas as pd
 
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout, in_checkout
+from constraint_geodesics.report.cells import PUBLISHED, fixed, plus_minus, records, short
 from constraint_geodesics.report.figures import PLANNERS, VARIANTS
 from constraint_geodesics.report.page import Links, Recorded, Table, runs_link
 from constraint_geodesics.report.results import (
     COLUMNS,
     COUNTED,
     LEARNED,
-    fixed,
     metrics_of,
-    plus_minus,
     read_comparison,
     read_metrics,
-    records,
     searched_items,
-    short,
     studies_at_hand,
     table_cells,
 )
 
-PUBLISHED = {
-    "prm": (499.42, 530.89, 24.43, 9.75, 1.53),
-    "rrt_star": (134.80, 155.28, 17.84, 5.21, 1.38),
-    "birrt": (53.00, 84.65, 25.52, 2.903, 0.16),
-    "learned_geodesic": (70.56, 79.81, 7.64, 3.8, 1.81),
-}
-"""Table I of the paper: shortest path, average, its ±, planning time [s], its ±."""
+PUBLISHED_AS = {"prm": "PRM", "rrt_star": "RRT* 10 s", "birrt": "BiRRT", LEARNED: "planner"}
+"""Where the paper's Table I has the planners of this run."""
 
 
 def published_table(params: Params, layout: Layout, table: pd.DataFrame, constraint: str) -> Table:
@@ -65,25 +57,19 @@ def published_table(params: Params, layout: Layout, table: pd.DataFrame, constra
 
 
 def _published_cells(planner: str) -> list[str]:
-    if planner not in PUBLISHED:
+    if planner not in PUBLISHED_AS:
         return ["–"] * 4
-    shortest, average, spread, time, time_spread = PUBLISHED[planner]
-    ratio, times = average / PUBLISHED[LEARNED][1], plus_minus(time, time_spread, fixed)
+    shortest, average, spread, time, time_spread = PUBLISHED[PUBLISHED_AS[planner]]
+    ratio, times = average / PUBLISHED["planner"][1], plus_minus(time, time_spread, fixed)
     return [fixed(shortest), plus_minus(average, spread, fixed), fixed(ratio), times]
 
 
 def _measured_cells(source: Mapping[str, Mapping[str, Any]], planner: str) -> list[str]:
     if planner not in source:
         return ["–"] * 5
-    row = source[planner]
-    learned = source[LEARNED]["latent_mean"]
-    return [
-        fixed(row["latent_shortest"]),
-        plus_minus(row["latent_mean"], row["latent_std"], fixed),
-        fixed(row["latent_mean"] / learned),
-        plus_minus(row["time_mean_s"], row["time_std_s"], short),
-        f"{row['success']:.0%}",
-    ]
+    _, valid, _, shortest, average, _, times, *_ = table_cells(source[planner])
+    ratio = source[planner]["latent_mean"] / source[LEARNED]["latent_mean"]
+    return [shortest, average, fixed(ratio), times, valid]
 
 
 def result_tables(params: Params, layout: Layout, table: pd.DataFrame) -> list[Table]:

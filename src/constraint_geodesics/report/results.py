@@ -5,7 +5,7 @@ lies in a folder.
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,14 @@ import pandera.pandas as pandera
 from constraint_geodesics.benchmark.statistics import APART, RANDOM, STRAIGHT, Counted, summarise
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.report.cells import (
+    Cells,
+    fixed,
+    markdown_table,
+    plus_minus,
+    records,
+    short,
+)
 from constraint_geodesics.report.figures import PLANNERS
 
 LEARNED = "learned_geodesic"
@@ -125,7 +133,7 @@ def result_table(layout: Layout) -> str:
     table = pd.read_csv(layout.root / "reports" / "table.csv")
     parts, named = [], ["manifold", "latent_dim", "counted"]
     for (manifold, latent_dim, counted), rows in table.groupby(named, sort=False):
-        cells: list[Sequence[str]] = [COLUMNS]
+        cells: Cells = [COLUMNS]
         for constraint, group in rows.groupby("constraint", sort=False):
             for k, row in enumerate(records(group)):
                 cells.append((str(constraint) if k == 0 else "", *table_cells(row)))
@@ -156,9 +164,7 @@ def geometry_table(layout: Layout) -> str:
     """What the geometry core reaches, as Markdown, from reports/geometry.json."""
     geometry = read_metrics(layout.root / "reports" / "geometry.json")
     constraint = geometry["constraint"]
-    rates: list[Sequence[str]] = [
-        (f"on `{geometry['manifold']}`, a second", "here", "the usual way", "ratio")
-    ]
+    rates: Cells = [(f"on `{geometry['manifold']}`, a second", "here", "the usual way", "ratio")]
     for suffix, how in (("", ""), ("_retracted", f", retracted onto {constraint}")):
         lengths, steps = geometry[f"curve_length{suffix}"], geometry[f"environment{suffix}"]
         for what, found, (own, naive, ratio) in (
@@ -173,7 +179,7 @@ def geometry_table(layout: Layout) -> str:
                     f"{found[ratio]:.0f}",
                 )
             )
-    ratios: list[Sequence[str]] = [
+    ratios: Cells = [
         (
             *("length over exact distance, mean", "random curve", "policy (worst seed)"),
             *("gradient", "domain of the pairs"),
@@ -286,37 +292,3 @@ def table_cells(row: Mapping[str, Any]) -> tuple[str, ...]:
         short(row["violation_median_deg"]),
         short(row["violation_max_deg"]),
     )
-
-
-def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows as dictionaries by column."""
-    return [{str(name): value for name, value in row.items()} for row in frame.to_dict("records")]
-
-
-def fixed(value: float) -> str:
-    """Two decimals, or a dash where there is no value."""
-    return "–" if np.isnan(value) else f"{value:.2f}"
-
-
-def short(value: float) -> str:
-    """Three digits, or a dash where there is no value."""
-    if np.isnan(value):
-        return "–"
-    return f"{value:.1e}" if 0 < abs(value) < 1e-3 else f"{value:.3g}"
-
-
-def plus_minus(mean: float, deviation: float, number: Callable[[float], str]) -> str:
-    """A mean and its deviation, if it has one."""
-    return number(mean) if np.isnan(deviation) else f"{number(mean)} ± {number(deviation)}"
-
-
-def markdown_table(rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table, its header first, aligned, so that it reads in a terminal too."""
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-
-    def line(cells: Sequence[str]) -> str:  # names to the left, figures to the right
-        sized = enumerate(zip(cells, widths, strict=True))
-        return " | ".join(c.ljust(width) if k < 2 else c.rjust(width) for k, (c, width) in sized)
-
-    rule = ["-" * width if k < 2 else "-" * (width - 1) + ":" for k, width in enumerate(widths)]
-    return "\n".join(f"| {line(cells)} |" for cells in (rows[0], rule, *rows[1:]))

@@ -10,8 +10,9 @@ import pandas as pd
 
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout, in_checkout
+from constraint_geodesics.report.cells import fixed, markdown_table, share, short
 from constraint_geodesics.report.page import Links, Recorded, Table, runs_link
-from constraint_geodesics.report.results import markdown_table, read_metrics, short
+from constraint_geodesics.report.results import read_metrics
 from constraint_geodesics.studies.proposals import (
     DESCENT,
     JOINTS,
@@ -51,21 +52,19 @@ def execution_block(params: Params, layout: Layout) -> Table:
     tilt = np.degrees(found["smallest_line_tilt_rad"])
     note = (
         f"{found['queries']} of {found['drawn']} drawn queries of {params.studies.constraint}, "
-        f"whose straight joint line "
-        f"tilts the cup by {tilt:.0f}° or more; followed by PyBullet's position control with "
-        f"gravity, with "
-        f"{params.execution.spheres} spheres in an open cup"
+        f"whose straight joint line tilts the cup by {tilt:.0f}° or more; followed by PyBullet's "
+        f"position control with gravity, with {params.execution.spheres} spheres in an open cup"
     )
     rows = [
         [
             kind,
             str(row["executed"]),
-            f"{row['kept_share_mean']:.0%}",
-            f"{row['kept_share_worst']:.0%}",
+            share(row["kept_share_mean"]),
+            share(row["kept_share_worst"]),
             f"{np.degrees(row['largest_tilt_rad']):.1f}",
             str(row["collisions"]),
             short(row["largest_tracking_error_rad"]),
-            f"{row['duration_mean_s']:.2f}",
+            fixed(row["duration_mean_s"]),
         ]
         for kind, row in kinds.items()
     ]
@@ -115,17 +114,16 @@ def _markdown(block: Table) -> str:
 def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]], link: Links) -> Table:
     first = next(iter(rows.values()))
     note = (
-        f"{first['queries']} queries, {first['solvable']} of which have a curve of the "
-        f"family; ratios over the "
-        f"{first['shared']} that every method solves"
+        f"{first['queries']} queries, {first['solvable']} of which have a curve of the family; "
+        f"ratios over the {first['shared']} that every method solves"
     )
     cells = [
         [
             method,
-            _number(row["feasible"], "{:.1%}"),
-            *(_number(row[f"shared_ratio_{what}"], "{:.4f}") for what in ("mean", "median", "p95")),
+            share(row["feasible"], 1),
+            *(fixed(row[f"shared_ratio_{what}"], 4) for what in ("mean", "median", "p95")),
             str(row["curves"]),
-            _number(row["time_median_ms"], "{:.3g}"),
+            short(row["time_median_ms"]),
         ]
         for method, row in rows.items()
     ]
@@ -133,7 +131,3 @@ def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]], link: 
     return Table(
         f"{constraint}, proposals", note, POLICY_COLUMNS, cells, planners=list(rows), links=links
     )
-
-
-def _number(value: float | None, form: str) -> str:
-    return "–" if value is None or np.isnan(value) else form.format(value)

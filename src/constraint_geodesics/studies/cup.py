@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
-from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import Physics, physics
 
@@ -24,12 +23,6 @@ UNLIMITED = 1e4
 """[N or N m]"""
 
 _Pose = tuple[Sequence[float], Sequence[float]]
-
-
-class ExecutionError(ValueError):
-    """A path, an axis or a setting that can't be executed; the message names it, its value and what
-    is allowed.
-    """
 
 
 @dataclass(frozen=True)
@@ -60,24 +53,10 @@ class CupSettings:
     settle_s: float = 0.5
     seed: int = 0
 
-    def __post_init__(self) -> None:
-        for name, least in _LEAST.items():
-            if not getattr(self, name) >= least:
-                raise ExecutionError(f"{name} = {getattr(self, name)}: must be at least {least}")
-        for name in _POSITIVE:
-            if not getattr(self, name) > 0:
-                raise ExecutionError(f"{name} = {getattr(self, name)}: must be positive")
-        if not self.inner_radius_m >= 2.2 * self.sphere_radius_m:
-            width = f"{2.2 * self.sphere_radius_m:.4g}"
-            raise ExecutionError(
-                f"inner_radius_m = {self.inner_radius_m}: must be at least {width}, so that two "
-                "spheres fit next to each other"
-            )
 
-
-_LEAST = dict.fromkeys(("gap_m", "friction", "restitution", "settle_s", "seed"), 0)
-_LEAST |= {"spheres": 1, "walls": 6}
-_POSITIVE = ("sphere_radius_m", "sphere_mass_kg", "height_m", "wall_m", "mass_kg", "step_s")
+def execution_name(query: int, kind: str) -> str:
+    """Of an execution's files among those of one constraint; `kind` says what was executed."""
+    return f"query{query}-{kind.replace(' ', '-')}"
 
 
 @dataclass(frozen=True)
@@ -125,14 +104,12 @@ def execute(
     with no more than the URDF's effort; where that is 0 they are not limited.
     cup_axis_in_tool: direction of the cup's opening in the tool frame, of any length.
     The same arguments give the same result, in any process on one machine.
-    Raises ExecutionError on a wrong shape, fewer than two waypoints, a number that is not finite,
-    times that do not rise or an axis of no length.
     """
     settings = settings or CupSettings()
-    q, t, axis = _checked(scene.robot, joints, times, cup_axis_in_tool)
+    cup = _cup_in_tool(cup_axis_in_tool / np.linalg.norm(cup_axis_in_tool), settings)
     with scene.world() as world:
-        simulation = _Simulation(physics(world), q[0], _cup_in_tool(axis, settings), settings)
-        return _follow(simulation, q, t - t[0], settings)
+        simulation = _Simulation(physics(world), joints[0], cup, settings)
+        return _follow(simulation, joints, times - times[0], settings)
 
 
 def _follow(
@@ -155,10 +132,10 @@ def _follow(
             tilt = max(tilt, simulation.tilt())
         if (k + 1) % every == 0 or k + 1 == moving + rest:
             frames.append(simulation.frame())
-            inside = _inside(*frames[-1][1:], settings)
-            simulation.free_outside(inside)
+            kept = inside(*frames[-1][1:], settings)
+            simulation.free_outside(kept)
             frame_times.append((k + 1) * settings.step_s)
-    measured = (settings.spheres, int(inside.sum()), error, tilt, float(t[-1]))
+    measured = (settings.spheres, int(kept.sum()), error, tilt, float(t[-1]))
     return Execution(*measured, np.array(frame_times), *map(np.array, zip(*frames, strict=True)))
 
 
@@ -219,10 +196,10 @@ class _Simulation:
         centres = np.array([self._pose(sphere)[0] for sphere in self._spheres])
         return self.joints(), centres, np.concatenate(self._pose(self._cup))
 
-    def free_outside(self, inside: Bool[np.ndarray, "S"]) -> None:
+    def free_outside(self, held: Bool[np.ndarray, "S"]) -> None:
         """Let the spheres that have left the cup touch the robot and the workcell from now on."""
-        for sphere, held in zip(self._spheres, inside, strict=True):
-            if sphere in self._held and not held:
+        for sphere, kept in zip(self._spheres, held, strict=True):
+            if sphere in self._held and not kept:
                 self._set_collisions(sphere, enabled=1)
                 self._held.remove(sphere)
 
@@ -282,32 +259,6 @@ class _Simulation:
         )
 
 
-def _checked(
-    robot: SerialRobot, joints: np.ndarray, times: np.ndarray, axis: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    q, t, direction = (np.asarray(values, dtype=np.float64) for values in (joints, times, axis))
-    if q.ndim != 2 or len(q) < 2 or q.shape[1] != robot.dof:
-        wanted = f"(T, {robot.dof}) with at least two waypoints"
-        raise ExecutionError(f"joints has shape {q.shape}: must be {wanted}")
-    if t.shape != q.shape[:1]:
-        raise ExecutionError(
-            f"times has shape {t.shape}: must be ({len(q)},), one for each waypoint"
-        )
-    if direction.shape != (3,):
-        raise ExecutionError(f"cup_axis_in_tool has shape {direction.shape}: must be (3,)")
-    for name, values in (("joints", q), ("times", t), ("cup_axis_in_tool", direction)):
-        if not np.isfinite(values).all():
-            raise ExecutionError(f"{name} = {values[~np.isfinite(values)][0]}: must be finite")
-    if not (np.diff(t) > 0).all():
-        k = int(np.diff(t).argmin())
-        rise = t[k + 1] - t[k]
-        raise ExecutionError(f"times[{k + 1}] - times[{k}] = {rise}: must be positive")
-    length = float(np.linalg.norm(direction))
-    if not length > 0:
-        raise ExecutionError(f"cup_axis_in_tool = {direction.tolist()}: must not be zero")
-    return q, t, direction / length
-
-
 def _velocities(q: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Velocities at the waypoints, of the parabola through each and its neighbours; rest at both
     ends.
@@ -361,7 +312,7 @@ def _places(settings: CupSettings, rng: np.random.Generator) -> Float[np.ndarray
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
 
 
-def _inside(
+def inside(
     centres: np.ndarray, cup_pose: np.ndarray, settings: CupSettings
 ) -> Bool[np.ndarray, "S"]:
     """Which spheres have their centre in the cup, below its rim."""

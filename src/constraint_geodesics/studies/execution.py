@@ -8,7 +8,7 @@ all: a fast swing can hold the spheres upside down, or throw one out of a level 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,6 +23,7 @@ from constraint_geodesics.params import ExecutionParams
 from constraint_geodesics.pipeline.progress import progress
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.cup import CupSettings, Execution, execute
+from constraint_geodesics.trajectory import Trajectory
 
 PLANNED, STRAIGHT = "planned path", "straight joint line"
 EXECUTED = "executed"
@@ -54,18 +55,7 @@ class ExecutionCheckError(ValueError):
     """An experiment without meaning; names the entry, its value and what is allowed."""
 
 
-class _TimedPath(Protocol):
-    """What is asked of a planner's answer: solved or why not, waypoints [rad], their times [s]."""
-
-    @property
-    def status(self) -> str: ...
-    @property
-    def joints(self) -> Float[np.ndarray, "T D"]: ...
-    @property
-    def times(self) -> Float[np.ndarray, "T"]: ...
-
-
-Plan = Callable[[Float[np.ndarray, "D"], Float[np.ndarray, "D"]], _TimedPath]
+Plan = Callable[[Float[np.ndarray, "D"], Float[np.ndarray, "D"]], Trajectory]
 """Plans from a start to a goal [rad] under the constraint that is looked at."""
 
 

@@ -266,10 +266,10 @@ def save_seeds(
     with (folder / "curves.npz").open("wb") as file:
         np.savez_compressed(file, phi=phi, seeds=seeds, starts=queries.starts, goals=queries.goals)
     rows = [{"seed": result.seed, **row} for result in results for row in result.policy.curve]
-    write_table(rows, learning)
+    write_rows(rows, learning)
 
 
-def write_table(rows: Sequence[Mapping[str, Any]], file: Path, **columns: str) -> None:
+def write_rows(rows: Sequence[Mapping[str, Any]], file: Path, **columns: str) -> None:
     """Rows as CSV, with the same text in the given columns of each."""
     file.parent.mkdir(parents=True, exist_ok=True)
     pd.DataFrame(rows).assign(**columns).to_csv(file, index=False)

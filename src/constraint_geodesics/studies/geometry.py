@@ -361,7 +361,7 @@ def solver_figures(
         ]
         geodesics_between(solver, problem, *pairs[0])  # warm: what is built once is built
         asked = [partial(geodesics_between, solver, problem, *pair) for pair in pairs]
-        single[name] = np.median([_seconds(ask) for ask in asked])
+        single[name] = np.median([seconds_of(ask) for ask in asked])
         began = time.perf_counter()
         found[name] = geodesics_between(solver, problem, ends.z_start, ends.z_goal)
         together[name] = (time.perf_counter() - began) / len(ends)
@@ -392,7 +392,8 @@ def _ratios(ratio: Float[np.ndarray, "P"]) -> dict[str, float]:
     }
 
 
-def _seconds(run: Callable[[], Any]) -> float:
+def seconds_of(run: Callable[[], object]) -> float:
+    """What one run takes."""
     began = time.perf_counter()
     run()
     return time.perf_counter() - began
@@ -413,7 +414,7 @@ def alternately(runs: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str,
     times: dict[str, list[float]] = {name: [] for name in runs}
     for turn in range(rounds + 1):
         for name, run in runs.items():
-            spent = _seconds(run)
+            spent = seconds_of(run)
             if turn:  # the first round warms up: compiled kernels, caches, allocated memory
                 times[name].append(spent)
     return {name: float(np.median(values)) for name, values in times.items()}

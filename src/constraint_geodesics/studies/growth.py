@@ -45,7 +45,7 @@ from constraint_geodesics.search.band import BandSettings
 from constraint_geodesics.search.candidates import Answer, candidates
 from constraint_geodesics.search.roadmap import build_roadmap
 from constraint_geodesics.search.space import space_of
-from constraint_geodesics.studies.geometry import one_thread
+from constraint_geodesics.studies.geometry import one_thread, seconds_of
 
 AXES = ("joints", "codimension", "obstacles", "queries", "latent dimension", "dataset rows")
 HELD = (
@@ -209,15 +209,11 @@ def measure_growth(
     references are taken, each the tool pose of a random free configuration, the same for all
     codimensions, and several layouts, where more spheres hold the fewer.
     Raises DatasetError if hardly any configuration under a constraint is free, ValueError if hardly
-    any is without one, there is no room for the spheres, or too few configurations to train on.
+    any is without one or there is no room for the spheres.
     """
     sizes = sizes or GrowthSizes()
     axes = (_joints, _codimension, _obstacles, _queries, _latent_dimension, _epochs, _roadmaps)
     samples: list[Sample] = []
-    if len(subject.joints) < max(sizes.rows):
-        raise ValueError(
-            f"{len(subject.joints)} configurations: training on {max(sizes.rows)} needs as many"
-        )
     with one_thread(), progress(description, sizes.steps) as advance:
         for axis in axes:
             for found in axis(subject, sizes):
@@ -420,7 +416,7 @@ def _latent_dimension(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sam
     what = f"{sizes.curves} curve lengths"
     with torch.no_grad():
         turns = [
-            [Sample("latent dimension", dim, what, _seconds(run)) for dim, run in runs.items()]
+            [Sample("latent dimension", dim, what, seconds_of(run)) for dim, run in runs.items()]
             for _ in range(sizes.length_repeats + 1)
         ]
     yield [sample for turn in turns[1:] for sample in turn]
@@ -450,7 +446,7 @@ def _roadmaps(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
     for _ in range(sizes.roadmap_repeats):
         for count in sizes.nodes:
             build = partial(build_roadmap, space, nodes[:count], settings.roadmap_neighbours)
-            yield [Sample("dataset rows", count, "roadmap", _seconds(build))]
+            yield [Sample("dataset rows", count, "roadmap", seconds_of(build))]
 
 
 def _free_configurations(
@@ -499,9 +495,3 @@ def _planned(subject: Subject, axis: str, value: int, asked: _Asked) -> list[Sam
                 solved = planner.plan(own, seed).status == "solved"
                 found.append(Sample(axis, value, name, time.perf_counter() - began, float(solved)))
     return found
-
-
-def _seconds(run: Callable[[], object]) -> float:
-    began = time.perf_counter()
-    run()
-    return time.perf_counter() - began

@@ -21,7 +21,6 @@ from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, Phi, repeated
 from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
 from constraint_geodesics.geometry.curves import PinnedPolynomial
-from constraint_geodesics.geometry.manifold import GeometryError
 from constraint_geodesics.learning.dataset import ShardTask, draw_free, draw_queries, seed_of
 from constraint_geodesics.learning.learned_manifold import JointManifold, LearnedManifold
 from constraint_geodesics.params import GeodesicParams
@@ -110,9 +109,7 @@ def policy_rows(
     Columns: method, seed, query, feasible, length_rad (nan where not feasible), optimum_rad
     (`family_optimum` or an answer, whichever is shorter; nan where there is neither), curves (met,
     the straight line once), time_ms (of the answer, on a problem that has answered before).
-    Raises GeometryError if the problem does not retract or there is no query.
     """
-    _require_queries(problem, ends)
     methods = _methods(problem, compared)
     queries, count = len(ends), len(methods)
     phi, rows = np.empty((queries, count, problem.curve.coefficients)), []
@@ -189,14 +186,9 @@ def family_optimum(
     From every start the problem's own descent, then BFGS on the cost, all queries in one batch.
     Starts and what the descent made of them count too, so no feasible start is shorter than the
     answer.
-    Raises GeometryError if the problem does not retract, there is no query, or the starts are not
-    (Q, K, p).
     """
-    _require_queries(problem, ends)
     settings = settings or OptimumSettings()
     queries, size = len(ends), problem.curve.coefficients
-    if starts.ndim != 3 or (len(starts), starts.shape[2]) != (queries, size):
-        raise GeometryError(f"starts has shape {starts.shape}: must be ({queries}, K, {size})")
     phi = np.concatenate([starts, _random_starts(problem, ends, settings)], axis=1)
     each = ends[np.repeat(np.arange(queries), phi.shape[1])]
     moved = descended(problem, phi.reshape(-1, size), each, settings.descent_steps)
@@ -491,15 +483,6 @@ def _spread(name: str, groups: Any) -> pd.DataFrame:
     column = groups[name]
     spread = {"mean": column.mean(), "median": column.median(), "p95": column.quantile(0.95)}
     return pd.DataFrame(spread).add_prefix(f"{name}_")
-
-
-def _require_queries(problem: LearnedProblem, ends: Ends) -> None:
-    if not problem.retract:
-        raise GeometryError(
-            "problem.retract = False: must be True, without it there is no descent to follow"
-        )
-    if not len(ends):
-        raise GeometryError("ends holds no query: must hold one at least")
 
 
 PAST_ROWS = 1000
