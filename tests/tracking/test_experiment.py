@@ -9,11 +9,12 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 import urllib.parse
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -437,28 +438,36 @@ def test_inputs_are_linked_by_dvcs_own_md5_and_nothing_is_printed(tmp_path: Path
 
 
 @contextmanager
-def dashboard(root: Path) -> Iterator[str]:
-    """The server of ui_command on a free port."""
+def server(
+    command: list[str], page: str, environment: dict[str, str] | None = None
+) -> Iterator[str]:
+    """The address of what a command serves on a free port, from when a page of it answers."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    command = ui_command(root, port)
     assert command[command.index("--host") + 1] == "127.0.0.1"
-    log = (root / "server.log").open("w")
-    server = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
-    try:
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline and server.poll() is None:
-            try:
-                urllib.request.urlopen(f"http://127.0.0.1:{port}/health")
-                break
-            except OSError:
-                time.sleep(0.1)
-        yield f"http://127.0.0.1:{port}"
-    finally:
-        server.terminate()
-        server.wait(20)
-        log.close()
+    command[command.index("--port") + 1] = str(port)
+    with tempfile.TemporaryFile() as log:
+        process = subprocess.Popen(
+            command, stdout=log, stderr=log, env=environment, start_new_session=True
+        )
+        try:
+            deadline = time.monotonic() + 90
+            while time.monotonic() < deadline and process.poll() is None:
+                try:
+                    urllib.request.urlopen(f"http://127.0.0.1:{port}/{page}")
+                    break
+                except OSError:
+                    time.sleep(0.1)
+            yield f"http://127.0.0.1:{port}"
+        finally:
+            os.killpg(process.pid, 15)
+            process.wait(20)
+
+
+def dashboard(root: Path) -> AbstractContextManager[str]:
+    """The server of ui_command."""
+    return server(ui_command(root, 5000), "health")
 
 
 def test_a_moved_checkout_keeps_its_figures_and_a_server_can_be_the_store(
@@ -475,10 +484,11 @@ def test_a_moved_checkout_keeps_its_figures_and_a_server_can_be_the_store(
 
         monkeypatch.setenv("MLFLOW_TRACKING_URI", address)
         capfd.readouterr()
-        with tracked_stage(Work("train", "cup"), "served", root) as stage:
-            child = stage.child("seed 1", {})
-            with child:
-                child.artifact(root / "data" / "joints.csv")
+        with (
+            tracked_stage(Work("train", "cup"), "served", root) as stage,
+            stage.child("seed 1", {}),
+        ):
+            stage.figure(root / "data" / "joints.csv")
         assert capfd.readouterr() == ("", "")
         with pytest.raises(TrackingError, match=address):
             ui_command(root, 5000)
@@ -488,5 +498,5 @@ def test_a_moved_checkout_keeps_its_figures_and_a_server_can_be_the_store(
         "train cup": "FINISHED",
         "cup seed 1": "FINISHED",
     }
-    (kept,) = (moved / "mlartifacts").rglob(f"{child.run_id}/artifacts/joints.csv")
+    (kept,) = (moved / "mlartifacts").rglob(f"{stage.run_id}/artifacts/figures/joints.csv")
     assert kept.read_text() == "1,2\n"
