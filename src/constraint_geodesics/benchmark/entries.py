@@ -261,8 +261,8 @@ def fewer(
     less = {"planners": kept, "queries": queries, "batch": 1}
     changed: dict[str, Any] = {"benchmark": params.benchmark.model_copy(update=less)}
     for block, described in (("constraints", params.constraints), ("unseen", params.unseen)):
-        wanted = described if constraints is None else constraints
-        changed[block] = {name: one for name, one in described.items() if name in wanted}
+        some = described if constraints is None else constraints
+        changed[block] = {name: one for name, one in described.items() if name in some}
     return params.model_copy(update=changed), slow
 
 

@@ -61,7 +61,7 @@ def export_arena(
             {"name": planners, "settings": [settings.get(name, "") for name in planners]}
         ),
         "experiments": pd.DataFrame(
-            [_experiment(", ".join(names), case, about) for names, case in cases]
+            [_experiment(", ".join(map(str, names)), case, about) for names, case in cases]
         ),
         "runs": pd.DataFrame(
             {

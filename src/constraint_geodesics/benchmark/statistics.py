@@ -405,7 +405,7 @@ def _times(group: pd.DataFrame) -> dict[str, float]:
         "time_mean_s": _mean(group["time_s"]),
         "time_std_s": group["time_s"].std(ddof=1),
         "time_median_s": group["time_s"].median(),
-        "time_p95_s": group["time_s"].quantile(0.95),
+        "time_p95_s": float(group["time_s"].quantile(0.95)),
     }
 
 
