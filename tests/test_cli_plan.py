@@ -19,6 +19,7 @@ from tests.planner_fixtures import NAMES, nodes_of, packaged_bundle, packaged_pl
 
 COMMAND = str(Path(sys.executable).parent / "geodesics")
 TOUCHES_ITSELF = "0 2.0 -0.2 0 0.3 0.1"
+ZEROS = "0 0 0 0 0 0"
 
 
 def called(monkeypatch, capfd, words: Sequence[str]) -> tuple[int, str, str]:
@@ -48,6 +49,10 @@ def command(monkeypatch, capfd):
 
 def words_of(q: np.ndarray) -> str:
     return " ".join(repr(float(x)) for x in q)
+
+
+def asked(start: str, goal: str, constraint: str = "level_cup") -> tuple[str, ...]:
+    return ("plan", f"--start={start}", f"--goal={goal}", "--constraint", constraint)
 
 
 def strict(text: str) -> dict:
@@ -84,21 +89,8 @@ def saved(tmp_path_factory) -> Path:
 
 def test_a_path_is_planned_and_its_files_are_written(command, query, tmp_path) -> None:
     csv, rrd, png = (tmp_path / "new" / f"path.{kind}" for kind in ("csv", "rrd", "png"))
-    code, out, err = command(
-        "plan",
-        "--start",
-        query[0],
-        "--goal",
-        query[1],
-        "--constraint",
-        "level_cup",
-        "--out",
-        str(csv),
-        "--record",
-        str(rrd),
-        "--picture",
-        str(png),
-    )
+    files = ("--out", str(csv), "--record", str(rrd), "--picture", str(png))
+    code, out, err = command(*asked(*query), *files)
     assert code == 0
     assert out.startswith("solved: ")
     assert out.count("\n") == 1
@@ -116,26 +108,14 @@ def test_a_path_is_planned_and_its_files_are_written(command, query, tmp_path) -
 
 
 def test_an_answer_is_one_json_object(command, query, tmp_path) -> None:
-    code, out, _ = command(
-        "plan", "--start", query[0], "--goal", query[1], "--constraint", "level_cup", "--json"
-    )
+    code, out, _ = command(*asked(*query), "--json")
     assert code == 0
     answer = strict(out)
     assert answer["status"] == "solved"
     assert answer["constraint"] == "level_cup"
     assert 0.0 <= answer["violation_bound_rad"] <= 1e-4
-    code, out, _ = command(
-        "plan",
-        "--start",
-        query[0],
-        "--goal",
-        TOUCHES_ITSELF,
-        "--constraint",
-        "free",
-        "--json",
-        "--out",
-        str(tmp_path / "path.csv"),
-    )
+    out_of_reach = asked(query[0], TOUCHES_ITSELF, "free")
+    code, out, _ = command(*out_of_reach, "--json", "--out", str(tmp_path / "path.csv"))
     assert code == 3
     answer = strict(out)
     assert answer["status"] == "in_collision"
@@ -154,9 +134,7 @@ def test_an_answer_is_one_json_object(command, query, tmp_path) -> None:
 def test_no_path_is_code_three_and_a_line_that_says_why(
     command, query, start, constraint, status
 ) -> None:
-    code, out, err = command(
-        "plan", f"--start={start}", "--goal", query[1], "--constraint", constraint
-    )
+    code, out, err = command(*asked(start, query[1], constraint))
     assert code == 3
     assert out.startswith(f"{status}: ")
     assert out.count("\n") == 1
@@ -188,53 +166,26 @@ def test_configurations_are_numbers_with_spaces_or_commas_negative_ones_first(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--start", "1 2 3", "--goal", "0 0 0 0 0 0", "--constraint", "free"), r"start.*\(3,\)"),
-        (
-            ("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 0 0", "--constraint", "free"),
-            r"goal.*\(7,\)",
-        ),
-        (
-            ("--start", "0 0 0 0 0 zero", "--goal", "0 0 0 0 0 0", "--constraint", "free"),
-            "--start '0 0 0 0 0 zero'",
-        ),
-        (("--start", "", "--goal", "0 0 0 0 0 0", "--constraint", "free"), r"start.*\(0,\)"),
-        (
-            ("--start", "nan 0 0 0 0 0", "--goal", "0 0 0 0 0 0", "--constraint", "free"),
-            r"start\[0\] is not finite",
-        ),
-        (
-            ("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 inf", "--constraint", "free"),
-            r"goal\[5\] is not finite",
-        ),
-        (
-            ("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 0", "--constraint", "cup"),
-            "'cup'.*level_cup",
-        ),
-        (
-            (
-                "--start",
-                "0 0 0 0 0 0",
-                "--goal",
-                "0 0 0 0 0 0",
-                "--constraint",
-                "free",
-                "--budget",
-                "0",
-            ),
-            "budget_s = 0",
-        ),
+        (asked("1 2 3", ZEROS, "free"), r"start.*\(3,\)"),
+        (asked(ZEROS, f"{ZEROS} 0", "free"), r"goal.*\(7,\)"),
+        (asked("0 0 0 0 0 zero", ZEROS, "free"), "--start '0 0 0 0 0 zero'"),
+        (asked("", ZEROS, "free"), r"start.*\(0,\)"),
+        (asked("nan 0 0 0 0 0", ZEROS, "free"), r"start\[0\] is not finite"),
+        (asked(ZEROS, "0 0 0 0 0 inf", "free"), r"goal\[5\] is not finite"),
+        (asked(ZEROS, ZEROS, "cup"), "'cup'.*level_cup"),
+        ((*asked(ZEROS, ZEROS, "free"), "--budget", "0"), "budget_s = 0"),
     ],
     ids=("three", "seven", "word", "nothing", "nan", "inf", "name", "budget"),
 )
 def test_wrong_usage_of_plan_is_code_two(command, words, said) -> None:
-    code, out, err = command("plan", *words)
+    code, out, err = command(*words)
     assert (code, out) == (2, "")
     assert re.search(said, error_line(err)), err
 
 
 @pytest.mark.parametrize("missing", ["--start", "--goal", "--constraint"])
 def test_every_needed_option_is_asked_for(command, missing) -> None:
-    given = {"--start": "0 0 0 0 0 0", "--goal": "0 0 0 0 0 0", "--constraint": "free"}
+    given = {"--start": ZEROS, "--goal": ZEROS, "--constraint": "free"}
     del given[missing]
     code, out, err = command("plan", *(word for pair in given.items() for word in pair))
     assert (code, out) == (2, "")
@@ -243,12 +194,8 @@ def test_every_needed_option_is_asked_for(command, missing) -> None:
 
 
 def test_a_planner_that_is_none_is_one_line(command, tmp_path) -> None:
-    words = {
-        "plan": ("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 0", "--constraint", "free"),
-        "constraints": (),
-    }
-    for name, own in words.items():
-        code, out, err = command(name, *own, "--planner", str(tmp_path))
+    for words in (asked(ZEROS, ZEROS, "free"), ("constraints",)):
+        code, out, err = command(*words, "--planner", str(tmp_path))
         assert code in (1, 2)
         assert out == ""
         assert "planner.json" in error_line(err)
@@ -256,17 +203,7 @@ def test_a_planner_that_is_none_is_one_line(command, tmp_path) -> None:
 
 def test_a_file_that_can_not_be_written_is_one_line(command, query, tmp_path) -> None:
     (tmp_path / "file").write_text("")
-    code, _, err = command(
-        "plan",
-        "--start",
-        query[0],
-        "--goal",
-        query[1],
-        "--constraint",
-        "free",
-        "--out",
-        str(tmp_path / "file" / "path"),
-    )
+    code, _, err = command(*asked(*query, "free"), "--out", str(tmp_path / "file" / "path"))
     assert code in (1, 2)
     assert str(tmp_path / "file") in error_line(err)
 
@@ -297,23 +234,17 @@ def test_a_certificate_is_one_json_object(command, saved) -> None:
     assert answer["collision_checks"] > 10
 
 
-def through_itself(folder: Path) -> Path:
+def test_a_collision_is_named_in_json_as_well(command, tmp_path) -> None:
     """A path into the arm itself, slow enough."""
-    file = folder / "collision.csv"
+    file = tmp_path / "collision.csv"
     rows = np.linspace(0.0, 1.0, 60)[:, None] * np.array([float(x) for x in TOUCHES_ITSELF.split()])
     names = ",".join(packaged_planner().scene.robot.joint_names)
     file.write_text("\n".join([names, *(",".join(map(repr, row)) for row in rows.tolist())]))
-    return file
-
-
-def test_a_collision_is_named(command, tmp_path) -> None:
-    code, out, _ = command("check", str(through_itself(tmp_path)), "--constraint", "free")
+    words = ("check", str(file), "--constraint", "free")
+    code, out, _ = command(*words)
     assert code == 3
     assert out.startswith("self_collision: ")
-
-
-def test_a_collision_is_json_as_well(command, tmp_path) -> None:
-    code, out, _ = command("check", str(through_itself(tmp_path)), "--constraint", "free", "--json")
+    code, out, _ = command(*words, "--json")
     assert code == 3
     assert strict(out)["violation"]["kind"] == "self_collision"
 
@@ -381,18 +312,7 @@ def test_constraints_are_listed(command) -> None:
 def test_the_installed_command_answers(query, tmp_path) -> None:
     """In processes of its own: a path, and wrong usage."""
     given = ("--planner", str(bundle.PACKAGED))
-    runs = {
-        0: (
-            "plan",
-            f"--start={query[0]}",
-            f"--goal={query[1]}",
-            "--constraint",
-            "level_cup",
-            "--json",
-            *given,
-        ),
-        2: ("check", "nowhere.csv", *given),
-    }
+    runs = {0: (*asked(*query), "--json", *given), 2: ("check", "nowhere.csv", *given)}
     for code, words in runs.items():
         done = subprocess.run(
             [COMMAND, *words], capture_output=True, text=True, cwd=tmp_path, check=False
@@ -407,20 +327,18 @@ def test_the_installed_command_answers(query, tmp_path) -> None:
 
 
 def test_a_budget_is_used(command, query) -> None:
-    words = ("--start", query[0], "--goal", query[1], "--constraint", "level_cup", "--json")
-    first, longer = (
-        strict(command("plan", *words, *more)[1]) for more in ((), ("--budget", "0.2"))
-    )
+    words = (*asked(*query), "--json")
+    first, longer = (strict(command(*words, *more)[1]) for more in ((), ("--budget", "0.2")))
     assert longer["planning_time_s"] >= 0.2
     assert longer["length_rad"] <= first["length_rad"]
 
 
 @pytest.mark.parametrize("method", ["planner", "learned", "learned+band"])
 def test_a_method_is_chosen_by_its_name_and_named_in_the_answer(command, query, method) -> None:
-    words = ("--start", query[0], "--goal", query[1], "--constraint", "level_cup", "--json")
-    code, out, _ = command("plan", *words, "--method", method)
+    words = (*asked(*query), "--json")
+    code, out, _ = command(*words, "--method", method)
     assert (code, strict(out)["method"]) == (0, method)
-    code, out, err = command("plan", *words, "--method", "paper")
+    code, out, err = command(*words, "--method", "paper")
     assert (code, out) == (2, "")
     assert "no method 'paper'" in error_line(err)
 
@@ -434,11 +352,8 @@ def test_a_method_is_chosen_by_its_name_and_named_in_the_answer(command, query, 
     ],
 )
 def test_what_bench_does_not_know_is_one_line(monkeypatch, capfd, tmp_path, words, said) -> None:
-    monkeypatch.setattr(
-        sys, "argv", ["geodesics", "bench", "--out", str(tmp_path / "bench"), *words]
-    )
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert stop.value.code == 1
-    assert said in error_line(capfd.readouterr().err)
+    words = ("bench", "--out", str(tmp_path / "bench"), *words)
+    code, _, err = called(monkeypatch, capfd, words)
+    assert code == 1
+    assert said in error_line(err)
     assert not (tmp_path / "bench").exists()

@@ -44,14 +44,9 @@ from tests.test_cli_plan import strict
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(bundle.__file__).parent
 SOURCES = PACKAGE.parent
-HERE = replace(
-    Surroundings.here(),
-    environ={
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith(("MLFLOW_", "DVC_", "GIT_"))
-    },
-)
+ENVIRON = {n: v for n, v in os.environ.items() if not n.startswith(("MLFLOW_", "DVC_", "GIT_"))}
+FROM_SOURCES = {**ENVIRON, "PYTHONPATH": str(SOURCES)}
+HERE = replace(Surroundings.here(), environ=ENVIRON)
 
 
 def look(check: str, root: Path, here: Surroundings = HERE) -> list[Finding]:
@@ -68,19 +63,17 @@ def only(findings: list[Finding], status: str) -> Finding:
 
 
 def with_environ(**changes: str | None) -> Surroundings:
-    changed = {**HERE.environ, **changes}
-    return replace(
-        HERE, environ={name: value for name, value in changed.items() if value is not None}
-    )
+    changed = {**ENVIRON, **changes}
+    return replace(HERE, environ={n: value for n, value in changed.items() if value is not None})
 
 
 def run(
-    *command: str | Path, folder: Path, environ: Mapping[str, str] | None = None
+    *command: str | Path, folder: Path, environ: Mapping[str, str] = ENVIRON
 ) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [str(word) for word in command],
         cwd=folder,
-        env=dict(HERE.environ if environ is None else environ),
+        env=dict(environ),
         capture_output=True,
         text=True,
         check=False,
@@ -95,9 +88,8 @@ def distribution(site: Path, name: str, version: str, url: str | None = None) ->
     folder.mkdir(parents=True)
     (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
     if url is not None:
-        (folder / "direct_url.json").write_text(
-            json.dumps({"dir_info": {"editable": True}, "url": url})
-        )
+        about = {"dir_info": {"editable": True}, "url": url}
+        (folder / "direct_url.json").write_text(json.dumps(about))
 
 
 def checkout(folder: Path) -> Path:
@@ -117,12 +109,10 @@ def test_another_python_is_named(tmp_path, version) -> None:
 
 def test_the_checkouts_own_environment_is_pointed_at(tmp_path) -> None:
     venv.create(tmp_path / ".venv", with_pip=False)
-    assert only(look("python", tmp_path, replace(HERE, python=(3, 12, 1))), "problem").mend == (
-        "source .venv/bin/activate"
-    )
-    assert (
-        only(look("python", tmp_path, replace(HERE, python=(3, 11, 9))), "ok").message == "3.11.9"
-    )
+    found = only(look("python", tmp_path, replace(HERE, python=(3, 12, 1))), "problem")
+    assert found.mend == "source .venv/bin/activate"
+    found = only(look("python", tmp_path, replace(HERE, python=(3, 11, 9))), "ok")
+    assert found.message == "3.11.9"
 
 
 def test_an_older_python_can_read_the_module() -> None:
@@ -131,30 +121,17 @@ def test_an_older_python_can_read_the_module() -> None:
     """
     for file in (PACKAGE / "__init__.py", PACKAGE / "doctor.py"):
         tree = ast.parse(file.read_text(), feature_version=(3, 8))
-        future = [
-            node
-            for node in tree.body
-            if isinstance(node, ast.ImportFrom) and node.module == "__future__"
-        ]
-        assert file.name == "__init__.py" or [name.name for name in future[0].names] == [
-            "annotations"
-        ]
+        imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+        future = [n.name for node in imports if node.module == "__future__" for n in node.names]
+        assert file.name == "__init__.py" or future == ["annotations"]
 
 
 def test_it_runs_without_any_package(tmp_path) -> None:
     """A Python that sees nothing but the standard library and src."""
     shutil.copy(ROOT / "requirements.lock", tmp_path)
     shutil.copy(ROOT / "params.yaml", tmp_path)
-    environ = {**HERE.environ, "PYTHONPATH": str(SOURCES)}
-    done = run(
-        sys.executable,
-        "-S",
-        "-m",
-        "constraint_geodesics.doctor",
-        "--json",
-        folder=tmp_path,
-        environ=environ,
-    )
+    words = ("-S", "-m", "constraint_geodesics.doctor", "--json")
+    done = run(sys.executable, *words, folder=tmp_path, environ=FROM_SOURCES)
     assert done.stderr == ""
     assert done.returncode == 1
     answer = json.loads(done.stdout)
@@ -166,19 +143,13 @@ def test_it_runs_without_any_package(tmp_path) -> None:
     )
     assert findings["packages"]["message"].endswith(f"and {count - 4} more")
     assert "neither in this checkout nor in pybullet_data" in findings["robot"]["message"]
-    assert not [
-        entry for entry in answer["findings"] if "could not be looked at" in entry["message"]
-    ]
+    assert "could not be looked at" not in done.stdout
 
 
 def test_packages_are_compared_with_the_lock(tmp_path) -> None:
     site = tmp_path / "site"
-    for name, version in (
-        ("torch", "2.13.0+cpu"),
-        ("Ruamel_Yaml", "0.19.1"),
-        ("numpy", "1.26.4"),
-        ("extra", "1"),
-    ):
+    there = {"torch": "2.13.0+cpu", "Ruamel_Yaml": "0.19.1", "numpy": "1.26.4", "extra": "1"}
+    for name, version in there.items():
         distribution(site, name, version)
     here = replace(HERE, installed=versions_in([str(site)]))
     lock = tmp_path / "requirements.lock"
@@ -191,9 +162,8 @@ def test_packages_are_compared_with_the_lock(tmp_path) -> None:
     assert missing.status == other.status == "problem"
     assert missing.mend == "python -m pip install -r requirements.lock"
     lock.write_text("torch==2.12.0\n")
-    assert (
-        "torch 2.13.0+cpu, not 2.12.0" in only(look("packages", tmp_path, here), "problem").message
-    )
+    found = only(look("packages", tmp_path, here), "problem")
+    assert "torch 2.13.0+cpu, not 2.12.0" in found.message
 
 
 def test_of_two_versions_the_one_that_python_finds_counts(tmp_path) -> None:
@@ -203,14 +173,9 @@ def test_of_two_versions_the_one_that_python_finds_counts(tmp_path) -> None:
     folders = [str(tmp_path / "first"), str(tmp_path / "second")]
     assert versions_in(folders) == {"numpy": "2.4.6"}
     ask = f"from constraint_geodesics.doctor import versions_in; print(versions_in({folders}))"
-    environ = {
-        **HERE.environ,
-        "PYTHONPATH": str(SOURCES),
-    }  # a package of MLflow's replaces Python's own way to look
-    assert (
-        run(sys.executable, "-S", "-c", ask, folder=tmp_path, environ=environ).stdout
-        == "{'numpy': '2.4.6'}\n"
-    )
+    # without site packages: one of MLflow's replaces Python's own way to look
+    done = run(sys.executable, "-S", "-c", ask, folder=tmp_path, environ=FROM_SOURCES)
+    assert done.stdout == "{'numpy': '2.4.6'}\n"
 
 
 @pytest.mark.parametrize(
@@ -266,11 +231,8 @@ def test_the_package_of_another_checkout_is_recognised(tmp_path) -> None:
     assert found.mend == "python -m pip install --no-deps --editable ."
     found = only(look("install", own, in_checkout(own, site)), "note")
     assert f"from {other}, another checkout; only PYTHONPATH" in found.message
-    found = only(
-        look("install", other, in_checkout(other, site, own / "src" / "constraint_geodesics")),
-        "problem",
-    )
-    assert found.mend == "unset PYTHONPATH"
+    here = in_checkout(other, site, own / "src" / "constraint_geodesics")
+    assert only(look("install", other, here), "problem").mend == "unset PYTHONPATH"
 
 
 def test_a_folder_that_is_no_checkout_is_noted(tmp_path) -> None:
@@ -297,11 +259,8 @@ def test_programs_of_a_moved_or_copied_environment_are_recognised(tmp_path) -> N
     assert only(look("install", old, replace(in_checkout(old, site), prefix=old / ".venv")), "ok")
 
     copy = Path(shutil.copytree(old, tmp_path / "copy", symlinks=True))
-    named = [
-        f
-        for f in look("install", copy, replace(in_checkout(copy, site), prefix=copy / ".venv"))
-        if ".venv" in f.message
-    ]
+    here = replace(in_checkout(copy, site), prefix=copy / ".venv")
+    named = [finding for finding in look("install", copy, here) if ".venv" in finding.message]
     assert only(named, "problem").message == (
         f"geodesics, long in {copy}/.venv/bin start {old}/.venv/bin/python, of another environment"
     )
@@ -326,9 +285,8 @@ def test_a_checkout_without_git_is_recognised(tmp_path) -> None:
     found = only(look("git", root, here), "problem")
     assert "no git repository" in found.message
     assert "dvc config core.no_scm true" in found.mend
-    assert (
-        only(look("git", root, with_environ(PATH=str(tmp_path))), "problem").mend == "install git"
-    )
+    nowhere = with_environ(PATH=str(tmp_path))
+    assert only(look("git", root, nowhere), "problem").mend == "install git"
     run("git", "init", "--quiet", folder=root)
     assert only(look("git", root, here), "ok").message == f"a repository in {root}"
 
@@ -348,11 +306,8 @@ def test_a_checkout_of_another_user_is_recognised(tmp_path) -> None:
 def test_a_folder_that_can_not_be_written_and_a_full_disk_are_recognised(tmp_path) -> None:
     assert only(look("disk", tmp_path), "ok").message.endswith("GB free")
     assert not list(tmp_path.iterdir())
-    assert [
-        f
-        for f in look("disk", Path("/proc"))
-        if f.status == "problem" and "/proc can't be written" in f.message
-    ]
+    problems = [found.message for found in look("disk", Path("/proc")) if found.status == "problem"]
+    assert [message for message in problems if "/proc can't be written" in message]
     (full,) = check_disk(tmp_path, HERE, least=10**18)
     assert full[0] == "problem"
     assert full[1].endswith("GB free, where a run needs 1000000000")
@@ -396,11 +351,8 @@ def test_missing_meshes_are_recognised(tmp_path) -> None:
     assert re.search(
         r"14 of its meshes are missing: package://xarm_description/.* and 10 more$", found.message
     )
-    meshes = Path(
-        shutil.copytree(
-            data_path() / "xarm" / "xarm_description", root / "robots" / "xarm_description"
-        )
-    )
+    meshes = root / "robots" / "xarm_description"
+    shutil.copytree(data_path() / "xarm" / "xarm_description", meshes)
     assert only(look("robot", root), "ok").message.startswith(f"{name} with 14 meshes")
     (meshes / "meshes" / "xarm6" / "visual" / "link3.stl").unlink()
     found = only(look("robot", root), "problem")
@@ -452,10 +404,8 @@ def recorded(root: Path) -> Path:
 def test_recordings_of_another_rerun_are_recognised(tmp_path) -> None:
     file = recorded(tmp_path)
     here = with_environ(PATH=str(tmp_path))
-    assert (
-        only(look("recordings", tmp_path, here), "ok").message
-        == f"1 found, all for the installed Rerun {rr.__version__}"
-    )
+    found = only(look("recordings", tmp_path, here), "ok")
+    assert found.message == f"1 found, all for the installed Rerun {rr.__version__}"
     written = file.read_bytes()
     major, minor, patch = numbers(rr.__version__)
     assert written[4:7] == bytes((major, minor, patch)), "where Rerun writes its version"
@@ -478,10 +428,8 @@ def test_another_rerun_on_the_path_is_noted(tmp_path) -> None:
     other = tmp_path / "rerun"
     other.write_text("#!/bin/sh\necho 'rerun-cli 0.22.1 [rustc 1.81.0] x86_64-unknown-linux-gnu'\n")
     other.chmod(0o755)
-    found = only(
-        look("recordings", tmp_path, with_environ(PATH=f"{tmp_path}:{HERE.environ['PATH']}")),
-        "note",
-    )
+    here = with_environ(PATH=f"{tmp_path}:{ENVIRON['PATH']}")
+    found = only(look("recordings", tmp_path, here), "note")
     assert f"{other} of version 0.22.1, but this environment has {rr.__version__}" in found.message
     own = with_environ(PATH=f"{HERE.prefix / 'bin'}:{tmp_path}")
     assert only(look("recordings", tmp_path, own), "ok")
@@ -506,6 +454,9 @@ def altered(store: Path, root: Path, statement: str) -> Path:
     return file
 
 
+UPGRADE, MOVED = "mlflow db upgrade sqlite:///mlflow.db", "mv mlflow.db mlflow.db.newer"
+
+
 def test_a_store_of_this_mlflow_is_well(store, tmp_path) -> None:
     assert only(look("mlflow", tmp_path), "ok").message == "no runs yet"
     assert only(look("mlflow", store.parent), "ok").message == "runs in mlflow.db"
@@ -516,21 +467,8 @@ def test_a_store_of_this_mlflow_is_well(store, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("version", "parts"),
     [
-        (
-            "451aebb31d03",
-            (
-                "of an older MLflow",
-                "cp mlflow.db mlflow.db.old && mlflow db upgrade sqlite:///mlflow.db",
-            ),
-        ),
-        (
-            "ffffffffffff",
-            (
-                "a newer one wrote it",
-                "pip install --upgrade mlflow",
-                "mv mlflow.db mlflow.db.newer",
-            ),
-        ),
+        ("451aebb31d03", ("of an older MLflow", f"cp mlflow.db mlflow.db.old && {UPGRADE}")),
+        ("ffffffffffff", ("a newer one wrote it", "pip install --upgrade mlflow", MOVED)),
     ],
 )
 def test_a_store_of_another_schema_is_recognised(store, tmp_path, version, parts) -> None:
@@ -554,12 +492,9 @@ def test_a_broken_store_is_recognised(store, tmp_path) -> None:
     found = only(look("mlflow", tmp_path), "problem")
     assert re.search("damaged|can't be read: .*malformed", found.message)
     file.write_bytes(b"<<<<<<< HEAD\n" * 1000)
-    assert (
-        "can't be read: file is not a database" in only(look("mlflow", tmp_path), "problem").message
-    )
-    assert only(look("mlflow", tmp_path), "problem").mend.startswith(
-        "mv mlflow.db mlflow.db.broken"
-    )
+    found = only(look("mlflow", tmp_path), "problem")
+    assert "can't be read: file is not a database" in found.message
+    assert found.mend.startswith("mv mlflow.db mlflow.db.broken")
 
 
 def test_a_store_in_use_is_no_broken_one(store, tmp_path) -> None:
@@ -687,10 +622,8 @@ def test_a_fresh_clone_is_not_called_changed(pipeline, tmp_path) -> None:
     clone = tmp_path / "clone"
     run("git", "clone", "--quiet", pipeline, clone, folder=tmp_path)
     found = only(look("pipeline", clone), "note")
-    assert (
-        found.message
-        == "outputs of 2 stages are not here, as in a fresh clone; planning works without"
-    )
+    said = "outputs of 2 stages are not here, as in a fresh clone; planning works without"
+    assert found.message == said
     assert found.mend == "make repro"
     (clone / "draw.py").write_text("# 2\n")
     changed, absent = look("pipeline", clone)
@@ -732,9 +665,8 @@ def test_a_pipeline_beside_the_main_one_is_noted(ran) -> None:
 
 
 def test_a_lock_file_broken_by_a_merge_is_recognised(ran) -> None:
-    (ran / "dvc.lock").write_text(
-        "<<<<<<< HEAD\nschema: '2.0'\n=======\nschema: '2.0'\n>>>>>>> other\n"
-    )
+    schema = "schema: '2.0'\n"
+    (ran / "dvc.lock").write_text(f"<<<<<<< HEAD\n{schema}=======\n{schema}>>>>>>> other\n")
     found = only(look("pipeline", ran), "problem")
     assert "DVC can't read dvc.lock" in found.message
     run(*found.mend.split(), folder=ran)
@@ -748,10 +680,8 @@ def test_dvc_at_work_or_too_slow_is_noted(ran) -> None:
     with (ran / ".dvc" / "tmp" / "lock").open("r+") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         (found,) = look("pipeline", ran)
-    assert (found.status, found.message) == (
-        "note",
-        "DVC is at work here: the stages were not looked at",
-    )
+    assert found.status == "note"
+    assert found.message == "DVC is at work here: the stages were not looked at"
 
 
 def test_without_a_pipeline_nothing_is_said(tmp_path) -> None:
@@ -787,10 +717,8 @@ def test_the_text_is_aligned_and_coloured_on_demand() -> None:
 
 
 def command(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    environ = {**HERE.environ, "PYTHONPATH": str(SOURCES)}
-    return run(
-        sys.executable, "-m", "constraint_geodesics.cli", *words, folder=folder, environ=environ
-    )
+    own = (sys.executable, "-m", "constraint_geodesics.cli")
+    return run(*own, *words, folder=folder, environ=FROM_SOURCES)
 
 
 def test_the_command_tells_by_its_exit_code(tmp_path) -> None:

@@ -13,9 +13,7 @@ from dvc.utils.serialize import modify_yaml
 from constraint_geodesics.gate import check_params
 from constraint_geodesics.params import ParamsError, WorkcellParams, load_params
 from constraint_geodesics.scene.body import Body
-from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.capsule import Capsule
-from constraint_geodesics.scene.sphere import Sphere
 
 ROOT = Path(__file__).resolve().parents[1]
 Change = Callable[[dict[str, Any]], Any]
@@ -98,8 +96,7 @@ def test_a_bad_parameter_is_named_in_one_line(
         assert part in message
 
 
-BODY = {"urdf": "nowhere.urdf"}
-TABLE = {"centre_m": [0.0, 0.0, -1.0], "size_m": [1.0, 1.0, 0.1], "exempt_links": ["arm"]}
+DOOR = {"kind": "urdf", "urdf": "nowhere.urdf"}
 REFUSED: list[tuple[Change, tuple[str, ...]]] = [
     (lambda p: p["robot"].update(urdf="no/arm.urdf"), ("robot", "no/arm.urdf", "no such URDF")),
     (lambda p: p["robot"].update(urdf="params.yaml"), ("robot.urdf", "params.yaml", "no URDF")),
@@ -109,8 +106,8 @@ REFUSED: list[tuple[Change, tuple[str, ...]]] = [
         lambda p: p["robot"].update(limits_rad={"joint1": [-9.0, 3.5]}),
         ("robot", "joint1", "[-9.0, 3.5]", "within the URDF's"),
     ),
-    (lambda p: p["workcell"].update(urdfs={"door": BODY}), ("workcell", "nowhere.urdf")),
-    (lambda p: p["workcell"].update(boxes={"table": TABLE}), ("workcell", "arm")),
+    (lambda p: shapes(p).update(door=DOOR), ("workcell", "nowhere.urdf")),
+    (lambda p: shapes(p)["table"].update(exempt_links=["arm"]), ("workcell", "arm")),
     (
         lambda p: p["manifolds"]["paper"].update(latent_dim=7),
         ("manifolds.paper.latent_dim=7", "at most 6"),
@@ -238,13 +235,3 @@ def test_shapes_of_every_kind_come_from_params_and_go_back(tmp_path: Path) -> No
     assert workcell.shapes["tray"] == Body("tray", "tray/traybox.urdf", rpy_rad=(0, 0, 1.5))
     assert WorkcellParams.model_validate(workcell.model_dump(mode="json")) == workcell
     assert WorkcellParams().including(*workcell.shapes.values()) == workcell
-
-
-def test_files_that_list_boxes_spheres_and_urdfs_apart_are_read_as_well() -> None:
-    box = {"centre_m": [0.0, 0.0, 1.0], "size_m": [1.0, 1.0, 1.0]}
-    ball = {"centre_m": [0.0, 0.0, 1.0], "radius_m": 0.1}
-    listed = {"boxes": {"a": box}, "spheres": {"b": ball}, "urdfs": {"c": {"urdf": "c.urdf"}}}
-    shapes = WorkcellParams.model_validate(listed).shapes
-    assert shapes["a"] == Box("a", (0.0, 0.0, 1.0), (1.0, 1.0, 1.0))
-    assert shapes["b"] == Sphere("b", (0.0, 0.0, 1.0), 0.1)
-    assert shapes["c"] == Body("c", "c.urdf")

@@ -38,9 +38,8 @@ app = typer.Typer(
 
 def main() -> None:
     """Entry point of the command: an error of the user's is one line, not a traceback."""
-    os.environ.update(
-        ONE_THREAD
-    )  # before anything heavy is loaded: answers are the same whoever calls
+    # before anything heavy is loaded: answers are the same whoever calls
+    os.environ.update(ONE_THREAD)
     try:
         app()
     except (ValueError, OSError, RuntimeError) as error:
@@ -117,7 +116,7 @@ def plan(
     start: Annotated[
         str, typer.Option(help='Start configuration: the joints in rad, as in "0.1 -0.5 …".')
     ],
-    goal: Annotated[str, typer.Option(help="Goal configuration [rad].")],
+    goal: Annotated[str, typer.Option(help="Goal configuration: the joints in rad.")],
     constraint: Annotated[
         str,
         typer.Option(
@@ -149,9 +148,7 @@ def plan(
             shell_complete=completion.methods,
         ),
     ] = "planner",
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the answer as one JSON object.")
-    ] = False,
+    as_json: bool = JSON,
 ) -> None:
     """Plan one path.  Exit code 0: solved; 2: wrong usage; 3: there is no path, and the line says
     why.
@@ -181,7 +178,7 @@ def plan(
 @app.command("check")
 def check(
     file: Annotated[
-        Path, typer.Argument(help="A path as CSV: a header, then one row of joints [rad] a line.")
+        Path, typer.Argument(help="A path as CSV: a header, then one row of joints in rad a line.")
     ],
     constraint: Annotated[
         str | None,
@@ -261,7 +258,7 @@ def bench(
     """Hold planners against each other on a few of the benchmark's queries; what is done is not
     done again.
     """
-    from constraint_geodesics.benchmark.entries import Wish, answered, committed_run, fewer
+    from constraint_geodesics.benchmark.entries import answered, committed_run, fewer
     from constraint_geodesics.benchmark.row import write_table
     from constraint_geodesics.benchmark.statistics import all_constraints, benchmark_summary
     from constraint_geodesics.params import load_params
@@ -270,7 +267,7 @@ def bench(
     from constraint_geodesics.report.benchmark_tables import asks_in_python, overview_markdown
 
     params, layout = load_params(), Layout()
-    some, left_out = fewer(params, Wish(queries, seeds, constraint, planner, longest))
+    some, left_out = fewer(params, queries, seeds, constraint, planner, longest)
     table = answered(committed_run(some, layout, out / "rows", out / "recordings"))
     write_table(table, out / "benchmark.csv", run_header(layout.root))
     order = {name: k for k, name in enumerate(some.benchmark.planners)}

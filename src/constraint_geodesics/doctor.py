@@ -104,15 +104,13 @@ def examine(
 
 def _examine_one(name: str, check: Check, root: Path, here: Surroundings) -> list[Finding]:
     answers: list[Answer] = []
-
-    def listen() -> Iterator[Answer]:
-        well = yield from check(root, here)
-        if well and not answers:
-            yield "ok", well, ""
-
+    look = check(root, here)
     try:
-        for one in listen():
-            answers.append(one)  # noqa: PERF402
+        while True:
+            answers.append(next(look))
+    except StopIteration as end:
+        if end.value and not answers:
+            answers.append(("ok", end.value, ""))
     except Exception as error:
         message = f"could not be looked at: {type(error).__name__}: {' '.join(str(error).split())}"
         answers.append(_problem(message, "mend what the message names, then look again"))
@@ -479,8 +477,7 @@ def _urdf_names(root: Path, here: Surroundings) -> dict[str, str]:
         described.append((str(card), json.loads(card.read_text("utf-8"))))
     named: dict[str, str] = {}
     for where, parameters in described:
-        workcell = parameters["workcell"]
-        bodies = {**workcell.get("urdfs", {}), **workcell.get("shapes", {})}.values()
+        bodies = parameters["workcell"].get("shapes", {}).values()
         named.setdefault(parameters["robot"]["urdf"], where)
         for urdf in (body["urdf"] for body in bodies if "urdf" in body):
             named.setdefault(urdf, where)

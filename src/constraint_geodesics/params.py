@@ -57,20 +57,15 @@ class WorkcellParams(_Record):
     @model_validator(mode="before")
     @classmethod
     def _named(cls, raw: Any) -> Any:
-        """Each shape with its name; earlier files list boxes, spheres and urdfs apart."""
+        """Each shape with its name."""
         if not isinstance(raw, dict):
             return raw
-        rest, found = dict(raw), dict(raw.get("shapes") or {})
-        for listed, kind in _LISTED_APART.items():
-            found |= {name: {"kind": kind, **one} for name, one in rest.pop(listed, {}).items()}
+        found = dict(raw.get("shapes") or {})
         for name, shape in found.items():
             if isinstance(shape, dict):  # lists become tuples here, as JSON's strict mode has them
                 given = {k: tuple(v) if isinstance(v, list) else v for k, v in shape.items()}
                 found[name] = given | {"name": name}
-        return rest | {"shapes": found}
-
-
-_LISTED_APART = {"boxes": "box", "spheres": "sphere", "urdfs": "urdf"}
+        return raw | {"shapes": found}
 
 
 class ComputeParams(_Record):
@@ -448,13 +443,8 @@ class Params(_Record):
         for each.
         """
         own = self.policies
-        steps = own.separate_steps if separate else own.steps
-        changed = {
-            "steps": steps,
-            "episode_steps": own.episode_steps,
-            "reward": own.reward,
-            "ppo": own.ppo,
-        }
+        changed: dict[str, Any] = {n: getattr(own, n) for n in ("episode_steps", "reward", "ppo")}
+        changed["steps"] = own.separate_steps if separate else own.steps
         return self.geodesics.model_copy(update=changed)
 
     @property

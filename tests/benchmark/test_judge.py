@@ -104,20 +104,12 @@ def test_a_level_turn_is_valid_and_its_lengths_are_known(
 
 
 def test_the_row_has_one_latent_length_a_manifold(cup, certifier, start, identity_chart):
-    row = judged(
-        around(start), cup, certifier, {"one": identity_chart, "two": identity_chart}
-    ).row()
+    charts = {"one": identity_chart, "two": identity_chart}
+    row = judged(around(start), cup, certifier, charts).row()
     assert row["latent_length_one"] == row["latent_length_two"]
     assert "latent_length" not in row
-    assert set(row) == set(
-        judged(
-            np.zeros((0, 6)),
-            cup,
-            certifier,
-            {"one": identity_chart, "two": identity_chart},
-            (start, start),
-        ).row()
-    )
+    nothing = judged(np.zeros((0, 6)), cup, certifier, charts, (start, start))
+    assert set(row) == set(nothing.row())
 
 
 def test_no_path_and_no_numbers_are_failures_that_have_no_length(
@@ -129,14 +121,8 @@ def test_no_path_and_no_numbers_are_failures_that_have_no_length(
     infinite = judged(broken, cup, certifier, {"identity": identity_chart}, (start, start))
     for found, reason in ((nothing, "no path"), (infinite, "not finite")):
         assert (found.valid, found.reason) == (False, reason)
-        assert np.isnan(
-            [
-                found.length_rad,
-                found.tool_length_m,
-                found.max_violation_rad,
-                *found.latent_length.values(),
-            ]
-        ).all()
+        lengths = [found.length_rad, found.tool_length_m, *found.latent_length.values()]
+        assert np.isnan([*lengths, found.max_violation_rad]).all()
 
 
 def test_every_rule_refuses_what_it_is_for(scene, cup, certifier, start):
@@ -148,9 +134,8 @@ def test_every_rule_refuses_what_it_is_for(scene, cup, certifier, start):
     upper = scene.robot.upper[0]
     beyond = start + (upper - 0.5) * np.eye(6)[0] + STEPS * np.eye(6)[0]
     assert judged(beyond, cup, certifier).reason == "joint limits"
-    tilted = (
-        start + 0.3 * STEPS * np.eye(6)[1]
-    )  # the shoulder turns about a horizontal axis: all of it is tilt
+    # the shoulder turns about a horizontal axis: all of it is tilt
+    tilted = start + 0.3 * STEPS * np.eye(6)[1]
     found = judged(tilted, cup, certifier)
     assert found.reason == "constraint"
     assert found.max_violation_rad == pytest.approx(0.3, abs=1e-6)
@@ -185,16 +170,10 @@ def test_the_angle_of_a_cone_is_measured_as_a_whole(scene, cup, certifier):
     for k in range(len(q)):
         still = np.stack([q[k], q[k] + 1e-9])
         assert judged(still, cup, certifier).max_violation_rad == pytest.approx(tilt[k], abs=1e-6)
-        excess = max(tilt[k] - tolerance, 0.0)
-        assert judged(still, relaxed, certifier).max_violation_rad == pytest.approx(
-            excess, abs=1e-6
-        )
-    assert (
-        judged(
-            q[:2], constraint_manifold(scene.robot, PARAMS.constraints["free"]), certifier
-        ).max_violation_rad
-        == 0.0
-    )
+        excess = pytest.approx(max(tilt[k] - tolerance, 0.0), abs=1e-6)
+        assert judged(still, relaxed, certifier).max_violation_rad == excess
+    free = constraint_manifold(scene.robot, PARAMS.constraints["free"])
+    assert judged(q[:2], free, certifier).max_violation_rad == 0.0
 
 
 @settings(deadline=None)

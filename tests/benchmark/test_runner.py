@@ -82,21 +82,14 @@ def batch(tmp_path) -> QueryBatch:
     )
 
 
-def rows_of(batch: QueryBatch) -> list[dict]:
-    return batch_rows(batch)
-
-
 def test_every_query_seed_and_planner_has_its_row_and_the_certifiers_word(batch) -> None:
     assert rows_to_do(batch) == 12
     assert run_batch(batch) == 12
-    table = table_of(rows_of(batch))
+    table = table_of(batch_rows(batch))
     assert list(table.columns) == list(COLUMNS)
     assert (table["kind"] == table["planner"] + "_kind").all()
-    assert table.groupby("planner")["settings"].unique().str[0].to_dict() == {
-        "band": "a",
-        "broken": "c",
-        "liar": "b",
-    }
+    digests = table.groupby("planner")["settings"].unique().str[0].to_dict()
+    assert digests == {"band": "a", "broken": "c", "liar": "b"}
     assert table.groupby("planner").size().to_dict() == {"band": 3, "broken": 3, "liar": 6}
     band, liar, broken = (table[table["planner"] == name] for name in ("band", "liar", "broken"))
     assert band["valid"].all()
@@ -107,7 +100,7 @@ def test_every_query_seed_and_planner_has_its_row_and_the_certifiers_word(batch)
     np.testing.assert_array_equal(band["best_known_rad"], band["length_rad"])
     assert (table["peak_memory_mb"] >= 0.0).all()
     assert (table["scene_s"] >= 0.25).all()
-    assert "FloatingPointError: a library gave up" in {row["reason"] for row in rows_of(batch)}
+    assert "FloatingPointError: a library gave up" in {row["reason"] for row in batch_rows(batch)}
 
 
 def test_what_is_done_is_not_done_again(batch) -> None:
@@ -121,13 +114,12 @@ def test_what_is_done_is_not_done_again(batch) -> None:
 def test_a_killed_run_goes_on_where_it_stopped(batch) -> None:
     run_batch(batch)
     lines = batch.file.read_text().splitlines(keepends=True)
-    whole = rows_of(batch)
-    batch.file.write_text(
-        "".join(lines[:15]) + lines[15][:40]
-    )  # a line before each row says that it is begun
+    whole = batch_rows(batch)
+    # a line before each row says that it is begun
+    batch.file.write_text("".join(lines[:15]) + lines[15][:40])
     assert rows_to_do(batch) == 5
     assert run_batch(batch) == 5
-    again = rows_of(batch)
+    again = batch_rows(batch)
     for old, new in zip(sorted(whole, key=key), sorted(again, key=key), strict=True):
         assert key(old) == key(new)
         assert (old["valid"], old["length_rad"]) == (new["valid"], new["length_rad"]) or old[
@@ -143,7 +135,9 @@ def test_a_row_that_killed_its_process_twice_is_a_failure(batch) -> None:
     for kills, reason in ((1, ""), (2, "the process died in it twice")):
         batch.file.write_text(f"{first}\n" * kills)
         run_batch(batch)
-        band = next(row for row in rows_of(batch) if row["planner"] == "band" and row["query"] == 0)
+        band = next(
+            row for row in batch_rows(batch) if row["planner"] == "band" and row["query"] == 0
+        )
         assert band["valid"] == (kills == 1)
         assert band["reason"] == reason
 
@@ -154,14 +148,9 @@ def test_rows_that_are_not_asked_for_any_more_do_not_count(batch) -> None:
         batch, queries=batch.queries[:2], baselines=(replace(ASKED[0], queries=1), ASKED[1])
     )
     assert rows_to_do(fewer) == 0
-    kept = [(row["planner"], row["query"], row["seed"]) for row in rows_of(fewer)]
-    assert sorted(kept) == [
-        ("band", 0, 0),
-        ("liar", 0, 0),
-        ("liar", 0, 1),
-        ("liar", 1, 0),
-        ("liar", 1, 1),
-    ]
+    kept = [(row["planner"], row["query"], row["seed"]) for row in batch_rows(fewer)]
+    liar = [("liar", query, seed) for query in (0, 1) for seed in (0, 1)]
+    assert sorted(kept) == [("band", 0, 0), *liar]
 
 
 def test_paths_are_handed_to_the_recorder_with_their_verdict(batch) -> None:
@@ -175,7 +164,7 @@ def test_paths_are_handed_to_the_recorder_with_their_verdict(batch) -> None:
     run_batch(replace(batch, record=record))
     assert {planner for planner, *_ in seen} == {"band", "liar"}
     assert all(valid == (planner == "band") for planner, _, _, valid, _ in seen)
-    named = {row["planner"]: row["recording"] for row in rows_of(batch)}
+    named = {row["planner"]: row["recording"] for row in batch_rows(batch)}
     assert named == {"band": "band.rrd", "liar": "liar.rrd", "broken": ""}
 
 
@@ -188,7 +177,7 @@ def test_a_changed_planner_is_asked_again_alone(batch) -> None:
     changed = replace(batch, baselines=(replace(ASKED[0], fingerprint="new"), *ASKED[1:]))
     assert rows_to_do(changed) == 3
     run_batch(changed)
-    assert {row["planner"]: row["fingerprint"] for row in rows_of(changed)}["band"] == "new"
+    assert {row["planner"]: row["fingerprint"] for row in batch_rows(changed)}["band"] == "new"
     assert rows_to_do(changed) == 0
 
 
@@ -202,12 +191,8 @@ def test_queries_are_kept_to_the_bit(batch, tmp_path) -> None:
     write_queries(batch.queries, tmp_path / "queries.csv")
     again = read_queries(tmp_path / "queries.csv")
     for old, new in zip(batch.queries, again, strict=True):
-        assert (old.constraint, old.scene, old.number, old.obstacle) == (
-            new.constraint,
-            new.scene,
-            new.number,
-            new.obstacle,
-        )
+        for name in ("constraint", "scene", "number", "obstacle"):
+            assert getattr(old, name) == getattr(new, name)
         assert old.start.tobytes() == new.start.tobytes()
         assert old.goal.tobytes() == new.goal.tobytes()
 

@@ -9,11 +9,12 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 import urllib.parse
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -92,12 +93,8 @@ def test_a_stage_is_a_parent_its_seeds_are_children(root: Path) -> None:
     held = PoseConstraintParams(
         description="level", axes=(0, 0, 0, 1, 1, 0), tolerance=(0,) * 6, reference=reference
     )
-    params = {
-        "seeds": [1, 3],
-        "constraint": held,
-        "long": "x" * 7000,
-        **{f"p{i}": i for i in range(150)},
-    }
+    params = {"seeds": [1, 3], "constraint": held, "long": "x" * 7000}
+    params |= {f"p{i}": i for i in range(150)}
     about = Subject({"constraint": "cup"}, {"manifold": {"latent_dim": 6}})
     with tracked_stage(Work("train", "planner-cup", params, [], about), "tree", root) as stage:
         tasks = [(stage.child(f"seed {seed}", {"seed": seed}), seed) for seed in (1, 3)]
@@ -126,50 +123,34 @@ def test_a_stage_is_a_parent_its_seeds_are_children(root: Path) -> None:
         "seeds/loss_mean": 4.0,
         "seeds/loss_std": 1.0,
     }
-    (mean,) = MlflowClient(tracking_uri(root)).get_metric_history(
-        parent.info.run_id, "seeds/loss_mean"
-    )
+    client = MlflowClient(tracking_uri(root))
+    (mean,) = client.get_metric_history(parent.info.run_id, "seeds/loss_mean")
     assert mean.step == 2, "the only step that both have"
 
-    assert (
-        child.data.tags.items() >= {**tags, "seed": "3", "mlflow.parentRunId": stage.run_id}.items()
-    )
+    own = {**tags, "seed": "3", "mlflow.parentRunId": stage.run_id}
+    assert child.data.tags.items() >= own.items()
     assert child.data.params == {**parent.data.params, "seed": "3"}, (
         "children of different runs can be compared"
     )
-    history = MlflowClient(tracking_uri(root)).get_metric_history(child.info.run_id, "loss")
+    history = client.get_metric_history(child.info.run_id, "loss")
     assert [(point.step, point.value) for point in history] == [(0, 4.0), (1, 3.5), (2, 3 + 1 / 3)]
     assert child.data.metrics == {"loss": 3 + 1 / 3, "final/length": 3.0}
 
 
 def test_a_run_says_where_its_paths_are_recorded(root: Path) -> None:
-    def row(planner: str, seed: int, recording: str) -> dict[str, Any]:
-        return {
-            "planner": planner,
-            "query": 0,
-            "seed": seed,
-            "length_rad": 1.5,
-            "recording": recording,
-        }
-
+    paths = [("line", 0, "line.rrd"), ("ours", 0, "a.rrd"), ("ours", 0, ""), ("ours", 1, "b.rrd")]
+    rows = [
+        {"planner": planner, "query": 0, "seed": seed, "length_rad": 1.5, "recording": recording}
+        for planner, seed, recording in paths
+    ]
     with tracked_stage(Work("train", "cup"), "recorded", root) as stage:
         for seed in (0, 1):
             with stage.child(f"seed {seed}", {"seed": seed}):
                 pass
-        stage.recordings(
-            [
-                row("line", 0, "line.rrd"),
-                row("ours", 0, "a.rrd"),
-                row("ours", 0, ""),
-                row("ours", 1, "b.rrd"),
-            ],
-            "ours",
-        )
+        stage.recordings(rows, "ours")
     runs = runs_of(tracking_uri(root), "recorded")
-    assert [runs[f"cup seed {seed}"].data.tags["recording"] for seed in (0, 1)] == [
-        "a.rrd",
-        "b.rrd",
-    ]
+    named = [runs[f"cup seed {seed}"].data.tags["recording"] for seed in (0, 1)]
+    assert named == ["a.rrd", "b.rrd"]
     listed = (root / "mlartifacts/recorded" / stage.run_id / "artifacts/recordings.md").read_text()
     for text in (listed, runs["train cup"].data.tags["mlflow.note.content"]):
         assert re.findall(r"`geodesics replay (\S+)`", text) == ["line.rrd", "a.rrd", "b.rrd"]
@@ -203,9 +184,8 @@ def test_a_run_of_an_experiment_is_named_after_it(
 
 def test_runs_are_found_by_constraint_manifold_and_reward() -> None:
     params = load_params(Path(__file__).resolve().parents[2] / "params.yaml")
-    found = subject_of(
-        params, constraint="slide", manifold="planner", reward=params.policies.reward
-    )
+    reward = params.policies.reward
+    found = subject_of(params, constraint="slide", manifold="planner", reward=reward)
     assert set(found.tags) == {"constraint", "manifold", "reward"}
     assert found.tags["reward"].startswith("corrected b=")
     assert found.params == {
@@ -339,17 +319,8 @@ def test_the_named_store_is_used(
         stage.figure(root / "data" / "joints.csv")
     monkeypatch.delenv("MLFLOW_TRACKING_URI")
     assert set(runs_of(f"sqlite:///{tmp_path}/elsewhere/runs.db", "named")) == {"label cup"}
-    kept = (
-        tmp_path
-        / "elsewhere"
-        / "mlartifacts"
-        / "named"
-        / stage.run_id
-        / "artifacts"
-        / "figures"
-        / "joints.csv"
-    )
-    assert kept.read_text() == "1,2\n"
+    own = tmp_path / "elsewhere" / "mlartifacts" / "named" / stage.run_id / "artifacts"
+    assert (own / "figures" / "joints.csv").read_text() == "1,2\n"
     assert MlflowClient(tracking_uri(root)).get_experiment_by_name("named") is None
 
 
@@ -437,28 +408,36 @@ def test_inputs_are_linked_by_dvcs_own_md5_and_nothing_is_printed(tmp_path: Path
 
 
 @contextmanager
-def dashboard(root: Path) -> Iterator[str]:
-    """The server of ui_command on a free port."""
+def server(
+    command: list[str], page: str, environment: dict[str, str] | None = None
+) -> Iterator[str]:
+    """The address of what a command serves on a free port, from when a page of it answers."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    command = ui_command(root, port)
     assert command[command.index("--host") + 1] == "127.0.0.1"
-    log = (root / "server.log").open("w")
-    server = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
-    try:
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline and server.poll() is None:
-            try:
-                urllib.request.urlopen(f"http://127.0.0.1:{port}/health")
-                break
-            except OSError:
-                time.sleep(0.1)
-        yield f"http://127.0.0.1:{port}"
-    finally:
-        server.terminate()
-        server.wait(20)
-        log.close()
+    command[command.index("--port") + 1] = str(port)
+    with tempfile.TemporaryFile() as log:
+        process = subprocess.Popen(
+            command, stdout=log, stderr=log, env=environment, start_new_session=True
+        )
+        try:
+            deadline = time.monotonic() + 90
+            while time.monotonic() < deadline and process.poll() is None:
+                try:
+                    urllib.request.urlopen(f"http://127.0.0.1:{port}/{page}")
+                    break
+                except OSError:
+                    time.sleep(0.1)
+            yield f"http://127.0.0.1:{port}"
+        finally:
+            os.killpg(process.pid, 15)
+            process.wait(20)
+
+
+def dashboard(root: Path) -> AbstractContextManager[str]:
+    """The server of ui_command."""
+    return server(ui_command(root, 5000), "health")
 
 
 def test_a_moved_checkout_keeps_its_figures_and_a_server_can_be_the_store(
@@ -475,10 +454,11 @@ def test_a_moved_checkout_keeps_its_figures_and_a_server_can_be_the_store(
 
         monkeypatch.setenv("MLFLOW_TRACKING_URI", address)
         capfd.readouterr()
-        with tracked_stage(Work("train", "cup"), "served", root) as stage:
-            child = stage.child("seed 1", {})
-            with child:
-                child.artifact(root / "data" / "joints.csv")
+        with (
+            tracked_stage(Work("train", "cup"), "served", root) as stage,
+            stage.child("seed 1", {}),
+        ):
+            stage.figure(root / "data" / "joints.csv")
         assert capfd.readouterr() == ("", "")
         with pytest.raises(TrackingError, match=address):
             ui_command(root, 5000)
@@ -488,5 +468,5 @@ def test_a_moved_checkout_keeps_its_figures_and_a_server_can_be_the_store(
         "train cup": "FINISHED",
         "cup seed 1": "FINISHED",
     }
-    (kept,) = (moved / "mlartifacts").rglob(f"{child.run_id}/artifacts/joints.csv")
+    (kept,) = (moved / "mlartifacts").rglob(f"{stage.run_id}/artifacts/figures/joints.csv")
     assert kept.read_text() == "1,2\n"

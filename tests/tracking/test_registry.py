@@ -6,22 +6,17 @@ import json
 import os
 import re
 import shutil
-import socket
-import subprocess
 import sys
-import tempfile
-import time
 import urllib.request
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tests.tracking.test_experiment import dashboard
+from tests.tracking.test_experiment import dashboard, server
 
 from constraint_geodesics import Planner
 from constraint_geodesics.bundle import PACKAGED
@@ -171,36 +166,15 @@ def test_the_champion_is_served_as_its_page_says(root: Path) -> None:
     assert "level_cup" in unknown["explanation"]
 
 
-@contextmanager
-def served(command: list[str], runs: str) -> Iterator[str]:
-    """What a command serves, on a free port; runs: the address of the dashboard."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    assert command[command.index("--host") + 1] == "127.0.0.1"
-    command[command.index("--port") + 1] = str(port)
+def served(command: list[str], runs: str) -> AbstractContextManager[str]:
+    """What a command serves; runs: the address of the dashboard."""
     environment = {
         **os.environ,
         "MLFLOW_TRACKING_URI": runs,
         "MLFLOW_DISABLE_TELEMETRY": "true",
         "PATH": f"{Path(sys.executable).parent}:/usr/bin",
     }
-    with tempfile.TemporaryFile() as log:
-        server = subprocess.Popen(
-            command, stdout=log, stderr=log, env=environment, start_new_session=True
-        )
-        try:
-            deadline = time.monotonic() + 90
-            while time.monotonic() < deadline and server.poll() is None:
-                try:
-                    urllib.request.urlopen(f"http://127.0.0.1:{port}/ping")
-                    break
-                except OSError:
-                    time.sleep(0.2)
-            yield f"http://127.0.0.1:{port}"
-        finally:
-            os.killpg(server.pid, 15)
-            server.wait(20)
+    return server(command, "ping", environment)
 
 
 def ask(address: str, body: str) -> list[dict[str, Any]]:

@@ -202,12 +202,11 @@ def spread(numbered: Sequence[tuple[int, QueryBatch]]) -> list[QueryBatch]:
     """Batches, each with its number within its constraint and scene, so that equal numbers stand
     evenly apart.
     """
-    count = 1 + max((number for number, _ in numbered), default=0)
-    starts = [index for index, (number, _) in enumerate(numbered) if number == 0]
-    placed = []
-    for index, (number, batch) in enumerate(numbered):
-        turn = sum(start <= index for start in starts) - 1
-        placed.append(((number + turn * count // len(starts)) % count, turn, batch))
+    numbers = [number for number, _ in numbered]
+    count, cases, turn, placed = 1 + max(numbers, default=0), numbers.count(0), -1, []
+    for number, batch in numbered:
+        turn += number == 0
+        placed.append(((number + turn * count // cases) % count, turn, batch))
     return [batch for *_, batch in sorted(placed, key=lambda entry: entry[:2])]
 
 
@@ -226,29 +225,24 @@ def at_most(entry: BaselineParams, queries: int, seeds: int) -> BaselineParams:
     return entry.model_copy(update=less)
 
 
-@dataclass(frozen=True)
-class Wish:
-    """A smaller benchmark: so many queries and seeds, some constraints and planners (None: all),
-    and no planner that is given more than `longest_s` for a query.
-    """
-
-    queries: int
-    seeds: int
-    constraints: Sequence[str] | None = None
-    planners: Sequence[str] | None = None
-    longest_s: float = 2.0
-
-
-def fewer(params: Params, wish: Wish) -> tuple[Params, list[str]]:
-    """The parameters with less to do, and the names of the planners that are left out for their
-    time.
+def fewer(
+    params: Params,
+    queries: int,
+    seeds: int,
+    constraints: Sequence[str] | None = None,
+    planners: Sequence[str] | None = None,
+    longest_s: float = 2.0,
+) -> tuple[Params, list[str]]:
+    """The parameters of a smaller benchmark: so many queries and seeds, some constraints and
+    planners (None: all), and no planner that is given more than `longest_s` for a query.  Returns
+    the names of those left out for their time as well.
 
     Raises BaselineError if a constraint or planner does not exist, or none is left.
     """
     known_planners = params.benchmark.planners
     for kind, wanted, known in (
-        ("constraint", wish.constraints, list(params.all_constraints)),
-        ("planner", wish.planners, list(known_planners)),
+        ("constraint", constraints, params.all_constraints),
+        ("planner", planners, known_planners),
     ):
         for name in wanted or ():
             if name not in known:
@@ -256,28 +250,21 @@ def fewer(params: Params, wish: Wish) -> tuple[Params, list[str]]:
                     f"there is no {kind} {name!r}: must be one of {', '.join(known)}"
                 )
     settings = all_settings(params)
-    named = [name for name in known_planners if wish.planners is None or name in wish.planners]
-    slow = [name for name in named if settings[name].given_s > wish.longest_s]
+    named = [name for name in known_planners if planners is None or name in planners]
+    slow = [name for name in named if settings[name].given_s > longest_s]
     kept = {
-        name: at_most(known_planners[name], wish.queries, wish.seeds)
-        for name in named
-        if name not in slow
+        name: at_most(known_planners[name], queries, seeds) for name in named if name not in slow
     }
     if not kept:
         raise BaselineError(
-            f"no planner is left: all of them are given more than {wish.longest_s:g} s a query"
+            f"no planner is left: all of them are given more than {longest_s:g} s a query"
         )
-    less = with_planners(params, kept)
-    benchmark = less.benchmark.model_copy(update={"queries": wish.queries, "batch": 1})
-    some = {
-        block: {
-            name: one
-            for name, one in described.items()
-            if wish.constraints is None or name in wish.constraints
-        }
-        for block, described in (("constraints", params.constraints), ("unseen", params.unseen))
-    }
-    return less.model_copy(update={"benchmark": benchmark, **some}), slow
+    less = {"planners": kept, "queries": queries, "batch": 1}
+    changed: dict[str, Any] = {"benchmark": params.benchmark.model_copy(update=less)}
+    for block, described in (("constraints", params.constraints), ("unseen", params.unseen)):
+        some = described if constraints is None else constraints
+        changed[block] = {name: one for name, one in described.items() if name in some}
+    return params.model_copy(update=changed), slow
 
 
 def data_digest(*folders: Path) -> str:

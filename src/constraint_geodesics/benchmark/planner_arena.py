@@ -6,13 +6,13 @@ and scene is an experiment.
 """
 
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pandas as pd
+
+from constraint_geodesics.benchmark.statistics import ratio_of
 
 SCHEMA = """
 CREATE TABLE experiments (
@@ -50,25 +50,40 @@ def export_arena(
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     file.unlink(missing_ok=True)
-    statuses = list(dict.fromkeys(rows["status"]))
+    status, statuses = pd.factorize(rows["status"])
+    planner, planners = pd.factorize(rows["planner"])
+    cases = rows.groupby(["constraint", "scene"], sort=False)
+    tables = {
+        "enums": pd.DataFrame(
+            {"name": "status", "value": range(len(statuses)), "description": statuses}
+        ),
+        "plannerConfigs": pd.DataFrame(
+            {"name": planners, "settings": [settings.get(name, "") for name in planners]}
+        ),
+        "experiments": pd.DataFrame(
+            [_experiment(", ".join(map(str, names)), case, about) for names, case in cases]
+        ),
+        "runs": pd.DataFrame(
+            {
+                "experimentid": 1 + cases.ngroup(),
+                "plannerid": 1 + planner,
+                "time": rows["time_s"],
+                "memory": rows["peak_memory_mb"],
+                "solved": rows["status"] == "solved",
+                "correct_solution": rows["valid"],
+                "solution_length": rows["length_rad"],
+                "length_over_best_known": ratio_of(rows),
+                "constraint_violation": rows["max_violation_rad"],
+                "query": rows["query"],
+                "seed": rows["seed"],
+                "status": status,
+            }
+        ).sort_values("experimentid", kind="stable"),
+    }
     with closing(sqlite3.connect(file)) as database, database:
         database.executescript(SCHEMA)
-        database.executemany(
-            "INSERT INTO enums VALUES ('status', ?, ?)",
-            [(k, name) for k, name in enumerate(statuses)],
-        )
-        planners = {
-            str(name): _insert(
-                database, "plannerConfigs", {"name": name, "settings": settings.get(str(name), "")}
-            )
-            for name in rows["planner"].unique()
-        }
-        for (constraint, scene), case in rows.groupby(["constraint", "scene"], sort=False):
-            experiment = _experiment(f"{constraint}, {scene}", case, about)
-            number = _insert(database, "experiments", experiment)
-            for row in case.to_dict("records"):
-                own = {"experimentid": number, "plannerid": planners[str(row["planner"])]}
-                _insert(database, "runs", own | _run(row, statuses))
+        for name, table in tables.items():
+            table.to_sql(name, database, if_exists="append", index=False)
 
 
 def _experiment(name: str, case: pd.DataFrame, about: Mapping[str, str]) -> dict[str, object]:
@@ -85,27 +100,3 @@ def _experiment(name: str, case: pd.DataFrame, about: Mapping[str, str]) -> dict
         "seed": 0,
         "setup": f"{case['query'].nunique()} queries; a run is one query and seed",
     }
-
-
-def _run(row: Mapping[Any, Any], statuses: Sequence[str]) -> dict[str, object]:
-    ratio = row["length_rad"] / row["best_known_rad"] if row["valid"] else None
-    return {
-        "time": row["time_s"],
-        "memory": row["peak_memory_mb"],
-        "solved": int(row["status"] == "solved"),
-        "correct_solution": int(row["valid"]),
-        "solution_length": row["length_rad"],
-        "length_over_best_known": ratio,
-        "constraint_violation": row["max_violation_rad"],
-        "query": row["query"],
-        "seed": row["seed"],
-        "status": statuses.index(row["status"]),
-    }
-
-
-def _insert(database: sqlite3.Connection, table: str, record: Mapping[str, object]) -> int:
-    values = [None if isinstance(x, float) and np.isnan(x) else x for x in record.values()]
-    places = ", ".join("?" * len(values))
-    found = database.execute(f"INSERT INTO {table} ({', '.join(record)}) VALUES ({places})", values)
-    assert found.lastrowid is not None
-    return found.lastrowid

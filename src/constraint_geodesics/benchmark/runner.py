@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -55,16 +55,13 @@ class Baseline:
     uses_clearance: bool = True
 
 
-class Builder(Protocol):
-    """Makes planners by name for one scene and constraint; picklable."""
-
-    def __call__(
-        self, names: Sequence[str], scene: Scene, constraint: str, manifold: ConstraintManifold
-    ) -> AbstractContextManager[tuple[Mapping[str, PathPlanner], Mapping[str, float]]]:
-        """The planners of these names, closed again when the context ends, and the seconds that
-        making them took.
-        """
-        ...
+Builder = Callable[
+    [Sequence[str], Scene, str, ConstraintManifold],
+    AbstractContextManager[tuple[Mapping[str, PathPlanner], Mapping[str, float]]],
+]
+"""Makes planners by name for a scene and a constraint's name and manifold, closed again when the
+context ends; with the seconds that making each took.  Picklable.
+"""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ the place of tasks.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -52,7 +53,7 @@ def benchmark_summary(rows: pd.DataFrame, reference: str) -> pd.DataFrame:
     beaten: the probability that a run of `reference` is shorter than one of the planner on a query,
     ties counted half, failures as infinitely long.
     """
-    rows = rows.assign(ratio=rows["length_rad"].where(rows["valid"]) / rows["best_known_rad"])
+    rows = rows.assign(ratio=ratio_of(rows))
     table = []
     for (constraint, scene), case in rows.groupby(CASE, sort=False):
         wanted = _lengths_by_query(case[case["planner"] == reference])
@@ -88,16 +89,16 @@ def _figures(own: pd.DataFrame) -> dict[str, Any]:
         "success_high": success_high,
         "claimed_but_invalid": int(((own["status"] == "solved") & ~own["valid"]).sum()),
         "not_applicable": int((own["status"] == "not_applicable").sum()),
-        "ratio_median": _quantile(ratio, 0.5),
-        "ratio_p95": _quantile(ratio, 0.95),
+        "ratio_median": ratio.quantile(0.5),
+        "ratio_p95": ratio.quantile(0.95),
         "ratio_iqm": middle,
         "ratio_iqm_low": low,
         "ratio_iqm_high": high,
         "ratio_p95_all": quantile_with_failures(solvable["ratio"].to_numpy(), 0.95),
-        "time_median_s": _quantile(time, 0.5),
-        "time_p95_s": _quantile(time, 0.95),
+        "time_median_s": time.quantile(0.5),
+        "time_p95_s": time.quantile(0.95),
         **reached,
-        "peak_memory_median_mb": _quantile(own["peak_memory_mb"], 0.5),
+        "peak_memory_median_mb": own["peak_memory_mb"].quantile(0.5),
     }
 
 
@@ -105,11 +106,7 @@ def interquartile_mean(values: Float[np.ndarray, "n"]) -> tuple[float, float, fl
     """Mean of the middle half, and its 95 % percentile bootstrap interval: low, mean, high; nan
     without values.
     """
-    return _interval(values, _trimmed)
-
-
-def _trimmed(values: np.ndarray, axis: int = 0) -> Any:
-    return stats.trim_mean(values, 0.25, axis=axis)
+    return _interval(values, partial(stats.trim_mean, proportiontocut=0.25))
 
 
 def _interval(
@@ -149,16 +146,12 @@ def over_budget(rows: pd.DataFrame, budgets: Sequence[float]) -> pd.DataFrame:
 
     A row counts from its time_s on; before, and where it is not valid, its length is infinite.
     """
-    table: list[dict[str, Any]] = []
-    keys = [*CASE, "planner"]
-    for key, own in _with_ratio(rows).groupby(keys, sort=False):
-        about = dict(zip(keys, key, strict=True))
+    keys, table = [*CASE, "planner"], []
+    for key, own in _solvable(rows).groupby(keys, sort=False):
         for budget in budgets:
-            reached = own["ratio"].where(own["time_s"] <= budget).to_numpy()
-            half, most = (quantile_with_failures(reached, share) for share in (0.5, 0.95))
-            success = float(np.isfinite(reached).mean())
-            figures = {"success": success, "ratio_p50": half, "ratio_p95": most}
-            table.append({**about, "budget_s": budget, **figures})
+            success, ratio = _within(own, budget)
+            figures = {"budget_s": budget, "success": success, "ratio_p95": ratio}
+            table.append(dict(zip(keys, key, strict=True)) | figures)
     return pd.DataFrame(table)
 
 
@@ -185,7 +178,7 @@ def ours_against_baselines(
     the same way, and two without any are "neither".
     """
     table = []
-    for case, found in _with_ratio(rows).groupby(CASE, sort=False):
+    for case, found in _solvable(rows).groupby(CASE, sort=False):
         groups = dict(list(found.groupby("planner", sort=False)))
         for budget in budgets:
             chosen = max((name for name in ours if ours[name] < budget), key=ours.__getitem__)
@@ -208,10 +201,14 @@ def ours_against_baselines(
     return pd.DataFrame(table)
 
 
-def _with_ratio(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows of solvable queries with their `ratio`, length over best known; nan where not valid."""
-    rows = rows[rows["best_known_rad"].notna()]
-    return rows.assign(ratio=rows["length_rad"].where(rows["valid"]) / rows["best_known_rad"])
+def ratio_of(rows: pd.DataFrame) -> "pd.Series[float]":
+    """Length over best known; nan where not valid."""
+    return rows["length_rad"].where(rows["valid"]) / rows["best_known_rad"]
+
+
+def _solvable(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows of solvable queries with their `ratio`."""
+    return rows.assign(ratio=ratio_of(rows))[rows["best_known_rad"].notna()]
 
 
 def _within(rows: pd.DataFrame, budget_s: float) -> tuple[float, float]:
@@ -305,18 +302,13 @@ def _beaten(wanted: Mapping[Any, np.ndarray], other: Mapping[Any, np.ndarray]) -
     half.
     """
     shares = []
-    for query in wanted.keys() & other.keys():
+    for query in [query for query in wanted if query in other]:  # a set's order changes by the run
         mine, others = np.meshgrid(wanted[query], other[query])
         known = np.isfinite(mine) | np.isfinite(others)
         if known.any():
             tied = np.isclose(mine, others, rtol=TIED)
             shares.append(np.where(tied, 0.5, mine < others)[known].mean())
     return float(np.mean(shares)) if shares else float("nan")
-
-
-def _quantile(values: "pd.Series[float]", share: float) -> float:
-    known = values.dropna()
-    return float(known.quantile(share)) if len(known) else float("nan")
 
 
 def comparison_figures(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
@@ -328,7 +320,7 @@ def comparison_figures(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
             "rows": len(own),
             "success": float(own["valid"].mean()),
             "claimed_but_invalid": int(((own["status"] == "solved") & ~own["valid"]).sum()),
-            "length_median_rad": _quantile(own["length_rad"].where(own["valid"]), 0.5),
+            "length_median_rad": float(own["length_rad"].where(own["valid"]).median()),
         }
         for planner, own in rows.groupby("planner", sort=False)
     }
@@ -361,11 +353,9 @@ def summarise(paths: pd.DataFrame, latent: str, counted: Counted = "valid") -> p
                 **_answers(group),
                 "compared": shared["query"].nunique(),
                 **_over_seeds(shared, f"latent_length_{latent}"),
-                "length_mean_rad": _figure_of(
-                    shared.groupby("query")["length_rad"].mean(), np.mean
-                ),
-                "over_best_median": _figure_of(over_best[mine.index], np.median),
-                "over_best_p95": _figure_of(over_best[mine.index], _quantile95),
+                "length_mean_rad": _mean(shared.groupby("query")["length_rad"].mean()),
+                "over_best_median": over_best[mine.index].median(),
+                "over_best_p95": over_best[mine.index].quantile(0.95),
                 **_violations(group),
                 **_times(group),
             }
@@ -394,39 +384,31 @@ def _answers(group: pd.DataFrame) -> dict[str, Any]:
 
 def _over_seeds(shared: pd.DataFrame, column: str) -> dict[str, float]:
     of_query = shared.groupby("query")[column]
-    variances = of_query.var(ddof=1).dropna()  # one seed alone has no spread
     return {
-        "latent_shortest": _figure_of(of_query.min(), np.mean),
-        "latent_mean": _figure_of(of_query.mean(), np.mean),
-        "latent_std": float(np.sqrt(_figure_of(variances, np.mean))),
+        "latent_shortest": _mean(of_query.min()),
+        "latent_mean": _mean(of_query.mean()),
+        "latent_std": float(np.sqrt(_mean(of_query.var(ddof=1)))),  # one seed alone has no spread
     }
 
 
 def _violations(group: pd.DataFrame) -> dict[str, float]:
     degrees = np.degrees(group["max_violation_rad"])
     return {
-        "violation_median_deg": _figure_of(degrees, np.median),
-        "violation_max_deg": _figure_of(degrees, np.max),
-        "violation_max_mm": 1e3 * _figure_of(group["max_violation_m"], np.max),
+        "violation_median_deg": degrees.median(),
+        "violation_max_deg": degrees.max(),
+        "violation_max_mm": 1e3 * group["max_violation_m"].max(),
     }
 
 
 def _times(group: pd.DataFrame) -> dict[str, float]:
     return {
-        "time_mean_s": _figure_of(group["time_s"], np.mean),
-        "time_std_s": float(group["time_s"].std(ddof=1)),
-        "time_median_s": _figure_of(group["time_s"], np.median),
-        "time_p95_s": _figure_of(group["time_s"], _quantile95),
+        "time_mean_s": _mean(group["time_s"]),
+        "time_std_s": group["time_s"].std(ddof=1),
+        "time_median_s": group["time_s"].median(),
+        "time_p95_s": float(group["time_s"].quantile(0.95)),
     }
 
 
-def _figure_of(
-    values: "pd.Series[float]", figure: Callable[[Float[np.ndarray, "n"]], Any]
-) -> float:
-    """A figure of the values that are there; nan if there is none."""
-    present = values.dropna().to_numpy(float)
-    return float(figure(present)) if len(present) else float("nan")
-
-
-def _quantile95(values: Float[np.ndarray, "n"]) -> float:
-    return float(np.quantile(values, 0.95))
+def _mean(values: "pd.Series[float]") -> float:
+    """Of the values that are there, added up as if there were no others; nan if there is none."""
+    return float(values.dropna().mean())

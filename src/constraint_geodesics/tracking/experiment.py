@@ -17,14 +17,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean, pstdev
 from threading import Timer
-from types import TracebackType
 from typing import Any, Self
 
 from pydantic import BaseModel
 
 from constraint_geodesics.params import Params, RewardParams
 from constraint_geodesics.tracking.store import (
-    METRICS_A_CALL,
     TrackingError,
     client_of,
     dataset_of,
@@ -103,10 +101,7 @@ class MetricLogger:
             if math.isfinite(value)
         ]
         with explained(self.tracking_uri):
-            for first in range(0, len(batch), METRICS_A_CALL):
-                client_of(self.tracking_uri).log_batch(
-                    self.run_id, metrics=batch[first : first + METRICS_A_CALL]
-                )
+            client_of(self.tracking_uri).log_batch(self.run_id, metrics=batch)
 
 
 @dataclass
@@ -131,22 +126,13 @@ class ChildRun:
             log_params(client, self.run_id, self.params)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         with explained(self.tracking_uri) if error is None else suppress(Exception):
             client_of(self.tracking_uri).set_terminated(self.run_id, _status(error))
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
         """Figures at an environment step."""
         MetricLogger(self.tracking_uri, self.run_id)(step, metrics)
-
-    def artifact(self, file: Path) -> None:
-        """Keep a copy of a file with the run."""
-        keep_copy(self.tracking_uri, self.run_id, file)
 
 
 @dataclass(frozen=True)
@@ -218,9 +204,8 @@ class StageRun:
             MetricLogger(self.tracking_uri, run_ids[name])(0, final)
         self.metric_logger()(0, _spread(figures))
         for step, rows in _together(curves):
-            self.metric_logger()(
-                step, {n: v for n, v in _spread(rows).items() if not n.endswith("_count")}
-            )
+            spread = _spread(rows).items()
+            self.metric_logger()(step, {n: v for n, v in spread if not n.endswith("_count")})
 
     def recordings(self, rows: Sequence[Mapping[str, Any]], shown: str = "") -> None:
         """Tell where paths are recorded: all of them in a file of this run and in its description;
@@ -232,12 +217,11 @@ class StageRun:
         recorded = [row for row in rows if row["recording"]]
         if not recorded:
             return
-        lines = [
-            f"- {row['planner']}, query {row['query']}, seed {row['seed']}, "
-            f"{row['length_rad']:.3f} rad: "
-            f"`geodesics replay {row['recording']}`"
-            for row in recorded
-        ]
+        line = (
+            "- {planner}, query {query}, seed {seed}, {length_rad:.3f} rad: "
+            "`geodesics replay {recording}`"
+        )
+        lines = [line.format_map(row) for row in recorded]
         run_ids = self._child_ids() if self.children else {}
         with explained(self.tracking_uri):
             client = client_of(self.tracking_uri)
@@ -356,22 +340,17 @@ def _note(stage: str, tags: Mapping[str, str]) -> str:
 
 def _children(run: StageRun) -> list[Any]:
     """Oldest first, so that the last run of one name is the one that counts."""
-    query = f"tags.`mlflow.parentRunId` = '{run.run_id}'"
-    found = client_of(run.tracking_uri).search_runs(
-        [run.experiment_id], query, order_by=["attributes.start_time ASC"]
-    )
-    return list(found)
+    query, order = f"tags.`mlflow.parentRunId` = '{run.run_id}'", ["attributes.start_time ASC"]
+    client = client_of(run.tracking_uri)
+    return list(client.search_runs([run.experiment_id], query, order_by=order))
 
 
 def _end(run: StageRun, status: str) -> None:
     """End a run, and what workers that died left running below it."""
-    client = client_of(run.tracking_uri)
-    if run.children:
-        for child in _children(run):
-            if child.info.status == "RUNNING":
-                client.set_terminated(
-                    child.info.run_id, "KILLED" if status == "FINISHED" else status
-                )
+    client, left = client_of(run.tracking_uri), "KILLED" if status == "FINISHED" else status
+    for child in _children(run) if run.children else ():
+        if child.info.status == "RUNNING":
+            client.set_terminated(child.info.run_id, left)
     client.set_terminated(run.run_id, status)
 
 

@@ -8,8 +8,7 @@ file of this package, so nothing is pickled.
 import hashlib
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -64,22 +63,6 @@ def register_planner(run: StageRun, folder: Path, code: Path, example: Mapping[s
 def _new_version(
     run: StageRun, folder: Path, code: Path, example: Mapping[str, Any], digest: str
 ) -> str:
-    with saved_model(folder, code, example) as model:
-        address = keep_folder(run.tracking_uri, run.run_id, model, FILES)
-    tags = {
-        "sha256": digest,
-        **{name: run.tags[name] for name in ("git_commit", "git_dirty") if name in run.tags},
-    }
-    return str(
-        client_of(run.tracking_uri)
-        .create_model_version(PLANNER_MODEL, address, run.run_id, tags)
-        .version
-    )
-
-
-@contextmanager
-def saved_model(folder: Path, code: Path, example: Mapping[str, Any]) -> Iterator[Path]:
-    """The model as files, gone when the context ends."""
     mlflow_module()
     import pandas as pd
     from mlflow import pyfunc
@@ -108,7 +91,11 @@ def saved_model(folder: Path, code: Path, example: Mapping[str, Any]) -> Iterato
             input_example=pd.DataFrame([dict(example)]),
             pip_requirements=installed_requirements(),
         )
-        yield target
+        address = keep_folder(run.tracking_uri, run.run_id, target, FILES)
+    tags = {name: run.tags[name] for name in ("git_commit", "git_dirty") if name in run.tags}
+    client = client_of(run.tracking_uri)
+    tags["sha256"] = digest
+    return str(client.create_model_version(PLANNER_MODEL, address, run.run_id, tags).version)
 
 
 def installed_requirements() -> list[str]:

@@ -17,7 +17,6 @@ import pandas as pd
 from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.pipeline.threads import one_thread
 from constraint_geodesics.planner import Planner
-from constraint_geodesics.trajectory import Trajectory
 
 
 class ServedPlanner(mlflow.pyfunc.PythonModel):
@@ -28,9 +27,8 @@ class ServedPlanner(mlflow.pyfunc.PythonModel):
     def load_context(self, context: Any) -> None:
         """Load the planner whose files lie with the model."""
         self.planner = Planner.load(context.artifacts["planner"])
-        self.free = (
-            threading.Lock()
-        )  # the server answers on several threads, and there is one world for collisions
+        # the server answers on several threads, and there is one world for collisions
+        self.free = threading.Lock()
 
     def predict(
         self, context: Any, model_input: pd.DataFrame, params: dict[str, Any] | None = None
@@ -44,9 +42,9 @@ class ServedPlanner(mlflow.pyfunc.PythonModel):
         well.
         """
         try:
-            return with_waypoints(
-                self.planner.plan(row["start"], row["goal"], constraint_of(str(row["constraint"])))
-            )
+            constraint = constraint_of(str(row["constraint"]))
+            path = self.planner.plan(row["start"], row["goal"], constraint)
+            return {**path.summary(), "joints": path.joints.tolist(), "times": path.times.tolist()}
         except ValueError as error:  # one bad row must not cost the others their answers
             return {"status": "bad_query", "explanation": str(error), "joints": [], "times": []}
 
@@ -64,11 +62,6 @@ def constraint_of(text: str) -> str | Constraint:
         raise ValueError(
             f"{text}: must have axes, and may have a tolerance, six numbers each: {error}"
         ) from None
-
-
-def with_waypoints(path: Trajectory) -> dict[str, Any]:
-    """A trajectory as JSON takes it."""
-    return {**path.summary(), "joints": path.joints.tolist(), "times": path.times.tolist()}
 
 
 mlflow.models.set_model(ServedPlanner())

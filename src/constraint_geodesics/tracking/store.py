@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import DatasetInput
 
-LONGEST_VALUE, PARAMS_A_CALL, METRICS_A_CALL = 6000, 100, 1000
-"""The most that MLflow takes."""
+LONGEST_VALUE = 6000
+"""Characters of a parameter: the most that MLflow takes."""
 DIGITS = 9
 """Of a reported number: enough to compare runs, too few to show the last bits of another processor.
 """
@@ -93,6 +93,8 @@ def fetch_artifacts(address: str, root: Path = Path()) -> Iterator[Path]:
                     artifact_uri=address, dst_path=folder, tracking_uri=uri, registry_uri=uri
                 )
                 found = Path(fetched)
+            elif not found.exists():
+                raise FileNotFoundError(f"its files are missing in {found}")
         except (mlflow.exceptions.MlflowException, OSError) as error:
             raise TrackingError(f"{address}: {' '.join(str(error).split())[:200]}") from None
         own = found / "artifacts" / "planner"
@@ -100,19 +102,14 @@ def fetch_artifacts(address: str, root: Path = Path()) -> Iterator[Path]:
 
 
 def _beside_store(uri: str, address: str) -> Path | None:
-    """Where files that only the dashboard's server could send lie beside an SQLite store, or None
-    for all others.
+    """Where the dashboard's server looks for files beside an SQLite store; MLflow itself would need
+    that server now.  None for all others.
     """
     database = _sqlite_file(uri)
-    if database is None:
+    source = "" if database is None else _stored_at(uri, address)
+    if database is None or not source.startswith("mlflow-artifacts:"):
         return None
-    source = _stored_at(uri, address)
-    if not source.startswith("mlflow-artifacts:"):
-        return None
-    place = _artifact_folder(database) / urlsplit(source).path.lstrip("/")
-    if not place.exists():
-        raise FileNotFoundError(f"its files are missing in {place}")
-    return place
+    return _artifact_folder(database) / urlsplit(source).path.lstrip("/")
 
 
 def _stored_at(uri: str, address: str) -> str:
@@ -230,7 +227,7 @@ def _artifact_folder(database: Path) -> Path:
 def keep_copy(uri: str, run_id: str, file: Path, folder: str | None = None) -> None:
     """Keep a copy of a file with a run."""
     with explained(uri):
-        client, target = client_of(uri), _own_folder(uri, run_id)
+        client, target = client_of(uri), _beside_store(uri, f"runs:/{run_id}")
         if target is None:
             client.log_artifact(run_id, str(file), folder)
             return
@@ -241,7 +238,7 @@ def keep_copy(uri: str, run_id: str, file: Path, folder: str | None = None) -> N
 def keep_folder(uri: str, run_id: str, folder: Path, name: str) -> str:
     """Keep a copy of a folder with a run, under a name; returns its address."""
     with explained(uri):
-        client, target = client_of(uri), _own_folder(uri, run_id)
+        client, target = client_of(uri), _beside_store(uri, f"runs:/{run_id}")
         if target is None:
             client.log_artifacts(run_id, str(folder), name)
         else:
@@ -249,22 +246,11 @@ def keep_folder(uri: str, run_id: str, folder: Path, name: str) -> str:
         return f"{client.get_run(run_id).info.artifact_uri}/{name}"
 
 
-def _own_folder(uri: str, run_id: str) -> Path | None:
-    """Where the dashboard's server will look for a run's files beside an SQLite store; MLflow
-    itself would need that server now.  None for other stores.
-    """
-    address, database = client_of(uri).get_run(run_id).info.artifact_uri, _sqlite_file(uri)
-    if database is None or not address.startswith("mlflow-artifacts:"):
-        return None
-    return _artifact_folder(database) / urlsplit(address).path.lstrip("/")
-
-
 def log_params(client: "MlflowClient", run_id: str, params: BaseModel | Mapping[str, Any]) -> None:
     """Parameters under names joined by "."; long texts are cut."""
     entity = mlflow_module().entities.Param
     batch = [entity(name, _text(value)) for name, value in flat(stored(params), ".").items()]
-    for first in range(0, len(batch), PARAMS_A_CALL):
-        client.log_batch(run_id, params=batch[first : first + PARAMS_A_CALL])
+    client.log_batch(run_id, params=batch)
 
 
 def stored(params: Any) -> Any:
