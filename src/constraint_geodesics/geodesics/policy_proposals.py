@@ -64,7 +64,7 @@ class LatentCurve:
 
 class PolicyProposals:
     """The best curve that each policy meets on its way from the straight latent line, feasible ones
-    first.  Implements Proposals, the planner's plug.
+    first.
     """
 
     def __init__(
@@ -88,24 +88,13 @@ class PolicyProposals:
         actors = [MeanPolicy.from_arrays(by_seed[seed]) for seed in sorted(by_seed)]
         return cls(LearnedManifold.from_arrays(manifold), actors, settings)
 
-    def __call__(
-        self,
-        manifold: ConstraintManifold,
-        start: Float[np.ndarray, "D"],
-        goal: Float[np.ndarray, "D"],
-        points: int,
-    ) -> Float[np.ndarray, "K n D"]:
-        """Decoded curves with their ends corrected (eqs. 9-11 and `lift`), not yet retracted."""
-        t = np.linspace(0.0, 1.0, points)
-        return np.stack([curve.decoded(t) for curve in self.curves(manifold, start, goal)])
-
     def curves(
         self,
         manifold: ConstraintManifold,
         start: Float[np.ndarray, "D"],
         goal: Float[np.ndarray, "D"],
     ) -> list[LatentCurve]:
-        """The same curves as functions of time."""
+        """Decoded curves with their ends corrected (eqs. 9-11 and `lift`), as functions of time."""
         problem = self._problem(manifold)
         ends = problem.ends(start[None], goal[None])
         found = propose(problem, self.policies, episode_settings(self.settings), ends)

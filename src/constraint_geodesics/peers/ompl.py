@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -23,11 +23,10 @@ from constraint_geodesics.constraints import kernels
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract, retract_batch
 from constraint_geodesics.learning.lift import as_executed
-from constraint_geodesics.peers.ompl_settings import OmplSettings
+from constraint_geodesics.peers.elastic_band import answer, without_path
+from constraint_geodesics.peers.ompl_settings import OmplSettings, Search
 from constraint_geodesics.problem import SATISFIED, PlanningProblem, Solution, refusal
 from constraint_geodesics.robot.kinematics import SerialRobot
-
-Search = Literal["prm", "prm_star", "rrt_star", "informed_rrt_star", "birrt"]
 
 _STALL = 0.2
 """A step along the constraint that advances by less than this share of itself leads nowhere."""
@@ -62,23 +61,23 @@ class SamplingPlanner:
         between.
         """
         began = time.perf_counter()
-        nothing = np.empty((0, problem.manifold.robot.dof))
         refused = refusal(problem)
         if refused is not None:
-            return Solution(refused, nothing, time.perf_counter() - began, 0)
+            return without_path(problem, refused, began)
         misfit = self._misfit(problem.manifold)
         if misfit:
-            return Solution("not_applicable", nothing, time.perf_counter() - began, 0, misfit)
+            return without_path(problem, "not_applicable", began, misfit)
         _start_random_numbers(seed)
         space = _Space(problem, self.settings)
         found, iterations = _SEARCHES[self.name](
             space, self.settings, began + self.settings.budget_s
         )
-        joints = nothing if found is None else self._as_executed(space, found)
-        if found is not None and self.row_spacing_rad is not None:
+        if found is None:
+            return answer(None, problem, began, iterations)
+        joints = (_simplified(space, found) if self.settings.simplify else space.dense(found))[0]
+        if self.row_spacing_rad is not None:
             joints = as_executed(problem.manifold, joints, self.row_spacing_rad)
-        status: Literal["solved", "not_found"] = "not_found" if found is None else "solved"
-        return Solution(status, joints, time.perf_counter() - began, iterations)
+        return answer(joints, problem, began, iterations)
 
     def _misfit(self, manifold: ConstraintManifold) -> str:
         """Why OMPL has no space of this kind for the constraint; empty where it has one."""
@@ -93,9 +92,6 @@ class SamplingPlanner:
                 f"is made of"
             )
         return ""
-
-    def _as_executed(self, space: "_Space", found: Any) -> Float[np.ndarray, "T D"]:
-        return _simplified(space, found)[0] if self.settings.simplify else space.dense(found)[0]
 
 
 def birrt_with_sampler(
