@@ -125,7 +125,7 @@ def distances(model: ClearanceModel, robot: SerialRobot, q: np.ndarray) -> tuple
         np.empty((dof, 3)),
         np.empty((dof, 3)),
     )
-    link_clearances(robot.chain.arrays, model.arrays, np.inf, q, *found)
+    link_clearances(robot.chain, model.arrays, np.inf, q, *found)
     return found
 
 
@@ -211,7 +211,7 @@ def test_beyond_the_distance_asked_for_there_is_a_bound_from_below(xarm) -> None
     model = clearance_model(xarm, (TABLE, WALL))
     q = xarm.sample(2000, np.random.default_rng(6))
     exact, bounded, far = model.clearance(xarm, q), np.empty(len(q)), 0.05
-    clearance_batch(xarm.chain.arrays, model.arrays, far, q, bounded)
+    clearance_batch(xarm.chain, model.arrays, far, q, bounded)
     assert (bounded <= exact).all()
     np.testing.assert_array_equal(bounded[exact <= far], exact[exact <= far])
     assert (bounded[exact > far] > far).all()
@@ -261,7 +261,7 @@ def test_points_passed_over_in_groups_are_none_that_are_nearest(xarm, bodies) ->
         distances, normals, nearest = np.empty(6), np.empty((6, 3)), np.empty((6, 3))
         axes, origins = np.empty((6, 3)), np.empty((6, 3))
         link_clearances(
-            xarm.chain.arrays, model.arrays, far, q, distances, normals, nearest, origins, axes
+            xarm.chain, model.arrays, far, q, distances, normals, nearest, origins, axes
         )
         for joint in range(6):
             exact = one_by_one(xarm, model, q, joint)
@@ -289,7 +289,7 @@ def one_by_one(robot, model, q, joint) -> float:
     )
     distances, normals, nearest = np.empty(6), np.empty((6, 3)), np.empty((6, 3))
     link_clearances(
-        robot.chain.arrays,
+        robot.chain,
         arrays,
         np.inf,
         q,

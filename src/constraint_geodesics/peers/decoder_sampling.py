@@ -49,6 +49,7 @@ class DecoderSettings(OmplSettings):
     """RRTConnect's, in the only space that takes samples from elsewhere."""
 
     family: ClassVar = "birrt"
+    made_by: ClassVar = MANIFOLD
 
     space: Literal["projected"] = "projected"
 
@@ -57,11 +58,6 @@ class DecoderSettings(OmplSettings):
         from constraint_geodesics.learning.inference import FrozenManifold
 
         return DecoderSampling(FrozenManifold.load(context.layout.manifold(context.searched)), self)
-
-    @property
-    def trained(self) -> tuple[str, ...]:
-        """The manifold."""
-        return MANIFOLD
 
 
 @dataclass(frozen=True)

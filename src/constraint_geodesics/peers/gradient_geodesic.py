@@ -66,6 +66,7 @@ class GradientGeodesicSettings(BaselineSettings):
     """
 
     family: ClassVar = "latent"
+    made_by: ClassVar = MANIFOLD
 
     segments: Count = 2
     drawn: Count = 1024
@@ -78,11 +79,6 @@ class GradientGeodesicSettings(BaselineSettings):
     def make(self, context: Context) -> PathPlanner:
         """On the manifold that the planner uses."""
         return GradientGeodesic(context.learned(context.searched), self)
-
-    @property
-    def trained(self) -> tuple[str, ...]:
-        """The manifold."""
-        return MANIFOLD
 
 
 @dataclass(frozen=True)

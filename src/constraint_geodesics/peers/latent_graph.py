@@ -45,6 +45,7 @@ class LatentGraphSettings(BaselineSettings):
     """
 
     family: ClassVar = "latent"
+    made_by: ClassVar = GRAPH
 
     shortcuts: Annotated[int, Field(ge=0)] = 100
     rounds: Count = 200
@@ -57,11 +58,6 @@ class LatentGraphSettings(BaselineSettings):
         if not isinstance(found, GraphSubmanifold):
             raise BaselineError(f"the manifold {searched!r} has a grid, not a graph")
         return LatentGraphSearch(context.learned(searched), constraint, found, self)
-
-    @property
-    def trained(self) -> tuple[str, ...]:
-        """The manifold and the graphs on it."""
-        return GRAPH
 
 
 @dataclass(frozen=True)

@@ -19,15 +19,11 @@ class StraightLatentSettings(BaselineSettings):
 
     family: ClassVar = "latent"
     random: ClassVar = False
+    made_by: ClassVar = MANIFOLD
 
     def make(self, context: Context) -> PathPlanner:
         """On the manifold that the planner uses."""
         return StraightLatent(context.learned(context.searched))
-
-    @property
-    def trained(self) -> tuple[str, ...]:
-        """The manifold."""
-        return MANIFOLD
 
 
 @dataclass(frozen=True)

@@ -320,7 +320,7 @@ def _clearances(task: Task, nodes: Nodes) -> tuple[np.ndarray, np.ndarray]:
     """
     values, gradients = np.empty(nodes.shape), np.empty((*nodes.shape, nodes.shape[1]))
     _link_clearances(
-        task.manifold.robot.chain.arrays,
+        task.manifold.robot.chain,
         task.clearance.arrays,
         np.ascontiguousarray(nodes),
         values,

@@ -308,7 +308,7 @@ def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
         return True
     smallest = np.empty(len(points))
     robot, margin = task.manifold.robot, task.settings.clearance_m
-    clearance_batch(robot.chain.arrays, task.clear.clearance, 2.0 * margin, points, smallest)
+    clearance_batch(robot.chain, task.clear.clearance, 2.0 * margin, points, smallest)
     # the ends are what they are; PyBullet has the last word on them
     return bool(smallest[1:-1].min(initial=np.inf) >= 0.5 * margin)
 
