@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -105,7 +106,7 @@ def birrt_with_sampler(
     """
     _start_random_numbers(seed)
     space = _Space(problem, settings, sampler)
-    found, iterations = _birrt(space, settings, deadline)
+    found, iterations = _SEARCHES["birrt"](space, settings, deadline)
     if found is None:
         return None, iterations
     joints, sound = _simplified(space, found)
@@ -381,28 +382,19 @@ def _shorten(space: _Space, path: Any) -> None:
     simplifier.reduceVertices(path)
 
 
-def _prm(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
-    """The first path over a roadmap of at most `iterations` samples."""
-    planner = geometric.PRM(space.information)
-    return _grow_roadmap(planner, space, settings.iterations, _MILESTONES_BETWEEN_LOOKS, deadline)
-
-
-def _prm_star(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
-    """The shortest path over a roadmap of `iterations` samples."""
-    planner = geometric.PRMstar(space.information)
-    return _grow_roadmap(planner, space, settings.iterations, settings.iterations, deadline)
-
-
 def _grow_roadmap(
-    planner: Any, space: _Space, most: int, between_looks: int, deadline: float
+    kind: type, every: int | None, space: _Space, settings: OmplSettings, deadline: float
 ) -> tuple[Any, int]:
-    """Grow a roadmap of at most `most` samples around both ends, looking for a path every few
-    samples.
+    """Grow a roadmap of at most `iterations` samples around both ends; returns its first path.
 
+    every: samples after which a path is looked for; None: after all of them, so that it is the
+    shortest.
     OMPL's own loop lets a second thread look while the first one samples for 0.2 s at a time, so
     that a path depends on the machine.  Here `solve` may not run at all: it only enters the ends
     and answers with the path that comes nearest to the goal, found by A*.
     """
+    most = settings.iterations
+    between_looks, planner = every or most, kind(space.information)
     planner.setProblemDefinition(space.definition)
     planner.setup()
     tries, wanted = 0, 0
@@ -429,13 +421,7 @@ def _grow_roadmap(
         planner.growRoadmapPtc(base.PlannerTerminationCondition(enough))
 
 
-def _rrt_star(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
-    planner = geometric.RRTstar(space.information)
-    planner.setRange(settings.range_rad)
-    return _grow_tree(planner, space, settings.iterations, deadline)
-
-
-def _informed_rrt_star(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
+def _informed_rrt_star(space: _Space) -> Any:
     """On a constraint OMPL's sampler of the ellipsoid leaves it, and nearly all of its samples are
     lost: there the tree rejects what lies outside instead, and is pruned.
     """
@@ -446,22 +432,19 @@ def _informed_rrt_star(space: _Space, settings: OmplSettings, deadline: float) -
         planner.setSampleRejection(True)
         planner.setNewStateRejection(True)
         planner.setTreePruning(True)
+    return planner
+
+
+def _grow_tree(
+    kind: Callable[[_Space], Any], space: _Space, settings: OmplSettings, deadline: float
+) -> tuple[Any, int]:
+    """Grow one of OMPL's trees; returns its path, if any, and the iterations."""
+    iterations, planner = 0, kind(space)
     planner.setRange(settings.range_rad)
-    return _grow_tree(planner, space, settings.iterations, deadline)
-
-
-def _birrt(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
-    planner = geometric.RRTConnect(space.information)
-    planner.setRange(settings.range_rad)
-    return _grow_tree(planner, space, settings.iterations, deadline)
-
-
-def _grow_tree(planner: Any, space: _Space, most: int, deadline: float) -> tuple[Any, int]:
-    iterations = 0
 
     def enough() -> bool:
         nonlocal iterations
-        if iterations >= most or time.perf_counter() > deadline:
+        if iterations >= settings.iterations or time.perf_counter() > deadline:
             return True
         iterations += 1
         space.expect_sample()
@@ -475,9 +458,9 @@ def _grow_tree(planner: Any, space: _Space, most: int, deadline: float) -> tuple
 
 
 _SEARCHES: dict[Search, Callable[[_Space, OmplSettings, float], tuple[Any, int]]] = {
-    "prm": _prm,
-    "prm_star": _prm_star,
-    "rrt_star": _rrt_star,
-    "informed_rrt_star": _informed_rrt_star,
-    "birrt": _birrt,
+    "prm": partial(_grow_roadmap, geometric.PRM, _MILESTONES_BETWEEN_LOOKS),
+    "prm_star": partial(_grow_roadmap, geometric.PRMstar, None),
+    "rrt_star": partial(_grow_tree, lambda space: geometric.RRTstar(space.information)),
+    "informed_rrt_star": partial(_grow_tree, _informed_rrt_star),
+    "birrt": partial(_grow_tree, lambda space: geometric.RRTConnect(space.information)),
 }

@@ -7,43 +7,16 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.robot import kernels
 
-Joints = Float[np.ndarray, "*batch D"]
-
 
 class RobotError(ValueError):
     """The robot description can't be used; the message names the file and what is wrong with it."""
-
-
-class Robot(Protocol):
-    """What the geometry, the constraints and the planners ask of a robot."""
-
-    @property
-    def dof(self) -> int:
-        """Number of joints D."""
-        ...
-
-    @property
-    def lower(self) -> Float[np.ndarray, "D"]:
-        """Lower joint limits [rad or m]."""
-        ...
-
-    @property
-    def upper(self) -> Float[np.ndarray, "D"]:
-        """Upper joint limits [rad or m]."""
-        ...
-
-    def forward(
-        self, q: Float[np.ndarray, "*batch D"]
-    ) -> tuple[Float[np.ndarray, "*batch 3"], Float[np.ndarray, "*batch 3 3"]]:
-        """Tool position [m] and rotation in the base frame."""
-        ...
 
 
 class ChainArrays(NamedTuple):

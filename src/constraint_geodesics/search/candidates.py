@@ -9,7 +9,7 @@ to the caller, who has it certified.  Curves of another kind come from a method 
 (methods.py), through `refined` or not.
 """
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
@@ -240,9 +240,21 @@ def _along(
             if found is not None:
                 yield found
                 break
-    for iterations in PARTLY_RELAXED if refine else (0,):
-        partly = replace(task, settings=replace(task.settings, iterations=iterations))
-        found = refined(partly, source, resample(corners, 4 * segments + 1), boxes=boxes)
+    nodes = resample(corners, 4 * segments + 1)
+    yield from less_and_less_relaxed(task, source, nodes, boxes, PARTLY_RELAXED if refine else (0,))
+
+
+def less_and_less_relaxed(
+    task: Task,
+    source: Source,
+    nodes: Float[np.ndarray, "n D"],
+    boxes: bool = False,
+    iterations: Iterable[int] = PARTLY_RELAXED,
+) -> Iterator[Candidate]:
+    """Sound curves of a band that must stay near where it began."""
+    for most in iterations:
+        partly = replace(task, settings=replace(task.settings, iterations=most))
+        found = refined(partly, source, nodes, boxes=boxes)
         if found is not None:
             yield found
 

@@ -1,7 +1,7 @@
 """What is prepared once for each constraint and kept for the next query: its space and roadmap."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 
 import numpy as np
@@ -164,10 +164,4 @@ def free_configurations(
 
 def band_settings(settings: PlannerParams) -> BandSettings:
     """The band's part of the planner's settings."""
-    return BandSettings(
-        settings.segments,
-        settings.iterations,
-        settings.accuracy,
-        settings.largest_step_rad,
-        settings.clearance_m,
-    )
+    return BandSettings(**{own.name: getattr(settings, own.name) for own in fields(BandSettings)})
