@@ -9,6 +9,7 @@ from tests.planner_fixtures import (
     assert_sound,
     packaged_chart,
     packaged_learned,
+    problem,
     problems,
     walled,
 )
@@ -113,7 +114,7 @@ def test_what_the_boxes_do_not_say_is_checked(planner: PathPlanner, world: World
 
 @each(*ON_THE_CHART)
 def test_what_collides_everywhere_is_not_found(planner: PathPlanner, world: World) -> None:
-    asked = problems(world, "level_cup", 1)[0]
+    asked = problem(world, "level_cup", 0)
 
     def only_ends(q: np.ndarray) -> bool:
         return any(np.array_equal(q, end) for end in (asked.start, asked.goal))

@@ -31,7 +31,6 @@ from constraint_geodesics.peers.latent_geodesic import (
     turned_away,
 )
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
-from constraint_geodesics.robot.kinematics import SerialRobot
 
 LIMIT_SAMPLES = 1000
 """Configurations that the scale of a chart of joint space is taken from."""
@@ -91,7 +90,8 @@ class BayesianPlanner:
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The cheapest curve met that is a path."""
         began = time.perf_counter()
-        chart = self.learned or joint_chart(problem.manifold.robot)
+        spread, rng = problem.manifold.robot.sample, np.random.default_rng(0)
+        chart = self.learned or JointManifold.of(spread(LIMIT_SAMPLES, rng))
         early = turned_away(problem, chart, began)
         if early is not None:
             return early
@@ -183,11 +183,6 @@ class _Cost:
     @cached_property
     def _direct(self) -> float:
         return max(float(np.linalg.norm(self.problem.goal - self.problem.start)), 1e-9)
-
-
-def joint_chart(robot: SerialRobot) -> JointManifold:
-    """Joint space in units of its own size: the scale of configurations spread over the limits."""
-    return JointManifold.of(robot.sample(LIMIT_SAMPLES, np.random.default_rng(0)))
 
 
 BASELINE = BayesianSettings

@@ -293,17 +293,12 @@ def _relaxed(
     settings: BandSettings,
     boxes: bool = False,
 ) -> Candidate | None:
-    """The curve through relaxed nodes, whether or not it runs into a box."""
+    """The curve through relaxed nodes, whether or not it runs into a box; None if its points leave
+    the constraint or the limits, or jump.
+    """
     space = task.clear if boxes else task.open
     band = relax(space, nodes, settings)
-    return _sound(space, source, band.nodes, band.iterations)
-
-
-def _sound(
-    space: Space, source: Source, nodes: Float[np.ndarray, "n D"], iterations: int
-) -> Candidate | None:
-    """The curve through nodes if its points keep the constraint and the limits, without a jump."""
-    curve = BandCurve.through(space, nodes)
+    curve = BandCurve.through(space, band.nodes)
     if curve is None:
         return None
     shares = np.linspace(0.0, 1.0, max(int(np.ceil(curve.length / CHECK_STEP)), 2) + 1)
@@ -312,7 +307,7 @@ def _sound(
     longest = JUMP * curve.length / (len(shares) - 1)
     if left > 1e-6 or steps.max() > longest:
         return None
-    return Candidate(source, curve, float(steps.sum()), shares, points, iterations)
+    return Candidate(source, curve, float(steps.sum()), shares, points, band.iterations)
 
 
 def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
