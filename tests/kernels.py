@@ -17,7 +17,7 @@ start, goal = planner.nodes("level_cup")[:2]
 with Certifier(planner.scene, Limits()) as certifier:
     times = np.linspace(0.0, 1.0, 9)
     certifier.certify(np.linspace(start, goal, 9), planner.constraints["level_cup"], times=times)
-planner.plan(start, goal, "level_cup", parts=Parts(straight=False, graph=False, policy=False))
+planner.plan(start, goal, "level_cup", parts=Parts(straight=False, graph=False))
 """
 PLANNED = """
 from tests.planner_fixtures import packaged_planner

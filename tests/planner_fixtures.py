@@ -2,6 +2,7 @@
 queries for it.
 """
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -9,11 +10,13 @@ import numpy as np
 from constraint_geodesics import bundle
 from constraint_geodesics.bundle import Bundle, read_bundle
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.constraints.constraint import ConstraintManifold
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.geodesics.learned_method import FOLDER, LearnedFiles, read_learned
+from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import PlanningProblem, Solution
+from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.world import World
 
@@ -64,6 +67,28 @@ def pairs_of(
         if (labels[a] == labels[b]) == joined:
             found.append((joints[a], joints[b]))
     return found
+
+
+@cache
+def packaged_chart() -> LearnedManifold:
+    return LearnedManifold.from_arrays(packaged_learned().manifold)
+
+
+def length(joints: np.ndarray) -> float:
+    return float(np.linalg.norm(np.diff(joints, axis=0), axis=1).sum())
+
+
+def problem(world: World, name: str, seed: int) -> PlanningProblem:
+    """One query of a constraint, its boxes unknown."""
+    start, goal = pairs_of(name, 1, seed)[0]
+    return PlanningProblem(start, goal, manifold_of(packaged_planner(), name), world.is_free)
+
+
+def walled(robot: SerialRobot, is_free: Callable[[np.ndarray], bool]) -> PlanningProblem:
+    """A turn without a constraint, through what `is_free` says."""
+    free = ConstraintManifold(robot, Constraint((0,) * 6))
+    start, goal = np.array([-1.0, 0, -1.0, 0, 0, 0]), np.array([1.0, 0, -1.0, 0, 0, 0])
+    return PlanningProblem(start, goal, free, is_free)
 
 
 def problems(world: World, name: str, count: int) -> list[PlanningProblem]:

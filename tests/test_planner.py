@@ -33,7 +33,7 @@ from tests.planner_fixtures import (
     pairs_of,
 )
 
-ONLY_GRAPH = Parts(straight=False, policy=False, tree=False)
+ONLY_GRAPH = Parts(straight=False, tree=False)
 OTHER_WAY_ROUND = np.array([0.0, 2.0, -0.2, 0.0, 0.3, 0.1])
 """A configuration in which the arm touches itself."""
 
@@ -232,7 +232,7 @@ def test_ends_beside_the_constraint_within_its_tolerance_are_taken(planner) -> N
 
 @pytest.mark.parametrize("name", ["level_cup", "slide"])
 def test_refinement_shortens_a_way_over_the_graph(planner, name) -> None:
-    plain = Parts(straight=False, policy=False, refinement=False, tree=False)
+    plain = Parts(straight=False, refinement=False, tree=False)
     ratios = []
     for ends in pairs_of(name, 6, seed=6):
         paths = [planner.plan(*ends, name, parts=parts) for parts in (ONLY_GRAPH, plain)]
@@ -340,7 +340,7 @@ def refusals(planner: Planner) -> dict[str, tuple[np.ndarray, np.ndarray, str, s
 )
 def test_what_can_not_be_planned_is_said(planner, tmp_path, status) -> None:
     start, goal, name, expected = refusals(planner)[status]
-    parts = Parts(False, False, False, tree=False) if status == "not_found" else Parts()
+    parts = Parts(False, False, tree=False) if status == "not_found" else Parts()
     path = planner.plan(start, goal, name, parts=parts)
     assert path.status == status, path.explanation
     assert re.search(expected, path.explanation), path.explanation
@@ -496,7 +496,7 @@ def test_without_a_reference_the_axes_are_held_where_the_start_has_them(planner)
     held = ConstraintManifold(robot, height.relative_to(Pose(position, rotation)))
     goals = retract(held, start + np.random.default_rng(1).uniform(-0.6, 0.6, (8, 6))).joints
     for goal in goals:
-        path = planner.plan(start, goal, height, parts=Parts(policy=False, graph=False, tree=False))
+        path = planner.plan(start, goal, height, parts=Parts(graph=False, tree=False))
         if path.status != "solved":
             continue
         found += 1
@@ -559,7 +559,7 @@ def test_the_answer_does_not_depend_on_earlier_queries() -> None:
 def test_many_constraints_may_come_and_go(small) -> None:
     """What is remembered of them changes no answer."""
     start, goal = pairs_of("free", 1, seed=15)[0]
-    straight = Parts(policy=False, graph=False, tree=False)
+    straight = Parts(graph=False, tree=False)
     wide = Constraint((0, 0, 1, 0, 0, 0), (0, 0, 5.0, 0, 0, 0))
     first = small.plan(start, goal, wide, parts=straight)
     assert first.status == "solved"
@@ -838,29 +838,27 @@ def test_rows_are_so_close_that_lines_between_them_keep_the_constraint(planner) 
     assert counts[0] <= counts[1] < counts[2]
 
 
-def test_proposed_curves_come_the_shortest_first_and_broken_ones_not_at_all(planner) -> None:
-    """Any callable may propose."""
+def test_curves_of_any_source_are_candidates_and_broken_ones_are_not(planner) -> None:
     task = task_of(planner, "level_cup")
     start, goal = pairs_of("level_cup", 1, seed=1)[0]
-
-    def proposals(manifold, first, last, points):
-        share = np.linspace(0.0, 1.0, points)[:, None]
-        line = (1.0 - share) * first + share * last
-        way_round = line + np.array([2.0, 0, 0, 0, 0, 0]) * np.sin(np.pi * share)
-        jumps = line + np.array([0, 0, 0, 0, 0, 4.0]) * (share > 0.5) * (share < 1.0)
-        return np.stack([jumps, way_round, np.full_like(line, np.nan), line])
-
-    only = Parts(straight=False, graph=False, refinement=False, tree=False)
-    found = list(candidates(task, start, goal, lambda: proposals, only))
-    assert isinstance(found[-1], Answer)
-    assert found[-1].status == "not_found"
-    lengths = [candidate.length for candidate in found[:-1]]
-    assert lengths == sorted(lengths)
-    assert len(lengths) == 2
-    assert {candidate.source for candidate in found[:-1]} == {"policy"}
-    best, worst = found[:2]
+    share = np.linspace(0.0, 1.0, task.settings.segments + 1)[:, None]
+    line = (1.0 - share) * start + share * goal
+    way_round = line + np.array([2.0, 0, 0, 0, 0, 0]) * np.sin(np.pi * share)
+    jumps = line + np.array([0, 0, 0, 0, 0, 4.0]) * (share > 0.5) * (share < 1.0)
+    for broken in (jumps, np.full_like(line, np.nan)):
+        assert refined(task, "policy", broken, refine=False) is None
+    best, worst = (refined(task, "policy", nodes, refine=False) for nodes in (line, way_round))
+    assert best.source == worst.source == "policy"
     assert best.length < 1.1 * np.linalg.norm(np.diff(best.points, axis=0), axis=1).sum()
     assert worst.length > best.length + 0.5
+
+
+def test_without_parts_that_propose_curves_none_is_found(planner) -> None:
+    only = Parts(straight=False, graph=False, refinement=False, tree=False)
+    ends = pairs_of("level_cup", 1, seed=1)[0]
+    (found,) = candidates(task_of(planner, "level_cup"), *ends, only)
+    assert isinstance(found, Answer)
+    assert found.status == "not_found"
 
 
 # budgets and obstacles
@@ -895,9 +893,7 @@ def test_a_sphere_that_no_graph_knows_is_gone_round(planner, name) -> None:
         assert path.status == "solved", path.explanation
         assert path.certificate is not None
         assert path.certificate.valid
-        alone = other.plan(
-            start, goal, name, parts=Parts(straight=False, policy=False, graph=False)
-        )
+        alone = other.plan(start, goal, name, parts=Parts(straight=False, graph=False))
         assert (alone.status, alone.source) == ("solved", "tree"), alone.explanation
 
 
@@ -914,7 +910,7 @@ def test_a_budget_makes_paths_no_longer_and_is_kept_roughly(planner) -> None:
 
 def test_without_parts_that_propose_curves_a_budget_is_not_waited_for(planner) -> None:
     start, goal = pairs_of("free", 1, seed=1)[0]
-    only = Parts(policy=False, graph=False, tree=False)
+    only = Parts(graph=False, tree=False)
     assert planner.plan(start, goal, "free", parts=only, budget_s=100.0).status == "solved"
 
 

@@ -1,10 +1,10 @@
 """What a query asks to reach: a seam, with a configuration as its first kind.
 
-A further kind is one file with a class that has `description`, `as_json` and `configurations`
-(a tool pose would solve the inverse kinematics there).  `Planner.plan` takes it as it is, and
-`Trajectory.goal` says which configuration was reached.  Apart from that file it touches `cli.py`,
-if the command is to have an option for it, and its tests: planner, search, certification,
-recording and benchmark know configurations alone.
+A further kind is one file with a class that has `description` and `configurations` (a tool pose
+would solve the inverse kinematics there).  `Planner.plan` takes it as it is, and `Trajectory.goal`
+says which configuration was reached.  Apart from that file it touches `cli.py`, if the command is
+to have an option for it, and its tests: planner, search, certification, recording and benchmark
+know configurations alone.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,10 +27,6 @@ class Goal(Protocol):
     @property
     def description(self) -> str:
         """In words, for explanations."""
-        ...
-
-    def as_json(self) -> dict[str, Any]:
-        """The kind and its values as JSON takes them."""
         ...
 
     def configurations(
@@ -56,10 +52,6 @@ class ConfigurationGoal:
     def description(self) -> str:
         """The joints."""
         return f"the configuration {self.joints.tolist()} rad"
-
-    def as_json(self) -> dict[str, Any]:
-        """The kind and the joints [rad]."""
-        return {"kind": "configuration", "joints_rad": self.joints.tolist()}
 
     def configurations(
         self, manifold: ConstraintManifold, start: Float[np.ndarray, "D"]

@@ -3,7 +3,7 @@
 A further method is one file with a class that implements `Method`, and one line there.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Protocol, Self
 
@@ -17,7 +17,6 @@ from constraint_geodesics.search.candidates import (
     Answer,
     Candidate,
     Parts,
-    Proposals,
     Task,
     candidates,
     improvements,
@@ -56,17 +55,11 @@ class Method(Protocol):
 
 
 class SearchMethod:
-    """The planner's own: straight line, roadmap and trees, each refined by an elastic band.
-
-    proposals: a plug for curves of another kind, learned ones for example.
-    """
+    """The planner's own: straight line, roadmap and trees, each refined by an elastic band."""
 
     name = "planner"
     roadmaps: Mapping[str, Roadmap] | None = None
     draw: Draw | None = None
-
-    def __init__(self, proposals: Callable[[], Proposals | None] = lambda: None) -> None:
-        self.proposals = proposals
 
     @classmethod
     def open(cls, source: str | Path | None, bundle: Bundle) -> Self:
@@ -77,7 +70,7 @@ class SearchMethod:
         self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts
     ) -> Iterator[Candidate | Answer]:
         """From the cheapest proposals to the most expensive."""
-        return candidates(task, start, goal, self.proposals, parts)
+        return candidates(task, start, goal, parts)
 
     def improvements(
         self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts

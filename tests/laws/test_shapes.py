@@ -140,7 +140,7 @@ def test_the_distance_changes_no_faster_than_the_point(kind: str, a: Any, b: Any
 def test_the_gradient_is_a_unit_vector_that_finite_differences_agree_with(
     kind: str, point: tuple[float, ...]
 ) -> None:
-    q, chain, model = np.array(point), room().chain.arrays, model_of(kind).arrays
+    q, chain, model = np.array(point), room().chain, model_of(kind).arrays
     found = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     link_clearances(chain, model, np.inf, q, *found)
     row = np.empty(3)

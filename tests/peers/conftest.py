@@ -1,11 +1,12 @@
-"""The packaged planner's workcell and its judge, for the tests of its peers."""
+"""The packaged planner's workcell, chart and judge, for the tests of its peers."""
 
 from collections.abc import Iterator
 
 import pytest
-from tests.planner_fixtures import packaged_planner
+from tests.planner_fixtures import packaged_chart, packaged_planner
 
 from constraint_geodesics.certification.certifier import Certifier, Limits
+from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.scene.world import World
 
 
@@ -13,6 +14,11 @@ from constraint_geodesics.scene.world import World
 def world() -> Iterator[World]:
     with packaged_planner().scene.world() as loaded:
         yield loaded
+
+
+@pytest.fixture(scope="session")
+def chart() -> LearnedManifold:
+    return packaged_chart()
 
 
 @pytest.fixture(scope="module")

@@ -1,9 +1,14 @@
-from collections.abc import Callable
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from tests.planner_fixtures import NAMES, assert_sound, manifold_of, packaged_planner, problems
+from tests.planner_fixtures import (
+    NAMES,
+    assert_sound,
+    length,
+    manifold_of,
+    packaged_planner,
+    problems,
+    walled,
+)
 
 from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
@@ -13,7 +18,7 @@ from constraint_geodesics.peers.ompl import SamplingPlanner
 from constraint_geodesics.peers.ompl_settings import OmplSettings
 from constraint_geodesics.peers.straight_band import StraightBand
 from constraint_geodesics.peers.wrappers import BandAfter, band_after
-from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
+from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
@@ -21,38 +26,7 @@ from constraint_geodesics.scene.world import World
 from constraint_geodesics.search.band import BandSettings
 
 BIRRT = SamplingPlanner("birrt", OmplSettings(budget_s=60.0, iterations=300))
-PLANNERS: tuple[PathPlanner, ...] = (StraightBand(), MultiStartBand(8), BandAfter(BIRRT))
 PILLAR = Box("pillar", (0.45, 0.0, 0.5), (0.1, 0.1, 1.0))
-
-
-def length(joints: np.ndarray) -> float:
-    return float(np.linalg.norm(np.diff(joints, axis=0), axis=1).sum())
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("planner", PLANNERS, ids=lambda planner: planner.name)
-def test_paths_are_certified(
-    planner: PathPlanner, name: str, world: World, certifier: Certifier
-) -> None:
-    solved = 0
-    for asked in problems(world, name, 3):
-        path = planner.plan(asked, seed=1)
-        if path.status == "solved":
-            assert_sound(path, asked, certifier)
-            solved += 1
-        else:
-            assert (path.status, path.joints.shape) == ("not_found", (0, 6))
-    assert solved
-
-
-@pytest.mark.parametrize("planner", PLANNERS, ids=lambda planner: planner.name)
-def test_seed_fixes_the_path(planner: PathPlanner, world: World) -> None:
-    first, other = problems(world, "level_cup", 2)
-    once = planner.plan(first, seed=5)
-    planner.plan(other, seed=6)
-    again = planner.plan(first, seed=5)
-    assert once.status == "solved"
-    np.testing.assert_array_equal(once.joints, again.joints)
 
 
 def test_many_starts_are_no_longer_than_one_and_the_band_no_longer_than_its_path(
@@ -85,46 +59,6 @@ def test_many_starts_depend_on_the_seed_where_the_straight_one_fails(world: Worl
         pytest.fail("no query where bends help")
 
 
-@pytest.mark.parametrize("planner", PLANNERS, ids=lambda planner: planner.name)
-def test_refused_problems_say_why(planner: PathPlanner, world: World) -> None:
-    asked = problems(world, "level_cup", 1)[0]
-    tilted = asked.start + np.array([0, 0, 0, 0, 0.3, 0])
-    free = ConstraintManifold(world.robot, Constraint((0,) * 6))
-    beyond, in_table = np.array([0, 0, -1.0, 0, 0, 3.6]), np.array([0, 1.5, -0.3, 0, 0, 0])
-    for wrong, status in (
-        (replace(asked, start=tilted), "start_violates"),
-        (replace(asked, goal=tilted), "goal_violates"),
-        (replace(asked, goal=beyond, manifold=free), "out_of_limits"),
-        (replace(asked, start=in_table, manifold=free), "in_collision"),
-        (replace(asked, goal=in_table, manifold=free), "in_collision"),
-    ):
-        path = planner.plan(wrong, seed=0)
-        assert (path.status, path.joints.shape, path.iterations) == (status, (0, 6), 0)
-
-
-@pytest.mark.parametrize(
-    "planner", [StraightBand(), MultiStartBand(4)], ids=lambda planner: planner.name
-)
-def test_ends_that_coincide_are_a_path(planner: PathPlanner, world: World) -> None:
-    asked = problems(world, "level_cup", 1)[0]
-    path = planner.plan(replace(asked, goal=asked.start.copy()), seed=0)
-    assert path.status == "solved"
-    np.testing.assert_array_equal(path.joints, [asked.start, asked.start])
-
-
-def walled(world: World, is_free: Callable[[np.ndarray], bool]) -> PlanningProblem:
-    free = ConstraintManifold(world.robot, Constraint((0,) * 6))
-    start, goal = np.array([-1.0, 0, -1.0, 0, 0, 0]), np.array([1.0, 0, -1.0, 0, 0, 0])
-    return PlanningProblem(start, goal, free, is_free)
-
-
-def test_what_the_boxes_do_not_say_is_checked(world: World) -> None:
-    asked = walled(world, lambda q: bool(abs(q[0]) > 0.2))
-    for planner in (StraightBand(), MultiStartBand(4)):
-        path = planner.plan(asked, seed=0)
-        assert (path.status, path.joints.shape) == ("not_found", (0, 6))
-
-
 def test_path_itself_where_every_band_touches_something(world: World) -> None:
     corner = np.array([0.0, -1.2, -1.0, 0, 0, 0])
 
@@ -133,7 +67,7 @@ def test_path_itself_where_every_band_touches_something(world: World) -> None:
             abs(q[1] - corner[1] * (1.0 - abs(q[0]))) < 1e-6
         )  # on the two lines past the corner only
 
-    asked = walled(world, is_free)
+    asked = walled(world.robot, is_free)
     lines = [np.linspace(a, b, 40) for a, b in ((asked.start, corner), (corner, asked.goal))]
     given = Solution("solved", np.concatenate([lines[0], lines[1][1:]]), 0.5, 7)
     after = band_after(asked, given, BandSettings())

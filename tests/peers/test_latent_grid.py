@@ -1,15 +1,15 @@
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from tests.planner_fixtures import (
+    assert_sound,
+    length,
     manifold_of,
     nodes_of,
-    packaged_learned,
     packaged_planner,
-    pairs_of,
+    problem,
 )
 
 from constraint_geodesics.certification.certifier import Certifier
@@ -34,22 +34,10 @@ from constraint_geodesics.peers.latent_grid import (
     LatentGridSettings,
     neighbours_on_grid,
 )
-from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
 
 FEW, DECODED = LatentGridSettings(rounds=4), LatentGridSettings(retracted=False)
-
-
-@pytest.fixture(scope="module")
-def world() -> Iterator[World]:
-    with packaged_planner().scene.world() as opened:
-        yield opened
-
-
-@pytest.fixture(scope="module")
-def chart() -> LearnedManifold:
-    return LearnedManifold.from_arrays(packaged_learned().manifold)
 
 
 @pytest.fixture(scope="module")
@@ -66,11 +54,6 @@ def plane(
     ).manifold
 
 
-def problem(world: World, name: str, seed: int) -> PlanningProblem:
-    start, goal = pairs_of(name, 1, seed)[0]
-    return PlanningProblem(start, goal, manifold_of(packaged_planner(), name), world.is_free)
-
-
 def graph_of(chart: LearnedManifold, name: str, world: World, params: Params) -> GraphSubmanifold:
     manifold, joints = manifold_of(packaged_planner(), name), nodes_of(name)[0]
     return on_graph(Surface(chart, manifold, world.free), joints, params.submanifold)
@@ -82,20 +65,9 @@ def grid_of(plane: LearnedManifold, name: str, params: Params, cells: int = 60) 
     return on_grid(plane, manifold, plane.encode(nodes_of("free")[0]), settings)
 
 
-def assert_sound(path: Solution, asked: PlanningProblem) -> None:
-    np.testing.assert_array_equal(path.joints[[0, -1]], [asked.start, asked.goal])
-    with Certifier(packaged_planner().scene) as judge:
-        found = judge.certify(path.joints, asked.manifold.constraint, asked.start, asked.goal)
-    assert found.violation is None, found.violation
-
-
-def length(path: Solution) -> float:
-    return float(np.linalg.norm(np.diff(path.joints, axis=0), axis=1).sum())
-
-
 @pytest.mark.parametrize("name", ["free", "level_cup", "slide"])
 def test_graph_paths_keep_the_constraint_and_shortcuts_shorten_them(
-    name: str, world: World, chart: LearnedManifold, params: Params
+    name: str, world: World, chart: LearnedManifold, params: Params, certifier: Certifier
 ) -> None:
     constraint = packaged_planner().constraints[name]
     search = LatentGraphSearch(chart, constraint, graph_of(chart, name, world, params))
@@ -110,8 +82,8 @@ def test_graph_paths_keep_the_constraint_and_shortcuts_shorten_them(
         if short.status == "solved":
             solved += 1
             for path in (short, plain):
-                assert_sound(path, asked)
-            assert length(short) <= length(plain) + 1e-3
+                assert_sound(path, asked, certifier)
+            assert length(short.joints) <= length(plain.joints) + 1e-3
             np.testing.assert_array_equal(search.plan(asked, 0).joints, short.joints)
     assert solved
 
@@ -139,7 +111,7 @@ def test_graph_goes_round_what_its_edges_do_not_know_of(
 
 
 def test_grid_paths_keep_the_constraint_only_where_they_are_retracted(
-    world: World, plane: LearnedManifold, params: Params
+    world: World, plane: LearnedManifold, params: Params, certifier: Certifier
 ) -> None:
     constraint = packaged_planner().constraints["level_cup"]
     search = GridSearch(plane, constraint, grid_of(plane, "level_cup", params), FEW)
@@ -150,7 +122,7 @@ def test_grid_paths_keep_the_constraint_only_where_they_are_retracted(
         path, decoded = search.plan(asked, 0), plain.plan(asked, 0)
         statuses.append(path.status)
         if path.status == "solved":
-            assert_sound(path, asked)
+            assert_sound(path, asked, certifier)
             np.testing.assert_array_equal(search.plan(asked, 1).joints, path.joints)
         else:
             assert path.explanation
@@ -160,7 +132,7 @@ def test_grid_paths_keep_the_constraint_only_where_they_are_retracted(
 
 
 def test_grid_without_a_constraint_needs_no_retraction(
-    world: World, plane: LearnedManifold, params: Params
+    world: World, plane: LearnedManifold, params: Params, certifier: Certifier
 ) -> None:
     constraint = packaged_planner().constraints["free"]
     search = GridSearch(plane, constraint, grid_of(plane, "free", params), DECODED)
@@ -171,7 +143,7 @@ def test_grid_without_a_constraint_needs_no_retraction(
     assert any(path.status == "solved" for path, _ in paths)
     for path, asked in paths:
         if path.status == "solved":
-            assert_sound(path, asked)
+            assert_sound(path, asked, certifier)
 
 
 def test_an_infinite_weight_keeps_the_way_inside_the_submanifold(

@@ -5,6 +5,7 @@ from multiprocessing import get_context
 
 import numpy as np
 import pytest
+from tests.planner_fixtures import walled
 
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.constraints.projection import retract
@@ -170,40 +171,18 @@ def test_seed_fixes_the_path_whatever_was_planned_before_and_in_any_process(worl
             np.testing.assert_array_equal(path.joints, elsewhere[name].result())
 
 
-def test_refused_problems_say_why(world: World) -> None:
-    level, free = (ConstraintManifold(world.robot, constraint) for constraint in (LEVEL, FREE))
-    start, goal = ends(level, world.is_free, 1)
-    tilted = start + np.array([0, 0, 0, 0, 0.3, 0])
-    beyond = np.array([0, 0, -1.0, 0, 0, 3.6])
-    in_table = np.array([0, 1.5, -0.3, 0, 0, 0])
-    assert not world.is_free(in_table)
-    for first, last, manifold, status in (
-        (tilted, goal, level, "start_violates"),
-        (start, tilted, level, "goal_violates"),
-        (start, beyond, free, "out_of_limits"),
-        (in_table, goal, free, "in_collision"),
-        (start, in_table, free, "in_collision"),
-    ):
-        path = planner_of("birrt").plan(
-            PlanningProblem(first, last, manifold, world.is_free), seed=0
-        )
-        assert (path.status, path.joints.shape, path.iterations) == (status, (0, 6), 0)
-
-
 @pytest.mark.parametrize("name", PLANNERS)
 def test_search_without_a_way_ends_after_its_iterations(name: Search, world: World) -> None:
-    manifold = ConstraintManifold(world.robot, FREE)
-    start, goal = np.array([-1.0, 0, -1.0, 0, 0, 0]), np.array([1.0, 0, -1.0, 0, 0, 0])
-    walled = PlanningProblem(start, goal, manifold, lambda q: abs(q[0]) > 0.2)
+    asked = walled(world.robot, lambda q: abs(q[0]) > 0.2)
     most = {"prm": 30, "rrt_star": 40, "birrt": 50}[name]
-    path = planner_of(name, iterations=most).plan(walled, seed=0)
+    path = planner_of(name, iterations=most).plan(asked, seed=0)
     assert path.status == "not_found"
     assert path.joints.shape == (0, 6)
     assert most - 5 < path.iterations <= most
 
     endless = planner_of(name, iterations=10**9, budget_s=0.1)
     began = time.perf_counter()
-    assert endless.plan(walled, seed=0).status == "not_found"
+    assert endless.plan(asked, seed=0).status == "not_found"
     assert time.perf_counter() - began < 2.0
 
 

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.planner_fixtures import (
-    NAMES,
     assert_sound,
+    length,
     manifold_of,
     packaged_planner,
     pairs_of,
@@ -34,23 +34,6 @@ TRUST = TrajectoryOptimisation(
     TrajectoryOptimisationSettings(method="trust-constr", starts=2, iterations=100)
 )
 PILLAR = Box("pillar", (0.45, 0.0, 0.5), (0.1, 0.1, 1.0))
-
-
-def length(joints: np.ndarray) -> float:
-    return float(np.linalg.norm(np.diff(joints, axis=0), axis=1).sum())
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_paths_are_certified(name: str, world: World, certifier: Certifier) -> None:
-    solved = 0
-    for asked in problems(world, name, 3):
-        path = SLSQP.plan(asked, seed=1)
-        if path.status == "solved":
-            assert_sound(path, asked, certifier)
-            solved += 1
-        else:
-            assert (path.status, path.joints.shape) == ("not_found", (0, 6))
-    assert solved
 
 
 def test_the_other_method_finds_the_same_path(world: World, certifier: Certifier) -> None:
@@ -94,39 +77,6 @@ def test_more_wanted_paths_are_no_longer(world: World) -> None:
         assert first.status == best.status == "solved"
         assert length(best.joints) <= length(first.joints)
         assert best.iterations > first.iterations
-
-
-@pytest.mark.parametrize("planner", [SLSQP, TRUST], ids=lambda planner: planner.name)
-def test_seed_fixes_the_path(planner: PathPlanner, world: World) -> None:
-    first, other = problems(world, "level_cup", 2)
-    once = planner.plan(first, seed=5)
-    planner.plan(other, seed=6)
-    again = planner.plan(first, seed=5)
-    assert once.status == "solved"
-    np.testing.assert_array_equal(once.joints, again.joints)
-
-
-def test_refused_problems_say_why(world: World) -> None:
-    asked = problems(world, "level_cup", 1)[0]
-    tilted = asked.start + np.array([0, 0, 0, 0, 0.3, 0])
-    free = ConstraintManifold(world.robot, Constraint((0,) * 6))
-    beyond, in_table = np.array([0, 0, -1.0, 0, 0, 3.6]), np.array([0, 1.5, -0.3, 0, 0, 0])
-    for wrong, status in (
-        (replace(asked, start=tilted), "start_violates"),
-        (replace(asked, goal=tilted), "goal_violates"),
-        (replace(asked, goal=beyond, manifold=free), "out_of_limits"),
-        (replace(asked, start=in_table, manifold=free), "in_collision"),
-        (replace(asked, goal=in_table, manifold=free), "in_collision"),
-    ):
-        path = SLSQP.plan(wrong, seed=0)
-        assert (path.status, path.joints.shape, path.iterations) == (status, (0, 6), 0)
-
-
-def test_without_a_way_nothing_is_found(world: World) -> None:
-    free = ConstraintManifold(world.robot, Constraint((0,) * 6))
-    start, goal = np.array([-1.0, 0, -1.0, 0, 0, 0]), np.array([1.0, 0, -1.0, 0, 0, 0])
-    path = SLSQP.plan(PlanningProblem(start, goal, free, lambda q: bool(abs(q[0]) > 0.2)), 0)
-    assert (path.status, path.joints.shape) == ("not_found", (0, 6))
 
 
 def test_limits_bend_the_path(world: World) -> None:

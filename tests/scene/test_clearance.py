@@ -116,7 +116,13 @@ def differences(
     return slopes
 
 
-def distances(model: ClearanceModel, robot: SerialRobot, q: np.ndarray) -> tuple[np.ndarray, ...]:
+def distances(
+    model: ClearanceModel, robot: SerialRobot, q: np.ndarray, far: float = np.inf
+) -> tuple[np.ndarray, ...]:
+    return measured(model.arrays, robot, q, far)
+
+
+def measured(arrays: tuple, robot: SerialRobot, q: np.ndarray, far: float) -> tuple:
     dof = robot.dof
     found = (
         np.empty(dof),
@@ -125,7 +131,7 @@ def distances(model: ClearanceModel, robot: SerialRobot, q: np.ndarray) -> tuple
         np.empty((dof, 3)),
         np.empty((dof, 3)),
     )
-    link_clearances(robot.chain.arrays, model.arrays, np.inf, q, *found)
+    link_clearances(robot.chain, arrays, far, q, *found)
     return found
 
 
@@ -211,7 +217,7 @@ def test_beyond_the_distance_asked_for_there_is_a_bound_from_below(xarm) -> None
     model = clearance_model(xarm, (TABLE, WALL))
     q = xarm.sample(2000, np.random.default_rng(6))
     exact, bounded, far = model.clearance(xarm, q), np.empty(len(q)), 0.05
-    clearance_batch(xarm.chain.arrays, model.arrays, far, q, bounded)
+    clearance_batch(xarm.chain, model.arrays, far, q, bounded)
     assert (bounded <= exact).all()
     np.testing.assert_array_equal(bounded[exact <= far], exact[exact <= far])
     assert (bounded[exact > far] > far).all()
@@ -258,17 +264,13 @@ def test_points_passed_over_in_groups_are_none_that_are_nearest(xarm, bodies) ->
     model, rng = clearance_model(xarm, bodies), np.random.default_rng(4)
     for q in xarm.sample(25, rng):
         far = float(rng.uniform(0.02, 0.3))
-        distances, normals, nearest = np.empty(6), np.empty((6, 3)), np.empty((6, 3))
-        axes, origins = np.empty((6, 3)), np.empty((6, 3))
-        link_clearances(
-            xarm.chain.arrays, model.arrays, far, q, distances, normals, nearest, origins, axes
-        )
+        found = distances(model, xarm, q, far)[0]
         for joint in range(6):
             exact = one_by_one(xarm, model, q, joint)
-            if distances[joint] <= far:
-                assert distances[joint] == pytest.approx(exact, abs=1e-12)
+            if found[joint] <= far:
+                assert found[joint] == pytest.approx(exact, abs=1e-12)
             else:
-                assert far < distances[joint] <= exact + 1e-12
+                assert far < found[joint] <= exact + 1e-12
 
 
 def one_by_one(robot, model, q, joint) -> float:
@@ -287,16 +289,4 @@ def one_by_one(robot, model, q, joint) -> float:
         model.arrays[1],
         np.concatenate([np.reshape(before, (-1, 7)), groups]),
     )
-    distances, normals, nearest = np.empty(6), np.empty((6, 3)), np.empty((6, 3))
-    link_clearances(
-        robot.chain.arrays,
-        arrays,
-        np.inf,
-        q,
-        distances,
-        normals,
-        nearest,
-        np.empty((6, 3)),
-        np.empty((6, 3)),
-    )
-    return float(distances[joint])
+    return float(measured(arrays, robot, q, np.inf)[0][joint])

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+from tests.planner_fixtures import length
 
 from constraint_geodesics.constraints.constraint import (
     Constraint,
@@ -106,10 +107,6 @@ def bent(nodes: np.ndarray, size: float) -> np.ndarray:
 
 def energy(nodes: np.ndarray) -> float:
     return 0.5 * float(np.square(np.diff(nodes, axis=0)).sum())
-
-
-def length(nodes: np.ndarray) -> float:
-    return float(np.linalg.norm(np.diff(nodes, axis=0), axis=1).sum())
 
 
 def pulls(nodes: np.ndarray) -> np.ndarray:

@@ -224,7 +224,7 @@ class ConstraintManifold:
     @cached_property
     def arrays(self) -> ManifoldArrays:
         """For the kernels."""
-        return ManifoldArrays(self.robot.chain.arrays, self.constraint.arrays(self.robot))
+        return ManifoldArrays(self.robot.chain, self.constraint.arrays(self.robot))
 
     def residual(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch m"]:
         """C ⊙ x of eq. 7 in each row's unit; zero where nothing is held, tolerance not yet taken

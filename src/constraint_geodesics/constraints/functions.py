@@ -281,7 +281,7 @@ def tip_on_sphere(
         raise ConstraintError(
             f"centre_m = {centre_m}, radius_m = {radius_m}: 3 finite numbers and a positive one"
         )
-    chain = robot.chain.arrays
+    chain = robot.chain
     prismatic, dof = chain.prismatic, robot.dof
 
     def residual(q: np.ndarray, out: np.ndarray) -> None:
@@ -312,7 +312,7 @@ def tip_on_sphere(
 
 def _sphere_bound(robot: SerialRobot, centre: np.ndarray, radius: float) -> float:
     """K of `tip_on_sphere` [m/rad²]."""
-    chain = robot.chain.arrays
+    chain = robot.chain
     frames = np.concatenate([chain.origins[1:], chain.tool[None]])
     strokes = chain.prismatic * np.maximum(abs(robot.lower), abs(robot.upper))
     behind = np.cumsum((np.linalg.norm(frames[:, :3, 3], axis=1) + strokes)[::-1])[::-1]

@@ -41,9 +41,10 @@ from constraint_geodesics.search.candidates import (
     Candidate,
     Parts,
     Task,
+    connection,
     refined,
 )
-from constraint_geodesics.search.roadmap import Roadmap, join
+from constraint_geodesics.search.roadmap import Roadmap
 
 FORMAT = 1
 FOLDER = "learned"
@@ -201,7 +202,7 @@ class LearnedMethod:
         """The policies' curves, feasible ones first; none where the sub-manifold's graph holds the
         ends to be unconnected.
         """
-        answer = _connection(task, start, goal)
+        answer = connection(task, start, goal)
         if answer.status != "not_connected":
             yield from self.sound(task, self.curves(task.manifold, start, goal))
         yield answer
@@ -230,17 +231,6 @@ class RefinedLearnedMethod(LearnedMethod):
         t = np.linspace(0.0, 1.0, task.settings.segments + 1)
         found = (refined(task, "policy", curve.decoded(t)) for curve in curves)
         return sorted((c for c in found if c is not None), key=lambda c: c.length)
-
-
-def _connection(task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]) -> Answer:
-    """How the ends lie in the sub-manifold's graph."""
-    roadmap = task.roadmap()
-    if roadmap is None:
-        return Answer("not_found")
-    at_start, at_goal = join(roadmap, task.clear, start), join(roadmap, task.clear, goal)
-    components = at_start.components(roadmap), at_goal.components(roadmap)
-    apart = all(components) and not (components[0] & components[1])
-    return Answer("not_connected" if apart else "not_found", at_start, at_goal)
 
 
 def sampled(curve: LatentCurve) -> Candidate | None:

@@ -518,7 +518,7 @@ class LearnedProblem:
         """Of the networks, robot, constraint, data and settings."""
         weights = _content(self.chart)
         settings = (self.curve, self.degree, self.retract, self.inclusion_weight, self.retraction)
-        chain = self.manifold.robot.chain.arrays
+        chain = self.manifold.robot.chain
         return str(
             joblib.hash((weights, chain, self.manifold.constraint.key, self.joints, settings))
         )

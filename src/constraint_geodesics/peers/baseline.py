@@ -78,6 +78,8 @@ class BaselineSettings(BaseModel):
     """Whether its search asks PyBullet through Python for every state."""
     uses_bundle: ClassVar[bool] = False
     """Whether it is made from the planner's files, though it may use nothing trained of them."""
+    made_by: ClassVar[tuple[str, ...]] = ()
+    """First words of the stages that train or extract what any of its kind needs."""
 
     band: bool = False
     restarts_s: Positive | None = None
@@ -88,8 +90,8 @@ class BaselineSettings(BaseModel):
 
     @property
     def trained(self) -> tuple[str, ...]:
-        """First words of the stages that train or extract what it needs."""
-        return ()
+        """As `made_by`, of what it needs with these settings."""
+        return self.made_by
 
     @property
     def ends_by_counting(self) -> bool:

@@ -17,22 +17,20 @@ from jaxtyping import Float
 from pydantic import Field
 
 from constraint_geodesics.fields import Count, Name, NonNegative, Positive
-from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, repeated
+from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.learned_manifold import JointManifold, LearnedManifold
 from constraint_geodesics.peers.baseline import MANIFOLD, BaselineSettings, Context
+from constraint_geodesics.peers.elastic_band import answer
 from constraint_geodesics.peers.latent_geodesic import (
     EXACT,
-    answer,
+    first_curves,
     free_rows,
     on_constraint,
-    ranks,
     retracted_problem,
     turned_away,
-    without_path,
 )
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
-from constraint_geodesics.robot.kinematics import SerialRobot
 
 LIMIT_SAMPLES = 1000
 """Configurations that the scale of a chart of joint space is taken from."""
@@ -92,10 +90,11 @@ class BayesianPlanner:
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The cheapest curve met that is a path."""
         began = time.perf_counter()
-        chart = self.learned or joint_chart(problem.manifold.robot)
-        refused = turned_away(problem, chart)
-        if refused is not None:
-            return without_path(problem, *refused, began)
+        spread, rng = problem.manifold.robot.sample, np.random.default_rng(0)
+        chart = self.learned or JointManifold.of(spread(LIMIT_SAMPLES, rng))
+        early = turned_away(problem, chart, began)
+        if early is not None:
+            return early
         rng = np.random.default_rng(seed)
         joints = on_constraint(problem.manifold, self.settings.drawn, rng)
         learned = retracted_problem(
@@ -103,7 +102,7 @@ class BayesianPlanner:
         )
         ends = learned.ends(problem.start[None], problem.goal[None])
         cost = _Cost(problem, learned, ends)
-        known = self._known(learned, ends, rng)
+        known = first_curves(learned, ends, self.settings.drawn, self.settings.kept, rng)
         values = np.array([cost(phi) for phi in known])
         met, found = self._searched(cost, known[np.argmin(values)], seed)
         phi, value = np.concatenate([met, known]), np.concatenate([found, values])
@@ -114,18 +113,6 @@ class BayesianPlanner:
             if rows is not None:
                 break
         return answer(rows, problem, began, len(phi))
-
-    def _known(
-        self, learned: LearnedProblem, ends: Ends, rng: np.random.Generator
-    ) -> Float[np.ndarray, "k p"]:
-        """The straight line and the cheapest of the curves drawn."""
-        straight = np.zeros((1, learned.curve.coefficients))
-        if not len(learned.joints):
-            return straight
-        many = repeated(ends, self.settings.drawn)
-        bent = learned.sample_curves(many, rng)
-        order = np.argsort(ranks(learned.evaluate(bent, many)), kind="stable")
-        return np.concatenate([straight, bent[order[: self.settings.kept]]])
 
     def _searched(
         self, cost: "_Cost", centre: Float[np.ndarray, "p"], seed: int
@@ -196,11 +183,6 @@ class _Cost:
     @cached_property
     def _direct(self) -> float:
         return max(float(np.linalg.norm(self.problem.goal - self.problem.start)), 1e-9)
-
-
-def joint_chart(robot: SerialRobot) -> JointManifold:
-    """Joint space in units of its own size: the scale of configurations spread over the limits."""
-    return JointManifold.of(robot.sample(LIMIT_SAMPLES, np.random.default_rng(0)))
 
 
 BASELINE = BayesianSettings

@@ -2,9 +2,7 @@
 
 from typing import ClassVar
 
-from constraint_geodesics.peers.baseline import Context
-from constraint_geodesics.peers.ompl_settings import OmplSettings
-from constraint_geodesics.problem import PathPlanner
+from constraint_geodesics.peers.ompl_settings import OmplSettings, Search
 
 
 class BirrtSettings(OmplSettings):
@@ -12,11 +10,10 @@ class BirrtSettings(OmplSettings):
 
     family: ClassVar = "birrt"
 
-    def make(self, context: Context) -> PathPlanner:
-        """Rows as far apart as the judge wants them."""
-        from constraint_geodesics.peers.ompl import SamplingPlanner
-
-        return SamplingPlanner("birrt", self, context.params.judge.row_spacing_rad)
+    @property
+    def search(self) -> Search:
+        """RRTConnect."""
+        return "birrt"
 
 
 BASELINE = BirrtSettings

@@ -10,7 +10,7 @@ are those of RRTConnect in `peers/ompl.py`.
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Literal, Protocol
 
@@ -21,7 +21,13 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.learning.lift import Chart
 from constraint_geodesics.peers.baseline import MANIFOLD, Context
-from constraint_geodesics.peers.elastic_band import is_clear, nothing, rows_along, settled
+from constraint_geodesics.peers.elastic_band import (
+    answer,
+    is_clear,
+    rows_along,
+    settled,
+    without_path,
+)
 from constraint_geodesics.peers.ompl_settings import OmplSettings
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 
@@ -43,6 +49,7 @@ class DecoderSettings(OmplSettings):
     """RRTConnect's, in the only space that takes samples from elsewhere."""
 
     family: ClassVar = "birrt"
+    made_by: ClassVar = MANIFOLD
 
     space: Literal["projected"] = "projected"
 
@@ -51,11 +58,6 @@ class DecoderSettings(OmplSettings):
         from constraint_geodesics.learning.inference import FrozenManifold
 
         return DecoderSampling(FrozenManifold.load(context.layout.manifold(context.searched)), self)
-
-    @property
-    def trained(self) -> tuple[str, ...]:
-        """The manifold."""
-        return MANIFOLD
 
 
 @dataclass(frozen=True)
@@ -77,20 +79,17 @@ class DecoderSampling:
         manifold = problem.manifold
         misfit = self._misfit(manifold)
         if misfit:
-            return replace(nothing(problem, began, 0, misfit), status="not_applicable")
+            return without_path(problem, "not_applicable", began, misfit)
         samples = decoded_samples(self.chart, manifold, np.random.default_rng(seed))
         deadline = began + self.settings.budget_s
         joints, iterations = birrt_with_sampler(
             problem, self.settings, partial(next, samples), seed, deadline
         )
-        if joints is None:
-            return nothing(problem, began, iterations)
-        rows = rows_along(manifold, joints)
-        if not is_clear(problem, rows):
-            return nothing(
-                problem, began, iterations, "its path touches something between its rows"
-            )
-        return Solution("solved", rows, time.perf_counter() - began, iterations)
+        rows = None if joints is None else rows_along(manifold, joints)
+        if rows is not None and not is_clear(problem, rows):
+            touches = "its path touches something between its rows"
+            return answer(None, problem, began, iterations, touches)
+        return answer(rows, problem, began, iterations)
 
     def _misfit(self, manifold: ConstraintManifold) -> str:
         """Why the decoder or OMPL's space cannot serve the constraint; empty where they can."""

@@ -1,13 +1,13 @@
 """Elastic bands without anything learned, on the same compiled kernels as the planner's own.
 
 An elastic band [Quinlan and Khatib 1993] is a chain of configurations that is shortened until it is
-taut; here on the constraint, by Newton's method (geodesics/band.py).  It finds the shortest path
+taut; here on the constraint, by Newton's method (search/band.py).  It finds the shortest path
 near the one it starts from, so what matters is the start: the straight joint line, many bends of
 it, or another planner's path.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +15,7 @@ from jaxtyping import Float
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.learning.lift import densify
-from constraint_geodesics.problem import SATISFIED, PlanningProblem, Solution, refusal
+from constraint_geodesics.problem import SATISFIED, PlanningProblem, Solution, Status, refusal
 from constraint_geodesics.scene.clearance import no_clearance
 from constraint_geodesics.search.band import BandSettings, project, step_lengths
 from constraint_geodesics.search.candidates import (
@@ -138,7 +138,7 @@ def task_of(problem: PlanningProblem, settings: BandSettings) -> Task:
     to `is_free`.
     """
     clearance = problem.clearance or no_clearance(problem.manifold.robot.dof)
-    return Task(problem.manifold, clearance, lambda: None, False, settings)
+    return Task(problem.manifold, clearance, lambda: None, settings)
 
 
 def settled(problem: PlanningProblem, began: float) -> Solution | None:
@@ -147,20 +147,49 @@ def settled(problem: PlanningProblem, began: float) -> Solution | None:
     """
     refused = refusal(problem)
     if refused is not None:
-        return Solution(refused, np.empty((0, len(problem.start))), time.perf_counter() - began, 0)
+        return without_path(problem, refused, began)
     if np.linalg.norm(problem.goal - problem.start) <= COINCIDENT:
-        return Solution(
-            "solved", np.stack([problem.start, problem.goal]), time.perf_counter() - began, 0
-        )
+        return answer(np.stack([problem.start, problem.goal]), problem, began, 0)
     return None
 
 
-def nothing(
-    problem: PlanningProblem, began: float, iterations: int, explanation: str = ""
+def answer(
+    rows: Float[np.ndarray, "T D"] | None,
+    problem: PlanningProblem,
+    began: float,
+    iterations: int,
+    explanation: str = "",
 ) -> Solution:
-    """The answer of a search that found no path."""
+    """The record of a search that ends now.  rows: of the path, None for none.  began: its clock
+    reading [s].  explanation: why there is no path.
+    """
+    if rows is None:
+        return without_path(problem, "not_found", began, explanation, iterations)
+    return Solution("solved", rows, time.perf_counter() - began, iterations)
+
+
+def without_path(
+    problem: PlanningProblem,
+    status: Status,
+    began: float,
+    explanation: str = "",
+    iterations: int = 0,
+) -> Solution:
+    """The record of a planner that has no path to give."""
     empty = np.empty((0, len(problem.start)))
-    return Solution("not_found", empty, time.perf_counter() - began, iterations, explanation)
+    return Solution(status, empty, time.perf_counter() - began, iterations, explanation)
+
+
+def first_free(
+    problem: PlanningProblem, task: Task, curves: Iterable[Candidate | None]
+) -> tuple[Float[np.ndarray, "T D"] | None, int]:
+    """`free_rows` of the first curve that has some, and how many curves were looked at."""
+    tried = 0
+    for tried, candidate in enumerate(curves, 1):
+        rows = None if candidate is None else free_rows(problem, task, candidate)
+        if rows is not None:
+            return rows, tried
+    return None, tried
 
 
 def free_rows(

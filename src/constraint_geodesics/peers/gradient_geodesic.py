@@ -22,17 +22,17 @@ from constraint_geodesics.geometry.curves import PinnedSpline
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import corrected, retracted
 from constraint_geodesics.peers.baseline import MANIFOLD, BaselineSettings, Context
+from constraint_geodesics.peers.elastic_band import answer
 from constraint_geodesics.peers.latent_geodesic import (
     EXACT,
     FINE_DEGREE,
     INFEASIBLE,
-    answer,
+    first_curves,
     free_rows,
     on_constraint,
     ranks,
     retracted_problem,
     turned_away,
-    without_path,
 )
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.scene.clearance import ClearanceModel
@@ -66,6 +66,7 @@ class GradientGeodesicSettings(BaselineSettings):
     """
 
     family: ClassVar = "latent"
+    made_by: ClassVar = MANIFOLD
 
     segments: Count = 2
     drawn: Count = 1024
@@ -78,11 +79,6 @@ class GradientGeodesicSettings(BaselineSettings):
     def make(self, context: Context) -> PathPlanner:
         """On the manifold that the planner uses."""
         return GradientGeodesic(context.learned(context.searched), self)
-
-    @property
-    def trained(self) -> tuple[str, ...]:
-        """The manifold."""
-        return MANIFOLD
 
 
 @dataclass(frozen=True)
@@ -104,9 +100,9 @@ class GradientGeodesic:
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The shortest curve that is a path; the random starts depend on the seed."""
         began = time.perf_counter()
-        refused = turned_away(problem, self.chart)
-        if refused is not None:
-            return without_path(problem, *refused, began)
+        early = turned_away(problem, self.chart, began)
+        if early is not None:
+            return early
         rng = np.random.default_rng(seed)
         joints = on_constraint(problem.manifold, self.settings.drawn, rng)
         learned = retracted_problem(
@@ -123,26 +119,16 @@ class GradientGeodesic:
         for _ in range(self.settings.rounds):
             if found is not None:
                 break
-            met = descended(
-                learned, self._starts(learned, ends, rng), ends, self.settings.descent_steps
-            )
-            iterations += self.settings.descent_steps
+            steps = self.settings.descent_steps
+            bent = self.settings.starts - 1
+            starts = first_curves(learned, ends, self.settings.drawn, bent, rng)
+            met = descended(learned, starts, ends, steps)
+            iterations += steps
             for cost in costs:
                 if found is None:
                     found, steps = self._polished(cost, met, problem)
                     iterations += steps
         return answer(found, problem, began, iterations)
-
-    def _starts(
-        self, learned: LearnedProblem, ends: Ends, rng: np.random.Generator
-    ) -> Float[np.ndarray, "K p"]:
-        straight = np.zeros((1, learned.curve.coefficients))
-        if not len(learned.joints) or self.settings.starts == 1:
-            return straight
-        many = repeated(ends, self.settings.drawn)
-        bent = learned.sample_curves(many, rng)
-        order = np.argsort(ranks(learned.evaluate(bent, many)), kind="stable")
-        return np.concatenate([straight, bent[order[: self.settings.starts - 1]]])
 
     def _polished(
         self, cost: "_Cost", met: Float[np.ndarray, "K p"], problem: PlanningProblem

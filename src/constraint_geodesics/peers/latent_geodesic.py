@@ -1,25 +1,16 @@
 """What planners on a learned manifold share: retracted curves, and the path that is executed."""
 
-import time
-
 import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
-from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem
+from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, repeated
 from constraint_geodesics.geometry.curves import CurveFamily
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import as_executed
-from constraint_geodesics.peers.elastic_band import is_clear
-from constraint_geodesics.problem import (
-    LIMIT_SLACK,
-    SATISFIED,
-    PlanningProblem,
-    Solution,
-    Status,
-    refusal,
-)
+from constraint_geodesics.peers.elastic_band import is_clear, without_path
+from constraint_geodesics.problem import LIMIT_SLACK, SATISFIED, PlanningProblem, Solution, refusal
 
 ROW_SPACING, LONGEST_STEP = 0.02, 0.1
 """Distance of a path's rows, and the longest one that is no jump [rad]."""
@@ -38,18 +29,28 @@ INFEASIBLE = 1e3
 """Added to the cost of a curve that is not feasible [rad]: more than any curve costs."""
 
 
-def turned_away(problem: PlanningProblem, chart: LearnedManifold) -> tuple[Status, str] | None:
-    """Status and explanation where a planner on this chart need not look at a problem, or
-    cannot.
+def turned_away(
+    problem: PlanningProblem,
+    chart: LearnedManifold,
+    began: float,
+    own: Constraint | None = None,
+    what: str = "",
+) -> Solution | None:
+    """The answer where a planner on this chart need not look at a problem, or cannot.
+
+    own: the only constraint that it knows, by a graph or grid of this name.
     """
     dof = problem.manifold.robot.dof
     if chart.ambient_dim != 2 * dof:
-        return (
-            "not_applicable",
-            f"the manifold is that of {chart.ambient_dim // 2} joints, the robot has {dof}",
-        )
+        another = f"the manifold is that of {chart.ambient_dim // 2} joints, the robot has {dof}"
+        return without_path(problem, "not_applicable", began, another)
     refused = refusal(problem)
-    return None if refused is None else (refused, "")
+    if refused is not None:
+        return without_path(problem, refused, began)
+    if own is not None and not same_constraint(problem.manifold.constraint, own):
+        another = f"the {what} is that of another constraint"
+        return without_path(problem, "not_applicable", began, another)
+    return None
 
 
 def retracted_problem(
@@ -75,6 +76,21 @@ def on_constraint(
         manifold, manifold.robot.sample(count, rng), Retraction(accuracy=1e-3, iterations=12)
     )
     return found.joints[found.converged & (manifold.robot.limit_distance(found.joints) >= 0.0)]
+
+
+def first_curves(
+    learned: LearnedProblem, ends: Ends, drawn: int, kept: int, rng: np.random.Generator
+) -> Float[np.ndarray, "k p"]:
+    """The straight line, and the `kept` cheapest of `drawn` curves bent towards random
+    configurations, if there are any.
+    """
+    straight = np.zeros((1, learned.curve.coefficients))
+    if not len(learned.joints) or kept == 0:
+        return straight
+    many = repeated(ends, drawn)
+    bent = learned.sample_curves(many, rng)
+    order = np.argsort(ranks(learned.evaluate(bent, many)), kind="stable")
+    return np.concatenate([straight, bent[order[:kept]]])
 
 
 def ranks(costs: Costs) -> Float[np.ndarray, "B"]:
@@ -115,23 +131,6 @@ def executable(
         return None
     looked_at = np.concatenate([rows, 0.5 * (rows[1:] + rows[:-1])])
     return rows if manifold.violation(looked_at).max() <= SATISFIED else None
-
-
-def answer(
-    joints: Float[np.ndarray, "T D"] | None, problem: PlanningProblem, began: float, iterations: int
-) -> Solution:
-    """The record of a search that ends now; began: its clock reading [s]."""
-    if joints is None:
-        return without_path(problem, "not_found", "", began, iterations)
-    return Solution("solved", joints, time.perf_counter() - began, iterations)
-
-
-def without_path(
-    problem: PlanningProblem, status: Status, explanation: str, began: float, iterations: int = 0
-) -> Solution:
-    """The record of a planner that has no path to give."""
-    nothing = np.empty((0, problem.manifold.robot.dof))
-    return Solution(status, nothing, time.perf_counter() - began, iterations, explanation)
 
 
 def straight_lengths(

@@ -25,15 +25,8 @@ from constraint_geodesics.learning.submanifold import (
     load_submanifold,
 )
 from constraint_geodesics.peers.baseline import GRAPH, BaselineError, BaselineSettings, Context
-from constraint_geodesics.peers.elastic_band import is_clear
-from constraint_geodesics.peers.latent_geodesic import (
-    answer,
-    executable,
-    same_constraint,
-    straight_lengths,
-    turned_away,
-    without_path,
-)
+from constraint_geodesics.peers.elastic_band import answer, is_clear
+from constraint_geodesics.peers.latent_geodesic import executable, straight_lengths, turned_away
 from constraint_geodesics.problem import SATISFIED, PathPlanner, PlanningProblem, Solution
 
 TRIED, ENOUGH = 32, 4
@@ -52,6 +45,7 @@ class LatentGraphSettings(BaselineSettings):
     """
 
     family: ClassVar = "latent"
+    made_by: ClassVar = GRAPH
 
     shortcuts: Annotated[int, Field(ge=0)] = 100
     rounds: Count = 200
@@ -64,11 +58,6 @@ class LatentGraphSettings(BaselineSettings):
         if not isinstance(found, GraphSubmanifold):
             raise BaselineError(f"the manifold {searched!r} has a grid, not a graph")
         return LatentGraphSearch(context.learned(searched), constraint, found, self)
-
-    @property
-    def trained(self) -> tuple[str, ...]:
-        """The manifold and the graphs on it."""
-        return GRAPH
 
 
 @dataclass(frozen=True)
@@ -100,13 +89,9 @@ class LatentGraphSearch:
         the seed.
         """
         began = time.perf_counter()
-        refused = turned_away(problem, self.chart)
-        if refused is not None:
-            return without_path(problem, *refused, began)
-        if not same_constraint(problem.manifold.constraint, self.constraint):
-            return without_path(
-                problem, "not_applicable", "the graph is that of another constraint", began
-            )
+        early = turned_away(problem, self.chart, began, self.constraint, "graph")
+        if early is not None:
+            return early
         points, searched = self._searched(problem)
         rows = None
         if points is not None:

@@ -28,15 +28,12 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import allowed_steps, corrected, retracted
 from constraint_geodesics.learning.submanifold import GridSubmanifold, load_submanifold
 from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings, Context
-from constraint_geodesics.peers.elastic_band import is_clear
+from constraint_geodesics.peers.elastic_band import answer, is_clear
 from constraint_geodesics.peers.latent_geodesic import (
-    answer,
     executable,
     retracted_problem,
-    same_constraint,
     straight_lengths,
     turned_away,
-    without_path,
 )
 from constraint_geodesics.problem import SATISFIED, PathPlanner, PlanningProblem, Solution
 
@@ -131,13 +128,9 @@ class GridSearch:
         part.
         """
         began = time.perf_counter()
-        refused = turned_away(problem, self.chart)
-        if refused is not None:
-            return without_path(problem, *refused, began)
-        if not same_constraint(problem.manifold.constraint, self.constraint):
-            return without_path(
-                problem, "not_applicable", "the grid is that of another constraint", began
-            )
+        early = turned_away(problem, self.chart, began, self.constraint, "grid")
+        if early is not None:
+            return early
         learned = retracted_problem(
             self.chart, problem.manifold, PinnedSpline(2, self.settings.segments)
         )
@@ -145,9 +138,7 @@ class GridSearch:
             learned = replace(learned, retract=False)
         ends = learned.ends(problem.start[None], problem.goal[None])
         joints, rounds, why = self._searched(problem, learned, ends)
-        if joints is None:
-            return without_path(problem, "not_found", why, began, rounds)
-        return answer(joints, problem, began, rounds)
+        return answer(joints, problem, began, rounds, why)
 
     def _searched(
         self, problem: PlanningProblem, learned: LearnedProblem, ends: Ends

@@ -12,9 +12,9 @@ from constraint_geodesics.fields import Count
 from constraint_geodesics.peers.baseline import BaselineSettings, Context
 from constraint_geodesics.peers.elastic_band import (
     Configurations,
+    answer,
     bent_lines,
-    free_rows,
-    nothing,
+    first_free,
     settled,
     task_of,
     uniform_configurations,
@@ -68,11 +68,9 @@ class MultiStartBand:
         task = task_of(problem, self.settings)
         lines = bent_lines(problem, self.settings.segments, self.starts, self.configurations, seed)
         found = [refined(task, "straight", line) for line in lines]
-        for candidate in sorted((c for c in found if c is not None), key=lambda c: c.length):
-            rows = free_rows(problem, task, candidate)
-            if rows is not None:
-                return Solution("solved", rows, time.perf_counter() - began, len(found))
-        return nothing(problem, began, len(found))
+        shortest_first = sorted((c for c in found if c is not None), key=lambda c: c.length)
+        rows, _ = first_free(problem, task, shortest_first)
+        return answer(rows, problem, began, len(found))
 
 
 BASELINE = ManyBandsSettings

@@ -13,7 +13,8 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from functools import partial
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -23,11 +24,10 @@ from constraint_geodesics.constraints import kernels
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract, retract_batch
 from constraint_geodesics.learning.lift import as_executed
-from constraint_geodesics.peers.ompl_settings import OmplSettings
+from constraint_geodesics.peers.elastic_band import answer, without_path
+from constraint_geodesics.peers.ompl_settings import OmplSettings, Search
 from constraint_geodesics.problem import SATISFIED, PlanningProblem, Solution, refusal
 from constraint_geodesics.robot.kinematics import SerialRobot
-
-Search = Literal["prm", "prm_star", "rrt_star", "informed_rrt_star", "birrt"]
 
 _STALL = 0.2
 """A step along the constraint that advances by less than this share of itself leads nowhere."""
@@ -62,23 +62,23 @@ class SamplingPlanner:
         between.
         """
         began = time.perf_counter()
-        nothing = np.empty((0, problem.manifold.robot.dof))
         refused = refusal(problem)
         if refused is not None:
-            return Solution(refused, nothing, time.perf_counter() - began, 0)
+            return without_path(problem, refused, began)
         misfit = self._misfit(problem.manifold)
         if misfit:
-            return Solution("not_applicable", nothing, time.perf_counter() - began, 0, misfit)
+            return without_path(problem, "not_applicable", began, misfit)
         _start_random_numbers(seed)
         space = _Space(problem, self.settings)
         found, iterations = _SEARCHES[self.name](
             space, self.settings, began + self.settings.budget_s
         )
-        joints = nothing if found is None else self._as_executed(space, found)
-        if found is not None and self.row_spacing_rad is not None:
+        if found is None:
+            return answer(None, problem, began, iterations)
+        joints = (_simplified(space, found) if self.settings.simplify else space.dense(found))[0]
+        if self.row_spacing_rad is not None:
             joints = as_executed(problem.manifold, joints, self.row_spacing_rad)
-        status: Literal["solved", "not_found"] = "not_found" if found is None else "solved"
-        return Solution(status, joints, time.perf_counter() - began, iterations)
+        return answer(joints, problem, began, iterations)
 
     def _misfit(self, manifold: ConstraintManifold) -> str:
         """Why OMPL has no space of this kind for the constraint; empty where it has one."""
@@ -94,9 +94,6 @@ class SamplingPlanner:
             )
         return ""
 
-    def _as_executed(self, space: "_Space", found: Any) -> Float[np.ndarray, "T D"]:
-        return _simplified(space, found)[0] if self.settings.simplify else space.dense(found)[0]
-
 
 def birrt_with_sampler(
     problem: PlanningProblem, settings: OmplSettings, sampler: Sampler, seed: int, deadline: float
@@ -109,7 +106,7 @@ def birrt_with_sampler(
     """
     _start_random_numbers(seed)
     space = _Space(problem, settings, sampler)
-    found, iterations = _birrt(space, settings, deadline)
+    found, iterations = _SEARCHES["birrt"](space, settings, deadline)
     if found is None:
         return None, iterations
     joints, sound = _simplified(space, found)
@@ -385,28 +382,19 @@ def _shorten(space: _Space, path: Any) -> None:
     simplifier.reduceVertices(path)
 
 
-def _prm(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
-    """The first path over a roadmap of at most `iterations` samples."""
-    planner = geometric.PRM(space.information)
-    return _grow_roadmap(planner, space, settings.iterations, _MILESTONES_BETWEEN_LOOKS, deadline)
-
-
-def _prm_star(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
-    """The shortest path over a roadmap of `iterations` samples."""
-    planner = geometric.PRMstar(space.information)
-    return _grow_roadmap(planner, space, settings.iterations, settings.iterations, deadline)
-
-
 def _grow_roadmap(
-    planner: Any, space: _Space, most: int, between_looks: int, deadline: float
+    kind: type, every: int | None, space: _Space, settings: OmplSettings, deadline: float
 ) -> tuple[Any, int]:
-    """Grow a roadmap of at most `most` samples around both ends, looking for a path every few
-    samples.
+    """Grow a roadmap of at most `iterations` samples around both ends; returns its first path.
 
+    every: samples after which a path is looked for; None: after all of them, so that it is the
+    shortest.
     OMPL's own loop lets a second thread look while the first one samples for 0.2 s at a time, so
     that a path depends on the machine.  Here `solve` may not run at all: it only enters the ends
     and answers with the path that comes nearest to the goal, found by A*.
     """
+    most = settings.iterations
+    between_looks, planner = every or most, kind(space.information)
     planner.setProblemDefinition(space.definition)
     planner.setup()
     tries, wanted = 0, 0
@@ -433,13 +421,7 @@ def _grow_roadmap(
         planner.growRoadmapPtc(base.PlannerTerminationCondition(enough))
 
 
-def _rrt_star(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
-    planner = geometric.RRTstar(space.information)
-    planner.setRange(settings.range_rad)
-    return _grow_tree(planner, space, settings.iterations, deadline)
-
-
-def _informed_rrt_star(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
+def _informed_rrt_star(space: _Space) -> Any:
     """On a constraint OMPL's sampler of the ellipsoid leaves it, and nearly all of its samples are
     lost: there the tree rejects what lies outside instead, and is pruned.
     """
@@ -450,22 +432,19 @@ def _informed_rrt_star(space: _Space, settings: OmplSettings, deadline: float) -
         planner.setSampleRejection(True)
         planner.setNewStateRejection(True)
         planner.setTreePruning(True)
+    return planner
+
+
+def _grow_tree(
+    kind: Callable[[_Space], Any], space: _Space, settings: OmplSettings, deadline: float
+) -> tuple[Any, int]:
+    """Grow one of OMPL's trees; returns its path, if any, and the iterations."""
+    iterations, planner = 0, kind(space)
     planner.setRange(settings.range_rad)
-    return _grow_tree(planner, space, settings.iterations, deadline)
-
-
-def _birrt(space: _Space, settings: OmplSettings, deadline: float) -> tuple[Any, int]:
-    planner = geometric.RRTConnect(space.information)
-    planner.setRange(settings.range_rad)
-    return _grow_tree(planner, space, settings.iterations, deadline)
-
-
-def _grow_tree(planner: Any, space: _Space, most: int, deadline: float) -> tuple[Any, int]:
-    iterations = 0
 
     def enough() -> bool:
         nonlocal iterations
-        if iterations >= most or time.perf_counter() > deadline:
+        if iterations >= settings.iterations or time.perf_counter() > deadline:
             return True
         iterations += 1
         space.expect_sample()
@@ -479,9 +458,9 @@ def _grow_tree(planner: Any, space: _Space, most: int, deadline: float) -> tuple
 
 
 _SEARCHES: dict[Search, Callable[[_Space, OmplSettings, float], tuple[Any, int]]] = {
-    "prm": _prm,
-    "prm_star": _prm_star,
-    "rrt_star": _rrt_star,
-    "informed_rrt_star": _informed_rrt_star,
-    "birrt": _birrt,
+    "prm": partial(_grow_roadmap, geometric.PRM, _MILESTONES_BETWEEN_LOOKS),
+    "prm_star": partial(_grow_roadmap, geometric.PRMstar, None),
+    "rrt_star": partial(_grow_tree, lambda space: geometric.RRTstar(space.information)),
+    "informed_rrt_star": partial(_grow_tree, _informed_rrt_star),
+    "birrt": partial(_grow_tree, lambda space: geometric.RRTConnect(space.information)),
 }

@@ -5,7 +5,10 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from constraint_geodesics.fields import Count, Positive
-from constraint_geodesics.peers.baseline import BaselineSettings
+from constraint_geodesics.peers.baseline import BaselineSettings, Context
+from constraint_geodesics.problem import PathPlanner
+
+Search = Literal["prm", "prm_star", "rrt_star", "informed_rrt_star", "birrt"]
 
 
 class OmplSettings(BaselineSettings):
@@ -30,6 +33,17 @@ class OmplSettings(BaselineSettings):
     chart_error_rad: Positive = 0.1
     exploration: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.75
     simplify: bool = True
+
+    @property
+    def search(self) -> Search:
+        """Which of OMPL's planners it is."""
+        raise NotImplementedError
+
+    def make(self, context: Context) -> PathPlanner:
+        """Rows as far apart as the judge wants them."""
+        from constraint_geodesics.peers.ompl import SamplingPlanner
+
+        return SamplingPlanner(self.search, self, context.params.judge.row_spacing_rad)
 
     @property
     def given_s(self) -> float:

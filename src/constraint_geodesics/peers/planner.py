@@ -11,6 +11,9 @@ from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.search.candidates import ALL_PARTS, Parts
 
 Part = Literal["straight", "policy", "graph", "refinement", "tree"]
+"""What an entry may switch off; "policy" is what the learned methods add, no part of the planner's
+own.
+"""
 
 
 class PlannerSettings(BaselineSettings):
@@ -33,7 +36,7 @@ class PlannerSettings(BaselineSettings):
         """Baselines made together share one planner of each method, opened once."""
         if self.method not in context.shared:
             context.shared[self.method] = _opened(context, self.method)
-        parts = replace(ALL_PARTS, **dict.fromkeys(self.switched_off, False))
+        parts = replace(ALL_PARTS, **dict.fromkeys(self.switched_off - {"policy"}, False))
         return OwnPlanner(context.shared[self.method], parts, self.budget_s)
 
     @property

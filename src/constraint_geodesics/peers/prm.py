@@ -3,9 +3,7 @@
 from typing import ClassVar
 
 from constraint_geodesics.fields import Count, Positive
-from constraint_geodesics.peers.baseline import Context
-from constraint_geodesics.peers.ompl_settings import OmplSettings
-from constraint_geodesics.problem import PathPlanner
+from constraint_geodesics.peers.ompl_settings import OmplSettings, Search
 
 
 class PrmSettings(OmplSettings):
@@ -17,12 +15,10 @@ class PrmSettings(OmplSettings):
     budget_s: Positive = 3.0
     iterations: Count = 100_000
 
-    def make(self, context: Context) -> PathPlanner:
-        """Rows as far apart as the judge wants them."""
-        from constraint_geodesics.peers.ompl import SamplingPlanner, Search
-
-        search: Search = "prm_star" if self.star else "prm"
-        return SamplingPlanner(search, self, context.params.judge.row_spacing_rad)
+    @property
+    def search(self) -> Search:
+        """With or without the star."""
+        return "prm_star" if self.star else "prm"
 
     @property
     def ends_by_counting(self) -> bool:

@@ -3,9 +3,7 @@
 from typing import ClassVar
 
 from constraint_geodesics.fields import Positive
-from constraint_geodesics.peers.baseline import Context
-from constraint_geodesics.peers.ompl_settings import OmplSettings
-from constraint_geodesics.problem import PathPlanner
+from constraint_geodesics.peers.ompl_settings import OmplSettings, Search
 
 
 class RrtStarSettings(OmplSettings):
@@ -17,12 +15,10 @@ class RrtStarSettings(OmplSettings):
     budget_s: Positive = 1.0
     range_rad: Positive = 4.0
 
-    def make(self, context: Context) -> PathPlanner:
-        """Rows as far apart as the judge wants them."""
-        from constraint_geodesics.peers.ompl import SamplingPlanner, Search
-
-        search: Search = "informed_rrt_star" if self.informed else "rrt_star"
-        return SamplingPlanner(search, self, context.params.judge.row_spacing_rad)
+    @property
+    def search(self) -> Search:
+        """Informed or not."""
+        return "informed_rrt_star" if self.informed else "rrt_star"
 
     @property
     def ends_by_counting(self) -> bool:

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from constraint_geodesics.peers.baseline import BaselineSettings, Context
-from constraint_geodesics.peers.elastic_band import FINER, free_rows, nothing, settled, task_of
+from constraint_geodesics.peers.elastic_band import FINER, answer, first_free, settled, task_of
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.search.band import BandSettings
 from constraint_geodesics.search.candidates import refined
@@ -41,20 +41,15 @@ class StraightBand:
         something.
         """
         began = time.perf_counter()
-        del seed
         early = settled(problem, began)
         if early is not None:
             return early
         task = task_of(problem, self.settings)
         straight = np.stack([problem.start, problem.goal])
-        tried = 0
-        for segments in (self.settings.segments * finer for finer in FINER):
-            tried += 1
-            candidate = refined(task, "straight", resample(straight, segments + 1))
-            rows = None if candidate is None else free_rows(problem, task, candidate)
-            if rows is not None:
-                return Solution("solved", rows, time.perf_counter() - began, tried)
-        return nothing(problem, began, tried)
+        lines = (resample(straight, self.settings.segments * finer + 1) for finer in FINER)
+        curves = (refined(task, "straight", line) for line in lines)
+        rows, tried = first_free(problem, task, curves)
+        return answer(rows, problem, began, tried)
 
 
 BASELINE = StraightBandSettings

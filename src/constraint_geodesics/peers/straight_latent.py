@@ -9,13 +9,8 @@ import numpy as np
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.peers.baseline import MANIFOLD, BaselineSettings, Context
-from constraint_geodesics.peers.latent_geodesic import (
-    answer,
-    free_rows,
-    retracted_problem,
-    turned_away,
-    without_path,
-)
+from constraint_geodesics.peers.elastic_band import answer
+from constraint_geodesics.peers.latent_geodesic import free_rows, retracted_problem, turned_away
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 
 
@@ -24,15 +19,11 @@ class StraightLatentSettings(BaselineSettings):
 
     family: ClassVar = "latent"
     random: ClassVar = False
+    made_by: ClassVar = MANIFOLD
 
     def make(self, context: Context) -> PathPlanner:
         """On the manifold that the planner uses."""
         return StraightLatent(context.learned(context.searched))
-
-    @property
-    def trained(self) -> tuple[str, ...]:
-        """The manifold."""
-        return MANIFOLD
 
 
 @dataclass(frozen=True)
@@ -49,9 +40,9 @@ class StraightLatent:
         "not_found".
         """
         began = time.perf_counter()
-        refused = turned_away(problem, self.chart)
-        if refused is not None:
-            return without_path(problem, *refused, began)
+        early = turned_away(problem, self.chart, began)
+        if early is not None:
+            return early
         learned = retracted_problem(
             self.chart, problem.manifold, PinnedPolynomial(self.chart.dim, 1)
         )

@@ -28,9 +28,9 @@ from constraint_geodesics.fields import Count, Positive
 from constraint_geodesics.peers.baseline import BaselineSettings, Context
 from constraint_geodesics.peers.elastic_band import (
     Configurations,
+    answer,
     bent_lines,
     free_rows,
-    nothing,
     settled,
     task_of,
     uniform_configurations,
@@ -182,14 +182,8 @@ class TrajectoryOptimisation:
                 found.append((candidate.length, rows))
             if len(found) >= self.settings.wanted:
                 break
-        if not found:
-            return nothing(problem, began, iterations)
-        return Solution(
-            "solved",
-            min(found, key=lambda each: each[0])[1],
-            time.perf_counter() - began,
-            iterations,
-        )
+        shortest = min(found, key=lambda each: each[0])[1] if found else None
+        return answer(shortest, problem, began, iterations)
 
     def _lines(self, problem: PlanningProblem, seed: int) -> Iterator[Nodes]:
         """The straight start, the bent ones, and at last the straight one with twice the
@@ -326,7 +320,7 @@ def _clearances(task: Task, nodes: Nodes) -> tuple[np.ndarray, np.ndarray]:
     """
     values, gradients = np.empty(nodes.shape), np.empty((*nodes.shape, nodes.shape[1]))
     _link_clearances(
-        task.manifold.robot.chain.arrays,
+        task.manifold.robot.chain,
         task.clearance.arrays,
         np.ascontiguousarray(nodes),
         values,

@@ -3,7 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +17,7 @@ from constraint_geodesics.peers.elastic_band import (
 )
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.search.band import BandSettings, step_lengths
-from constraint_geodesics.search.candidates import PARTLY_RELAXED, Candidate, Task, refined
+from constraint_geodesics.search.candidates import Candidate, Task, less_and_less_relaxed, refined
 from constraint_geodesics.search.roadmap import resample
 
 KEPT_ANSWERS = 16
@@ -121,11 +121,7 @@ def _bands_along(task: Task, joints: Float[np.ndarray, "T D"]) -> Iterator[Candi
         candidate = refined(task, "graph", resample(joints, pieces + 1))
         if candidate is not None:
             yield candidate
-    for iterations in PARTLY_RELAXED:
-        partly = replace(task, settings=replace(task.settings, iterations=iterations))
-        candidate = refined(partly, "graph", resample(joints, segments * FINER[-1] + 1))
-        if candidate is not None:
-            yield candidate
+    yield from less_and_less_relaxed(task, "graph", resample(joints, segments * FINER[-1] + 1))
 
 
 @dataclass(frozen=True)

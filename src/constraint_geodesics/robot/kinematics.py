@@ -7,57 +7,19 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.robot import kernels
 
-Joints = Float[np.ndarray, "*batch D"]
-
 
 class RobotError(ValueError):
     """The robot description can't be used; the message names the file and what is wrong with it."""
 
 
-class Robot(Protocol):
-    """What the geometry, the constraints and the planners ask of a robot."""
-
-    @property
-    def dof(self) -> int:
-        """Number of joints D."""
-        ...
-
-    @property
-    def lower(self) -> Float[np.ndarray, "D"]:
-        """Lower joint limits [rad or m]."""
-        ...
-
-    @property
-    def upper(self) -> Float[np.ndarray, "D"]:
-        """Upper joint limits [rad or m]."""
-        ...
-
-    def forward(
-        self, q: Float[np.ndarray, "*batch D"]
-    ) -> tuple[Float[np.ndarray, "*batch 3"], Float[np.ndarray, "*batch 3 3"]]:
-        """Tool position [m] and rotation in the base frame."""
-        ...
-
-
 class ChainArrays(NamedTuple):
-    """A chain as the compiled kernels take it; `Chain` says what the fields are."""
-
-    origins: np.ndarray
-    axes: np.ndarray
-    prismatic: np.ndarray
-    base: np.ndarray
-    tool: np.ndarray
-
-
-@dataclass(frozen=True)
-class Chain:
     """The serial chain from the root link to the tool link, as the compiled kernels take it (see
     kernels.py).
     """
@@ -67,11 +29,6 @@ class Chain:
     prismatic: np.ndarray
     base: Float[np.ndarray, "4 4"]
     tool: Float[np.ndarray, "4 4"]
-
-    @property
-    def arrays(self) -> ChainArrays:
-        """For the kernels."""
-        return ChainArrays(self.origins, self.axes, self.prismatic, self.base, self.tool)
 
 
 @dataclass(frozen=True)
@@ -85,7 +42,7 @@ class SerialRobot:
     lower: Float[np.ndarray, "D"]
     upper: Float[np.ndarray, "D"]
     velocity: Float[np.ndarray, "D"]
-    chain: Chain
+    chain: ChainArrays
 
     @property
     def dof(self) -> int:
@@ -98,14 +55,14 @@ class SerialRobot:
         """Tool position [m] and rotation in the base frame, of configurations q [rad]."""
         flat = self._flat(q)
         positions, rotations = np.empty((len(flat), 3)), np.empty((len(flat), 3, 3))
-        kernels.forward_batch(self.chain.arrays, flat, positions, rotations)
+        kernels.forward_batch(self.chain, flat, positions, rotations)
         return positions.reshape(*q.shape[:-1], 3), rotations.reshape(*q.shape[:-1], 3, 3)
 
     def jacobian(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch 6 D"]:
         """Geometric Jacobian in the base frame: three linear rows [m/rad], three angular rows."""
         flat = self._flat(q)
         jacobians = np.empty((len(flat), 6, self.dof))
-        kernels.jacobian_batch(self.chain.arrays, flat, jacobians)
+        kernels.jacobian_batch(self.chain, flat, jacobians)
         return jacobians.reshape(*q.shape[:-1], 6, self.dof)
 
     def skeleton(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch n 3"]:
@@ -114,7 +71,7 @@ class SerialRobot:
         """
         flat = self._flat(q)
         points = np.empty((len(flat), self.dof + 2, 3))
-        kernels.skeleton_batch(self.chain.arrays, flat, points)
+        kernels.skeleton_batch(self.chain, flat, points)
         return points.reshape(*q.shape[:-1], self.dof + 2, 3)
 
     def limit_distance(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch"]:
@@ -170,7 +127,7 @@ def load_robot(
     origins = np.array([origin for _, origin in joints])
     axes = np.array([_axis(joint) for joint, _ in joints])
     prismatic = np.array([joint.get("type") == "prismatic" for joint, _ in joints])
-    chain = Chain(origins, axes, prismatic, np.eye(4), tool)
+    chain = ChainArrays(origins, axes, prismatic, np.eye(4), tool)
     name = root.get("name", urdf.stem)
     return SerialRobot(name, urdf, tool_link, names, lower, upper, velocity, chain)
 

@@ -84,7 +84,7 @@ class ClearanceModel:
         """
         flat = np.ascontiguousarray(q, np.float64).reshape(-1, robot.dof)
         smallest = np.empty(len(flat))
-        clearance_batch(robot.chain.arrays, self.arrays, np.inf, flat, smallest)
+        clearance_batch(robot.chain, self.arrays, np.inf, flat, smallest)
         return smallest.reshape(q.shape[:-1])
 
 

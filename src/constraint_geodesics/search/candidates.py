@@ -1,14 +1,15 @@
 """The project's own planner: proposals of a curve, the shortest of which is refined by an elastic
 band.
 
-Proposals are tried in the order of what they cost: the straight joint line, curves of the policies
-on the learned manifold, the sub-manifold's graph, two trees grown towards each other.  Each is
-relaxed by Newton's method on the exact constraint; the shortest curve that is continuous, within
-the limits and clear of the workcell's boxes and spheres is drawn as rows so close together that the
-straight lines between them keep the constraint, and goes to the caller, who has it certified.
+Proposals are tried in the order of what they cost: the straight joint line, the way over the
+constraint's graph, two trees grown towards each other.  Each is relaxed by Newton's method on the
+exact constraint; one that is continuous, within the limits and clear of the workcell's shapes is
+drawn as rows so close together that the straight lines between them keep the constraint, and goes
+to the caller, who has it certified.  Curves of another kind come from a method of their own
+(methods.py), through `refined` or not.
 """
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
@@ -46,30 +47,11 @@ BENDS = 4
 """
 
 
-class Proposals(Protocol):
-    """Curves proposed for a query, as points (K, n + 1, D) [rad] from start to goal, the most
-    promising first.
-    """
-
-    def __call__(
-        self,
-        manifold: ConstraintManifold,
-        start: Float[np.ndarray, "D"],
-        goal: Float[np.ndarray, "D"],
-        points: int,
-    ) -> Float[np.ndarray, "K n D"]:
-        """Some curves, each of which need not be continuous."""
-        ...
-
-
 @dataclass(frozen=True)
 class Parts:
-    """Which parts of the planner are switched on; all of them but for an ablation.  policy: curves
-    of `Proposals`, where the planner was given any.
-    """
+    """Which parts of the planner are switched on; all of them but for an ablation."""
 
     straight: bool = True
-    policy: bool = True
     graph: bool = True
     refinement: bool = True
     tree: bool = True
@@ -83,14 +65,12 @@ class Task:
     """One constraint, prepared: the space of its configurations with and without the workcell's
     boxes, its graph.
 
-    roadmap: the graph, made when it is first asked for; None where there is none.  has_graph:
-    whether it came with the planner.
+    roadmap: the graph, made when it is first asked for; None where there is none.
     """
 
     manifold: ConstraintManifold
     clearance: ClearanceModel
     roadmap: Callable[[], Roadmap | None]
-    has_graph: bool
     settings: BandSettings = field(default_factory=BandSettings)
 
     def __post_init__(self) -> None:
@@ -139,18 +119,13 @@ def candidates(
     task: Task,
     start: Float[np.ndarray, "D"],
     goal: Float[np.ndarray, "D"],
-    proposals: Callable[[], Proposals | None],
     parts: Parts = ALL_PARTS,
 ) -> Iterator[Candidate | Answer]:
     """Sound curves from the cheapest proposals to the dearest, of one kind the shortest first; an
     Answer ends them.
 
     A straight start that leads through a box is pushed out of it only after the graph was asked:
-    that takes longer.
-
-    A graph that came with the planner goes before the policies, which take longer to ask; one that
-    has to be made, which takes longer still, after them.  Trees come last, and not where the graph
-    holds the ends to be unconnected.
+    that takes longer.  Trees come last, and not where the graph holds the ends to be unconnected.
     """
     segments = task.settings.segments
     blocked = None
@@ -166,9 +141,6 @@ def candidates(
             yield found
         else:
             blocked = found
-    asked = parts.policy and not (parts.graph and task.has_graph)
-    if asked:
-        yield from _proposed(task, proposals(), start, goal, parts.refinement)
     answer = Answer("not_found")
     if parts.graph:
         answer = yield from _over_graph(task, start, goal, parts.refinement, blocked is not None)
@@ -177,8 +149,6 @@ def candidates(
         pushed = _relaxed(task, "straight", blocked.curve.nodes, task.settings, boxes=True)
         if pushed is not None and _is_clear(task, pushed.points):
             yield pushed
-    if parts.policy and not asked and answer.status != "not_connected":
-        yield from _proposed(task, proposals(), start, goal, parts.refinement)
     if parts.tree and answer.status != "not_connected":
         for seed in range(TREES):
             yield from _over_tree(task, start, goal, parts.refinement, seed)
@@ -216,20 +186,6 @@ def improvements(
         seed += 1
 
 
-def _proposed(
-    task: Task,
-    proposals: Proposals | None,
-    start: Float[np.ndarray, "D"],
-    goal: Float[np.ndarray, "D"],
-    refine: bool,
-) -> Iterator[Candidate]:
-    if proposals is None:
-        return
-    curves = proposals(task.manifold, start, goal, task.settings.segments + 1)
-    relaxed = [refined(task, "policy", nodes, refine) for nodes in curves]
-    yield from sorted((c for c in relaxed if c is not None), key=lambda c: c.length)
-
-
 def _over_graph(
     task: Task,
     start: Float[np.ndarray, "D"],
@@ -237,20 +193,29 @@ def _over_graph(
     refine: bool,
     boxes: bool,
 ) -> Generator[Candidate, None, Answer]:
-    """The relaxed way over the graph; returns how the ends are joined to it.  boxes: whether some
-    are in the way.
+    """The relaxed way over the graph; returns `connection`.  boxes: whether some are in the way."""
+    answer, roadmap = connection(task, start, goal), task.roadmap()
+    if answer.status == "not_connected" or roadmap is None:
+        return answer
+    assert answer.at_start is not None
+    assert answer.at_goal is not None
+    corners = shortest_way(roadmap, start, goal, answer.at_start, answer.at_goal, task.clear)
+    if corners is not None:
+        yield from _along(task, "graph", corners, refine, boxes)
+    return answer
+
+
+def connection(task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]) -> Answer:
+    """How the ends are joined to the graph: "not_connected" where its components keep them apart,
+    else "not_found".
     """
     roadmap = task.roadmap()
     if roadmap is None:
         return Answer("not_found")
     at_start, at_goal = join(roadmap, task.clear, start), join(roadmap, task.clear, goal)
-    if not (at_start.components(roadmap) & at_goal.components(roadmap)):
-        apart = len(at_start.nodes) > 0 and len(at_goal.nodes) > 0
-        return Answer("not_connected" if apart else "not_found", at_start, at_goal)
-    corners = shortest_way(roadmap, start, goal, at_start, at_goal, task.clear)
-    if corners is not None:
-        yield from _along(task, "graph", corners, refine, boxes)
-    return Answer("not_found", at_start, at_goal)
+    components = at_start.components(roadmap), at_goal.components(roadmap)
+    apart = all(components) and not (components[0] & components[1])
+    return Answer("not_connected" if apart else "not_found", at_start, at_goal)
 
 
 def _over_tree(
@@ -275,9 +240,21 @@ def _along(
             if found is not None:
                 yield found
                 break
-    for iterations in PARTLY_RELAXED if refine else (0,):
-        partly = replace(task, settings=replace(task.settings, iterations=iterations))
-        found = refined(partly, source, resample(corners, 4 * segments + 1), boxes=boxes)
+    nodes = resample(corners, 4 * segments + 1)
+    yield from less_and_less_relaxed(task, source, nodes, boxes, PARTLY_RELAXED if refine else (0,))
+
+
+def less_and_less_relaxed(
+    task: Task,
+    source: Source,
+    nodes: Float[np.ndarray, "n D"],
+    boxes: bool = False,
+    iterations: Iterable[int] = PARTLY_RELAXED,
+) -> Iterator[Candidate]:
+    """Sound curves of a band that must stay near where it began."""
+    for most in iterations:
+        partly = replace(task, settings=replace(task.settings, iterations=most))
+        found = refined(partly, source, nodes, boxes=boxes)
         if found is not None:
             yield found
 
@@ -316,17 +293,12 @@ def _relaxed(
     settings: BandSettings,
     boxes: bool = False,
 ) -> Candidate | None:
-    """The curve through relaxed nodes, whether or not it runs into a box."""
+    """The curve through relaxed nodes, whether or not it runs into a box; None if its points leave
+    the constraint or the limits, or jump.
+    """
     space = task.clear if boxes else task.open
     band = relax(space, nodes, settings)
-    return _sound(space, source, band.nodes, band.iterations)
-
-
-def _sound(
-    space: Space, source: Source, nodes: Float[np.ndarray, "n D"], iterations: int
-) -> Candidate | None:
-    """The curve through nodes if its points keep the constraint and the limits, without a jump."""
-    curve = BandCurve.through(space, nodes)
+    curve = BandCurve.through(space, band.nodes)
     if curve is None:
         return None
     shares = np.linspace(0.0, 1.0, max(int(np.ceil(curve.length / CHECK_STEP)), 2) + 1)
@@ -335,7 +307,7 @@ def _sound(
     longest = JUMP * curve.length / (len(shares) - 1)
     if left > 1e-6 or steps.max() > longest:
         return None
-    return Candidate(source, curve, float(steps.sum()), shares, points, iterations)
+    return Candidate(source, curve, float(steps.sum()), shares, points, band.iterations)
 
 
 def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
@@ -343,7 +315,7 @@ def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
         return True
     smallest = np.empty(len(points))
     robot, margin = task.manifold.robot, task.settings.clearance_m
-    clearance_batch(robot.chain.arrays, task.clear.clearance, 2.0 * margin, points, smallest)
+    clearance_batch(robot.chain, task.clear.clearance, 2.0 * margin, points, smallest)
     # the ends are what they are; PyBullet has the last word on them
     return bool(smallest[1:-1].min(initial=np.inf) >= 0.5 * margin)
 

@@ -1,7 +1,7 @@
 """What is prepared once for each constraint and kept for the next query: its space and roadmap."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 
 import numpy as np
@@ -54,7 +54,6 @@ class Preparation:
         self._tasks: dict[tuple, Task] = {}
         self._roadmaps: dict[tuple, Roadmap | None] = {}
         self._named: frozenset[tuple] = frozenset()
-        self._supplied: frozenset[tuple] = frozenset()
 
     def supply(
         self, constraints: Mapping[str, Constraint], roadmaps: Mapping[str, Roadmap]
@@ -66,7 +65,6 @@ class Preparation:
             inside = np.clip(roadmap.joints, self.scene.robot.lower, self.scene.robot.upper)
             inside.setflags(write=False)
             self._roadmaps[constraints[name].key] = replace(roadmap, joints=inside)
-        self._supplied = frozenset(self._roadmaps)
 
     def task(self, constraint: Constraint) -> Task:
         """The constraint, prepared; its roadmap is made when it is first asked for."""
@@ -77,8 +75,8 @@ class Preparation:
                 del self._tasks[oldest]
                 self._roadmaps.pop(oldest, None)
             manifold = ConstraintManifold(self.scene.robot, constraint)
-            roadmap, supplied = partial(self._roadmap, key, manifold), key in self._supplied
-            self._tasks[key] = Task(manifold, self._clearance, roadmap, supplied, self.band)
+            roadmap = partial(self._roadmap, key, manifold)
+            self._tasks[key] = Task(manifold, self._clearance, roadmap, self.band)
         return self._tasks[key]
 
     def _roadmap(self, key: tuple, manifold: ConstraintManifold) -> Roadmap | None:
@@ -166,10 +164,4 @@ def free_configurations(
 
 def band_settings(settings: PlannerParams) -> BandSettings:
     """The band's part of the planner's settings."""
-    return BandSettings(
-        settings.segments,
-        settings.iterations,
-        settings.accuracy,
-        settings.largest_step_rad,
-        settings.clearance_m,
-    )
+    return BandSettings(**{own.name: getattr(settings, own.name) for own in fields(BandSettings)})

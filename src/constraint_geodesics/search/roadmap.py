@@ -70,10 +70,10 @@ class Joined:
         return {int(roadmap.labels[node]) for node in self.nodes}
 
 
-def join(roadmap: Roadmap, space: Space, q: Float[np.ndarray, "D"], tried: int = NEAREST) -> Joined:
+def join(roadmap: Roadmap, space: Space, q: Float[np.ndarray, "D"]) -> Joined:
     """The edges from a configuration to the graph."""
     distances = np.linalg.norm(roadmap.joints - q, axis=1)
-    count = min(tried, len(distances))
+    count = min(NEAREST, len(distances))
     nearest = np.argpartition(distances, count - 1)[:count]
     nearest = nearest[np.argsort(distances[nearest], kind="stable")]
     lengths = np.empty(count)

@@ -33,7 +33,7 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.training import TrainingRun, train_manifold
 from constraint_geodesics.learning.vae import JointVae
 from constraint_geodesics.params import ManifoldParams, Params
-from constraint_geodesics.peers.elastic_band import free_rows, nothing, settled, task_of
+from constraint_geodesics.peers.elastic_band import answer, first_free, settled, task_of
 from constraint_geodesics.pipeline.progress import progress
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.robot.kinematics import SerialRobot
@@ -42,7 +42,7 @@ from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.scene.world import World
 from constraint_geodesics.search.band import BandSettings
-from constraint_geodesics.search.candidates import Answer, candidates
+from constraint_geodesics.search.candidates import Candidate, candidates
 from constraint_geodesics.search.roadmap import build_roadmap
 from constraint_geodesics.search.space import space_of
 from constraint_geodesics.studies.geometry import one_thread, seconds_of
@@ -178,20 +178,14 @@ class BandAndTrees:
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The first candidate that touches nothing; `seed` is ignored, trees have their own."""
         began = time.perf_counter()
-        del seed
         early = settled(problem, began)
         if early is not None:
             return early
         task = task_of(problem, self.settings)
-        tried = 0
-        for candidate in candidates(task, problem.start, problem.goal, lambda: None):
-            if isinstance(candidate, Answer):
-                break
-            tried += 1
-            rows = free_rows(problem, task, candidate)
-            if rows is not None:
-                return Solution("solved", rows, time.perf_counter() - began, tried)
-        return nothing(problem, began, tried)
+        found = candidates(task, problem.start, problem.goal)
+        curves = (candidate for candidate in found if isinstance(candidate, Candidate))
+        rows, tried = first_free(problem, task, curves)
+        return answer(rows, problem, began, tried)
 
 
 def measure_growth(
