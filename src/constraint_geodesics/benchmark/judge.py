@@ -2,16 +2,18 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.params import JudgeParams
+
+if TYPE_CHECKING:
+    from constraint_geodesics.learning.learned_manifold import LearnedManifold
 
 Free = Callable[[Float[np.ndarray, "n D"]], Bool[np.ndarray, "n"]]
 
@@ -57,7 +59,7 @@ def measure_path(
     start: Float[np.ndarray, "D"],
     goal: Float[np.ndarray, "D"],
     manifold: ConstraintManifold,
-    charts: Mapping[str, LearnedManifold],
+    charts: Mapping[str, "LearnedManifold"],
     certifier: Certifier,
     spacing_rad: float,
 ) -> PathMeasures:
@@ -85,7 +87,7 @@ def measure_path(
     )
 
 
-def _unmeasured(reason: str, charts: Mapping[str, LearnedManifold]) -> PathMeasures:
+def _unmeasured(reason: str, charts: Mapping[str, "LearnedManifold"]) -> PathMeasures:
     nan = float("nan")
     return PathMeasures(False, reason, nan, nan, dict.fromkeys(charts, nan), nan, nan, nan)
 

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -26,11 +26,13 @@ from constraint_geodesics.benchmark.queries import Query
 from constraint_geodesics.benchmark.row import KEY, key_of, read_rows
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import JudgeParams
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from constraint_geodesics.learning.learned_manifold import LearnedManifold
 
 _WARM: set[tuple[str, str]] = set()  # planners and scenes that this process has asked before
 
@@ -96,7 +98,7 @@ class QueryBatch:
     build: Builder
     judge: JudgeParams
     file: Path
-    learned: Mapping[str, LearnedManifold] = field(default_factory=dict)
+    learned: Mapping[str, "LearnedManifold"] = field(default_factory=dict)
     record: Recorder | None = None
 
     @property
