@@ -31,6 +31,7 @@ SLOW_FIRST = ("pipeline", "report", "laws", "constraints", "geodesics", "trackin
 """Folders that take longest: what is left for the end is small, and no worker waits for another."""
 
 
+@pytest.hookimpl(tryfirst=True)  # xdist reads the groups in the same hook
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """A file stays on one worker, so that what its tests share is made once."""
     order = {folder: place for place, folder in enumerate(SLOW_FIRST)}

@@ -15,6 +15,7 @@ import yaml
 ROOT = Path(__file__).resolve().parents[2]
 
 SMALL: dict[str, Any] = {
+    "compute": {"workers": 1},  # a worker would take longer to start than to work
     "labels": {"queries": 3, "free_rows": 4000, "constrained_rows": 1000, "shard_rows": 1000},
     "manifolds": {
         "paper": {"epochs": 3, "variance_epochs": 1, "variance_centres": 32, "batch_size": 128},
