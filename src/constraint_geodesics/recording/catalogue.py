@@ -116,12 +116,16 @@ def read_entry(file: Path) -> Listed:
 
 
 def _rows(layout: Layout) -> Iterator[Listed]:
-    """Learned paths that keep a cup level first, then by stage."""
+    """Learned paths that keep a cup level first, then by stage.  All stages but the benchmark share
+    the pipeline's queries, which stand in one scene.
+    """
     stages = (layout.root / "reports" / stage for stage in SEARCHING)
     learned, sampled, executed = (sorted(folder.glob("*.csv")) for folder in stages)
     learned.sort(key=_first_to_see)
     for file in (*learned, *sampled, layout.benchmark_table, *executed):
         rows = [_listed(row, file.stem) for row in _named(file)]
+        if file != layout.benchmark_table:
+            rows = [replace(row, scene="") for row in rows]
         yield from sorted(
             rows, key=lambda row: (*row.problem, not row.planner.startswith("learned"))
         )
