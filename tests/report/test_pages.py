@@ -141,14 +141,12 @@ def small_params():
     )
     submanifold = params.submanifold.model_copy(update={"grid": 20, "nodes": 30, "neighbours": 4})
     labels = params.labels.model_copy(update={"queries": QUERIES})
-    compute = params.compute.model_copy(update={"workers": 1})  # small work: a worker starts longer
     return params.model_copy(
         update={
             "constraints": constraints,
             "geodesics": geodesics,
             "submanifold": submanifold,
             "labels": labels,
-            "compute": compute,
         }
     )
 

@@ -2,14 +2,12 @@
 (reports/index.html).
 """
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from constraint_geodesics.params import Params
-from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.recording.png import save_png
 from constraint_geodesics.report import pipeline_tables, study_report
@@ -53,8 +51,7 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
     (reports / "execution.md").write_text(executed)
     if "policies" in studies:
         (reports / "policies.md").write_text(study_report.policies_markdown(params, layout))
-    saved = parallel_map(partial(save_figure, layout), [*drawn, *cards], params.compute)
-    pictures, described = saved[: len(drawn)], saved[len(drawn) :]
+    pictures, described = ([save_figure(layout, one) for one in own] for own in (drawn, cards))
     ablated = [picture for picture in pictures if picture.name == ABLATION]
     others = [picture for picture in pictures if picture.name != ABLATION]
     write_page(layout, "index", drawn=others, ablated=ablated, cards=described, **content)
