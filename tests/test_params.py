@@ -72,6 +72,8 @@ BAD: list[tuple[Change, tuple[str, ...]]] = [
     ),
     (lambda p: p["geodesics"]["reward"].update(length_weight=0.9), ("geodesics.reward", "(0, 1]")),
     (lambda p: p["compute"].update(backend="dask"), ("compute", "dask_address")),
+    (lambda p: p["recording"].update(queries=0), ("recording.queries=0", "equal to 1")),
+    (lambda p: p["execution"].update(recorded=0), ("execution.recorded=0", "equal to 1")),
     (lambda p: p.pop("judge"), ("judge is missing",)),
     (lambda p: p["constraints"].pop("free"), ("constraints.free",)),
     (lambda p: shapes(p)["table"].pop("kind"), ("workcell.shapes.table.kind is missing",)),

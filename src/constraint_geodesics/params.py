@@ -390,7 +390,7 @@ class ExecutionParams(_Record):
     seed: Seed
     least_tilt_rad: Positive
     spheres: Count
-    recorded: Annotated[int, Field(ge=0)]
+    recorded: Count
 
 
 class JudgeParams(_Record):
@@ -406,7 +406,7 @@ class JudgeParams(_Record):
 class RecordingParams(_Record):
     """Which paths are recorded for replay."""
 
-    queries: Annotated[int, Field(ge=0)]
+    queries: Count
     frames: Annotated[int, Field(ge=2)]
 
 

@@ -41,7 +41,7 @@ CUP = CupSettings(spheres=3, settle_s=0.25)
 
 def wanted(queries: int, least_tilt_rad: float) -> ExecutionParams:
     return ExecutionParams.model_construct(
-        queries=queries, least_tilt_rad=least_tilt_rad, seed=SEED, spheres=3, recorded=0
+        queries=queries, least_tilt_rad=least_tilt_rad, seed=SEED, spheres=3, recorded=1
     )
 
 
