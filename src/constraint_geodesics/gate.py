@@ -80,7 +80,7 @@ def _planner_problems(params: Params) -> Iterator[str]:
     bench = params.benchmark
     for name, planner in bench.planners.items():
         try:
-            registry.settings_of(name, planner, load=False)
+            registry.settings_of(name, planner)
         except BaselineError as error:
             yield str(error)
     for name in bench.compared.planners:

@@ -41,19 +41,15 @@ def kind_of(kind: str) -> type[BaselineSettings]:
     return found
 
 
-def settings_of(name: str, entry: BaselineParams, *, load: bool = True) -> BaselineSettings:
+def settings_of(name: str, entry: BaselineParams) -> BaselineSettings:
     """The settings of a line of `benchmark.planners`, checked.
 
-    load: False leaves a kind unloaded that is given no settings but those that all kinds have, and
-    checks these alone; some kinds take seconds to load.
     Raises BaselineError, one line: the entry, its value and what is allowed.
     """
     where = f"benchmark.planners.{name}"
     try:
-        given, shared = json.dumps(entry.settings), BaselineSettings.model_fields.keys()
-        alike = not load and entry.kind in kinds() and entry.settings.keys() <= shared
-        kind = BaselineSettings if alike else kind_of(entry.kind)
-        return kind.model_validate_json(given, strict=True)
+        given = json.dumps(entry.settings)
+        return kind_of(entry.kind).model_validate_json(given, strict=True)
     except BaselineError as error:
         raise BaselineError(f"{where}: {error}") from None
     except ValidationError as error:
