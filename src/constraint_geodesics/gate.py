@@ -11,6 +11,7 @@ from xml.etree.ElementTree import ParseError
 from constraint_geodesics.params import Params, ParamsError
 from constraint_geodesics.peers import registry
 from constraint_geodesics.peers.baseline import BaselineError
+from constraint_geodesics.scene.pieces import read_pieces
 from constraint_geodesics.scene.scene import Scene, robot_from
 from constraint_geodesics.scene.urdf import find_urdf
 
@@ -28,16 +29,21 @@ def check_params(params: Params) -> None:
 
 
 def _check_robot(params: Params) -> None:
-    """URDF, tool link, joints and limits; then the workcell's bodies and the links they name."""
+    """URDF, tool link, joints, limits and collision shapes; then the workcell's bodies and the
+    links they name.
+    """
     robot = params.robot
     try:
-        robot_from(robot)
+        read_pieces(robot_from(robot).urdf)
     except ParseError as error:
         raise ParamsError(f"robot.urdf: {find_urdf(robot.urdf)}: no URDF: {error}") from None
     except (ValueError, OSError) as error:
         raise ParamsError(f"robot: {error}") from None
     try:
-        with Scene.from_params(params).world():
+        scene = Scene.from_params(params)
+        for shape in scene.workcell:
+            shape.pieces()
+        with scene.world():
             pass
     except (ValueError, OSError, RuntimeError) as error:
         raise ParamsError(f"workcell: {error}") from None

@@ -309,7 +309,6 @@ class PlannerParams(_Record):
     accuracy: Positive
     largest_step_rad: Positive
     clearance_m: NonNegative
-    collision_spacing_rad: Positive
     acceleration_rad_s2: Positive
     roadmap_nodes: Annotated[int, Field(ge=10)]
     roadmap_neighbours: Count

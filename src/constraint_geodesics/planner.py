@@ -201,7 +201,7 @@ class Planner:
     def _answer(self, query: Query, budget_s: float | None) -> Trajectory:
         """The answer for one configuration as the goal."""
         task, start, goal = query.task, query.start, query.goal
-        refused = refused_ends(query, self._world)
+        refused = refused_ends(query, self._certifier.collisions)
         if refused is not None:
             return self._nothing(query, *refused)
         if np.abs(start - goal).max() <= COINCIDENT_RAD:
@@ -306,7 +306,6 @@ def limits_of(settings: PlannerParams, judge: JudgeParams, dof: int) -> Limits:
         end_tolerance_rad=judge.end_tolerance_rad,
         max_step_rad=judge.max_step_rad,
         violation_tolerance=judge.violation_tolerance,
-        collision_spacing_rad=settings.collision_spacing_rad,
         acceleration_rad_s2=(settings.acceleration_rad_s2,) * dof,
     )
 

@@ -15,6 +15,9 @@ from constraint_geodesics.scene.clearance import ClearanceModel
 SATISFIED = 1e-4
 """Largest violation [rad or m] at which a configuration still keeps its constraint."""
 
+CHECK_SPACING = 0.05
+"""Distance of the configurations [rad] at which a path is looked at where no proof is at hand."""
+
 LIMIT_SLACK = 1e-9
 """How far beyond a limit an end may lie [rad], by rounding."""
 
@@ -50,6 +53,21 @@ class PlanningProblem:
     """Whether one configuration (D,) touches neither itself nor the workcell."""
     clearance: ClearanceModel | None = None
     """Distances to the workcell's boxes, for planners that use them; None if unknown."""
+    is_clear: Callable[[np.ndarray], bool] | None = None
+    """Whether the straight lines between rows (T, D) touch nothing; None if `is_free` is all that
+    is known.
+    """
+
+    def keeps_clear(self, rows: Float[np.ndarray, "T D"]) -> bool:
+        """Whether a path touches nothing on its whole way, where that is known, else at
+        configurations CHECK_SPACING apart; the ends are known to be free.
+        """
+        if self.is_clear is not None:
+            return self.is_clear(rows)
+        passed = np.insert(np.cumsum(np.linalg.norm(np.diff(rows, axis=0), axis=1)), 0, 0.0)
+        at = np.linspace(0.0, passed[-1], int(np.ceil(passed[-1] / CHECK_SPACING)) + 1)[1:-1]
+        points = np.stack([np.interp(at, passed, column) for column in rows.T], axis=1)
+        return all(self.is_free(q) for q in points)
 
 
 @dataclass(frozen=True)

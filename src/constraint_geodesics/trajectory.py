@@ -40,7 +40,7 @@ class Asked:
 class Statistics:
     """How an answer came about.
 
-    planning_time_s: everything, PyBullet's check included.  method: of the planner.  source: the
+    planning_time_s: everything, the certificate included.  method: of the planner.  source: the
     proposal that the waypoints came from, "" without a path.
     """
 
@@ -99,7 +99,7 @@ class Trajectory:
 
     @property
     def planning_time_s(self) -> float:
-        """Everything, PyBullet's check included, which took `collision_time_s` of it."""
+        """Everything, the certificate included."""
         return self.statistics.planning_time_s
 
     @property
@@ -120,8 +120,15 @@ class Trajectory:
         return np.nan if self.certificate is None else self.certificate.violation_bound
 
     @property
+    def clearance_m(self) -> float:
+        """What the arm is proven to keep from itself and the workcell on the whole path [m]: at
+        least half of the least distance that it has.
+        """
+        return np.nan if self.certificate is None else self.certificate.clearance_m
+
+    @property
     def collision_time_s(self) -> float:
-        """What PyBullet's check of the path took."""
+        """What the proof took that nothing touches."""
         return np.nan if self.certificate is None else self.certificate.collision_time_s
 
     def at(self, s: float | Sequence[float] | Float[np.ndarray, "n"]) -> Float[np.ndarray, "*n D"]:
@@ -187,6 +194,7 @@ class Trajectory:
             "duration_s": self.times[-1] if len(self.times) else np.nan,
             "max_violation_rad": self.max_violation_rad,
             "violation_bound_rad": self.violation_bound_rad,
+            "clearance_m": self.clearance_m,
             "planning_time_s": self.planning_time_s,
             "collision_time_s": self.collision_time_s,
         }

@@ -50,7 +50,6 @@ def judge_limits(judge: JudgeParams) -> Limits:
         end_tolerance_rad=judge.end_tolerance_rad,
         max_step_rad=judge.max_step_rad,
         violation_tolerance=judge.violation_tolerance,
-        collision_spacing_rad=judge.spacing_rad,
     )
 
 

@@ -188,7 +188,8 @@ def _answered(batch: QueryBatch, query: Query, jobs: Sequence[_Job]) -> Iterator
         clearance = clearance_model(scene.robot, scene.workcell)
         assert clearance.arrays  # they are made when first asked for
         clearance_s = time.perf_counter() - began
-        problem = PlanningProblem(query.start, query.goal, manifold, world.is_free, clearance)
+        known = world.is_free, clearance, certifier.collisions.is_clear
+        problem = PlanningProblem(query.start, query.goal, manifold, *known)
         grown_by: dict[tuple[str, int], float] = {}
         for job in jobs:
             baseline = job.baseline

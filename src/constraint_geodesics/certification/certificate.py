@@ -20,7 +20,6 @@ class Limits:
     end_tolerance_rad: of each joint at the start and the goal.  max_step_rad: between rows, in
     Euclidean norm.
     violation_tolerance: of the constraint beyond its own tolerance, rad or m, at and between rows.
-    collision_spacing_rad: between the configurations examined for collision, along the path.
     acceleration_rad_s2: of each joint, or None for no demand.  pose_tolerance: rad or m, against
     PyBullet's pose.
     Raises CertificationError for a value that is negative, not finite, or zero where it must be
@@ -31,7 +30,6 @@ class Limits:
     max_step_rad: float = 0.1
     violation_tolerance: float = 1e-4
     limit_tolerance_rad: float = 1e-9
-    collision_spacing_rad: float = 0.05
     acceleration_rad_s2: tuple[float, ...] | None = None
     pose_tolerance: float = 1e-6
 
@@ -45,10 +43,10 @@ class Limits:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise CertificationError(f"{name} = {value}: must be finite and not negative")
-        for name in ("max_step_rad", "collision_spacing_rad"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise CertificationError(f"{name} = {value}: must be finite and positive")
+        if not (np.isfinite(self.max_step_rad) and self.max_step_rad > 0):
+            raise CertificationError(
+                f"max_step_rad = {self.max_step_rad}: must be finite and positive"
+            )
         for value in self.acceleration_rad_s2 or ():
             if not value > 0:
                 raise CertificationError(
@@ -79,10 +77,13 @@ class Certificate:
     between them; violation_bound: proven for the whole piecewise linear path; both the larger of
     the angles' [rad] and the positions' [m], which also stand separately.  limit_distance_rad: to
     the nearest joint limit, negative outside.
-    collision_checks: configurations examined.  largest_pose_difference: of the tool pose from
-    PyBullet's [rad or m].
-    duration_s: nan without times.  time_s: what certification took,
-    of which collision_time_s for PyBullet's checks of pose and collision.
+    clearance_m: what all bodies that may meet are proven to keep apart on the whole path, at least
+    half of the least distance that they have; nan where it was not looked at.  asked_pybullet: how
+    many parts of the path come so close to something that the proof rests on PyBullet's distances
+    there; clearance_m is 0 then.  rests_on: what was taken for the bodies.
+    largest_pose_difference: of all links from PyBullet's [rad or m].
+    duration_s: nan without times.  time_s: what certification took, of which collision_time_s for
+    collisions.
     """
 
     violation: Violation | None
@@ -95,7 +96,9 @@ class Certificate:
     max_violation_m: float
     violation_bound_m: float
     limit_distance_rad: float
-    collision_checks: int
+    clearance_m: float
+    asked_pybullet: int
+    rests_on: str
     largest_pose_difference: float
     duration_s: float
     time_s: float
@@ -113,16 +116,16 @@ class Certificate:
 
 
 def _known(record: Violation | Certificate) -> dict[str, Any]:
-    """Its fields, None for what is not a number."""
+    """Its fields, None for what is no finite number."""
     fields = vars(record).items()
-    return {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in fields}
+    return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in fields}
 
 
 def blank(violation: Violation | None, began: float) -> Certificate:
     """The certificate of what is no path."""
     nan = float("nan")
-    measures = (nan,) * 9
-    return Certificate(violation, *measures, 0, nan, nan, time.perf_counter() - began, 0.0)
+    measures = (nan,) * 10
+    return Certificate(violation, *measures, 0, "", nan, nan, time.perf_counter() - began, 0.0)
 
 
 def malformed(kind: str, row: int | None, message: str) -> Violation:

@@ -1,12 +1,13 @@
 """The certificate of a path: every promise checked again, by code that shares no geometry with the
 search.
 
-What it takes from elsewhere are the robot's limits and PyBullet's word on collisions
-(robot/bullet.py).  Its kinematics are unit quaternions along the chain that PyBullet itself loaded,
-not the project's reading of the URDF, and are compared with PyBullet's poses in every certificate.
+What it takes from elsewhere are the robot's limits, the convex pieces of its links and of the
+workcell (scene/pieces.py), and PyBullet's distances where two of them come closer than the proof's
+margin.  Its kinematics are unit quaternions along the chain that PyBullet itself loaded, not the
+project's reading of the URDF, and are compared with PyBullet's poses of all links once.
 A path is what an arm executes: straight joint lines between its rows.  The constraint is bounded
-along all of them, by the file of its kind here; joint limits hold between rows because they hold at
-both ends; collisions are examined at points of the path, so they are sampled, not proven.
+along all of them, by the file of its kind here, and so is the distance of all bodies that may meet,
+by collision_kernels.py; joint limits hold between rows because they hold at both ends.
 """
 
 import time
@@ -28,6 +29,7 @@ from constraint_geodesics.certification.certificate import (
     real_array,
 )
 from constraint_geodesics.certification.chain import read_chain
+from constraint_geodesics.certification.collisions import CollisionCheck, Separation
 from constraint_geodesics.certification.kept import Asked, Kept, how_kept
 from constraint_geodesics.certification.motion import MotionLimits, check_times
 from constraint_geodesics.constraints.constraint import Constraint
@@ -35,7 +37,8 @@ from constraint_geodesics.scene.scene import Scene
 
 __all__ = ["Certificate", "CertificationError", "Certifier", "Limits", "Violation"]
 
-_POSE_ROWS = 5
+_POSES = 24
+"""Configurations at which the kinematics are compared with PyBullet's."""
 
 
 class _Path(NamedTuple):
@@ -85,6 +88,10 @@ class Certifier:
             )
         self._world = scene.world()
         self._chain = read_chain(self._world.loaded_chain(), self._dof)
+        self.collisions = CollisionCheck(
+            scene, self._chain, self._world, self.limits.limit_tolerance_rad
+        )
+        self._pose_difference, self._wrong_pose = self._compared_with_pybullet()
 
     def __enter__(self) -> Self:
         return self
@@ -114,14 +121,13 @@ class Certifier:
         collisions: bool = True,
     ) -> Certificate:
         """Check a path [rad], with its times [s] if it has them, and report the first promise it
-        breaks.
+        breaks.  collisions: whether they are looked at.
 
         A constraint without a reference is held relative to the tool's pose at `start`, or else at
         the first row.
         The order: the array itself, ends, joint limits, steps, constraint at the rows and between
-        them, times, velocity and acceleration, pose, self-collision, collision with the workcell.
-        A collision reported is the first one met in a coarse-to-fine order.  Once one promise is
-        broken no later one is looked at; what is cheap to measure is measured all the same.
+        them, times, velocity and acceleration, pose, collisions.  Once one promise is broken no
+        later one is looked at; what is cheap to measure is measured all the same.
         Raises CertificationError if `start` or `goal` has the wrong shape, or the reference is no
         pose.
         """
@@ -138,18 +144,18 @@ class Certifier:
         limits = MotionLimits(self._velocity, self.limits.acceleration_rad_s2)
         clock, duration = check_times(rows, times, limits)
         path = _Path(rows, steps, margin, kept)
-        violation = next(chain(self._broken(path, *ends), clock), None)
-        asked, difference, examined = time.perf_counter(), float("nan"), 0
-        if violation is None:
-            difference, violation = self._pose_difference(rows)
+        violation = next(chain(self._broken(path, *ends), clock), self._wrong_pose)
+        asked, apart = time.perf_counter(), Separation(violation)
         if violation is None and collisions:
-            examined, violation = self._collision(rows, steps)
+            apart = self.collisions.along(rows)
         now = time.perf_counter()
         return Certificate(
-            violation,
+            apart.violation,
             **path.measures(),
-            collision_checks=examined,
-            largest_pose_difference=difference,
+            clearance_m=apart.clearance_m,
+            asked_pybullet=apart.asked,
+            rests_on=self.collisions.rests_on,
+            largest_pose_difference=self._pose_difference,
             duration_s=duration,
             time_s=now - began,
             collision_time_s=now - asked,
@@ -236,55 +242,28 @@ class Certifier:
         )
         return Violation("step", row, float(steps[row]), allowed, text)
 
-    def _pose_difference(self, rows: np.ndarray) -> tuple[float, Violation | None]:
-        """The certifier's kinematics against PyBullet's, at rows spread over the path [rad or m,
-        the larger].
+    def _compared_with_pybullet(self) -> tuple[float, Violation | None]:
+        """The certifier's kinematics against PyBullet's, of all links at configurations spread over
+        the limits [rad or m, the larger]; what is wrong with a difference that is too large.
         """
-        chosen = np.unique(np.linspace(0, len(rows) - 1, _POSE_ROWS).round().astype(int))
-        theirs = self._world.label(rows[chosen])
-        own = self.tool_poses(rows[chosen])
-        metres = np.sqrt(np.square(own[:, :3] - theirs.position).sum(axis=1))
-        same = own[:, 3:] * np.sign((own[:, 3:] * theirs.quaternion).sum(axis=1, keepdims=True))
-        chord = np.sqrt(np.square(same - theirs.quaternion).sum(axis=1))
-        difference = np.maximum(metres, 4.0 * np.arcsin(np.minimum(0.5 * chord, 1.0)))
-        value, allowed = float(difference.max()), self.limits.pose_tolerance
+        low, high = np.maximum(self._lower, -np.pi), np.minimum(self._upper, np.pi)
+        drawn = np.random.default_rng(0).uniform(low, high, (_POSES, self._dof))
+        theirs, own = self._world.label(drawn), self.tool_poses(drawn)
+        value = _largest(own, np.hstack([theirs.position, theirs.quaternion]))
+        value = max(value, self.collisions.pose_difference(drawn))
+        allowed = self.limits.pose_tolerance
         if value <= allowed:
             return value, None
-        row = int(chosen[np.argmax(difference)])
         text = (
-            f"the tool pose of row {row} is {value:.3g} (rad or m) off PyBullet's, "
-            f"{allowed:.3g} is allowed"
+            f"the robot's links are {value:.3g} (rad or m) off PyBullet's somewhere within the "
+            f"limits, {allowed:.3g} is allowed"
         )
-        return value, Violation("pose", row, value, allowed, text)
-
-    def _collision(self, rows: np.ndarray, steps: np.ndarray) -> tuple[int, Violation | None]:
-        """How many configurations were examined, and the first one met that touches something."""
-        along = np.concatenate([[0.0], np.cumsum(steps)])
-        count = max(int(np.ceil(along[-1] / self.limits.collision_spacing_rad)), 1) + 1
-        places = np.linspace(0.0, along[-1], count)[_coarse_to_fine(count)]
-        segment = np.clip(np.searchsorted(along, places, side="right") - 1, 0, len(steps) - 1)
-        share = (places - along[segment]) / np.where(steps[segment] > 0, steps[segment], 1.0)
-        points = rows[segment] + share[:, None] * (rows[segment + 1] - rows[segment])
-        index = self._world.first_collision(points)
-        if index is None:
-            return count, None
-        labels = self._world.label(points[index : index + 1])
-        own = bool(labels.self_collision[0])
-        kind, what = ("self_collision", "itself") if own else ("workcell_collision", "the workcell")
-        row = int(segment[index])
-        text = (
-            f"the arm touches {what} on the line from row {row}, {share[index]:.0%} of the "
-            f"way to the next"
-        )
-        return index + 1, Violation(kind, row, float("nan"), float("nan"), text)
+        return value, Violation("pose", None, value, allowed, text)
 
 
-def _coarse_to_fine(count: int) -> np.ndarray:
-    """0 to count − 1, both ends first, then what halves the gaps."""
-    last = count - 1
-    step = 1 << max(last - 1, 0).bit_length()
-    order = [0, last] if last > 0 else [0]
-    while step > 1:
-        order.extend(range(step // 2, last, step))
-        step //= 2
-    return np.array(order)
+def _largest(own: Float[np.ndarray, "n 7"], theirs: Float[np.ndarray, "n 7"]) -> float:
+    """The largest difference of poses, positions [m] and quaternions [rad]."""
+    metres = np.linalg.norm(own[:, :3] - theirs[:, :3], axis=1)
+    same = own[:, 3:] * np.sign((own[:, 3:] * theirs[:, 3:]).sum(axis=1, keepdims=True))
+    chord = np.linalg.norm(same - theirs[:, 3:], axis=1)
+    return float(np.maximum(metres, 4.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))).max())

@@ -21,13 +21,7 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.learning.lift import Chart
 from constraint_geodesics.peers.baseline import MANIFOLD, Context
-from constraint_geodesics.peers.elastic_band import (
-    answer,
-    is_clear,
-    rows_along,
-    settled,
-    without_path,
-)
+from constraint_geodesics.peers.elastic_band import answer, rows_along, settled, without_path
 from constraint_geodesics.peers.ompl_settings import OmplSettings
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 
@@ -86,7 +80,7 @@ class DecoderSampling:
             problem, self.settings, partial(next, samples), seed, deadline
         )
         rows = None if joints is None else rows_along(manifold, joints)
-        if rows is not None and not is_clear(problem, rows):
+        if rows is not None and not problem.keeps_clear(rows):
             touches = "its path touches something between its rows"
             return answer(None, problem, began, iterations, touches)
         return answer(rows, problem, began, iterations)

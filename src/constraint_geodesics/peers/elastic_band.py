@@ -32,8 +32,6 @@ ROW_SPACING = 0.04
 """Distance of the rows [rad] that are drawn along a given path, before they are halved where that
 is not enough.
 """
-CHECK_SPACING = 0.05
-"""Distance of the configurations [rad] that are checked for collision on a path."""
 COINCIDENT = 1e-9
 """Ends that are no further apart [rad] are one configuration: a band between them has no direction.
 """
@@ -123,16 +121,6 @@ def _projected(
     return moved
 
 
-def is_clear(problem: PlanningProblem, rows: Float[np.ndarray, "T D"]) -> bool:
-    """Whether configurations CHECK_SPACING apart are free; the ends are known to be."""
-    passed = np.concatenate([[0.0], np.cumsum(step_lengths(rows))])
-    at = np.linspace(0.0, passed[-1], int(np.ceil(passed[-1] / CHECK_SPACING)) + 1)[1:-1]
-    points = np.stack([np.interp(at, passed, column) for column in rows.T], axis=1)
-    # from the middle outwards a collision is met sooner than from an end, which is free
-    order = np.argsort(np.abs(np.arange(len(points)) - 0.5 * len(points)), kind="stable")
-    return all(problem.is_free(points[row]) for row in order)
-
-
 def task_of(problem: PlanningProblem, settings: BandSettings) -> Task:
     """The problem's constraint and boxes as the band takes them; boxes that are not known are left
     to `is_free`.
@@ -201,4 +189,4 @@ def free_rows(
     points bridge: there the rows in between know nothing of boxes, but are checked like all others.
     """
     rows = halved(problem.manifold, rows_of(task, candidate, SATISFIED)[1])
-    return rows if is_clear(problem, rows) else None
+    return rows if problem.keeps_clear(rows) else None

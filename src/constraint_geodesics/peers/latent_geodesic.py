@@ -9,7 +9,7 @@ from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, 
 from constraint_geodesics.geometry.curves import CurveFamily
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import as_executed
-from constraint_geodesics.peers.elastic_band import is_clear, without_path
+from constraint_geodesics.peers.elastic_band import without_path
 from constraint_geodesics.problem import LIMIT_SLACK, SATISFIED, PlanningProblem, Solution, refusal
 
 ROW_SPACING, LONGEST_STEP = 0.02, 0.1
@@ -105,7 +105,7 @@ def free_rows(
     something.
     """
     rows = executable(problem.manifold, learned.path(phi, ends, LONGEST_STEP))
-    return rows if rows is not None and is_clear(problem, rows) else None
+    return rows if rows is not None and problem.keeps_clear(rows) else None
 
 
 def executable(

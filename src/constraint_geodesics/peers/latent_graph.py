@@ -25,7 +25,7 @@ from constraint_geodesics.learning.submanifold import (
     load_submanifold,
 )
 from constraint_geodesics.peers.baseline import GRAPH, BaselineError, BaselineSettings, Context
-from constraint_geodesics.peers.elastic_band import answer, is_clear
+from constraint_geodesics.peers.elastic_band import answer
 from constraint_geodesics.peers.latent_geodesic import executable, straight_lengths, turned_away
 from constraint_geodesics.problem import SATISFIED, PathPlanner, PlanningProblem, Solution
 
@@ -98,7 +98,7 @@ class LatentGraphSearch:
             shorter = self._shortened(problem, points, np.random.default_rng(seed))
             for candidate in (shorter, points):
                 drawn = executable(problem.manifold, candidate)
-                if drawn is not None and is_clear(problem, drawn):
+                if drawn is not None and problem.keeps_clear(drawn):
                     rows = drawn
                     break
         return answer(rows, problem, began, searched)
@@ -165,7 +165,7 @@ class LatentGraphSearch:
             return None
         if problem.manifold.robot.limit_distance(joints[1:-1]).min(initial=np.inf) < 0.0:
             return None
-        return joints if all(problem.is_free(q) for q in joints[1:-1]) else None
+        return joints if problem.keeps_clear(joints) else None
 
     def _shortened(
         self, problem: PlanningProblem, points: Float[np.ndarray, "k D"], rng: np.random.Generator

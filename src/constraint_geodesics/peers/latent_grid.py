@@ -28,7 +28,7 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import allowed_steps, corrected, retracted
 from constraint_geodesics.learning.submanifold import GridSubmanifold, load_submanifold
 from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings, Context
-from constraint_geodesics.peers.elastic_band import answer, is_clear
+from constraint_geodesics.peers.elastic_band import answer
 from constraint_geodesics.peers.latent_geodesic import (
     executable,
     retracted_problem,
@@ -203,7 +203,7 @@ class GridSearch:
         rows = executable(problem.manifold, path)
         if rows is None:
             return "the path jumps or leaves the limits"
-        return rows if is_clear(problem, rows) else "the path collides"
+        return rows if problem.keeps_clear(rows) else "the path collides"
 
     def _failure(
         self,

@@ -292,7 +292,7 @@ class _Space:
         if longest > _WANDER * self.settings.delta_rad * (1.0 + 1e-6):
             return False
         within = self.problem.manifold.robot.limit_distance(joints).min() >= 0.0
-        return bool(within) and all(self.problem.is_free(q) for q in joints[1:-1])
+        return bool(within) and self.problem.keeps_clear(joints)
 
     def _state(self, q: np.ndarray) -> Any:
         state = self.information.getStateSpace().allocState()

@@ -151,7 +151,7 @@ def _movable(
     """
     found, pending = [], np.eye(4)
     for joint in path:
-        pending = pending @ _origin(joint)
+        pending = pending @ origin_of(joint)
         kind, name = joint.get("type"), joint.get("name", "")
         if kind == "fixed":
             continue
@@ -186,8 +186,9 @@ def _attribute(joint: ElementTree.Element, child: str, name: str, urdf: Path) ->
     return value
 
 
-def _origin(joint: ElementTree.Element) -> np.ndarray:
-    origin = joint.find("origin")
+def origin_of(element: ElementTree.Element) -> Float[np.ndarray, "4 4"]:
+    """The transform that a URDF's joint, or a link's shape, gives as its origin."""
+    origin = element.find("origin")
     transform = np.eye(4)
     if origin is not None:
         transform[:3, :3] = rotation_from_rpy(

@@ -1,4 +1,4 @@
-"""A body read from a URDF.  Its meshes are PyBullet's alone: the planner's distances miss it."""
+"""A body read from a URDF.  The planner's distances miss it; the certificate takes its pieces."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +8,7 @@ import numpy as np
 
 from constraint_geodesics.fields import Vector3
 from constraint_geodesics.robot.kinematics import rotation_from_rpy
+from constraint_geodesics.scene.pieces import Piece, read_pieces
 from constraint_geodesics.scene.shape import PlacedUrdf, Shape
 from constraint_geodesics.scene.urdf import find_urdf
 
@@ -27,6 +28,12 @@ class Body(Shape):
         """The URDF at its pose."""
         turn = rotation_from_rpy(np.array(self.rpy_rad))
         return PlacedUrdf(find_urdf(self.urdf), self.position_m, turn)
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """Those of all its links."""
+        model, pose = self.urdf_model(), np.eye(4)
+        pose[:3, :3], pose[:3, 3] = model.rotation, model.position
+        return tuple(p.at(pose) for link in read_pieces(model.file) for p in link.pieces)
 
     def add_to(self, bullet: Any) -> int:
         """All of the URDF, its moving joints at 0."""

@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import ConfigDict
 
+from constraint_geodesics.scene.pieces import Piece, box_corners
+
 Triple = tuple[float, float, float]
 
 
@@ -24,6 +26,11 @@ class RoundedBox(NamedTuple):
     half_edges: Triple
     rounding: float = 0.0
     turn: Float[np.ndarray, "3 3"] = np.eye(3)
+
+    def piece(self) -> Piece:
+        """It as a convex piece, in the base frame."""
+        corners = box_corners(np.array(self.half_edges))
+        return Piece(corners @ self.turn.T + np.array(self.centre), self.rounding)
 
 
 class PlacedUrdf(NamedTuple):
@@ -50,6 +57,12 @@ class Shape(ABC):
         check alone.
         """
         return ()
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """Convex pieces that cover it, in the base frame.  Raises RobotError where there are
+        none.
+        """
+        return tuple(box.piece() for box in self.rounded_boxes())
 
     def urdf_model(self) -> PlacedUrdf | None:
         """Its meshes, where it has some; they are drawn by Rerun itself."""

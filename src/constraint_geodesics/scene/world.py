@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -77,6 +77,13 @@ class LinkHull:
     points: Float[np.ndarray, "n 3"]
 
 
+class BodyKey(NamedTuple):
+    """A link of the robot, or a shape of the workcell."""
+
+    name: str
+    fixed: bool
+
+
 class _Client:
     """PyBullet's functions and constants, for one physics client of its own."""
 
@@ -121,8 +128,12 @@ class World:
         self._link_index[bullet.getBodyInfo(body)[0].decode()] = -1
         self._joints = [joint_index[name] for name in robot.joint_names]
         self._tool = self._link_index[robot.tool_link]
+        names = [shape.name for shape in fixed]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two shapes of the workcell are called {twice[0]!r}")
         with quiet():
             bodies = [shape.add_to(bullet) for shape in fixed]
+        self._fixed = dict(zip(names, bodies, strict=True))
         self._exempt = dict(zip(bodies, map(self._links, fixed), strict=True))
         for other, links in self._exempt.items():
             for link in links:  # a pair that may touch need not be examined again and again
@@ -164,6 +175,39 @@ class World:
     def first_collision(self, q: Float[np.ndarray, "n D"]) -> int | None:
         """Index of the first configuration that is not free; None where all are."""
         return next((index for index, row in enumerate(q) if not self.is_free(row)), None)
+
+    def link_poses(
+        self, q: Float[np.ndarray, "D"], links: Sequence[str]
+    ) -> list[Float[np.ndarray, "4 4"]]:
+        """Poses of the frames of links in the base frame at one configuration."""
+        self._place(q)
+        found = []
+        for name in links:
+            pose = np.eye(4)
+            if (index := self._link_index[name]) >= 0:
+                state = self._bullet.getLinkState(self._body, index, computeForwardKinematics=1)
+                turn = self._bullet.getMatrixFromQuaternion(state[5])
+                pose[:3, :3], pose[:3, 3] = np.array(turn).reshape(3, 3), state[4]
+            found.append(pose)
+        return found
+
+    def distance(
+        self, q: Float[np.ndarray, "D"], first: BodyKey, second: BodyKey, most_m: float
+    ) -> float:
+        """PyBullet's distance of two bodies at one configuration [m], negative where they overlap;
+        inf where it is more than `most_m`.
+        """
+        self._place(q)
+        # a little more, so that what is as far away as `most_m` is still found
+        (a, i), (b, k) = self._indices(first), self._indices(second)
+        found = self._bullet.getClosestPoints(a, b, most_m + 1e-4, i, k)
+        return min((point[8] for point in found), default=np.inf)
+
+    def _indices(self, key: BodyKey) -> tuple[int, int]:
+        """A body's index and that of its link; -2 stands for all links."""
+        if key.fixed:
+            return self._fixed[key.name], -2
+        return self._body, self._link_index[key.name]
 
     def loaded_chain(self) -> LoadedChain:
         """The chain from the base to the tool, as PyBullet understood the URDF."""

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from constraint_geodesics.certification.collisions import CollisionCheck
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.problem import Status, ends_refused
@@ -15,7 +16,7 @@ ALTERNATIVES = 64
 """Configurations from which another goal with the same tool pose is looked for."""
 
 
-def refused_ends(query: Query, world: World) -> tuple[Status, str] | None:
+def refused_ends(query: Query, collisions: CollisionCheck) -> tuple[Status, str] | None:
     """Why these ends can't be those of a path; None where they can."""
     manifold = query.task.manifold
     ends = {"start": query.start, "goal": query.goal}
@@ -26,12 +27,8 @@ def refused_ends(query: Query, world: World) -> tuple[Status, str] | None:
     if status is not None:
         return status, next(line for end, q in ends.items() if (line := _limit(manifold, end, q)))
     for end, q in ends.items():
-        if not world.is_free(q):
-            own = bool(world.label(q[None]).self_collision[0])
-            return (
-                "in_collision",
-                f"the {end} touches {'the arm itself' if own else 'the workcell'}",
-            )
+        if not collisions.is_free(q):
+            return "in_collision", f"the {end} touches {collisions.what_touches(q)}"
     return None
 
 

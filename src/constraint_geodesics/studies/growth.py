@@ -20,6 +20,7 @@ import pandas as pd
 import torch
 from jaxtyping import Float, Int
 
+from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import (
     Constraint,
     ConstraintManifold,
@@ -307,15 +308,13 @@ class _Asked:
     manifold: ConstraintManifold
     queries: Queries
 
-    def problems(self, world: World) -> list[PlanningProblem]:
-        """As the planners are asked; world: of the same scene."""
+    def problems(self, world: World, certifier: Certifier) -> list[PlanningProblem]:
+        """As the planners are asked; world and certifier: of the same scene."""
         clearance = clearance_model(self.scene.robot, self.scene.workcell)
         _ = clearance.arrays  # made once for a workcell, not once a query
         ends = zip(self.queries.starts, self.queries.goals, strict=True)
-        return [
-            PlanningProblem(start, goal, self.manifold, world.is_free, clearance)
-            for start, goal in ends
-        ]
+        known = world.is_free, clearance, certifier.collisions.is_clear
+        return [PlanningProblem(start, goal, self.manifold, *known) for start, goal in ends]
 
 
 def _joints(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
@@ -358,8 +357,8 @@ def _obstacles(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
 def _queries(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
     scene, manifold, peer = subject.scene, subject.manifold, subject.planners[subject.peer]
     pool = draw_queries(scene, manifold, CONSTRAINT, max(sizes.all_batches), sizes.seed)
-    with scene.world() as world:
-        problems = _Asked(scene, manifold, pool).problems(world)
+    with scene.world() as world, Certifier(scene) as certifier:
+        problems = _Asked(scene, manifold, pool).problems(world, certifier)
 
         def one_by_one(rows: Int[np.ndarray, "B"]) -> Sequence[bool]:
             answers = [peer.plan(replace(problems[row]), seed=int(row)) for row in rows]
@@ -472,8 +471,8 @@ def _held(scene: Scene, axes: tuple[int, ...], pose: Pose, k: int, sizes: Growth
 
 def _warmed(subject: Subject, asked: _Asked) -> None:
     """One query that does not count: it loads compiled code."""
-    with asked.scene.world() as world:
-        problem = asked.problems(world)[0]
+    with asked.scene.world() as world, Certifier(asked.scene) as certifier:
+        problem = asked.problems(world, certifier)[0]
         for planner in subject.planners.values():
             planner.plan(problem, seed=0)
 
@@ -481,8 +480,8 @@ def _warmed(subject: Subject, asked: _Asked) -> None:
 def _planned(subject: Subject, axis: str, value: int, asked: _Asked) -> list[Sample]:
     """Every planner on every query, the planners in turn."""
     found = []
-    with asked.scene.world() as world:
-        for seed, problem in enumerate(asked.problems(world)):
+    with asked.scene.world() as world, Certifier(asked.scene) as certifier:
+        for seed, problem in enumerate(asked.problems(world, certifier)):
             for name, planner in subject.planners.items():
                 own = replace(problem)  # a planner may remember the very problem that it answered
                 began = time.perf_counter()

@@ -1,0 +1,204 @@
+"""Freedom from collision on the whole of a path: proven by collision_kernels.py, and by PyBullet's
+distances where two bodies come closer than the proof's margin.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.certification import collision_kernels as kernels
+from constraint_geodesics.certification.bodies import Body, collider
+from constraint_geodesics.certification.certificate import Violation, malformed
+from constraint_geodesics.certification.chain import Chain
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.world import World
+
+MARGIN_M = 1e-4
+"""What bodies are proven to keep apart, beyond the margins that PyBullet puts around meshes.  The
+distances here are at most 0.02 mm above PyBullet's (tests/certification/test_collisions.py).
+"""
+_PARTS = (16, 256, 4096)
+"""Parts that PyBullet is asked about; the last number ends the attempt."""
+_SHORTEST_M = 1e-6
+"""Motion over which PyBullet is asked for no shorter parts."""
+_ROUNDING_M = 1e-9
+
+
+class Separation(NamedTuple):
+    """What was found on a path: the first violation met, a distance that all bodies which may meet
+    are proven to keep [m], and how many parts of the path rest on PyBullet's distances.
+    """
+
+    violation: Violation | None
+    clearance_m: float = float("nan")
+    asked: int = 0
+
+
+class CollisionCheck:
+    """Of one scene, in a PyBullet world that it does not own.
+
+    Raises RobotError if a collision shape can't be bounded, naming it.
+    """
+
+    def __init__(self, scene: Scene, chain: Chain, world: World, beyond_rad: float) -> None:
+        self._world = world
+        self.collider = collider(scene, chain, MARGIN_M, beyond_rad)
+        self._standing = self._rigid_contact(scene.robot.dof)
+
+    @property
+    def rests_on(self) -> str:
+        """What was taken for the bodies, and what was left out."""
+        bodies = self.collider.bodies
+        shapes = sum(body.shape is not None for body in bodies)
+        line = f"convex pieces of {len(bodies) - shapes} links and {shapes} shapes"
+        if covered := self.collider.covered():
+            line += f", hulls that cover more than the meshes of {', '.join(covered)}"
+        if apart := len(self.collider.apart):
+            line += f"; {apart} pairs that never meet within the joint limits"
+        return line
+
+    def is_free(self, q: Float[np.ndarray, "D"]) -> bool:
+        """Whether one configuration touches nothing: by PyBullet's word where bodies come close,
+        and beyond the limits, where pairs are left out that never meet within them.
+        """
+        low, high = self.collider.limits
+        inside = bool((q >= low).all() and (q <= high).all())
+        if inside and self._standing is None and self._nearest(q, MARGIN_M) >= MARGIN_M:
+            return True
+        return self._world.is_free(q)
+
+    def what_touches(self, q: Float[np.ndarray, "D"]) -> str:
+        """What a configuration touches that is not free."""
+        own = bool(self._world.label(q[None]).self_collision[0])
+        return "the arm itself" if own else "the workcell"
+
+    def clearance(self, q: Float[np.ndarray, "D"]) -> float:
+        """The least distance of bodies that may meet [m], inf where none may; 0 or less where they
+        touch.
+        """
+        return self._nearest(q, np.inf)
+
+    def _nearest(self, q: Float[np.ndarray, "D"], most: float) -> float:
+        place = np.ascontiguousarray(q, float)
+        return float(kernels.nearest_pair(self.collider.arrays, place, most)[0])
+
+    def is_clear(self, rows: Float[np.ndarray, "T D"]) -> bool:
+        """Whether the straight joint lines between rows within the limits touch nothing."""
+        return self.along(np.ascontiguousarray(rows, float)).violation is None
+
+    def along(self, rows: Float[np.ndarray, "T D"]) -> Separation:
+        """Whether the straight joint lines between the rows are free.  A violation is the first one
+        met, halving the path.
+        """
+        if self._standing is not None:
+            return Separation(malformed(*self._standing))
+        for most in _PARTS:
+            undecided = np.empty((most, 4))
+            proven, _, count = kernels.prove_apart(self.collider.arrays, rows, MARGIN_M, undecided)
+            for part in undecided[: min(count, most)]:
+                if (violation := self._decide(rows, *part)) is not None:
+                    return Separation(violation)
+            if count <= most:
+                # PyBullet's distances prove that nothing touches, not by how much
+                return Separation(None, 0.0 if count else float(proven), int(count))
+        row, start, end, pair = undecided[0]
+        return Separation(self._unproven(int(row), 0.5 * (start + end), pair))
+
+    def pose_difference(self, q: Float[np.ndarray, "n D"]) -> float:
+        """The largest difference of any link's pieces from where PyBullet has them [m]."""
+        arrays, largest = self.collider.arrays, 0.0
+        frames = np.empty((q.shape[1] + 1, 12))
+        zero = np.empty_like(frames)
+        kernels.joint_frames(arrays.chain, np.zeros(q.shape[1]), zero)
+        links = [body for body in self.collider.bodies if body.shape is None]
+        at_zero = self._world.link_poses(np.zeros(q.shape[1]), [body.name for body in links])
+        for row in q:
+            kernels.joint_frames(arrays.chain, row, frames)
+            theirs = self._world.link_poses(row, [body.name for body in links])
+            for body, pose, first in zip(links, theirs, at_zero, strict=True):
+                corners = np.concatenate([piece.corners for piece in body.pieces])
+                moved = _in_base(corners, frames[body.frame])
+                at_first = _in_base(corners, zero[body.frame])
+                own = (at_first - first[:3, 3]) @ first[:3, :3]
+                difference = own @ pose[:3, :3].T + pose[:3, 3] - moved
+                largest = max(largest, float(np.linalg.norm(difference, axis=1).max()))
+        return largest
+
+    def _decide(
+        self, rows: np.ndarray, row: float, start: float, end: float, pair: float
+    ) -> Violation | None:
+        """What PyBullet's distances say of a part of a line: between two places they change by no
+        more than the bodies move.
+        """
+        first, second = self._named(pair)
+        i, line = int(row), rows[int(row) + 1] - rows[int(row)]
+        reach = self._reach(pair)
+        waiting = [(start, end)]
+        while waiting:
+            start, end = waiting.pop()
+            middle, motion = 0.5 * (start + end), 0.5 * (end - start) * float(np.abs(line) @ reach)
+            apart = self._world.distance(rows[i] + middle * line, first.key, second.key, motion)
+            if apart < 0.0:
+                return self._touches(i, middle, first, second)
+            if apart <= motion + _ROUNDING_M:
+                if motion < _SHORTEST_M:
+                    return self._unproven(i, middle, pair)
+                waiting += [(middle, end), (start, middle)]
+        return None
+
+    def _named(self, pair: float) -> tuple[Body, Body]:
+        a, b = self.collider.pair(pair)
+        return self.collider.bodies[a], self.collider.bodies[b]
+
+    def _reach(self, pair: float) -> Float[np.ndarray, "D"]:
+        """How far the second body's points get from the axes of the joints that move the two."""
+        nodes, row = self.collider.arrays.nodes, self.collider.arrays.pairs[int(pair)]
+        a, b = nodes[int(row[0])], nodes[int(row[1])]
+        reach = b[kernels.REACH :].copy()
+        reach[: int(a[kernels.FRAME])] = 0.0
+        return reach
+
+    def _rigid_contact(self, dof: int) -> tuple[str, int | None, str] | None:
+        """Kind, row and message of a contact that is there at every configuration."""
+        arrays, zeros = self.collider.arrays, np.zeros(dof)
+        for k, (a, b) in enumerate(self.collider.rigid):
+            first, second = self.collider.bodies[a], self.collider.bodies[b]
+            alone = arrays._replace(pairs=_only(arrays.pairs, arrays.top + k), top=1)
+            if kernels.nearest_pair(alone, zeros, MARGIN_M)[0] >= MARGIN_M:
+                continue
+            if self._world.distance(zeros, first.key, second.key, MARGIN_M) < 0.0:
+                text = f"{second.name} and {first.name} touch at every configuration"
+                return _kind(first, second), None, text
+        return None
+
+    def _touches(self, row: int, share: float, first: Body, second: Body) -> Violation:
+        text = (
+            f"{second.name} touches {first.name} on the line from row {row}, {share:.0%} of the "
+            f"way to the next"
+        )
+        return malformed(_kind(first, second), row, text)
+
+    def _unproven(self, row: int, share: float, pair: float) -> Violation:
+        first, second = self._named(pair)
+        text = (
+            f"{second.name} and {first.name} come so close on the line from row {row}, {share:.0%} "
+            f"of the way to the next, that no proof keeps them apart"
+        )
+        return malformed("clearance", row, text)
+
+
+def _in_base(points: Float[np.ndarray, "n 3"], frame: np.ndarray) -> Float[np.ndarray, "n 3"]:
+    return points @ frame[3:].reshape(3, 3).T + frame[:3]
+
+
+def _only(pairs: np.ndarray, row: int) -> np.ndarray:
+    """The table with one pair of bodies first, the pairs of their pieces where they were."""
+    table = pairs.copy()
+    table[0] = pairs[row]
+    return table
+
+
+def _kind(first: Body, second: Body) -> str:
+    own = first.shape is None and second.shape is None
+    return "self_collision" if own else "workcell_collision"

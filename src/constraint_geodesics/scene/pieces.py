@@ -1,0 +1,212 @@
+"""The convex pieces that PyBullet collides, read from the same URDF and mesh files.
+
+PyBullet takes each object of an OBJ mesh, and the whole of an STL mesh, as one convex hull, and
+keeps a margin of its own around it; of boxes, balls and the like it takes the exact shape.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import ConvexHull, QhullError
+
+from constraint_geodesics.robot.kinematics import RobotError, origin_of
+
+MESH_MARGIN = 0.001
+"""What PyBullet keeps around the hull of a mesh [m]."""
+NOT_CONVEX = 0.001
+"""A mesh with corners so deep inside its hull [m] is not convex."""
+_SIDES = 64
+_SIGNS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+
+
+class Piece(NamedTuple):
+    """All points within `rounding` [m] of the convex hull of its corners (n, 3) [m].
+
+    hollow_m: how far corners of its mesh lie inside that hull at most, which covers more than the
+    mesh, as PyBullet does.
+    """
+
+    corners: Float[np.ndarray, "n 3"]
+    rounding: float = 0.0
+    hollow_m: float = 0.0
+
+    def at(self, pose: Float[np.ndarray, "4 4"]) -> "Piece":
+        """The same piece elsewhere."""
+        return self._replace(corners=self.corners @ pose[:3, :3].T + pose[:3, 3])
+
+
+@dataclass(frozen=True)
+class LinkPieces:
+    """A link of a URDF: the link it hangs on, None for the root; the joints that move it, from the
+    root on; its pieces in the root's frame, all joints at 0.
+    """
+
+    name: str
+    parent: str | None
+    joints: tuple[str, ...]
+    pieces: tuple[Piece, ...]
+
+
+def box_corners(half_edges: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
+    """Corners of a box around the origin; fewer than 8 where edges are 0."""
+    return np.unique(_SIGNS * half_edges, axis=0)
+
+
+def read_pieces(urdf: Path) -> list[LinkPieces]:
+    """All links of a URDF.  Raises RobotError where a collision shape can't be bounded, naming the
+    file and the link.
+    """
+    root = ElementTree.parse(urdf).getroot()
+    above = {_link(j, "child"): (_link(j, "parent"), j) for j in root.findall("joint")}
+    found = []
+    for link in root.findall("link"):
+        name = link.get("name", "")
+        pose, joints, at = np.eye(4), list[str](), name
+        while at in above:
+            at, joint = above[at]
+            pose = origin_of(joint) @ pose
+            joints.append(joint.get("name", ""))
+        pieces = [
+            piece.at(pose @ origin_of(collision))
+            for collision in link.findall("collision")
+            for piece in _pieces_of(collision, urdf, name)
+        ]
+        parent = above[name][0] if name in above else None
+        found.append(LinkPieces(name, parent, tuple(reversed(joints)), tuple(pieces)))
+    return found
+
+
+def _link(joint: ElementTree.Element, end: str) -> str:
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")
+
+
+def _pieces_of(collision: ElementTree.Element, urdf: Path, link: str) -> Iterator[Piece]:
+    geometry = collision.find("geometry")
+    shapes = [] if geometry is None else list(geometry)
+    if not shapes:
+        raise RobotError(f"{urdf}: a collision shape of link {link!r} has no geometry")
+    shape = shapes[0]
+    try:
+        yield from _KINDS[shape.tag](shape, urdf)
+    except KeyError:
+        raise RobotError(
+            f"{urdf}: the collision shape {shape.tag!r} of link {link!r} can't be bounded: must be "
+            f"one of {', '.join(_KINDS)}"
+        ) from None
+    except (ValueError, QhullError, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise RobotError(f"{urdf}: collision shape of link {link!r}: {reason}") from None
+
+
+def _numbers(shape: ElementTree.Element, name: str, default: str | None = None) -> np.ndarray:
+    text = shape.get(name, default)
+    if text is None:
+        raise ValueError(f"a {shape.tag} without {name}")
+    return np.array(text.split(), float)
+
+
+def _size(shape: ElementTree.Element, name: str) -> np.ndarray:
+    """Sizes [m], which must be positive."""
+    sizes = _numbers(shape, name)
+    if not (sizes > 0.0).all():
+        raise ValueError(f"a {shape.tag} with {name} {shape.get(name)}, which must be positive")
+    return sizes
+
+
+def _box(shape: ElementTree.Element, _: Path) -> Iterator[Piece]:
+    yield Piece(box_corners(0.5 * _size(shape, "size")))
+
+
+def _sphere(shape: ElementTree.Element, _: Path) -> Iterator[Piece]:
+    yield Piece(np.zeros((1, 3)), float(_size(shape, "radius")[0]))
+
+
+def _capsule(shape: ElementTree.Element, _: Path) -> Iterator[Piece]:
+    half = np.array([0.0, 0.0, 0.5 * _size(shape, "length")[0]])
+    yield Piece(np.array([-half, half]), float(_size(shape, "radius")[0]))
+
+
+def _cylinder(shape: ElementTree.Element, _: Path) -> Iterator[Piece]:
+    """The prism around it."""
+    half = 0.5 * float(_size(shape, "length")[0])
+    radius = float(_size(shape, "radius")[0]) / np.cos(np.pi / _SIDES)
+    turn = np.linspace(0.0, 2.0 * np.pi, _SIDES, endpoint=False)
+    x, y, z = radius * np.cos(turn), radius * np.sin(turn), np.full(_SIDES, half)
+    yield Piece(np.concatenate([np.stack([x, y, -z], 1), np.stack([x, y, z], 1)]))
+
+
+def _mesh(shape: ElementTree.Element, urdf: Path) -> Iterator[Piece]:
+    file = _mesh_file(shape.get("filename", ""), urdf)
+    scale = _numbers(shape, "scale", "1 1 1")
+    for points in read_mesh(file):
+        yield mesh_piece(points * scale)
+
+
+_KINDS = {"mesh": _mesh, "box": _box, "sphere": _sphere, "cylinder": _cylinder, "capsule": _capsule}
+
+
+def mesh_piece(points: Float[np.ndarray, "n 3"]) -> Piece:
+    """The hull of a mesh's corners.  Raises QhullError where it has no volume."""
+    hull = ConvexHull(points)
+    inside = hull.equations[:, :3] @ points.T + hull.equations[:, 3:]
+    hollow = float(-inside.max(axis=0).min())
+    return Piece(points[hull.vertices], MESH_MARGIN, hollow)
+
+
+def _mesh_file(name: str, urdf: Path) -> Path:
+    """Beside the URDF, or in a folder above it, as PyBullet looks for package:// addresses."""
+    plain = name.removeprefix("package://").removeprefix("file://")
+    for folder in (Path(), *urdf.resolve().parents):
+        if (folder / plain).is_file():
+            return folder / plain
+    raise ValueError(f"there is no mesh {name!r}")
+
+
+def read_mesh(file: Path) -> list[Float[np.ndarray, "n 3"]]:
+    """Corners of each object of an OBJ file, or of the whole of an STL file.  Raises ValueError for
+    another kind of file, and for one without faces.
+    """
+    readers = {".obj": _read_obj, ".stl": _read_stl}
+    kind = file.suffix.lower()
+    if kind not in readers:
+        raise ValueError(f"{file.name} is no mesh that can be read: must be OBJ or STL")
+    objects = readers[kind](file)
+    if not objects or not all(np.isfinite(points).all() for points in objects):
+        raise ValueError(f"{file.name} has no faces, or corners that are no finite numbers")
+    return objects
+
+
+def _read_obj(file: Path) -> list[Float[np.ndarray, "n 3"]]:
+    corners: list[list[float]] = []
+    objects: list[set[int]] = [set()]
+    for line in file.read_text(errors="replace").splitlines():
+        kind, *words = line.split() or [""]
+        if kind in ("o", "g"):
+            objects.append(set())
+        elif kind == "v":
+            corners.append([float(x) for x in words[:3]])
+        elif kind == "f":
+            # numbers count from 1, negative ones from the last corner backwards
+            numbers = [int(word.split("/")[0]) for word in words]
+            objects[-1].update(n - 1 if n > 0 else len(corners) + n for n in numbers)
+    points = np.array(corners, float).reshape(-1, 3)
+    return [points[sorted(used)] for used in objects if used]
+
+
+def _read_stl(file: Path) -> list[Float[np.ndarray, "n 3"]]:
+    data = file.read_bytes()
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) == 84 + 50 * count:
+        face = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+        points = np.frombuffer(data[84:], face)["corners"].reshape(-1, 3).astype(float)
+    else:
+        lines = data.decode(errors="replace").splitlines()
+        rows = [line.split()[1:4] for line in lines if line.split()[:1] == ["vertex"]]
+        points = np.array(rows, float).reshape(-1, 3)
+    return [np.unique(points, axis=0)] if len(points) else []

@@ -1,0 +1,69 @@
+"""Stage: the proof of freedom from collision against PyBullet at dense configurations, on 20,000
+paths of two robots; about a quarter of an hour on two cores.
+"""
+
+import json
+import sys
+from dataclasses import asdict
+
+from constraint_geodesics.benchmark.queries import TABLE, read_queries
+from constraint_geodesics.bundle import read_bundle
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.planner import Planner
+from constraint_geodesics.robot.kinematics import load_robot
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.urdf import find_urdf
+from constraint_geodesics.studies.collision_proof import (
+    KINDS,
+    Trial,
+    graze,
+    grazings,
+    summed,
+    try_scene,
+)
+
+SEVEN_JOINTS = ("kuka_iiwa/model.urdf", "lbr_iiwa_link_7", "lbr_iiwa_link_0")
+"""A robot of pybullet_data: its URDF, its tool's link and the one that stands on the table."""
+SCENES, LINES, GRAZED = 10, 200, 500
+"""Scenes of each kind and robot, straight lines in each, and shapes that are grazed."""
+
+
+def main(params: Params, layout: Layout) -> None:
+    """Write reports/collision_proof.json."""
+    scene = Scene.from_params(params)
+    urdf, tool, base = SEVEN_JOINTS
+    table = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1), (base,))
+    other = Scene(load_robot(find_urdf(urdf), tool), (table,))
+    paths = []
+    with Planner(read_bundle(layout.planner), str(layout.planner)) as planner:
+        for name in params.constraints:
+            queries = read_queries(layout.benchmark_queries(name))
+            alone = [query for query in queries if query.scene == TABLE]
+            answers = [planner.plan(query.start, query.goal, name) for query in alone]
+            paths += [answer.joints for answer in answers if answer.status == "solved"]
+    trials = [
+        Trial(own, own.robot.name, kind, k, LINES, tuple(paths[k::SCENES]) if own is scene else ())
+        for own in (scene, other)
+        for kind in KINDS
+        for k in range(SCENES)
+    ]
+    counts = parallel_map(try_scene, trials, params.compute, description="certified paths")
+    tasks = grazings(scene, paths, GRAZED, seed=0)
+    found = parallel_map(graze, tasks, params.compute, description="grazed shapes")
+    grazed = [each for each in found if each is not None]
+    report = {
+        "paths": [asdict(each) for each in summed([each for own in counts for each in own])],
+        "grazed": len(grazed),
+        "certified_beside_smaller": sum(each.beside_smaller for each in grazed),
+        "certified_beside_larger": sum(each.beside_larger for each in grazed),
+    }
+    file = layout.root / "reports" / "collision_proof.json"
+    file.write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])

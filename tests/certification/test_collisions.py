@@ -1,0 +1,317 @@
+"""The proof of freedom from collision against PyBullet, dense sampling and known geometry."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from constraint_geodesics.certification import collision_kernels as kernels
+from constraint_geodesics.certification.certifier import Certifier
+from constraint_geodesics.certification.collisions import MARGIN_M
+from constraint_geodesics.constraints.constraint import Constraint
+from constraint_geodesics.learning.lift import densify
+from constraint_geodesics.robot.kinematics import RobotError, load_robot
+from constraint_geodesics.scene.body import Body
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.capsule import Capsule
+from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.studies.collision_proof import KINDS, Grazing, Trial, graze, try_scene
+
+FREE = Constraint((0,) * 6)
+ABOVE_M, BELOW_M = 2e-5, 1e-4
+"""How far distances may lie above and below PyBullet's."""
+LINK = """
+  <link name="link{i}"><inertial><mass value="1"/>
+    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+    <collision><origin xyz="0.03 0 0.08" rpy="0.2 0 0"/>
+      <geometry>{shape}</geometry></collision></link>"""
+JOINT = """
+  <joint name="joint{i}" type="{kind}"><parent link="link{i}"/><child link="link{next}"/>
+    <origin xyz="0.05 0 0.22" rpy="0.3 {i} -0.7"/><axis xyz="{axis}"/>
+    <limit lower="-0.6" upper="0.7" velocity="2" effort="1"/></joint>"""
+JOINTS = (("revolute", "0 1 0"), ("prismatic", "0 0.6 0.8"), ("revolute", "1 0 0"))
+SHAPES = (
+    '<box size="0.1 0.08 0.12"/>',
+    '<cylinder radius="0.04" length="0.15"/>',
+    '<sphere radius="0.06"/>',
+    '<capsule radius="0.03" length="0.1"/>',
+)
+
+
+@pytest.fixture(scope="module")
+def sliding(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """An arm of two hinges and a slide between them, of primitive shapes, among three others."""
+    links = "".join(LINK.format(i=i, shape=shape) for i, shape in enumerate(SHAPES))
+    joints = "".join(
+        JOINT.format(i=i, next=i + 1, kind=kind, axis=axis) for i, (kind, axis) in enumerate(JOINTS)
+    )
+    file = tmp_path_factory.mktemp("sliding") / "arm.urdf"
+    file.write_text(f'<robot name="sliding">{links}{joints}</robot>')
+    around = (
+        Box("box", (0.3, 0.1, 0.5), (0.1, 0.2, 0.1)),
+        Capsule("pipe", (-0.3, -0.3, 0.3), (-0.2, 0.3, 0.8), 0.03),
+        Sphere("ball", (0.1, -0.35, 0.6), 0.08),
+    )
+    return Scene(load_robot(file, "link3"), around)
+
+
+@pytest.fixture(scope="module", params=["xarm", "kuka", "sliding"])
+def any_scene(request: pytest.FixtureRequest) -> Scene:
+    name = {"xarm": "scene", "kuka": "kuka_scene", "sliding": "sliding"}[request.param]
+    found: Scene = request.getfixturevalue(name)
+    return found
+
+
+@pytest.fixture(scope="module")
+def certifier(scene: Scene) -> Iterator[Certifier]:
+    with Certifier(scene) as own:
+        yield own
+
+
+def lines(scene: Scene, count: int, seed: int = 0) -> list[np.ndarray]:
+    """Straight joint lines between random configurations, some of them bent."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for k in range(count):
+        corners = scene.robot.sample(2 + k % 2, rng)
+        found.append(np.ascontiguousarray(densify(corners, 0.05 + 0.3 * rng.uniform())))
+    return found
+
+
+# The distance of convex pieces.
+
+
+def test_distances_are_pybullets(any_scene: Scene) -> None:
+    """But for a hundredth of a millimetre above, and what PyBullet drops of a hull's corners
+    below.
+    """
+    rng, seen = np.random.default_rng(0), 0
+    with Certifier(any_scene) as certifier, any_scene.world() as world:
+        collider = certifier.collisions.collider
+        for q in any_scene.robot.sample(60, rng):
+            for p, (a, b) in enumerate(collider.moving):
+                row = collider.arrays.pairs[[p]]
+                first, last = int(row[0, 2]), int(row[0, 3])
+                keep = np.concatenate([row, collider.arrays.pairs[first:last]])
+                keep[0, 2:4] = (1, len(keep)) if last > first else (0, 0)
+                alone = collider.arrays._replace(pairs=keep, top=1)
+                own, _ = kernels.nearest_pair(alone, q, 0.3)
+                keys = collider.bodies[a].key, collider.bodies[b].key
+                theirs = world.distance(q, *keys, 0.3)
+                if own < 0.29 and theirs > 0.0:
+                    seen += 1
+                    assert -BELOW_M < own - theirs < ABOVE_M
+    assert seen > 50
+
+
+def test_pairs_that_are_left_out_never_meet(any_scene: Scene) -> None:
+    with Certifier(any_scene) as certifier, any_scene.world() as world:
+        collider = certifier.collisions.collider
+        named = [(collider.bodies[a].key, collider.bodies[b].key) for a, b in collider.apart]
+        for q in any_scene.robot.sample(300, np.random.default_rng(3)):
+            assert all(world.distance(q, *keys, 0.0) == np.inf for keys in named)
+    assert named
+
+
+def test_cylinders_balls_and_capsules_reach_as_far_as_they_should(sliding: Scene) -> None:
+    """In the URDF and in the scene, with PyBullet as the measure: the prism around a cylinder is
+    the largest difference.
+    """
+    with Certifier(sliding) as certifier, sliding.world() as world:
+        for q in sliding.robot.sample(400, np.random.default_rng(1)):
+            clearance = certifier.collisions.clearance(q)
+            if abs(clearance) > 2e-4:
+                assert world.is_free(q) == (clearance > 0.0)
+
+
+# The proof along a path.
+
+
+def test_what_is_proven_holds_everywhere(any_scene: Scene) -> None:
+    """Against the distances at dense configurations: the proven one is less, and at least half of
+    what is attained.
+    """
+    proven = 0
+    with Certifier(any_scene) as certifier:
+        check, arrays = certifier.collisions, certifier.collisions.collider.arrays
+        for rows in lines(any_scene, 60):
+            undecided = np.empty((4, 4))
+            bound, attained, count = kernels.prove_apart(arrays, rows, MARGIN_M, undecided)
+            truth = min(check.clearance(q) for q in densify(rows, 0.01))
+            # between the configurations a distance may still fall by what the bodies move
+            assert attained >= truth - 0.01
+            if count == 0:
+                proven += 1
+                assert MARGIN_M < bound <= truth
+                assert bound >= min(0.5 * attained, attained) - 1e-12
+            else:
+                assert truth < 0.01
+    assert proven > 10
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nothing_is_certified_that_touches(scene: Scene, kuka_scene: Scene, kind: str) -> None:
+    """Lines among shapes, PyBullet asked at every 0.005 rad."""
+    for seed, own in enumerate((scene, kuka_scene)):
+        for counts in try_scene(Trial(own, "arm", kind, seed, 40)):
+            assert counts.wrongly_certified == 0
+            assert counts.certified >= counts.free - 1
+            assert counts.undecided <= 1
+            assert 10 < counts.free <= counts.paths
+
+
+@pytest.mark.parametrize("kind", ["sphere", "box"])
+def test_a_shape_that_is_only_just_missed(scene: Scene, kind: str) -> None:
+    """A millimetre smaller than what touches it is certified, half a millimetre larger is not."""
+    start = np.array([0.3, -0.4, -0.9, 0.2, 1.2, 0.1])
+    rows = densify(np.stack([start, start + np.array([1.2, 0.3, -0.2, 0.4, 0.1, 1.0])]), 0.05)
+    grazed = graze(Grazing(scene, kind, rows, (0.35, 0.45, 0.35)))
+    assert grazed is not None
+    assert grazed.beside_smaller
+    assert not grazed.beside_larger
+
+
+def test_a_thin_plate_between_two_rows_is_seen(scene: Scene) -> None:
+    """Both rows are free of it, and so is every tenth of the way."""
+    rows = np.array([[0.0, -0.4, -0.9, 0.0, 1.2, 0.0], [0.09, -0.4, -0.9, 0.0, 1.2, 0.0]])
+    skeleton = scene.robot.skeleton(rows.mean(axis=0)[None])[0]
+    x, y, z = map(float, skeleton[-1] * [1.25, 1.25, 1.0])
+    with_plate = replace(
+        scene, workcell=(*scene.workcell, Box("plate", (x, y, z), (0.2, 1e-4, 0.2)))
+    )
+    with Certifier(with_plate) as certifier:
+        assert certifier.certify(rows, FREE).violation.kind == "workcell_collision"
+
+
+def test_many_rows_and_few_say_the_same(certifier: Certifier, scene: Scene) -> None:
+    for line in lines(scene, 20, seed=5):
+        ends = np.ascontiguousarray(line[[0, -1]])
+        finer = np.ascontiguousarray(densify(ends, 0.02))
+        found = {certifier.collisions.is_clear(rows) for rows in (ends, finer)}
+        assert len(found) == 1
+
+
+def test_a_path_that_stands_still(certifier: Certifier) -> None:
+    q = np.array([0.3, -0.4, -0.9, 0.2, 1.2, 0.1])
+    found = certifier.collisions.along(np.stack([q, q, q]))
+    assert found.violation is None
+    assert 0.5 * certifier.collisions.clearance(q) <= found.clearance_m
+
+
+# What PyBullet is asked, and what is said.
+
+
+def beside_the_tool(scene: Scene, q: np.ndarray, gap_m: float) -> Scene:
+    """With a ball that is so far from the arm at q, by PyBullet's distance."""
+    place = scene.robot.forward(q)[0] * [1.3, 1.3, 1.0]
+    x, y, z = map(float, place)
+    with replace(scene, workcell=(Sphere("ball", (x, y, z), 0.01),)).world() as world:
+        from constraint_geodesics.scene.world import BodyKey
+
+        links = ("link3", "link4", "link5", "link6")
+        apart = min(world.distance(q, BodyKey("ball", True), BodyKey(n, False), 1.0) for n in links)
+    ball = Sphere("ball", (x, y, z), 0.01 + apart - gap_m)
+    return replace(scene, workcell=(*scene.workcell, ball))
+
+
+@pytest.mark.parametrize(
+    ("gap_m", "asked", "kind"), [(5e-4, 0, None), (3e-5, 1, None), (-3e-5, 0, "workcell_collision")]
+)
+def test_pybullet_decides_where_bodies_all_but_touch(
+    scene: Scene, gap_m: float, asked: int, kind: str | None
+) -> None:
+    q = np.array([0.3, -0.4, -0.9, 0.2, 1.2, 0.1])
+    # the base alone turns away from the ball, so that the gap is least at the first row
+    with Certifier(beside_the_tool(scene, q, gap_m)) as certifier:
+        for side in (-0.01, 0.01):
+            rows = np.stack([q, q + np.array([side, 0, 0, 0, 0, 0])])
+            found = certifier.collisions.along(rows)
+            if found.violation is None:
+                break
+    assert (found.violation.kind if found.violation else None) == kind
+    assert min(found.asked, 1) == asked
+
+
+def test_a_collision_is_named(certifier: Certifier, scene: Scene) -> None:
+    """By both bodies, where it is."""
+    rows = densify(np.stack([np.zeros(6), np.array([0.0, 1.3, -0.5, 0.0, 0.0, 0.0])]), 0.05)
+    violation = certifier.certify(rows, FREE).violation
+    assert violation.kind == "workcell_collision"
+    assert " touches table on the line from row " in violation.message
+    assert 0 <= violation.row < len(rows)
+
+
+def test_what_touches_for_good_refuses_every_path(scene: Scene) -> None:
+    blocked = replace(scene, workcell=(*scene.workcell, Sphere("stone", (0.0, 0.0, 0.1), 0.05)))
+    with Certifier(blocked) as certifier:
+        q = np.array([0.3, -0.4, -0.9, 0.2, 1.2, 0.1])
+        violation = certifier.certify(np.stack([q, q + 0.01]), FREE).violation
+        assert not certifier.collisions.is_free(q)
+    assert violation.kind == "workcell_collision"
+    assert violation.message == "link_base and stone touch at every configuration"
+
+
+# What can't be bounded.
+
+
+def room(folder: Path, geometry: str) -> Body:
+    """A URDF of one link."""
+    file = folder / "room.urdf"
+    file.write_text(
+        f'<robot name="room"><link name="wall"><collision><geometry>{geometry}</geometry>'
+        "</collision></link></robot>"
+    )
+    return Body("room", file, (1.0, 1.0, 1.0))
+
+
+def solid(corners: np.ndarray) -> str:
+    """Triangles over all corners, as an ASCII STL file."""
+    faces = [corners[[i, i + 1, (i + 2) % len(corners)]] for i in range(len(corners) - 1)]
+    rows = "".join(
+        "facet normal 0 0 0\nouter loop\n"
+        + "".join(f"vertex {x} {y} {z}\n" for x, y, z in face)
+        + "endloop\nendfacet\n"
+        for face in faces
+    )
+    return f"solid s\n{rows}endsolid s\n"
+
+
+@pytest.mark.parametrize(
+    ("geometry", "message"),
+    [
+        ('<plane normal="0 0 1"/>', "'plane' of link 'wall' can't be bounded"),
+        ('<box size="1 0 1"/>', "link 'wall': a box with size 1 0 1, which must be positive"),
+        ('<mesh filename="wall.dae"/>', "wall.dae is no mesh that can be read: must be OBJ or STL"),
+        ('<mesh filename="none.obj"/>', "there is no mesh 'none.obj'"),
+        ('<mesh filename="flat.stl"/>', "link 'wall'"),
+        ('<mesh filename="empty.obj"/>', "empty.obj has no faces"),
+    ],
+)
+def test_what_cannot_be_bounded_is_named(
+    tmp_path: Path, scene: Scene, geometry: str, message: str
+) -> None:
+    (tmp_path / "wall.dae").write_text("<COLLADA/>")
+    (tmp_path / "empty.obj").write_text("v 0 0 0\n")
+    flat = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    (tmp_path / "flat.stl").write_text(solid(flat))
+    with pytest.raises(RobotError, match="room.urdf") as found:
+        room(tmp_path, geometry).pieces()
+    assert message in str(found.value)
+
+
+def test_a_mesh_that_is_not_convex_is_covered_by_its_hull_and_named(
+    tmp_path: Path, scene: Scene
+) -> None:
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.2, 0.2, 0.2]], float)
+    (tmp_path / "wall.stl").write_text(solid(0.1 * corners))
+    (piece,) = room(tmp_path, '<mesh filename="wall.stl"/>').pieces()
+    assert len(piece.corners) == 4
+    np.testing.assert_allclose(piece.hollow_m, 0.02, atol=1e-9)
+    added = replace(
+        scene, workcell=(*scene.workcell, room(tmp_path, '<mesh filename="wall.stl"/>'))
+    )
+    with Certifier(added) as certifier:
+        assert "hulls that cover more than the meshes of room" in certifier.collisions.rests_on
