@@ -229,7 +229,9 @@ def check(
 def _clearance(certificate: "Certificate") -> str:
     """What was proven of collisions, in words."""
     if certificate.asked_pybullet:
-        return "free of collision by PyBullet's distances where bodies come closer than 0.1 mm"
+        return "free of collision, by PyBullet's distances where bodies all but touch"
+    if not math.isfinite(certificate.clearance_m):
+        return "with nothing that can touch"
     return f"at least {1e3 * certificate.clearance_m:.1f} mm from any collision"
 
 

@@ -121,8 +121,8 @@ class Trajectory:
 
     @property
     def clearance_m(self) -> float:
-        """What the arm is proven to keep from itself and the workcell on the whole path [m]: at
-        least half of the least distance that it has.
+        """What bodies that can meet within the joint limits are proven to keep apart on the whole
+        path [m]: at least half of the least distance that they have.
         """
         return np.nan if self.certificate is None else self.certificate.clearance_m
 

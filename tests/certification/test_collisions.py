@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from constraint_geodesics.certification import collision_kernels as kernels
+from constraint_geodesics.certification.bodies import collider
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.certification.collisions import MARGIN_M
 from constraint_geodesics.constraints.constraint import Constraint
@@ -16,13 +17,14 @@ from constraint_geodesics.robot.kinematics import RobotError, load_robot
 from constraint_geodesics.scene.body import Body
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.capsule import Capsule
+from constraint_geodesics.scene.pieces import Piece
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.studies.collision_proof import KINDS, Grazing, Trial, graze, try_scene
 
 FREE = Constraint((0,) * 6)
-ABOVE_M, BELOW_M = 2e-5, 1e-4
-"""How far distances may lie above and below PyBullet's."""
+ABOVE_M = 2e-5
+"""How far distances may lie above PyBullet's."""
 LINK = """
   <link name="link{i}"><inertial><mass value="1"/>
     <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
@@ -85,32 +87,32 @@ def lines(scene: Scene, count: int, seed: int = 0) -> list[np.ndarray]:
 
 
 def test_distances_are_pybullets(any_scene: Scene) -> None:
-    """But for a hundredth of a millimetre above, and what PyBullet drops of a hull's corners
-    below.
+    """Of all pairs: hardly above, which is what the margin is for, and below by what PyBullet drops
+    of a hull's corners, or by how it rounds a box's edges and draws a cylinder with few sides.
     """
-    rng, seen = np.random.default_rng(0), 0
+    below, seen = (2e-3 if any_scene.robot.name == "sliding" else 1e-4), 0
     with Certifier(any_scene) as certifier, any_scene.world() as world:
-        collider = certifier.collisions.collider
-        for q in any_scene.robot.sample(60, rng):
-            for p, (a, b) in enumerate(collider.moving):
-                row = collider.arrays.pairs[[p]]
+        whole = collider(any_scene, certifier.collisions.collider.arrays.chain, np.inf, 0.0)
+        assert not whole.apart
+        for q in any_scene.robot.sample(60, np.random.default_rng(0)):
+            for p, (a, b) in enumerate(whole.moving):
+                row = whole.arrays.pairs[[p]]
                 first, last = int(row[0, 2]), int(row[0, 3])
-                keep = np.concatenate([row, collider.arrays.pairs[first:last]])
+                keep = np.concatenate([row, whole.arrays.pairs[first:last]])
                 keep[0, 2:4] = (1, len(keep)) if last > first else (0, 0)
-                alone = collider.arrays._replace(pairs=keep, top=1)
+                alone = whole.arrays._replace(pairs=keep, top=1)
                 own, _ = kernels.nearest_pair(alone, q, 0.3)
-                keys = collider.bodies[a].key, collider.bodies[b].key
-                theirs = world.distance(q, *keys, 0.3)
+                theirs = world.distance(q, whole.bodies[a].key, whole.bodies[b].key, 0.3)
                 if own < 0.29 and theirs > 0.0:
                     seen += 1
-                    assert -BELOW_M < own - theirs < ABOVE_M
-    assert seen > 50
+                    assert -below < own - theirs < ABOVE_M
+    assert seen > 300
 
 
 def test_pairs_that_are_left_out_never_meet(any_scene: Scene) -> None:
     with Certifier(any_scene) as certifier, any_scene.world() as world:
-        collider = certifier.collisions.collider
-        named = [(collider.bodies[a].key, collider.bodies[b].key) for a, b in collider.apart]
+        own = certifier.collisions.collider
+        named = [(own.bodies[a].key, own.bodies[b].key) for a, b in own.apart]
         for q in any_scene.robot.sample(300, np.random.default_rng(3)):
             assert all(world.distance(q, *keys, 0.0) == np.inf for keys in named)
     assert named
@@ -127,7 +129,98 @@ def test_cylinders_balls_and_capsules_reach_as_far_as_they_should(sliding: Scene
                 assert world.is_free(q) == (clearance > 0.0)
 
 
+def furthest(arrays: kernels.Bodies, node: int, direction: np.ndarray) -> tuple[float, float]:
+    """How far a piece reaches along a direction, from the worst corner to begin at; and the
+    truth.
+    """
+    hulls, first = arrays.hulls, int(arrays.nodes[node, kernels.CORNER])
+    corners, waiting = {first}, [first]
+    while waiting:
+        at = waiting.pop()
+        beside = {int(k) for k in hulls[at + 4 : at + 4 + int(hulls[at + 3])]}
+        waiting += beside - corners
+        corners |= beside
+    true = max(float(hulls[k : k + 3] @ direction) for k in corners)
+    return min(kernels._furthest(hulls, k, *direction)[1] for k in corners), true
+
+
+def test_a_way_along_edges_leads_to_the_furthest_corner(any_scene: Scene) -> None:
+    rng = np.random.default_rng(0)
+    with Certifier(any_scene) as certifier:
+        own = certifier.collisions.collider
+        for node in range(len(own.bodies), len(own.arrays.nodes)):
+            for direction in rng.normal(size=(10, 3)):
+                np.testing.assert_allclose(*furthest(own.arrays, node, direction), atol=1e-12)
+
+
+def test_corners_that_all_but_coincide_hide_nothing(tmp_path: Path, scene: Scene) -> None:
+    """A cylinder's mesh whose corners are there several times, but for rounding."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
+    rim = np.stack([np.cos(turn), np.sin(turn), np.ones(48)], 1)
+    corners = np.concatenate([rim, rim * [1.0, 1.0, -1.0]]) * [0.04, 0.04, 0.07]
+    rng = np.random.default_rng(0)
+    for noise in (0.0, 1e-15, 1e-13, 1e-9):
+        many = np.concatenate([corners + noise * rng.normal(size=corners.shape) for _ in range(4)])
+        faces = [
+            f"f {i + 1} {(i + 7) % len(many) + 1} {(i + 59) % len(many) + 1}" for i in range(384)
+        ]
+        text = [f"v {x!r} {y!r} {z!r}" for x, y, z in many.tolist()]
+        (tmp_path / "wall.obj").write_text("\n".join([*text, *faces]))
+        walled = replace(scene, workcell=(room(tmp_path, '<mesh filename="wall.obj"/>'),))
+        with Certifier(walled) as certifier:
+            arrays = certifier.collisions.collider.arrays
+            for direction in rng.normal(size=(100, 3)):
+                found, true = furthest(arrays, len(arrays.nodes) - 1, direction)
+                truth = ((corners + np.ones(3)) @ direction).max()
+                np.testing.assert_allclose((found, true), truth, atol=1e-6)
+
+
 # The proof along a path.
+
+
+def test_bodies_move_no_further_than_the_bounds_say(any_scene: Scene) -> None:
+    """The two laws that the proof rests on, for every piece and the frame of every joint: how far
+    corners move, and how far they get off the line between the ends of their way.
+    """
+    rng, dof = np.random.default_rng(2), any_scene.robot.dof
+    shares = np.linspace(0.0, 1.0, 21)
+    moved, bent = [0.0], [0.0]
+    with Certifier(any_scene) as certifier:
+        own = certifier.collisions.collider
+    frames = np.empty((len(shares), dof + 1, 12))
+    for _ in range(20):
+        start = any_scene.robot.sample(1, rng)[0]
+        step = rng.uniform(-0.5, 0.5, dof)
+        steps = np.stack([np.abs(step), np.abs(step), np.zeros(dof)])
+        for frame, share in zip(frames, shares, strict=True):
+            kernels.joint_frames(own.arrays.chain, start + share * step, frame)
+        node = len(own.bodies)
+        for body in own.bodies:
+            for piece in body.pieces:
+                for below in range(body.frame):
+                    nodes = own.arrays.nodes[[node, node]]
+                    nodes[0, kernels.FRAME] = below
+                    motion, bend = kernels._bounds_of_motion(nodes, 0, 1, steps)
+                    seen = np.stack(
+                        [seen_from(frame, below, body.frame, piece) for frame in frames]
+                    )
+                    away = np.linalg.norm(seen - seen[0], axis=2).max()
+                    line = seen[0] + shares[:, None, None] * (seen[-1] - seen[0])
+                    off = np.linalg.norm(seen - line, axis=2).max()
+                    assert away <= motion + 1e-12
+                    assert off <= bend + 1e-12
+                    moved.append(away / motion)
+                    bent.append(off / bend)
+                node += 1
+    assert max(moved) > 0.8
+    assert max(bent) > 0.8
+
+
+def seen_from(frames: np.ndarray, below: int, own: int, piece: Piece) -> np.ndarray:
+    """A piece's corners in the frame below."""
+    lower, upper = frames[below], frames[own]
+    in_base = piece.corners @ upper[3:].reshape(3, 3).T + upper[:3]
+    return (in_base - lower[:3]) @ lower[3:].reshape(3, 3)
 
 
 def test_what_is_proven_holds_everywhere(any_scene: Scene) -> None:
@@ -175,15 +268,17 @@ def test_a_shape_that_is_only_just_missed(scene: Scene, kind: str) -> None:
 
 
 def test_a_thin_plate_between_two_rows_is_seen(scene: Scene) -> None:
-    """Both rows are free of it, and so is every tenth of the way."""
-    rows = np.array([[0.0, -0.4, -0.9, 0.0, 1.2, 0.0], [0.09, -0.4, -0.9, 0.0, 1.2, 0.0]])
-    skeleton = scene.robot.skeleton(rows.mean(axis=0)[None])[0]
-    x, y, z = map(float, skeleton[-1] * [1.25, 1.25, 1.0])
-    with_plate = replace(
-        scene, workcell=(*scene.workcell, Box("plate", (x, y, z), (0.2, 1e-4, 0.2)))
-    )
+    """Both rows are free of it, and so is all but a little of the way."""
+    rows = np.array([[q, -0.4, -0.9, 0.0, 1.2, 0.0] for q in (-0.5, 0.5)])
+    middle = rows.mean(axis=0)
+    x, y, z = scene.robot.skeleton(middle[None])[0, -1].tolist()
+    plate = Box("plate", (x, y, z), (0.05, 1e-4, 0.05))
+    with_plate = replace(scene, workcell=(*scene.workcell, plate))
+    with with_plate.world() as world:
+        assert world.free(rows).all()
+        assert not world.is_free(middle)
     with Certifier(with_plate) as certifier:
-        assert certifier.certify(rows, FREE).violation.kind == "workcell_collision"
+        assert certifier.collisions.along(rows).violation.kind == "workcell_collision"
 
 
 def test_many_rows_and_few_say_the_same(certifier: Certifier, scene: Scene) -> None:
@@ -300,6 +395,47 @@ def test_what_cannot_be_bounded_is_named(
     with pytest.raises(RobotError, match="room.urdf") as found:
         room(tmp_path, geometry).pieces()
     assert message in str(found.value)
+
+
+def test_a_shape_without_pieces_is_refused(scene: Scene) -> None:
+    """A new kind that only PyBullet knows would be left out."""
+
+    class Bare(Box):
+        def rounded_boxes(self) -> tuple:
+            return ()
+
+    bare = Bare("bare", (0.5, 0.0, 0.5), (0.1, 0.1, 0.1))
+    with pytest.raises(RobotError, match="'bare': a shape without pieces can't be bounded"):
+        Certifier(replace(scene, workcell=(*scene.workcell, bare)))
+
+
+def test_objects_of_a_mesh_are_pieces_of_their_own(tmp_path: Path) -> None:
+    """Where they have a name, as PyBullet takes them; corners may be counted backwards, and a mesh
+    scaled and turned over.
+    """
+    cube = [f"v {x} {y} {z}" for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+    far = [f"v {x} {y} {z}" for x in (3, 4) for y in (0, 1) for z in (0, 1)]
+    faces = ["f -8 -7 -6", "f -5 -4 -3", "f -2/1 -1/2/3 -8"]
+    for line, count in (("o second", 2), ("g second", 2), ("o", 1), ("g", 1)):
+        (tmp_path / "wall.obj").write_text("\n".join([*cube, *faces, line, *far, *faces]))
+        geometry = '<mesh filename="wall.obj" scale="0.1 -0.1 0.2"/>'
+        pieces = room(tmp_path, geometry).pieces()
+        assert len(pieces) == count
+        corners = np.concatenate([piece.corners for piece in pieces]) - 1.0
+        np.testing.assert_allclose(corners.min(axis=0), [0.0, -0.1, 0.0], atol=1e-9)
+        np.testing.assert_allclose(corners.max(axis=0), [0.4, 0.0, 0.2], atol=1e-9)
+
+
+def test_binary_and_plain_stl_say_the_same(tmp_path: Path) -> None:
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    faces = np.zeros(4, np.dtype([("n", "<f4", 3), ("c", "<f4", (3, 3)), ("a", "<u2")]))
+    faces["c"] = corners[[[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]]
+    (tmp_path / "b.stl").write_bytes(bytes(80) + (4).to_bytes(4, "little") + faces.tobytes())
+    (tmp_path / "a.stl").write_text(solid(corners.astype(float)))
+    binary, plain = (
+        room(tmp_path, f'<mesh filename="{name}.stl"/>').pieces()[0].corners for name in "ba"
+    )
+    np.testing.assert_array_equal(binary, plain)
 
 
 def test_a_mesh_that_is_not_convex_is_covered_by_its_hull_and_named(

@@ -2,24 +2,26 @@
 the joints' axes, and the pairs of bodies that move relative to each other.
 """
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 
 from constraint_geodesics.certification import collision_kernels as kernels
 from constraint_geodesics.certification.chain import Chain, rotated
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.pieces import NOT_CONVEX, Piece, read_pieces
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.shape import RoundedBox, Shape
+from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.world import BodyKey
 
 _SIDES = 256
 _MIXED = 9
 """Pieces with fewer corners are no hulls to be computed: any two corners count as neighbours."""
+_TRIED, _ROUNDING_M = 200, 1e-9
 _CELLS = 20_000
 """Cells of joint values over which it is tried to prove that two bodies never meet."""
 _FEW_JOINTS = 3
@@ -30,25 +32,21 @@ _FEW_JOINTS = 3
 class Body:
     """A link, or a shape around the arm: the frame that carries it, and its pieces there.
 
-    parent: the link that a link hangs on.
+    parent: the link that a link hangs on.  pose: of a link's own frame in the base frame, all
+    joints at 0.
     """
 
     name: str
     frame: int
     pieces: tuple[Piece, ...]
     parent: str | None = None
+    pose: Float[np.ndarray, "4 4"] | None = None
     shape: Shape | None = None
 
     @property
     def key(self) -> BodyKey:
         """What it is in a world."""
         return BodyKey(self.name, self.shape is not None)
-
-    @property
-    def boxes(self) -> tuple[RoundedBox | None, ...]:
-        """The rounded box that each piece is; None where it is none."""
-        boxes = () if self.shape is None else self.shape.rounded_boxes()
-        return boxes if len(boxes) == len(self.pieces) else (None,) * len(self.pieces)
 
 
 def read_bodies(scene: Scene, chain: Chain) -> list[Body]:
@@ -65,14 +63,15 @@ def read_bodies(scene: Scene, chain: Chain) -> list[Body]:
         pose[:3, :3], pose[:3, 3] = frames[frame, 3:].reshape(3, 3), frames[frame, :3]
         pieces = tuple(piece.at(np.linalg.inv(pose)) for piece in link.pieces)
         if pieces:
-            found.append(Body(link.name, frame, pieces, link.parent))
+            found.append(Body(link.name, frame, pieces, link.parent, link.pose))
     shapes = ((shape, shape.pieces()) for shape in scene.workcell)
     return found + [Body(s.name, 0, pieces, shape=s) for s, pieces in shapes if pieces]
 
 
 def pairs_of(bodies: Sequence[Body]) -> Iterator[tuple[int, int]]:
-    """Bodies that PyBullet would find in contact, that of the lower frame first: not a link and the
-    one it hangs on, not a shape and a link that may touch it, not two shapes.
+    """Bodies whose contact PyBullet reports, that of the lower frame first: not a link and the one
+    it hangs on, not a shape and a link that may touch it, or the one that carries the arm, not two
+    shapes.
     """
     order = sorted(range(len(bodies)), key=lambda i: (bodies[i].frame, bodies[i].shape is None, i))
     for place, a in enumerate(order):
@@ -80,7 +79,9 @@ def pairs_of(bodies: Sequence[Body]) -> Iterator[tuple[int, int]]:
             first, second = bodies[a], bodies[b]
             if first.shape is not None and second.shape is not None:
                 continue
-            if first.shape is not None and second.name in first.shape.exempt_links:
+            if first.shape is not None and (
+                second.name in first.shape.exempt_links or second.parent is None
+            ):
                 continue
             if first.shape is None and first.name == second.parent:
                 continue
@@ -157,8 +158,8 @@ class _Nodes:
     def add_body(self, body: Body) -> None:
         """A body and its pieces."""
         first = len(self._pieces)
-        for piece, box in zip(body.pieces, body.boxes, strict=True):
-            self._add_piece(body.frame, piece, box)
+        for piece in body.pieces:
+            self._add_piece(body.frame, piece)
         own = np.array(self._pieces[first:])
         self._ranges.append(range(first, len(self._pieces)))
         row = own[0].copy()
@@ -172,7 +173,7 @@ class _Nodes:
             row[size] = (away + own[:, size]).max()
         self._bodies.append(row)
 
-    def _add_piece(self, frame: int, piece: Piece, box: RoundedBox | None) -> None:
+    def _add_piece(self, frame: int, piece: Piece) -> None:
         row = np.zeros(kernels.REACH + self._robot.dof)
         corners, beside = _with_neighbours(piece.corners)
         begins = len(self._hulls) + np.cumsum([0, *(4 + len(own) for own in beside)])
@@ -183,9 +184,9 @@ class _Nodes:
         row[[kernels.FRAME, kernels.ROUNDING, kernels.CORNER]] = frame, piece.rounding, begins[0]
         row[kernels.BALL : kernels.BOX] = (*centre, radius * (1.0 + 1e-9))
         row[kernels.BOX : kernels.PLACE] = -1.0
-        if box is not None:
-            row[kernels.BALL : kernels.BALL + 3] = box.centre
-            row[kernels.BOX : kernels.PLACE] = (*box.half_edges, *np.ravel(box.turn))
+        if piece.box is not None:
+            row[kernels.BALL : kernels.BALL + 3] = piece.box[:3]
+            row[kernels.BOX : kernels.PLACE] = piece.box[3:]
         row[kernels.REACH :] = self._reach(frame, corners, piece.rounding)
         self._pieces.append(row)
 
@@ -239,14 +240,37 @@ def _cylinder(radius: float, low: float, high: float) -> Float[np.ndarray, "n 3"
 def _with_neighbours(
     points: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "m 3"], list[Int[np.ndarray, "k"]]]:
-    """Corners of a convex hull, and for each those that share a face with it."""
-    if len(points) < _MIXED:
-        others = np.arange(len(points))
-        return points, [np.delete(others, i) for i in others]
-    hull = ConvexHull(points)
-    corners, faces = np.unique(hull.simplices, return_inverse=True)
-    faces = faces.reshape(hull.simplices.shape)
-    edges = np.concatenate([faces[:, [i, k]] for i in range(3) for k in range(3) if i != k])
-    edges = np.unique(edges, axis=0)
-    ends = np.searchsorted(edges[:, 0], range(1, len(corners)))
-    return points[corners], np.split(edges[:, 1], ends)
+    """Corners of a convex hull, and for each those beside it: that share a face, or all others
+    where a way along edges might end before the corner that lies furthest out.
+    """
+    if len(points) >= _MIXED:
+        with contextlib.suppress(QhullError):  # flat
+            hull = ConvexHull(points)
+            corners, faces = np.unique(hull.simplices, return_inverse=True)
+            faces = faces.reshape(hull.simplices.shape)
+            edges = np.concatenate([faces[:, [i, k]] for i in range(3) for k in range(3) if i != k])
+            edges = np.unique(edges, axis=0)
+            starts = np.searchsorted(edges[:, 0], range(len(corners)))
+            own = points[corners]
+            if _leads_furthest(own, edges[:, 1], starts, hull.equations[:, :3]):
+                return own, np.split(edges[:, 1], starts[1:])
+    others = np.arange(len(points))
+    return points, [np.delete(others, i) for i in others]
+
+
+def _leads_furthest(
+    corners: Float[np.ndarray, "m 3"],
+    beside: Int[np.ndarray, "E"],
+    starts: Int[np.ndarray, "m"],
+    normals: Float[np.ndarray, "f 3"],
+) -> bool:
+    """Whether no corner lies further out than all beside it without being the furthest, in the
+    directions of the faces, near them, and in others.
+    """
+    rng = np.random.default_rng(0)
+    near = normals + 1e-3 * rng.normal(size=normals.shape)
+    directions = np.concatenate([normals, near, rng.normal(size=(_TRIED, 3))])
+    values = corners @ directions.T
+    highest = np.maximum.reduceat(values[beside], starts)
+    ends = values >= highest
+    return bool((values.max(axis=0) - np.where(ends, values, np.inf) <= _ROUNDING_M).all())

@@ -77,8 +77,9 @@ class Certificate:
     between them; violation_bound: proven for the whole piecewise linear path; both the larger of
     the angles' [rad] and the positions' [m], which also stand separately.  limit_distance_rad: to
     the nearest joint limit, negative outside.
-    clearance_m: what all bodies that may meet are proven to keep apart on the whole path, at least
-    half of the least distance that they have; nan where it was not looked at.  asked_pybullet: how
+    clearance_m: what bodies that can meet within the joint limits are proven to keep apart on the
+    whole path, at least half of the least distance that they have; nan where it was not looked
+    at.  asked_pybullet: how
     many parts of the path come so close to something that the proof rests on PyBullet's distances
     there; clearance_m is 0 then.  rests_on: what was taken for the bodies.
     largest_pose_difference: of all links from PyBullet's [rad or m].

@@ -71,7 +71,7 @@ class Certifier:
     """Certifies paths of one robot in its workcell; holds a PyBullet world until it is closed.
 
     Raises CertificationError if the limits do not fit the robot, or PyBullet's chain has a joint it
-    can't follow.
+    can't follow, and RobotError if a collision shape can't be bounded.
     """
 
     def __init__(self, scene: Scene, limits: Limits | None = None) -> None:

@@ -64,7 +64,7 @@ SHARE = 0.5
 _CLOSE = 0.3
 """Motion [m] over which two bodies are not looked at closer: halving the interval costs less."""
 _SHORTEST = 1e-6
-"""Motion [m] over which nothing is halved any more."""
+"""Increment of a joint [rad or m] below which nothing is halved any more."""
 _ITERATIONS = 48
 _CONVERGED = 1e-7
 _DEEPEST = 64
@@ -392,10 +392,10 @@ def _nearest(bodies, top, frames, at, level, simplex):
                 continue
             rounding = nodes[a, ROUNDING] + nodes[b, ROUNDING]
             wanted = (level[ATTAINED] + rounding, -np.inf)
-            _, upper = distance(bodies, frames, at, p, wanted, simplex)
-            if upper - rounding < level[ATTAINED]:
+            lower, _ = distance(bodies, frames, at, p, wanted, simplex)
+            if max(lower, 0.0) - rounding < level[ATTAINED]:
                 nearest = p
-            _attained(level, upper - rounding)
+            _attained(level, max(lower, 0.0) - rounding)
     return nearest
 
 
@@ -449,18 +449,18 @@ def _is_proven(bodies, frames, places, p, level, steps, simplex):
         bound = -np.inf
         x, y, z = pairs[p, VECTOR], pairs[p, VECTOR + 1], pairs[p, VECTOR + 2]
         if bend < motion and (x != 0.0 or y != 0.0 or z != 0.0):
-            bound, enough = np.inf, level[ASKED] + rounding + bend
+            gap, enough = np.inf, level[ASKED] + rounding + bend
             for end in range(2):
-                if bound > enough:
+                if gap > enough:
                     n = _turned(frames, places[end], f, x, y, z)
-                    bound = min(bound, _gap(hulls, nodes, frames, places[end], (a, b), n))
-            bound -= bend
+                    gap = min(gap, _gap(hulls, nodes, frames, places[end], (a, b), n))
+            if gap > enough:  # at both ends
+                bound = gap - bend
         if attempt == 0 and bound - rounding <= level[ASKED]:
             too_little = level[MARGIN] + rounding + min(motion, bend)
             wanted = (level[ASKED] + rounding + motion, too_little)
             lower, upper = distance(bodies, frames, places[2], p, wanted, simplex)
             _attained(level, upper - rounding)
-            # not the gap of before: it may be that of one end, and less is asked for now
             bound = lower - motion
         if bound - rounding > level[ASKED]:
             level[PROVEN] = min(level[PROVEN], bound - rounding)

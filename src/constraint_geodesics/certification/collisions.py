@@ -84,8 +84,11 @@ class CollisionCheck:
         return float(kernels.nearest_pair(self.collider.arrays, place, most)[0])
 
     def is_clear(self, rows: Float[np.ndarray, "T D"]) -> bool:
-        """Whether the straight joint lines between rows within the limits touch nothing."""
-        return self.along(np.ascontiguousarray(rows, float)).violation is None
+        """Whether the straight joint lines between rows are within the limits and touch nothing."""
+        low, high = self.collider.limits
+        within = len(rows) > 0 and bool(((rows >= low) & (rows <= high)).all())
+        path = np.ascontiguousarray(rows, float)
+        return within and self.along(path).violation is None
 
     def along(self, rows: Float[np.ndarray, "T D"]) -> Separation:
         """Whether the straight joint lines between the rows are free.  A violation is the first one
@@ -93,6 +96,8 @@ class CollisionCheck:
         """
         if self._standing is not None:
             return Separation(malformed(*self._standing))
+        if len(rows) == 1:
+            rows = np.concatenate([rows, rows])
         for most in _PARTS:
             undecided = np.empty((most, 4))
             proven, _, count = kernels.prove_apart(self.collider.arrays, rows, MARGIN_M, undecided)
@@ -100,36 +105,35 @@ class CollisionCheck:
                 if (violation := self._decide(rows, *part)) is not None:
                     return Separation(violation)
             if count <= most:
-                # PyBullet's distances prove that nothing touches, not by how much
+                # PyBullet's distances say that nothing touches, not by how much
                 return Separation(None, 0.0 if count else float(proven), int(count))
-        row, start, end, pair = undecided[0]
-        return Separation(self._unproven(int(row), 0.5 * (start + end), pair))
+        text = f"bodies come closer than {1e3 * MARGIN_M} mm on more than {most} parts of the path"
+        return Separation(malformed("clearance", None, text))
 
     def pose_difference(self, q: Float[np.ndarray, "n D"]) -> float:
-        """The largest difference of any link's pieces from where PyBullet has them [m]."""
-        arrays, largest = self.collider.arrays, 0.0
-        frames = np.empty((q.shape[1] + 1, 12))
-        zero = np.empty_like(frames)
-        kernels.joint_frames(arrays.chain, np.zeros(q.shape[1]), zero)
-        links = [body for body in self.collider.bodies if body.shape is None]
-        at_zero = self._world.link_poses(np.zeros(q.shape[1]), [body.name for body in links])
+        """How far any corner of a link's pieces is from where PyBullet has it at most [m]."""
+        frames = np.empty((2, q.shape[1] + 1, 12))
+        kernels.joint_frames(self.collider.arrays.chain, np.zeros(q.shape[1]), frames[0])
+        links = [(b, b.pose) for b in self.collider.bodies if b.pose is not None]
+        largest = 0.0
         for row in q:
-            kernels.joint_frames(arrays.chain, row, frames)
-            theirs = self._world.link_poses(row, [body.name for body in links])
-            for body, pose, first in zip(links, theirs, at_zero, strict=True):
+            kernels.joint_frames(self.collider.arrays.chain, row, frames[1])
+            theirs = self._world.link_poses(row, [body.name for body, _ in links])
+            for (body, at_zero), pose in zip(links, theirs, strict=True):
                 corners = np.concatenate([piece.corners for piece in body.pieces])
-                moved = _in_base(corners, frames[body.frame])
-                at_first = _in_base(corners, zero[body.frame])
-                own = (at_first - first[:3, 3]) @ first[:3, :3]
-                difference = own @ pose[:3, :3].T + pose[:3, 3] - moved
-                largest = max(largest, float(np.linalg.norm(difference, axis=1).max()))
+                own = _in_base(corners, frames[1, body.frame])
+                in_link = (_in_base(corners, frames[0, body.frame]) - at_zero[:3, 3]) @ at_zero[
+                    :3, :3
+                ]
+                off = in_link @ pose[:3, :3].T + pose[:3, 3] - own
+                largest = max(largest, float(np.linalg.norm(off, axis=1).max()))
         return largest
 
     def _decide(
         self, rows: np.ndarray, row: float, start: float, end: float, pair: float
     ) -> Violation | None:
         """What PyBullet's distances say of a part of a line: between two places they change by no
-        more than the bodies move.
+        more than the bodies move.  Where bodies overlap by more than the margin, they touch.
         """
         first, second = self._named(pair)
         i, line = int(row), rows[int(row) + 1] - rows[int(row)]
@@ -138,8 +142,10 @@ class CollisionCheck:
         while waiting:
             start, end = waiting.pop()
             middle, motion = 0.5 * (start + end), 0.5 * (end - start) * float(np.abs(line) @ reach)
-            apart = self._world.distance(rows[i] + middle * line, first.key, second.key, motion)
-            if apart < 0.0:
+            q = rows[i] + middle * line
+            apart = self._world.distance(q, first.key, second.key, motion)
+            # PyBullet rounds the edges of boxes: what is deeper than the margin is a contact too
+            if apart < 0.0 or self.clearance(q) < -MARGIN_M:
                 return self._touches(i, middle, first, second)
             if apart <= motion + _ROUNDING_M:
                 if motion < _SHORTEST_M:

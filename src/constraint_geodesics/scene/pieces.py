@@ -1,7 +1,8 @@
 """The convex pieces that PyBullet collides, read from the same URDF and mesh files.
 
-PyBullet takes each object of an OBJ mesh, and the whole of an STL mesh, as one convex hull, and
-keeps a margin of its own around it; of boxes, balls and the like it takes the exact shape.
+PyBullet takes each object of an OBJ mesh, the whole of an STL mesh, and a URDF's cylinder as one
+convex hull, and keeps a margin of its own around it; of boxes, balls and capsules it takes the
+exact shape, but for the edges of a box, which it rounds off.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -16,8 +17,11 @@ from scipy.spatial import ConvexHull, QhullError
 
 from constraint_geodesics.robot.kinematics import RobotError, origin_of
 
-MESH_MARGIN = 0.001
-"""What PyBullet keeps around the hull of a mesh [m]."""
+HULL_MARGIN = 0.001
+"""What PyBullet keeps around a hull [m]."""
+_SAME = 7
+"""Corners of a mesh that agree to so many decimals [m] are one."""
+_BLOCK = 4096
 NOT_CONVEX = 0.001
 """A mesh with corners so deep inside its hull [m] is not convex."""
 _SIDES = 64
@@ -28,27 +32,30 @@ class Piece(NamedTuple):
     """All points within `rounding` [m] of the convex hull of its corners (n, 3) [m].
 
     hollow_m: how far corners of its mesh lie inside that hull at most, which covers more than the
-    mesh, as PyBullet does.
+    mesh, as PyBullet does.  box: centre (3,), half edges (3,) and turn (9,) of the box that the
+    hull is, where it is known to be one.
     """
 
     corners: Float[np.ndarray, "n 3"]
     rounding: float = 0.0
     hollow_m: float = 0.0
+    box: Float[np.ndarray, "15"] | None = None
 
     def at(self, pose: Float[np.ndarray, "4 4"]) -> "Piece":
         """The same piece elsewhere."""
-        return self._replace(corners=self.corners @ pose[:3, :3].T + pose[:3, 3])
+        return self._replace(corners=self.corners @ pose[:3, :3].T + pose[:3, 3], box=None)
 
 
 @dataclass(frozen=True)
 class LinkPieces:
     """A link of a URDF: the link it hangs on, None for the root; the joints that move it, from the
-    root on; its pieces in the root's frame, all joints at 0.
+    root on; its frame and its pieces in the root's frame, all joints at 0.
     """
 
     name: str
     parent: str | None
     joints: tuple[str, ...]
+    pose: Float[np.ndarray, "4 4"]
     pieces: tuple[Piece, ...]
 
 
@@ -77,7 +84,7 @@ def read_pieces(urdf: Path) -> list[LinkPieces]:
             for piece in _pieces_of(collision, urdf, name)
         ]
         parent = above[name][0] if name in above else None
-        found.append(LinkPieces(name, parent, tuple(reversed(joints)), tuple(pieces)))
+        found.append(LinkPieces(name, parent, tuple(reversed(joints)), pose, tuple(pieces)))
     return found
 
 
@@ -133,12 +140,13 @@ def _capsule(shape: ElementTree.Element, _: Path) -> Iterator[Piece]:
 
 
 def _cylinder(shape: ElementTree.Element, _: Path) -> Iterator[Piece]:
-    """The prism around it."""
+    """The prism around it, where PyBullet takes one within it."""
     half = 0.5 * float(_size(shape, "length")[0])
     radius = float(_size(shape, "radius")[0]) / np.cos(np.pi / _SIDES)
     turn = np.linspace(0.0, 2.0 * np.pi, _SIDES, endpoint=False)
     x, y, z = radius * np.cos(turn), radius * np.sin(turn), np.full(_SIDES, half)
-    yield Piece(np.concatenate([np.stack([x, y, -z], 1), np.stack([x, y, z], 1)]))
+    rims = np.concatenate([np.stack([x, y, -z], 1), np.stack([x, y, z], 1)])
+    yield Piece(rims, HULL_MARGIN)
 
 
 def _mesh(shape: ElementTree.Element, urdf: Path) -> Iterator[Piece]:
@@ -153,10 +161,12 @@ _KINDS = {"mesh": _mesh, "box": _box, "sphere": _sphere, "cylinder": _cylinder, 
 
 def mesh_piece(points: Float[np.ndarray, "n 3"]) -> Piece:
     """The hull of a mesh's corners.  Raises QhullError where it has no volume."""
-    hull = ConvexHull(points)
-    inside = hull.equations[:, :3] @ points.T + hull.equations[:, 3:]
-    hollow = float(-inside.max(axis=0).min())
-    return Piece(points[hull.vertices], MESH_MARGIN, hollow)
+    corners = np.unique(points.round(_SAME), axis=0)
+    hull = ConvexHull(corners)
+    normals, offsets = hull.equations[:, :3], hull.equations[:, 3:]
+    blocks = np.array_split(corners, range(_BLOCK, len(corners), _BLOCK))
+    hollow = max(float(-(normals @ own.T + offsets).max(axis=0).min()) for own in blocks)
+    return Piece(corners[hull.vertices], HULL_MARGIN + 10.0**-_SAME, hollow)
 
 
 def _mesh_file(name: str, urdf: Path) -> Path:
@@ -187,7 +197,7 @@ def _read_obj(file: Path) -> list[Float[np.ndarray, "n 3"]]:
     objects: list[set[int]] = [set()]
     for line in file.read_text(errors="replace").splitlines():
         kind, *words = line.split() or [""]
-        if kind in ("o", "g"):
+        if kind in ("o", "g") and words:  # without a name PyBullet goes on with the same one
             objects.append(set())
         elif kind == "v":
             corners.append([float(x) for x in words[:3]])

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import ConfigDict
 
+from constraint_geodesics.robot.kinematics import RobotError
 from constraint_geodesics.scene.pieces import Piece, box_corners
 
 Triple = tuple[float, float, float]
@@ -30,7 +31,9 @@ class RoundedBox(NamedTuple):
     def piece(self) -> Piece:
         """It as a convex piece, in the base frame."""
         corners = box_corners(np.array(self.half_edges))
-        return Piece(corners @ self.turn.T + np.array(self.centre), self.rounding)
+        box = np.array([*self.centre, *self.half_edges, *np.ravel(self.turn)])
+        at = corners @ self.turn.T + np.array(self.centre)
+        return Piece(at, self.rounding, box=box)
 
 
 class PlacedUrdf(NamedTuple):
@@ -53,16 +56,19 @@ class Shape(ABC):
     exempt_links: tuple[str, ...]
 
     def rounded_boxes(self) -> tuple[RoundedBox, ...]:
-        """What the planner's distances see of it; of nothing, the planner learns at PyBullet's
-        check alone.
+        """What the planner's distances see of it; of nothing, the planner learns from the
+        certificate alone.
         """
         return ()
 
     def pieces(self) -> tuple[Piece, ...]:
-        """Convex pieces that cover it, in the base frame.  Raises RobotError where there are
-        none.
+        """Convex pieces that cover it, in the base frame: what the certificate sees.  Raises
+        RobotError where there are none.
         """
-        return tuple(box.piece() for box in self.rounded_boxes())
+        boxes = self.rounded_boxes()
+        if not boxes:
+            raise RobotError(f"workcell {self.name!r}: a shape without pieces can't be bounded")
+        return tuple(box.piece() for box in boxes)
 
     def urdf_model(self) -> PlacedUrdf | None:
         """Its meshes, where it has some; they are drawn by Rerun itself."""

@@ -120,6 +120,7 @@ class World:
         self._bullet = bullet = _Client()
         self.robot = robot
         flags = bullet.URDF_USE_SELF_COLLISION | bullet.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
+        bullet.setPhysicsEngineParameter(enableFileCaching=0)  # a file may be written anew
         with quiet():
             self._body = body = bullet.loadURDF(str(robot.urdf), useFixedBase=True, flags=flags)
         info = [bullet.getJointInfo(body, i) for i in range(bullet.getNumJoints(body))]
