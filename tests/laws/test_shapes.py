@@ -194,9 +194,13 @@ def test_several_shapes_leave_the_smallest_distance() -> None:
 
 
 def test_a_kind_is_known_in_its_own_file_and_among_the_shapes() -> None:
-    """A new kind takes two files.  The benchmarks choose a sphere as what stands in the way."""
+    """A new kind takes two files.  The benchmarks choose a sphere as what stands in the way, and
+    the proof of collisions is tried among spheres and boxes.
+    """
     package = Path(__file__).resolve().parents[2] / "src" / "constraint_geodesics"
     chosen = {"benchmark/queries.py", "benchmark/runner.py", "studies/growth.py"}
+    tried = {"studies/collision_proof.py"}
+    others = {Sphere: chosen | tried, Box: tried}
     for kind in (Box, Sphere, Capsule, Body):
         home = kind.__module__.split(".", 1)[1].replace(".", "/") + ".py"
         named = {
@@ -204,6 +208,6 @@ def test_a_kind_is_known_in_its_own_file_and_among_the_shapes() -> None:
             for file in package.rglob("*.py")
             if kind.__module__ in file.read_text()
         }
-        assert named <= {"scene/shapes.py"} | (chosen if kind is Sphere else set())
+        assert named <= {"scene/shapes.py"} | others.get(kind, set())
         assert f"class {kind.__name__}(Shape)" in (package / home).read_text()
     assert "Capsule" in str(AnyShape)

@@ -115,7 +115,8 @@ def test_a_pillar_is_kept_clear_of(scene: Scene) -> None:
     with around.world() as loaded, Certifier(around, Limits()) as judge:
         clearance = clearance_model(around.robot, around.workcell)
         for start, goal in pairs_of("level_cup", 8, 5):
-            asked = PlanningProblem(start, goal, manifold, loaded.is_free, clearance)
+            known = loaded.is_free, clearance, judge.collisions.is_clear
+            asked = PlanningProblem(start, goal, manifold, *known)
             if not loaded.free(np.stack([start, goal])).all():
                 continue
             blind = TrajectoryOptimisation(TrajectoryOptimisationSettings(starts=1)).plan(
