@@ -28,8 +28,8 @@ from constraint_geodesics.studies.collision_proof import (
 
 SEVEN_JOINTS = ("kuka_iiwa/model.urdf", "lbr_iiwa_link_7", "lbr_iiwa_link_0")
 """A robot of pybullet_data: its URDF, its tool's link and the one that stands on the table."""
-SCENES, LINES, GRAZED = 10, 200, 500
-"""Scenes of each kind and robot, straight lines in each, and shapes that are grazed."""
+SCENES, LINES, GRAZED = 10, 230, 650
+"""Scenes of each kind and robot, straight lines in each, and shapes that are tried for grazing."""
 
 
 def main(params: Params, layout: Layout) -> None:
