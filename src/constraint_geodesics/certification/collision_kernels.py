@@ -32,6 +32,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
+from constraint_geodesics.certification.kernels import BASE, next_frame
+
 _COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 
 # columns of a node
@@ -93,49 +95,23 @@ class Bodies(NamedTuple):
 def joint_frames(chain, q, frames):
     """Frames (D + 1, 12) of one configuration: position [m], then rotation by rows."""
     turns, offsets, prismatic, _ = chain
-    w, x, y, z = 1.0, 0.0, 0.0, 0.0
-    p0, p1, p2 = 0.0, 0.0, 0.0
-    for j in range(q.shape[0] + 1):
-        if j > 0:
-            # v + 2 s × (s × v + w v) for the offset v
-            v0, v1, v2 = offsets[j - 1, 0], offsets[j - 1, 1], offsets[j - 1, 2]
-            c0, c1, c2 = (
-                y * v2 - z * v1 + w * v0,
-                z * v0 - x * v2 + w * v1,
-                x * v1 - y * v0 + w * v2,
+    w, x, y, z, p0, p1, p2 = BASE
+    a0, a1, a2 = 0.0, 0.0, 1.0
+    for f in range(q.shape[0] + 1):
+        if f > 0:
+            j = f - 1
+            angle, slide = (0.0, q[j]) if prismatic[j] else (q[j], 0.0)
+            w, x, y, z, p0, p1, p2, a0, a1, a2 = next_frame(
+                turns, offsets, j, angle, slide, (w, x, y, z, p0, p1, p2)
             )
-            p0 += v0 + 2.0 * (y * c2 - z * c1)
-            p1 += v1 + 2.0 * (z * c0 - x * c2)
-            p2 += v2 + 2.0 * (x * c1 - y * c0)
-            tw, tx, ty, tz = turns[j - 1, 0], turns[j - 1, 1], turns[j - 1, 2], turns[j - 1, 3]
-            if not prismatic[j - 1]:
-                c, s = np.cos(0.5 * q[j - 1]), np.sin(0.5 * q[j - 1])
-                tw, tx, ty, tz = c * tw - s * tz, c * tx + s * ty, c * ty - s * tx, c * tz + s * tw
-            w, x, y, z = (
-                w * tw - x * tx - y * ty - z * tz,
-                w * tx + x * tw + y * tz - z * ty,
-                w * ty - x * tz + y * tw + z * tx,
-                w * tz + x * ty - y * tx + z * tw,
-            )
-        a0, a1, a2 = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), w * w - x * x - y * y + z * z
-        if j > 0 and prismatic[j - 1]:
-            p0, p1, p2 = p0 + q[j - 1] * a0, p1 + q[j - 1] * a1, p2 + q[j - 1] * a2
-        frames[j, 0], frames[j, 1], frames[j, 2] = p0, p1, p2
-        frames[j, 3], frames[j, 4], frames[j, 5] = (
-            w * w + x * x - y * y - z * z,
-            2.0 * (x * y - w * z),
-            a0,
-        )
-        frames[j, 6], frames[j, 7], frames[j, 8] = (
-            2.0 * (x * y + w * z),
-            w * w - x * x + y * y - z * z,
-            a1,
-        )
-        frames[j, 9], frames[j, 10], frames[j, 11] = (
-            2.0 * (x * z - w * y),
-            2.0 * (y * z + w * x),
-            a2,
-        )
+        frames[f, 0], frames[f, 1], frames[f, 2] = p0, p1, p2
+        frames[f, 3] = w * w + x * x - y * y - z * z
+        frames[f, 4] = 2.0 * (x * y - w * z)
+        frames[f, 6] = 2.0 * (x * y + w * z)
+        frames[f, 7] = w * w - x * x + y * y - z * z
+        frames[f, 9] = 2.0 * (x * z - w * y)
+        frames[f, 10] = 2.0 * (y * z + w * x)
+        frames[f, 5], frames[f, 8], frames[f, 11] = a0, a1, a2
 
 
 @njit(inline="always", **_COMPILE)

@@ -62,6 +62,34 @@ _SHARPNESS = 2e-7
 _RELATIVE_SHARPNESS = 0.01
 _SHORTEST = 1.0 / 1024.0
 _NEARLY_A_HALF_TURN = 3.0
+BASE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""The base's frame, as `next_frame` takes it."""
+
+
+# inlined, and with few arrays: each one that is passed counts references in every turn of a loop
+@njit(inline="always", **_COMPILE)
+def next_frame(turns, offsets, j, angle, slide, frame):
+    """Frame j, turned by an angle about its z axis and moved along it, from the frame before, both
+    as quaternion (w, x, y, z) and position; then its z axis.
+    """
+    w, x, y, z, p0, p1, p2 = frame
+    # v + 2 s × (s × v + w v) for the offset v
+    v0, v1, v2 = offsets[j, 0], offsets[j, 1], offsets[j, 2]
+    c0, c1, c2 = y * v2 - z * v1 + w * v0, z * v0 - x * v2 + w * v1, x * v1 - y * v0 + w * v2
+    p0 += v0 + 2.0 * (y * c2 - z * c1)
+    p1 += v1 + 2.0 * (z * c0 - x * c2)
+    p2 += v2 + 2.0 * (x * c1 - y * c0)
+    tw, tx, ty, tz = turns[j, 0], turns[j, 1], turns[j, 2], turns[j, 3]
+    c, s = np.cos(0.5 * angle), np.sin(0.5 * angle)
+    tw, tx, ty, tz = c * tw - s * tz, c * tx + s * ty, c * ty - s * tx, c * tz + s * tw
+    w, x, y, z = (
+        w * tw - x * tx - y * ty - z * tz,
+        w * tx + x * tw + y * tz - z * ty,
+        w * ty - x * tz + y * tw + z * tx,
+        w * tz + x * ty - y * tx + z * tw,
+    )
+    a0, a1, a2 = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), w * w - x * x - y * y + z * z
+    return w, x, y, z, p0 + slide * a0, p1 + slide * a1, p2 + slide * a2, a0, a1, a2
 
 
 @njit(**_COMPILE)
@@ -70,33 +98,17 @@ def _pose(chain, q, axes, origins):
     (D, 3).
     """
     turns, offsets, prismatic, _ = chain
-    w, x, y, z = 1.0, 0.0, 0.0, 0.0
-    p0, p1, p2 = 0.0, 0.0, 0.0
-    dof = q.shape[0]
+    frame, dof = BASE, q.shape[0]
     for j in range(dof + 1):
-        # v + 2 s × (s × v + w v) for the offset v
-        v0, v1, v2 = offsets[j, 0], offsets[j, 1], offsets[j, 2]
-        c0, c1, c2 = y * v2 - z * v1 + w * v0, z * v0 - x * v2 + w * v1, x * v1 - y * v0 + w * v2
-        p0 += v0 + 2.0 * (y * c2 - z * c1)
-        p1 += v1 + 2.0 * (z * c0 - x * c2)
-        p2 += v2 + 2.0 * (x * c1 - y * c0)
-        tw, tx, ty, tz = turns[j, 0], turns[j, 1], turns[j, 2], turns[j, 3]
-        if j < dof and not prismatic[j]:
-            c, s = np.cos(0.5 * q[j]), np.sin(0.5 * q[j])
-            tw, tx, ty, tz = c * tw - s * tz, c * tx + s * ty, c * ty - s * tx, c * tz + s * tw
-        w, x, y, z = (
-            w * tw - x * tx - y * ty - z * tz,
-            w * tx + x * tw + y * tz - z * ty,
-            w * ty - x * tz + y * tw + z * tx,
-            w * tz + x * ty - y * tx + z * tw,
-        )
+        angle, slide = 0.0, 0.0  # the tool's
         if j < dof:
-            a0, a1, a2 = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), w * w - x * x - y * y + z * z
+            angle, slide = (0.0, q[j]) if prismatic[j] else (q[j], 0.0)
+        w, x, y, z, p0, p1, p2, a0, a1, a2 = next_frame(turns, offsets, j, angle, slide, frame)
+        frame = (w, x, y, z, p0, p1, p2)
+        if j < dof:
             axes[j, 0], axes[j, 1], axes[j, 2] = a0, a1, a2
-            if prismatic[j]:
-                p0, p1, p2 = p0 + q[j] * a0, p1 + q[j] * a1, p2 + q[j] * a2
             origins[j, 0], origins[j, 1], origins[j, 2] = p0, p1, p2
-    return w, x, y, z, p0, p1, p2
+    return frame
 
 
 @njit(**_COMPILE)
