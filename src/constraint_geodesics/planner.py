@@ -65,7 +65,8 @@ class Planner:
         self._acceleration = np.full(dof, settings.acceleration_rad_s2)
         self._certifier = Certifier(self.scene, limits_of(settings, bundle.judge, dof))
         self._world = self.scene.world()
-        self._preparation = Preparation(self.scene, self._world, settings, self.method.draw)
+        apart = self._certifier.collisions.apart
+        self._preparation = Preparation(self.scene, self._world, settings, self.method.draw, apart)
         roadmaps = bundle.roadmaps if self.method.roadmaps is None else self.method.roadmaps
         self._preparation.supply(self.constraints, roadmaps)
         self.band = self._preparation.band

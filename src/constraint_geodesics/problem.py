@@ -52,7 +52,7 @@ class PlanningProblem:
     is_free: Callable[[np.ndarray], bool]
     """Whether one configuration (D,) touches neither itself nor the workcell."""
     clearance: ClearanceModel | None = None
-    """Distances to the workcell's boxes, for planners that use them; None if unknown."""
+    """Distances of what may meet, for planners that use them; None if unknown."""
     is_clear: Callable[[np.ndarray], bool] | None = None
     """Whether the straight lines between rows (T, D) touch nothing; None if `is_free` is all that
     is known.

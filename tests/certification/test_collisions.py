@@ -8,17 +8,19 @@ import numpy as np
 import pytest
 
 from constraint_geodesics.certification import collision_kernels as kernels
-from constraint_geodesics.certification.bodies import collider
 from constraint_geodesics.certification.certifier import Certifier
+from constraint_geodesics.certification.collider import collider
 from constraint_geodesics.certification.collisions import MARGIN_M
 from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.robot.kinematics import RobotError, load_robot
+from constraint_geodesics.scene import convex_kernels as convex
 from constraint_geodesics.scene.body import Body
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.pieces import Piece
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.studies.collision_proof import KINDS, Grazing, Trial, graze, try_scene
 
@@ -133,7 +135,7 @@ def furthest(arrays: kernels.Bodies, node: int, direction: np.ndarray) -> tuple[
     """How far a piece reaches along a direction, from the worst corner to begin at; and the
     truth.
     """
-    hulls, first = arrays.hulls, int(arrays.nodes[node, kernels.CORNER])
+    hulls, first = arrays.hulls, int(arrays.nodes[node, convex.CORNER])
     corners, waiting = {first}, [first]
     while waiting:
         at = waiting.pop()
@@ -141,7 +143,7 @@ def furthest(arrays: kernels.Bodies, node: int, direction: np.ndarray) -> tuple[
         waiting += beside - corners
         corners |= beside
     true = max(float(hulls[k : k + 3] @ direction) for k in corners)
-    return min(kernels._furthest(hulls, k, *direction)[1] for k in corners), true
+    return min(convex.furthest(hulls, k, *direction)[1] for k in corners), true
 
 
 def test_a_way_along_edges_leads_to_the_furthest_corner(any_scene: Scene) -> None:
@@ -199,7 +201,7 @@ def test_bodies_move_no_further_than_the_bounds_say(any_scene: Scene) -> None:
             for piece in body.pieces:
                 for below in range(body.frame):
                     nodes = own.arrays.nodes[[node, node]]
-                    nodes[0, kernels.FRAME] = below
+                    nodes[0, convex.FRAME] = below
                     motion, bend = kernels._bounds_of_motion(nodes, 0, 1, steps)
                     seen = np.stack(
                         [seen_from(frame, below, body.frame, piece) for frame in frames]
@@ -401,8 +403,7 @@ def test_a_shape_without_pieces_is_refused(scene: Scene) -> None:
     """A new kind that only PyBullet knows would be left out."""
 
     class Bare(Box):
-        def rounded_boxes(self) -> tuple:
-            return ()
+        pieces = Shape.pieces
 
     bare = Bare("bare", (0.5, 0.0, 0.5), (0.1, 0.1, 0.1))
     with pytest.raises(RobotError, match="'bare': a shape without pieces can't be bounded"):

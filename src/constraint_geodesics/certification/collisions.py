@@ -8,9 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.certification import collision_kernels as kernels
-from constraint_geodesics.certification.bodies import Body, collider
 from constraint_geodesics.certification.certificate import Violation, malformed
 from constraint_geodesics.certification.chain import Chain
+from constraint_geodesics.certification.collider import collider
+from constraint_geodesics.scene import convex_kernels as convex
+from constraint_geodesics.scene.bodies import Body
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
 
@@ -57,6 +59,11 @@ class CollisionCheck:
         if apart := len(self.collider.apart):
             line += f"; {apart} pairs that never meet within the joint limits"
         return line
+
+    @property
+    def apart(self) -> tuple[tuple[int, int], ...]:
+        """Pairs of `read_bodies` that are proven never to meet within the joint limits."""
+        return self.collider.apart
 
     def is_free(self, q: Float[np.ndarray, "D"]) -> bool:
         """Whether one configuration touches nothing: by PyBullet's word where bodies come close,
@@ -161,8 +168,8 @@ class CollisionCheck:
         """How far the second body's points get from the axes of the joints that move the two."""
         nodes, row = self.collider.arrays.nodes, self.collider.arrays.pairs[int(pair)]
         a, b = nodes[int(row[0])], nodes[int(row[1])]
-        reach = b[kernels.REACH :].copy()
-        reach[: int(a[kernels.FRAME])] = 0.0
+        reach = b[convex.REACH :].copy()
+        reach[: int(a[convex.FRAME])] = 0.0
         return reach
 
     def _rigid_contact(self, dof: int) -> tuple[str, int | None, str] | None:

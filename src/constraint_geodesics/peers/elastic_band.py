@@ -16,7 +16,7 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.problem import SATISFIED, PlanningProblem, Solution, Status, refusal
-from constraint_geodesics.scene.clearance import no_clearance
+from constraint_geodesics.scene.clearance import NO_CLEARANCE
 from constraint_geodesics.search.band import BandSettings, project, step_lengths
 from constraint_geodesics.search.candidates import (
     HALVINGS,
@@ -113,7 +113,7 @@ def halved(
 def _projected(
     manifold: ConstraintManifold, points: Float[np.ndarray, "n D"]
 ) -> Float[np.ndarray, "n D"]:
-    """On the constraint and within the limits, whatever the boxes; the points may be far from
+    """On the constraint and within the limits, whatever is in the way; the points may be far from
     either.
     """
     moved = np.ascontiguousarray(points)
@@ -122,10 +122,10 @@ def _projected(
 
 
 def task_of(problem: PlanningProblem, settings: BandSettings) -> Task:
-    """The problem's constraint and boxes as the band takes them; boxes that are not known are left
+    """The problem's constraint and clearance as the band takes them; one that is not known is left
     to `is_free`.
     """
-    clearance = problem.clearance or no_clearance(problem.manifold.robot.dof)
+    clearance = problem.clearance or NO_CLEARANCE
     return Task(problem.manifold, clearance, lambda: None, settings)
 
 
@@ -186,7 +186,8 @@ def free_rows(
     """The candidate's rows, or None if it touches something.
 
     Where a curve is pushed past the corner of a box, its projection has a kink that no more of its
-    points bridge: there the rows in between know nothing of boxes, but are checked like all others.
+    points bridge: there the rows in between know nothing of clearance, but are checked like all
+    others.
     """
     rows = halved(problem.manifold, rows_of(task, candidate, SATISFIED)[1])
     return rows if problem.keeps_clear(rows) else None

@@ -50,8 +50,8 @@ LEAST_GRADIENT = 1e-3
 ALIKE = 0.02
 """Curves whose coefficients differ by less, in units of the ends' distance, are one."""
 MARGIN, PUSH = 0.01, 200.0
-"""Distance to the workcell's boxes that is kept [m], and the cost of what is missing, as a mean
-along the curve [rad/m].
+"""Distance of what may meet that is kept [m], and the cost of what is missing, as a mean along the
+curve [rad/m].
 """
 CLEARANCE_POINTS = 65
 
@@ -90,7 +90,7 @@ class GradientGeodesic:
     tangential part of the path's curvature, pulled back to the chart), each with a step size of its
     own.  That stands still where the mean Jacobian of the decoder is no longer exact; from there
     BFGS on the cost itself polishes the best.  Where every one of these collides, they are pushed
-    out of the workcell's boxes, as far as `problem.clearance` knows them.
+    out of collisions, as far as `problem.clearance` knows them.
     """
 
     chart: LearnedManifold
@@ -113,7 +113,7 @@ class GradientGeodesic:
         )
         ends = learned.ends(problem.start[None], problem.goal[None])
         costs = [_Cost(learned, ends)]
-        if problem.clearance is not None and len(problem.clearance.boxes):
+        if problem.clearance is not None and problem.clearance.arrays.top:
             costs.append(_Cost(learned, ends, problem.clearance))
         found, iterations = None, 0
         for _ in range(self.settings.rounds):

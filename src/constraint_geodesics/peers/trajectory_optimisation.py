@@ -5,7 +5,7 @@ min ½ Σᵢ ‖qᵢ₊₁ − qᵢ‖²  over the waypoints q₁ … q_{n−1} 
 to
     r(qᵢ) = 0          held axes without a tolerance (the residual of eq. 7),
     ‖r_g(qᵢ)‖² ≤ tol²   groups g of axes with one,
-    l ≤ qᵢ ≤ u          joint limits, and  d(qᵢ) ≥ clearance  to the workcell's boxes.
+    l ≤ qᵢ ≤ u          joint limits, and  d(qᵢ) ≥ clearance  of the links that a joint carries.
 The sum of squared steps has the shortest path as its minimum, with even steps.  "SLSQP" is Kraft's
 method [1988], "trust-constr" the one of Byrd, Hribar and Nocedal [1999] and Lalee, Nocedal and
 Plantenga [1998].
@@ -36,7 +36,13 @@ from constraint_geodesics.peers.elastic_band import (
     uniform_configurations,
 )
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
-from constraint_geodesics.scene.clearance import clearance_row, link_clearances
+from constraint_geodesics.scene.clearance import (
+    DISTANCE,
+    contact_row,
+    near_contacts,
+    new_contacts,
+    second_frame,
+)
 from constraint_geodesics.search.band import BandSettings
 from constraint_geodesics.search.candidates import Task, refined
 
@@ -49,6 +55,8 @@ LOST = 0.1
 """Waypoints that lie so far beyond a limit [rad] at the end are those of an optimisation that
 diverged.
 """
+FAR = 0.2
+"""Distances of bodies [m] beyond which they are not told apart."""
 _ROUNDS = 3
 _TRUST_REGION_ENDS = {"gtol": 1e-5, "xtol": 1e-6}
 
@@ -258,8 +266,8 @@ def _started(manifold: ConstraintManifold, line: Nodes) -> Nodes:
 
 
 def demands_of(task: Task, beyond: np.ndarray, near: bool) -> list[Demand]:
-    """The constraint, the lower and upper limits that `beyond` (2, D) names, and the boxes if they
-    are near.
+    """The constraint, the lower and upper limits that `beyond` (2, D) names, and clearance where
+    bodies are near.
     """
     found = _axes(task.manifold)
     found += [_limits(task.manifold, beyond)] * bool(beyond.any())
@@ -315,8 +323,8 @@ def _limits(manifold: ConstraintManifold, beyond: np.ndarray) -> Demand:
 
 
 def _clearances(task: Task, nodes: Nodes) -> tuple[np.ndarray, np.ndarray]:
-    """How far each link is clear of the boxes beyond what is asked (n, D) [m], and the derivatives
-    (n, D, D).
+    """How far the links that each joint carries are clear of what they must not touch beyond what
+    is asked (n, D) [m], and the derivatives (n, D, D).
     """
     values, gradients = np.empty(nodes.shape), np.empty((*nodes.shape, nodes.shape[1]))
     _link_clearances(
@@ -331,23 +339,17 @@ def _clearances(task: Task, nodes: Nodes) -> tuple[np.ndarray, np.ndarray]:
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy", nogil=True)
 def _link_clearances(chain, model, q, values, gradients):  # type: ignore[no-untyped-def]
-    """Distances of each joint's links to the nearest box, of q (B, D) into values (B, D), at most 1
-    m, and their gradients (B, D, D).
+    """The smallest distance of the links that each joint carries, of q (B, D) into values (B, D),
+    at most FAR, and their gradients (B, D, D).
     """
-    dof = q.shape[1]
-    normals, nearest = np.empty((dof, 3)), np.empty((dof, 3))
-    joint_origins, joint_axes = np.empty((dof, 3)), np.empty((dof, 3))
+    contacts = new_contacts(model, q.shape[1])
     for b in range(q.shape[0]):
-        link_clearances(
-            chain, model, np.inf, q[b], values[b], normals, nearest, joint_origins, joint_axes
-        )
-        for link in range(dof):
-            if values[b, link] < 1.0:
-                clearance_row(
-                    chain[2], link, normals, nearest, joint_origins, joint_axes, gradients[b, link]
-                )
-            else:
-                values[b, link], gradients[b, link] = 1.0, 0.0
+        values[b], gradients[b] = FAR, 0.0
+        for c in range(near_contacts(chain, model, q[b], FAR, contacts)):
+            link = second_frame(contacts, c) - 1
+            if contacts.found[c, DISTANCE] < values[b, link]:
+                values[b, link] = contacts.found[c, DISTANCE]
+                contact_row(chain.prismatic, contacts, c, gradients[b, link])
 
 
 BASELINE = TrajectoryOptimisationSettings

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from constraint_geodesics.fields import Positive, Vector3
+from constraint_geodesics.scene.pieces import Piece
 from constraint_geodesics.scene.shape import RoundedBox, Shape, Triple, add_body
 
 
@@ -23,9 +24,9 @@ class Box(Shape):
         x, y, z = self.size_m
         return 0.5 * x, 0.5 * y, 0.5 * z
 
-    def rounded_boxes(self) -> tuple[RoundedBox, ...]:
+    def pieces(self) -> tuple[Piece, ...]:
         """It is one, without rounding."""
-        return (RoundedBox(self.centre_m, self._half_edges),)
+        return (RoundedBox(self.centre_m, self._half_edges).piece(),)
 
     def add_to(self, bullet: Any) -> int:
         """A box of PyBullet."""

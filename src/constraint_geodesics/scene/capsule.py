@@ -9,7 +9,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.fields import Positive, Vector3
-from constraint_geodesics.scene.shape import RoundedBox, Shape, add_body
+from constraint_geodesics.scene.pieces import Piece
+from constraint_geodesics.scene.shape import RoundedBox, Shape, Triple, add_body
 
 
 @dataclass(frozen=True)
@@ -28,24 +29,27 @@ class Capsule(Shape):
         """Of the line between its ends, without the half spheres."""
         return float(np.linalg.norm(np.subtract(self.to_m, self.from_m)))
 
-    def rounded_boxes(self) -> tuple[RoundedBox, ...]:
+    def pieces(self) -> tuple[Piece, ...]:
         """A box with one edge, along the line, rounded by the radius."""
-        x, y, z = (0.5 * (a + b) for a, b in zip(self.from_m, self.to_m, strict=True))
         half_edges = (0.0, 0.0, 0.5 * self.length_m)
-        return (RoundedBox((x, y, z), half_edges, self.radius_m, self._turn()),)
+        return (RoundedBox(self._centre, half_edges, self.radius_m, self._turn()).piece(),)
 
     def add_to(self, bullet: Any) -> int:
         """A capsule of PyBullet, which has it along its z axis."""
-        (core,) = self.rounded_boxes()
         size = {"radius": self.radius_m, "height": self.length_m}
         kind = bullet.GEOM_CAPSULE
-        return add_body(bullet, core.centre, self._quaternion(), shapeType=kind, **size)
+        return add_body(bullet, self._centre, self._quaternion(), shapeType=kind, **size)
 
     def drawn(self, rerun: Any, style: Mapping[str, Any]) -> Any:
         """A capsule of Rerun, which begins at the origin and runs along its z axis."""
         turn = rerun.Quaternion(xyzw=self._quaternion())
         size = {"lengths": [self.length_m], "radii": [self.radius_m]}
         return rerun.Capsules3D(translations=[self.from_m], quaternions=[turn], **size, **style)
+
+    @property
+    def _centre(self) -> Triple:
+        x, y, z = (0.5 * (a + b) for a, b in zip(self.from_m, self.to_m, strict=True))
+        return x, y, z
 
     def _turn(self) -> Float[np.ndarray, "3 3"]:
         """Turns the z axis into the direction of the line."""

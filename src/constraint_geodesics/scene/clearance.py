@@ -1,86 +1,96 @@
-"""Clearance of a robot's links to the shapes of its workcell, compiled: what keeps curves out of a
-collision.
+"""Clearance of an arm to the shapes of its workcell and to itself, compiled: what keeps curves out
+of a collision.
 
-Every shape is rounded boxes.  Every link is a set of points: the corners of its collision hulls
-that lie furthest out in evenly spread directions, as good as the hull itself against the flat side
-of a box, and where there are round shapes points on the hull's faces as well.
-PyBullet remains the judge: this model knows neither the contact of the arm with itself nor bodies
-given as meshes.
+It is the distance of the convex pieces that the certificate knows too, on the search's own
+kinematics, with the direction in which it grows; where pieces overlap, how deep they do.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from numba import njit
-from scipy.spatial import ConvexHull
 
 from constraint_geodesics.robot.kernels import frame_of, joint_frame
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene import convex_kernels
+from constraint_geodesics.scene.bodies import Body, NodeTable, pairs_of, read_bodies
+from constraint_geodesics.scene.convex_kernels import (
+    BOX,
+    CORNERS,
+    FRAME,
+    NEAREST,
+    PLACE,
+    REACH,
+    ROUNDING,
+    SIMPLEX,
+    VECTOR,
+    distance,
+    gap_along,
+    into,
+    pieces_of,
+    place_balls,
+    roughly_apart,
+    turned,
+)
 from constraint_geodesics.scene.shape import Shape
-from constraint_geodesics.scene.world import World, directions
 
-DIRECTIONS = 48
-"""Directions in which a link's outermost corners are looked for."""
-FACE_SPACING = 0.03
-"""Distance of the points on a hull's faces, at most [m]: a sphere of 0.1 m reaches 1 mm in between
-them.
+# columns of a contact
+DISTANCE, PAIR = 0, 1
+"""Distance [m], and which pair of pieces it is."""
+NORMAL, POINT = 2, 5
+"""Unit vector (3) from the first body to the second, and the second's nearest point (3), in the
+base frame.
 """
-GROUP = 12
-"""Points that are passed over together where a ball around them is far enough."""
+_CONTACT = 8
+_OVERLAPPING = 1e-7
+FINEST_M = 0.001
+"""Motion over which a line is looked at no closer: the certificate does."""
+_DEEPEST = 32
+_SIGNS = [(x, y, z) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) for z in (-1.0, 0.0, 1.0)]
+_TRIED = np.array([np.divide(s, np.linalg.norm(s)) for s in _SIGNS if any(s)])
+"""Directions (26, 3) in which overlapping pieces are looked at."""
 _COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 
 
 class ClearanceArrays(NamedTuple):
-    """A clearance model as the compiled kernels take it.
-
-    points (K, 3) [m]; shapes (B, 16 + D): centre, half edges, rounding and turn (9) of the boxes,
-    and their exempt links; groups (G, 7) of neighbouring points, those of one joint together:
-    centre and radius of a ball around them, the first point, the one after the last, the joint.
+    """What may meet, as convex_kernels.py takes it: hulls (H,), nodes (N, REACH + D) and pairs
+    (P, PAIR), of which the first `top` are of bodies.
     """
 
-    points: np.ndarray
-    shapes: np.ndarray
-    groups: np.ndarray
+    hulls: np.ndarray
+    nodes: np.ndarray
+    pairs: np.ndarray
+    top: int
+
+
+class Contacts(NamedTuple):
+    """What the kernels write into: nodes and pairs of their own, frames (1, D + 1, 12), joint
+    origins and axes (D, 3), and `found` (P, 8), the contacts by the columns above.
+    """
+
+    nodes: np.ndarray
+    pairs: np.ndarray
+    frames: np.ndarray
+    origins: np.ndarray
+    axes: np.ndarray
+    simplex: np.ndarray
+    found: np.ndarray
 
 
 @dataclass(frozen=True)
 class ClearanceModel:
-    """Points of the links, and the rounded boxes they must keep clear of.
+    """A scene's convex pieces, and the pairs of them that may meet."""
 
-    points (K, 3) [m] in the frame that the joint `joints` (K,) carries; boxes (B, 16): centre, half
-    edges and rounding [m], and turn, of each; exempt (B, D): which of them the links carried by a
-    joint may touch.
-    """
-
-    points: Float[np.ndarray, "K 3"]
-    joints: Int[np.ndarray, "K"]
-    boxes: Float[np.ndarray, "B 16"]
-    exempt: Bool[np.ndarray, "B D"]
-
-    @cached_property
-    def arrays(self) -> ClearanceArrays:
-        """For the kernels."""
-        order, groups, first = [np.empty(0, np.int64)], [np.empty((0, 7))], 0
-        for joint in np.unique(self.joints):
-            for rows in _neighbours(self.points, np.flatnonzero(self.joints == joint)):
-                centre = self.points[rows].mean(axis=0)
-                radius = np.linalg.norm(self.points[rows] - centre, axis=1).max()
-                groups.append(np.array([[*centre, radius, first, first + len(rows), joint]], float))
-                order.append(rows)
-                first += len(rows)
-        boxes = np.concatenate([self.boxes, self.exempt], axis=1)
-        points = np.ascontiguousarray(self.points[np.concatenate(order)])
-        return ClearanceArrays(points, boxes, np.concatenate(groups))
+    arrays: ClearanceArrays
 
     def clearance(
         self, robot: SerialRobot, q: Float[np.ndarray, "*batch D"]
     ) -> Float[np.ndarray, "*batch"]:
-        """Smallest distance of any link to any box it must not touch [m], negative inside; inf
-        without boxes.
+        """Smallest distance of any two bodies that must not touch [m], negative where they overlap;
+        inf without any.
         """
         flat = np.ascontiguousarray(q, np.float64).reshape(-1, robot.dof)
         smallest = np.empty(len(flat))
@@ -88,183 +98,299 @@ class ClearanceModel:
         return smallest.reshape(q.shape[:-1])
 
 
-def no_clearance(dof: int) -> ClearanceModel:
-    """The model of an empty workcell."""
-    nothing = np.empty((0, dof), bool)
-    return ClearanceModel(np.empty((0, 3)), np.empty(0, np.int64), np.empty((0, 16)), nothing)
+_NOTHING = np.empty(0), np.empty((0, REACH)), np.empty((0, convex_kernels.PAIR))
+NO_CLEARANCE = ClearanceModel(ClearanceArrays(*_NOTHING, 0))
+"""Where nothing can meet."""
 
 
-def clearance_model(robot: SerialRobot, workcell: Sequence[Shape]) -> ClearanceModel:
-    """The model of one robot among shapes; what is no rounded box is left to PyBullet."""
-    solids = [(shape, box) for shape in workcell for box in shape.rounded_boxes()]
-    if not solids:
-        return no_clearance(robot.dof)
-    with World(robot) as world:
-        hulls = [hull for hull in world.hulls() if hull.joint >= 0]
-    if not hulls:
-        return no_clearance(robot.dof)
-    points_of = surface if any(box.rounding > 0.0 for _, box in solids) else outermost
-    kept = sorted(((h.joint, points_of(h.points)) for h in hulls), key=lambda link: link[0])
-    exempt = np.zeros((len(solids), robot.dof), bool)
-    for b, (shape, _) in enumerate(solids):
-        exempt[b, [hull.joint for hull in hulls if hull.link in shape.exempt_links]] = True
-    return ClearanceModel(
-        np.concatenate([points for _, points in kept]),
-        np.concatenate([np.full(len(points), joint) for joint, points in kept]),
-        np.array([np.concatenate([np.ravel(part) for part in box]) for _, box in solids]),
-        exempt,
-    )
-
-
-def outermost(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """The points that lie furthest out in any of DIRECTIONS evenly spread directions."""
-    return np.ascontiguousarray(
-        points[np.unique((points @ directions(DIRECTIONS).T).argmax(axis=0))]
-    )
-
-
-def surface(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Points on the convex hull of the outermost points, at most FACE_SPACING apart along its
-    faces.
+def clearance_model(
+    robot: SerialRobot, workcell: Sequence[Shape], apart: Collection[tuple[int, int]] = ()
+) -> ClearanceModel:
+    """The model of one robot among shapes.  apart: pairs of `read_bodies` that are known never to
+    meet, which need no look.  Raises RobotError where a collision shape can't be bounded, naming
+    it.
     """
-    corners = outermost(points)
-    found = [corners]
-    for face in corners[ConvexHull(corners).simplices]:
-        pieces = int(
-            np.ceil(max(np.linalg.norm(face[k] - face[k - 1]) for k in range(3)) / FACE_SPACING)
-        )
-        shares = [(i, j, pieces - i - j) for i in range(pieces + 1) for j in range(pieces + 1 - i)]
-        found.append(np.array(shares, float) @ face / pieces)
-    return np.ascontiguousarray(np.unique(np.concatenate(found).round(9), axis=0))
+    frames = _frames(robot.chain, np.zeros(robot.dof))
+    bodies = read_bodies(robot, workcell, frames[0])
+    moving = ((a, b) for a, b in pairs_of(bodies) if bodies[a].frame != bodies[b].frame)
+    pairs = [pair for pair in moving if pair not in apart]
+    if not pairs:
+        return NO_CLEARANCE
+    table = NodeTable(bodies)
+    nodes = np.concatenate([table.nodes, _reaches(robot, bodies, table)], axis=1)
+    return ClearanceModel(ClearanceArrays(table.hulls, nodes, table.pairs(pairs), len(pairs)))
 
 
-def _neighbours(
-    points: Float[np.ndarray, "K 3"], rows: Int[np.ndarray, "n"]
-) -> list[Int[np.ndarray, "m"]]:
-    """The rows in groups of at most GROUP points, halved along their widest side until they are."""
-    if len(rows) <= GROUP:
-        return [rows]
-    side = int(np.ptp(points[rows], axis=0).argmax())
-    sorted_rows = rows[np.argsort(points[rows, side], kind="stable")]
-    half = len(rows) // 2
-    return _neighbours(points, sorted_rows[:half]) + _neighbours(points, sorted_rows[half:])
+def _reaches(
+    robot: SerialRobot, bodies: Sequence[Body], table: NodeTable
+) -> Float[np.ndarray, "N D"]:
+    """How far points of each node get from each axis at most: along the links, stretched out."""
+    reach, prismatic = np.zeros((len(table.nodes), robot.dof)), robot.chain.prismatic
+    extents = np.abs(np.stack([robot.lower, robot.upper])).max(axis=0) * prismatic
+    lengths = np.linalg.norm(robot.chain.origins[:, :3, 3], axis=1)
+    for b, (body, nodes) in enumerate(zip(bodies, table.pieces, strict=True)):
+        for node, piece in zip(nodes, body.pieces, strict=True):
+            away = np.linalg.norm(piece.corners, axis=1).max() + piece.rounding
+            for j in range(body.frame - 1, -1, -1):
+                away += extents[j]
+                reach[node, j] = 1.0 if prismatic[j] else away
+                away += lengths[j]
+        reach[b] = reach[nodes].max(axis=0)
+    return reach
 
 
 @njit(**_COMPILE)
-def link_clearances(chain, model, far, q, distances, normals, nearest, joint_origins, joint_axes):
-    """For the links carried by each joint: distance (D,) [m] to the nearest box, the direction (D,
-    3) away from it and the point (D, 3) that is nearest, in the base frame; joint origins and axes
-    (D, 3) come with it. Links that are further away than `far` [m] get a bound from below instead.
-    """
+def new_contacts(model, dof):
+    """What the kernels write into."""
+    return Contacts(
+        model.nodes.copy(),
+        model.pairs.copy(),
+        np.empty((1, dof + 1, 12)),
+        np.empty((dof, 3)),
+        np.empty((dof, 3)),
+        np.empty(SIMPLEX),
+        np.empty((max(model.pairs.shape[0], 1), _CONTACT)),
+    )
+
+
+@njit(**_COMPILE)
+def _place(chain, q, frames, joint_origins, joint_axes):
+    """Frames (1, D + 1, 12) of one configuration, joint origins and axes (D, 3)."""
     origins, axes, prismatic, base, _ = chain
-    points, boxes, groups = model
+    # the base's frame is where its links are read
+    frames[0, 0] = 0.0
+    frames[0, 0, 3] = frames[0, 0, 7] = frames[0, 0, 11] = 1.0
     frame = frame_of(base)
-    g = 0
     for j in range(q.shape[0]):
-        distances[j] = np.inf
         frame = joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes)
         p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = frame
-        passed_over = np.inf
-        while g < groups.shape[0] and groups[g, 6] == j:
-            u, v, w = groups[g, 0], groups[g, 1], groups[g, 2]
-            x = p0 + r00 * u + r01 * v + r02 * w
-            y = p1 + r10 * u + r11 * v + r12 * w
-            z = p2 + r20 * u + r21 * v + r22 * w
-            radius, first, last = groups[g, 3], int(groups[g, 4]), int(groups[g, 5])
-            g += 1
-            for b in range(boxes.shape[0]):
-                if boxes[b, 16 + j] != 0.0:
-                    continue
-                dx, dy, dz = _from_centre(boxes[b], x, y, z)
-                ex, ey, ez = abs(dx) - boxes[b, 3], abs(dy) - boxes[b, 4], abs(dz) - boxes[b, 5]
-                bound = max(ex, ey, ez)
-                if bound > 0.0:
-                    ex, ey, ez = max(ex, 0.0), max(ey, 0.0), max(ez, 0.0)
-                    bound = np.sqrt(ex * ex + ey * ey + ez * ez)
-                bound -= boxes[b, 6] + radius
-                if bound > far or bound >= distances[j]:
-                    passed_over = min(passed_over, bound)
-                    continue
-                for k in range(first, last):
-                    _nearer(frame, points[k], boxes[b], j, (distances, normals, nearest))
-        if distances[j] > far:
-            distances[j] = min(distances[j], passed_over)
-
-
-@njit(inline="always", **_COMPILE)
-def _from_centre(box, x, y, z):
-    """A point of the base frame, from a box's centre and along its edges."""
-    x, y, z = x - box[0], y - box[1], z - box[2]
-    return (
-        x * box[7] + y * box[10] + z * box[13],
-        x * box[8] + y * box[11] + z * box[14],
-        x * box[9] + y * box[12] + z * box[15],
-    )
-
-
-@njit(inline="always", **_COMPILE)
-def _nearer(frame, point, box, j, found):
-    """Take a point of the links that joint j carries for the nearest, if it is nearer to the box
-    than all before; found: distances, normals and nearest points so far.
-    """
-    distances, normals, nearest = found
-    p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = frame
-    x = p0 + r00 * point[0] + r01 * point[1] + r02 * point[2]
-    y = p1 + r10 * point[0] + r11 * point[1] + r12 * point[2]
-    z = p2 + r20 * point[0] + r21 * point[1] + r22 * point[2]
-    dx, dy, dz = _from_centre(box, x, y, z)
-    ex, ey, ez = abs(dx) - box[3], abs(dy) - box[4], abs(dz) - box[5]
-    if ex <= 0.0 and ey <= 0.0 and ez <= 0.0:
-        distance = max(ex, ey, ez)
-        nx = (1.0 if dx > 0.0 else -1.0) if distance == ex else 0.0
-        ny = (1.0 if dy > 0.0 else -1.0) if distance == ey and nx == 0.0 else 0.0
-        nz = (1.0 if dz > 0.0 else -1.0) if nx == 0.0 and ny == 0.0 else 0.0
-    else:
-        ox, oy, oz = max(ex, 0.0), max(ey, 0.0), max(ez, 0.0)
-        distance = np.sqrt(ox * ox + oy * oy + oz * oz)
-        nx = (ox if dx > 0.0 else -ox) / distance
-        ny = (oy if dy > 0.0 else -oy) / distance
-        nz = (oz if dz > 0.0 else -oz) / distance
-    distance -= box[6]
-    if distance < distances[j]:
-        distances[j] = distance
-        normals[j, 0] = nx * box[7] + ny * box[8] + nz * box[9]
-        normals[j, 1] = nx * box[10] + ny * box[11] + nz * box[12]
-        normals[j, 2] = nx * box[13] + ny * box[14] + nz * box[15]
-        nearest[j, 0], nearest[j, 1], nearest[j, 2] = x, y, z
+        own = frames[0, j + 1]
+        own[0], own[1], own[2] = p0, p1, p2
+        own[3], own[4], own[5] = r00, r01, r02
+        own[6], own[7], own[8] = r10, r11, r12
+        own[9], own[10], own[11] = r20, r21, r22
 
 
 @njit(**_COMPILE)
-def clearance_row(prismatic, link, normals, nearest, joint_origins, joint_axes, row):
-    """Gradient (D,) of the distance of the links that joint `link` carries."""
-    n, p = normals[link], nearest[link]
-    row[:] = 0.0
-    for j in range(link + 1):
-        a, o = joint_axes[j], joint_origins[j]
-        if prismatic[j]:
-            row[j] = n[0] * a[0] + n[1] * a[1] + n[2] * a[2]
+def _frames(chain, q):
+    frames, dof = np.empty((1, q.shape[0] + 1, 12)), q.shape[0]
+    _place(chain, q, frames, np.empty((dof, 3)), np.empty((dof, 3)))
+    return frames
+
+
+@njit(**_COMPILE)
+def _shallowest(bodies, frames, p, simplex):
+    """How deep a pair of pieces overlaps, as a distance below 0, in the direction in which it is
+    least of those that are tried, which becomes the pair's; the second's deepest point into
+    `simplex`.
+    """
+    hulls, nodes, pairs = bodies
+    a, b = int(pairs[p, 0]), int(pairs[p, 1])
+    f, g = int(nodes[a, FRAME]), int(nodes[b, FRAME])
+    x = nodes[b, PLACE] - nodes[a, PLACE]
+    y = nodes[b, PLACE + 1] - nodes[a, PLACE + 1]
+    z = nodes[b, PLACE + 2] - nodes[a, PLACE + 2]
+    length = max(np.sqrt(x * x + y * y + z * z), 1e-12)
+    n = (x / length, y / length, z / length)
+    best, most = n, gap_along(bodies, frames, 0, p, n)
+    box = nodes[a, BOX] >= 0.0
+    count = _TRIED.shape[0]
+    for k in range(count + 6 if box else count):
+        if k < count:
+            n = (_TRIED[k, 0], _TRIED[k, 1], _TRIED[k, 2])
+        else:
+            at, sign = BOX + 3 + (k - count) // 2, 1.0 if k % 2 == 0 else -1.0
+            n = (sign * nodes[a, at], sign * nodes[a, at + 3], sign * nodes[a, at + 6])
+        value = gap_along(bodies, frames, 0, p, n)
+        if value > most:
+            best, most = n, value
+    most = gap_along(bodies, frames, 0, p, best)  # once more, for its corners
+    corner = int(pairs[p, CORNERS + 1])
+    x, y, z = turned(frames, 0, g, hulls[corner], hulls[corner + 1], hulls[corner + 2])
+    simplex[NEAREST, 3] = x + frames[0, g, 0]
+    simplex[NEAREST, 4] = y + frames[0, g, 1]
+    simplex[NEAREST, 5] = z + frames[0, g, 2]
+    x, y, z = into(frames, 0, f, best[0], best[1], best[2])
+    pairs[p, VECTOR], pairs[p, VECTOR + 1], pairs[p, VECTOR + 2] = x, y, z
+    return most
+
+
+@njit(**_COMPILE)
+def _measure(bodies, frames, simplex, p, far, contact):
+    """The contact (8,) of one pair of pieces; False where they are further apart than `far` [m]."""
+    _, nodes, pairs = bodies
+    a, b = int(pairs[p, 0]), int(pairs[p, 1])
+    if roughly_apart(nodes, a, b) >= far:
+        return False
+    rounding = nodes[a, ROUNDING] + nodes[b, ROUNDING]
+    lower, upper = distance(bodies, frames, 0, p, (far + rounding, -np.inf), simplex)
+    if lower - rounding >= far:
+        return False
+    if upper < _OVERLAPPING:
+        lower = _shallowest(bodies, frames, p, simplex)
+    x, y, z = pairs[p, VECTOR], pairs[p, VECTOR + 1], pairs[p, VECTOR + 2]
+    x, y, z = turned(frames, 0, int(nodes[a, FRAME]), x, y, z)
+    contact[DISTANCE], contact[PAIR] = lower - rounding, p
+    contact[NORMAL], contact[NORMAL + 1], contact[NORMAL + 2] = x, y, z
+    for d in range(3):
+        contact[POINT + d] = simplex[NEAREST, 3 + d]
+    return True
+
+
+@njit(**_COMPILE)
+def near_contacts(chain, model, q, far, room):
+    """The contacts of one configuration that are nearer than `far` [m] into `room`, the nearest
+    first, one for each pair of bodies; returns how many.
+    """
+    nodes, pairs, frames, found = room.nodes, room.pairs, room.frames, room.found
+    simplex, bodies = room.simplex, (model.hulls, room.nodes, room.pairs)
+    _place(chain, q, frames, room.origins, room.axes)
+    place_balls(nodes, frames, 0)
+    count = 0
+    for body in range(model.top):
+        if roughly_apart(nodes, int(pairs[body, 0]), int(pairs[body, 1])) >= far:
             continue
-        x, y, z = p[0] - o[0], p[1] - o[1], p[2] - o[2]
-        row[j] = (
-            n[0] * (a[1] * z - a[2] * y)
-            + n[1] * (a[2] * x - a[0] * z)
-            + n[2] * (a[0] * y - a[1] * x)
-        )
+        least = far
+        first, last = pieces_of(pairs, body)
+        for p in range(first, last):
+            if _measure(bodies, frames, simplex, p, least, found[count]):
+                least = found[count, DISTANCE]
+        if least >= far:
+            continue
+        at = count
+        while at > 0 and found[at, DISTANCE] < found[at - 1, DISTANCE]:
+            for d in range(_CONTACT):
+                found[at, d], found[at - 1, d] = found[at - 1, d], found[at, d]
+            at -= 1
+        count += 1
+    return count
+
+
+@njit(**_COMPILE)
+def _motion(nodes, pairs, p, first, second):
+    """How far the second of a pair moves at most, seen from the first [m], over half a line."""
+    a, b = int(pairs[p, 0]), int(pairs[p, 1])
+    motion = 0.0
+    for j in range(int(nodes[a, FRAME]), int(nodes[b, FRAME])):
+        motion += abs(second[j] - first[j]) * nodes[b, REACH + j]
+    return 0.5 * motion
+
+
+@njit(**_COMPILE)
+def _apart(bodies, frames, simplex, p, motion):
+    """Whether a pair of pieces is further apart than `motion` [m]: 1 for yes, −1 if it overlaps, 0
+    else.
+    """
+    _, nodes, pairs = bodies
+    a, b = int(pairs[p, 0]), int(pairs[p, 1])
+    if roughly_apart(nodes, a, b) > motion:
+        return 1
+    rounding = nodes[a, ROUNDING] + nodes[b, ROUNDING]
+    lower, upper = distance(bodies, frames, 0, p, (motion + rounding, rounding), simplex)
+    if lower - rounding > motion:
+        return 1
+    return -1 if upper <= rounding else 0
+
+
+@njit(**_COMPILE)
+def stays_clear(chain, model, first, second, room):
+    """Whether nothing overlaps on the straight joint line between two configurations, but for parts
+    over which nothing moves by more than FINEST_M.
+    """
+    nodes, pairs, frames, simplex = room.nodes, room.pairs, room.frames, room.simplex
+    bodies, found, dof = (model.hulls, room.nodes, room.pairs), room.found, first.shape[0]
+    q, parts = np.empty(dof), np.empty((_DEEPEST, 2))
+    for d in range(dof):
+        q[d] = 0.5 * (first[d] + second[d])
+    _place(chain, q, frames, room.origins, room.axes)
+    place_balls(nodes, frames, 0)
+    count = 0
+    for body in range(model.top):
+        a, b = int(pairs[body, 0]), int(pairs[body, 1])
+        if roughly_apart(nodes, a, b) > _motion(nodes, pairs, body, first, second):
+            continue
+        begin, end = pieces_of(pairs, body)
+        for p in range(begin, end):
+            motion = _motion(nodes, pairs, p, first, second)
+            apart = _apart(bodies, frames, simplex, p, motion)
+            if apart < 0:
+                return False
+            if apart == 0 and motion > FINEST_M:
+                found[count, PAIR] = p
+                count += 1
+    for c in range(count):
+        p, left = int(found[c, PAIR]), 2
+        motion = _motion(nodes, pairs, p, first, second)
+        parts[0, 0], parts[0, 1], parts[1, 0], parts[1, 1] = 0.0, 0.5, 0.5, 1.0
+        while left > 0:
+            left -= 1
+            start, end = parts[left, 0], parts[left, 1]
+            middle, moves = 0.5 * (start + end), motion * (end - start)
+            for d in range(dof):
+                q[d] = first[d] + middle * (second[d] - first[d])
+            _place(chain, q, frames, room.origins, room.axes)
+            place_balls(nodes, frames, 0)
+            apart = _apart(bodies, frames, simplex, p, moves)
+            if apart < 0:
+                return False
+            if apart == 0 and moves > FINEST_M and left + 2 <= _DEEPEST:
+                parts[left, 0], parts[left, 1] = start, middle
+                parts[left + 1, 0], parts[left + 1, 1] = middle, end
+                left += 2
+    return True
+
+
+@njit(**_COMPILE)
+def same_contacts(chain, model, q, count, room):
+    """The contacts of the same pairs of pieces at another configuration, as near or not."""
+    simplex, bodies = room.simplex, (model.hulls, room.nodes, room.pairs)
+    _place(chain, q, room.frames, room.origins, room.axes)
+    place_balls(room.nodes, room.frames, 0)
+    for c in range(count):
+        _measure(bodies, room.frames, simplex, int(room.found[c, PAIR]), np.inf, room.found[c])
+
+
+@njit(inline="always", **_COMPILE)
+def second_frame(room, c):
+    """The frame that carries the second body of a contact; joint j carries frame j + 1."""
+    return int(room.nodes[int(room.pairs[int(room.found[c, PAIR]), 1]), FRAME])
+
+
+@njit(**_COMPILE)
+def contact_row(prismatic, room, c, row):
+    """Gradient (D,) of a contact's distance."""
+    nodes, pairs, found, axes, origins = room.nodes, room.pairs, room.found, room.axes, room.origins
+    p = int(found[c, PAIR])
+    first, last = int(nodes[int(pairs[p, 0]), FRAME]), int(nodes[int(pairs[p, 1]), FRAME])
+    n0, n1, n2 = found[c, NORMAL], found[c, NORMAL + 1], found[c, NORMAL + 2]
+    p0, p1, p2 = found[c, POINT], found[c, POINT + 1], found[c, POINT + 2]
+    row[:] = 0.0
+    for j in range(first, last):
+        a0, a1, a2 = axes[j, 0], axes[j, 1], axes[j, 2]
+        if prismatic[j]:
+            row[j] = n0 * a0 + n1 * a1 + n2 * a2
+            continue
+        x, y, z = p0 - origins[j, 0], p1 - origins[j, 1], p2 - origins[j, 2]
+        row[j] = n0 * (a1 * z - a2 * y) + n1 * (a2 * x - a0 * z) + n2 * (a0 * y - a1 * x)
 
 
 @njit(**_COMPILE)
 def clearance_batch(chain, model, far, q, smallest):
-    """Smallest distance of any link to any box, of q (B, D) into smallest (B,); beyond `far` a
-    bound from below.
+    """Smallest distance of any two bodies that must not touch, of q (B, D) into smallest (B,), at
+    most `far`.
     """
-    dof = q.shape[1]
-    distances, normals, nearest = np.empty(dof), np.empty((dof, 3)), np.empty((dof, 3))
-    joint_origins, joint_axes = np.empty((dof, 3)), np.empty((dof, 3))
+    room = new_contacts(model, q.shape[1])
     for b in range(q.shape[0]):
-        link_clearances(
-            chain, model, far, q[b], distances, normals, nearest, joint_origins, joint_axes
-        )
-        value = np.inf
-        for j in range(dof):
-            value = min(value, distances[j])
-        smallest[b] = value
+        smallest[b] = far
+        if near_contacts(chain, model, q[b], far, room) > 0:
+            smallest[b] = room.found[0, DISTANCE]
+
+
+@njit(**_COMPILE)
+def path_stays_clear(chain, model, q):
+    """Whether nothing overlaps on the straight joint lines between configurations (T, D)."""
+    room = new_contacts(model, q.shape[1])
+    clear = True
+    for b in range(q.shape[0] - 1):
+        clear = clear and stays_clear(chain, model, q[b], q[b + 1], room)
+    return clear

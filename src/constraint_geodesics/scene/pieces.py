@@ -64,6 +64,14 @@ def box_corners(half_edges: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
     return np.unique(_SIGNS * half_edges, axis=0)
 
 
+def prism(sides: int, radius: float, low: float, high: float) -> Float[np.ndarray, "n 3"]:
+    """Corners of the prism around a cylinder about the z axis."""
+    turn = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
+    wide = radius / np.cos(np.pi / sides)
+    x, y, one = wide * np.cos(turn), wide * np.sin(turn), np.ones(sides)
+    return np.concatenate([np.stack([x, y, low * one], 1), np.stack([x, y, high * one], 1)])
+
+
 def read_pieces(urdf: Path) -> list[LinkPieces]:
     """All links of a URDF.  Raises RobotError where a collision shape can't be bounded, naming the
     file and the link.
@@ -141,12 +149,8 @@ def _capsule(shape: ElementTree.Element, _: Path) -> Iterator[Piece]:
 
 def _cylinder(shape: ElementTree.Element, _: Path) -> Iterator[Piece]:
     """The prism around it, where PyBullet takes one within it."""
-    half = 0.5 * float(_size(shape, "length")[0])
-    radius = float(_size(shape, "radius")[0]) / np.cos(np.pi / _SIDES)
-    turn = np.linspace(0.0, 2.0 * np.pi, _SIDES, endpoint=False)
-    x, y, z = radius * np.cos(turn), radius * np.sin(turn), np.full(_SIDES, half)
-    rims = np.concatenate([np.stack([x, y, -z], 1), np.stack([x, y, z], 1)])
-    yield Piece(rims, HULL_MARGIN)
+    half, radius = 0.5 * float(_size(shape, "length")[0]), float(_size(shape, "radius")[0])
+    yield Piece(prism(_SIDES, radius, -half, half), HULL_MARGIN)
 
 
 def _mesh(shape: ElementTree.Element, urdf: Path) -> Iterator[Piece]:

@@ -55,20 +55,11 @@ class Shape(ABC):
     name: str
     exempt_links: tuple[str, ...]
 
-    def rounded_boxes(self) -> tuple[RoundedBox, ...]:
-        """What the planner's distances see of it; of nothing, the planner learns from the
-        certificate alone.
-        """
-        return ()
-
     def pieces(self) -> tuple[Piece, ...]:
-        """Convex pieces that cover it, in the base frame: what the certificate sees.  Raises
-        RobotError where there are none.
+        """Convex pieces that cover it, in the base frame.  Raises RobotError where there are
+        none.
         """
-        boxes = self.rounded_boxes()
-        if not boxes:
-            raise RobotError(f"workcell {self.name!r}: a shape without pieces can't be bounded")
-        return tuple(box.piece() for box in boxes)
+        raise RobotError(f"workcell {self.name!r}: a shape without pieces can't be bounded")
 
     def urdf_model(self) -> PlacedUrdf | None:
         """Its meshes, where it has some; they are drawn by Rerun itself."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from constraint_geodesics.fields import Positive, Vector3
+from constraint_geodesics.scene.pieces import Piece
 from constraint_geodesics.scene.shape import RoundedBox, Shape, add_body
 
 
@@ -18,9 +19,9 @@ class Sphere(Shape):
     exempt_links: tuple[str, ...] = ()
     kind: Literal["sphere"] = "sphere"
 
-    def rounded_boxes(self) -> tuple[RoundedBox, ...]:
+    def pieces(self) -> tuple[Piece, ...]:
         """A box without edges, rounded by the radius."""
-        return (RoundedBox(self.centre_m, (0.0, 0.0, 0.0), self.radius_m),)
+        return (RoundedBox(self.centre_m, (0.0, 0.0, 0.0), self.radius_m).piece(),)
 
     def add_to(self, bullet: Any) -> int:
         """A sphere of PyBullet."""

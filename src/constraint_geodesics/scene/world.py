@@ -6,8 +6,6 @@ The only importer of pybullet.  Every world is a client of its own; nothing is s
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import accumulate
-from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -64,17 +62,6 @@ class LoadedChain:
     position: tuple[float, float, float]
     quaternion: tuple[float, float, float, float]
     links: tuple[LoadedLink, ...]
-
-
-@dataclass(frozen=True)
-class LinkHull:
-    """Corners of one link's collision shapes (n, 3) [m] in the frame that joint `joint` carries;
-    -1: the base's.
-    """
-
-    link: str
-    joint: int
-    points: Float[np.ndarray, "n 3"]
 
 
 class BodyKey(NamedTuple):
@@ -233,61 +220,6 @@ class World:
         position, quaternion = bullet.getBasePositionAndOrientation(body)
         return LoadedChain(position, quaternion, tuple(reversed(links)))
 
-    def hulls(self) -> list[LinkHull]:
-        """The collision shapes of all links that have one."""
-        bullet, body = self._bullet, self._body
-        self._place(np.zeros(self.robot.dof))
-        frames = _joint_frames(self.robot)
-        found = []
-        for link, index in sorted(self._link_index.items(), key=lambda item: item[1]):
-            shapes = bullet.getCollisionShapeData(body, index)
-            corners = [self._corners(index, shape) for shape in shapes]
-            points = np.concatenate([np.empty((0, 3)), *corners])
-            if not len(points) or index < 0:
-                continue
-            state = bullet.getLinkState(body, index, computeForwardKinematics=1)
-            rotation = np.array(bullet.getMatrixFromQuaternion(state[1])).reshape(3, 3)
-            joint = self._carrier(index)
-            pose = np.linalg.inv(frames[joint]) if joint >= 0 else np.eye(4)
-            in_base = points @ rotation.T + state[0]
-            found.append(LinkHull(link, joint, in_base @ pose[:3, :3].T + pose[:3, 3]))
-        return found
-
-    def _corners(self, link: int, shape: tuple) -> Float[np.ndarray, "n 3"]:
-        """Outermost points of one collision shape in the link's inertial frame; those of a round
-        one are many.
-        """
-        bullet = self._bullet
-        kind, size = shape[2], np.array(shape[3])
-        if kind == bullet.GEOM_MESH:
-            with quiet():
-                mesh = bullet.getMeshData(self._body, link)[1]
-            if mesh:  # of a link with one shape; it is in the inertial frame already
-                return np.array(mesh).reshape(-1, 3)
-            points = _mesh_vertices(Path(shape[4].decode())) * size
-        elif kind == bullet.GEOM_BOX:
-            signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-            points = 0.5 * size * signs
-        elif kind == bullet.GEOM_SPHERE:
-            points = size[0] * directions(96)
-        elif kind in (bullet.GEOM_CYLINDER, bullet.GEOM_CAPSULE):
-            turn = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
-            rim = np.stack([np.cos(turn), np.sin(turn), np.zeros(32)], axis=1)
-            end = size[1] * (rim if kind == bullet.GEOM_CYLINDER else directions(96))
-            points = np.concatenate([end + np.array([0.0, 0.0, s * size[0]]) for s in (-0.5, 0.5)])
-        else:
-            return np.empty((0, 3))
-        rotation = np.array(bullet.getMatrixFromQuaternion(shape[6])).reshape(3, 3)
-        return points @ rotation.T + shape[5]
-
-    def _carrier(self, link: int) -> int:
-        """Which joint of the chain moves a link last; -1 for none."""
-        while link >= 0:
-            if link in self._joints:
-                return self._joints.index(link)
-            link = self._bullet.getJointInfo(self._body, link)[16]
-        return -1
-
     def _place(self, q: np.ndarray) -> None:
         values = np.asarray(q, float)[:, None].tolist()
         self._bullet.resetJointStatesMultiDof(self._body, self._joints, values)
@@ -310,28 +242,6 @@ class World:
                 f"workcell {body.name!r}: {unknown} are not links of {self.robot.name}"
             )
         return frozenset(self._link_index[name] for name in body.exempt_links)
-
-
-def _mesh_vertices(file: Path) -> Float[np.ndarray, "n 3"]:
-    """Vertices of an OBJ file; none of another kind of file."""
-    if file.suffix.lower() != ".obj" or not file.is_file():
-        return np.empty((0, 3))
-    lines = file.read_text(errors="replace").splitlines()
-    rows = [line.split()[1:4] for line in lines if line.startswith("v ")]
-    return np.array(rows, float).reshape(-1, 3)
-
-
-def directions(count: int) -> Float[np.ndarray, "count 3"]:
-    """Evenly spread unit vectors (Fibonacci's lattice)."""
-    k = np.arange(count) + 0.5
-    height, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + np.sqrt(5.0)) * k
-    width = np.sqrt(1.0 - height**2)
-    return np.stack([width * np.cos(turn), width * np.sin(turn), height], axis=1)
-
-
-def _joint_frames(robot: SerialRobot) -> list[Float[np.ndarray, "4 4"]]:
-    """The frame of each joint in the base frame, all joints at 0."""
-    return list(accumulate(robot.chain.origins, np.matmul, initial=robot.chain.base))[1:]
 
 
 @dataclass(frozen=True)

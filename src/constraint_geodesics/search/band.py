@@ -2,8 +2,8 @@
 curve through it.
 
 The short second-order refinement of a proposed curve.  It works in joint space on the exact
-constraint, within the joint limits and clear of the workcell's boxes; the arithmetic is in
-band_kernels.py.
+constraint, within the joint limits and clear of the workcell and of the arm itself; the arithmetic
+is in band_kernels.py.
 """
 
 from dataclasses import dataclass
@@ -28,8 +28,7 @@ _ZERO = np.zeros(1)
 class BandSettings:
     """segments: of the band.  iterations: of Newton's method, at most.  accuracy: relative decrease
     of the energy below which it stops.  largest_step_rad: of one node in one iteration.
-    clearance_m: kept to the workcell's boxes, no less than what PyBullet's own margin of its
-    collision shapes asks for.
+    clearance_m: kept to the workcell, and by links to each other.
     """
 
     segments: int = 16
@@ -51,11 +50,15 @@ class Band:
     converged: bool
 
 
-def relax(space: Space, nodes: Float[np.ndarray, "n D"], settings: BandSettings) -> Band:
-    """The shortest band near the given one, its ends fixed."""
+def relax(
+    space: Space, nodes: Float[np.ndarray, "n D"], settings: BandSettings, guarded: bool = False
+) -> Band:
+    """The shortest band near the given one, its ends fixed.  guarded: no line between two nodes
+    that touches nothing is moved into something.
+    """
     moved = np.array(nodes, np.float64)
     left, iterations, converged = band_kernels.relax_band(
-        space, moved, settings.iterations, settings.accuracy, settings.largest_step_rad
+        space, moved, settings.iterations, settings.accuracy, settings.largest_step_rad, guarded
     )
     return Band(moved, left, iterations, converged)
 
@@ -108,14 +111,14 @@ def step_lengths(points: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T-1"]:
 def project(space: Space, points: Float[np.ndarray, "n D"]) -> float:
     """Move points onto the space, in place; returns what is left of the violation [rad or m].
 
-    The constraint alone is cheap; limits and boxes are taken together with it only where one of
+    The constraint alone is cheap; limits and clearance are taken together with it only where one of
     them is broken.
     """
     worst = np.empty(len(points))
     manifold = ManifoldArrays(space.chain, space.constraint)
     retract_batch(manifold, np.ones(len(points)), points, _PROJECTION, worst)
     beyond = ((points < space.limits[0]) | (points > space.limits[1])).any(axis=1)
-    if len(space.clearance.points):
+    if space.clearance.top:
         smallest = np.empty(len(points))
         clearance_batch(space.chain, space.clearance, 2.0 * space.margin, points, smallest)
         beyond |= smallest < space.margin

@@ -27,11 +27,18 @@ from constraint_geodesics.constraints.kernels import (
     shared_tolerance,
 )
 from constraint_geodesics.constraints.projection import normal_matrix
+from constraint_geodesics.scene.clearance import (
+    DISTANCE,
+    PAIR,
+    contact_row,
+    near_contacts,
+    same_contacts,
+)
 from constraint_geodesics.search.space import (
+    CLOSE,
     NEAR,
     Workspace,
-    link_row,
-    measure_links,
+    is_free,
     project_node,
     workspace,
 )
@@ -48,7 +55,7 @@ class _Active(NamedTuple):
     which may be let go, how far its bound is away, and its multiplier; (D,) each.
 
     of: i < m a row of the residual, m the rows that are bounded together, m + 1 a joint limit, m +
-    2 + d the links of joint d.
+    2 + c the contact of the pair c of pieces.
     """
 
     rows: np.ndarray
@@ -60,13 +67,13 @@ class _Active(NamedTuple):
 
 
 class _BandWork(NamedTuple):
-    """What the kernels of a band write into: link_weights, here, there, moved, row (D,); the second
-    derivatives full (D, D).
+    """What the kernels of a band write into: contact_weights, here, there, moved, row (D,); the
+    second derivatives full (D, D).
     """
 
     node: Workspace
     active: _Active
-    link_weights: np.ndarray
+    contact_weights: np.ndarray
     here: np.ndarray
     there: np.ndarray
     moved: np.ndarray
@@ -109,9 +116,9 @@ def _size_together(bounds, residual):
 
 
 @njit(**COMPILE)
-def _weighted_gradient(space, q, cone_weight, work, out):
+def _weighted_gradient(space, q, cone_weight, contacts, work, out):
     """Σ_j λ_j ∇c_j (D,) of one configuration: of the residual's rows, of the size of those that are
-    bounded together, and of the links' clearances.
+    bounded together, and of so many contacts.
     """
     node, bounds = work.node, space.constraint.rows
     residual, jacobian = node.residual, node.jacobian
@@ -127,14 +134,13 @@ def _weighted_gradient(space, q, cone_weight, work, out):
         if weight != 0.0:
             for d in range(q.shape[0]):
                 out[d] += weight * jacobian[i, d]
-    if not work.link_weights.any():
+    if contacts == 0:
         return
-    measure_links(space, q, node.links)
-    for link in range(q.shape[0]):
-        if work.link_weights[link] != 0.0:
-            link_row(space, link, node.links, work.row)
-            for d in range(q.shape[0]):
-                out[d] -= work.link_weights[link] * work.row[d]
+    same_contacts(space.chain, space.clearance, q, contacts, node.contacts)
+    for c in range(contacts):
+        contact_row(space.chain.prismatic, node.contacts, c, work.row)
+        for d in range(q.shape[0]):
+            out[d] -= work.contact_weights[c] * work.row[d]
 
 
 @njit(**COMPILE)
@@ -189,16 +195,25 @@ def _gather(space, q, work):
             of[size], signs[size], loose[size] = count + 1, side, True
             slack[size] = limits[1, d] - q[d] if side > 0.0 else q[d] - limits[0, d]
             size += 1
-    if space.clearance.points.shape[0] > 0:
-        measure_links(space, q, node.links)
-        for d in range(dof):
-            if size < dof and node.links.distances[d] <= space.margin + NEAR:
-                link_row(space, d, node.links, rows[size])
-                for j in range(dof):
-                    rows[size, j] = -rows[size, j]
-                of[size], signs[size], loose[size] = count + 2 + d, 1.0, True
-                slack[size] = node.links.distances[d] - space.margin
-                size += 1
+    if space.clearance.top > 0:
+        far, found = space.margin + CLOSE, node.contacts.found
+        near = near_contacts(space.chain, space.clearance, q, far, node.contacts)
+        for c in range(near):
+            if size == dof:
+                break
+            contact_row(space.chain.prismatic, node.contacts, c, rows[size])
+            length = 0.0
+            for j in range(dof):
+                length += rows[size, j] ** 2
+            length = np.sqrt(length)
+            slack[size] = (found[c, DISTANCE] - space.margin) / max(length, 1e-12)
+            # whether the joints get so far in a step is told in their own units
+            if slack[size] > NEAR:
+                continue
+            for j in range(dof):
+                rows[size, j] = -rows[size, j] / length
+            of[size], signs[size], loose[size] = count + 2 + int(found[c, PAIR]), 1.0 / length, True
+            size += 1
     return size
 
 
@@ -303,13 +318,13 @@ def _null_space(rows, size, left, basis):
 
 @njit(**COMPILE)
 def _weigh(active, size, work):
-    """The multipliers as weights of the constraint's rows and the links; returns that of the rows
-    bounded together, and whether anything is curved.
+    """The multipliers as weights of the constraint's rows and of the contacts, those that count
+    first; returns the weight of the rows bounded together, how many contacts count, and whether
+    anything is curved.
     """
     weights, count = work.node.weights, work.node.weights.shape[0]
     weights[:] = 0.0
-    work.link_weights[:] = 0.0
-    cone_weight = 0.0
+    cone_weight, contacts = 0.0, 0
     curved = False
     for i in range(size):
         of = active.of[i]
@@ -320,13 +335,15 @@ def _weigh(active, size, work):
             cone_weight = active.multipliers[i]
             curved = True
         elif of >= count + 2:
-            work.link_weights[of - count - 2] = active.multipliers[i]
+            work.contact_weights[contacts] = active.multipliers[i] * active.signs[i]
+            work.node.contacts.found[contacts, PAIR] = of - count - 2
+            contacts += 1
             curved = True
-    return cone_weight, curved
+    return cone_weight, contacts, curved
 
 
 @njit(**COMPILE)
-def _add_curvature(space, q, cone_weight, basis, hessian, work):
+def _add_curvature(space, q, cone_weight, contacts, basis, hessian, work):
     """Add Nᵀ (Σ λ_j ∇²c_j) N to the leading (k, k) of `hessian`, N (D, k): in closed form where the
     constraint's kind knows one, else by finite differences.
     """
@@ -334,7 +351,7 @@ def _add_curvature(space, q, cone_weight, basis, hessian, work):
     node, full, here, there, moved = work.node, work.full, work.here, work.there, work.moved
     if (
         cone_weight == 0.0
-        and not work.link_weights.any()
+        and contacts == 0
         and curvature(space, node.weights, node.constraint, full)
     ):
         for k in range(count):
@@ -348,11 +365,11 @@ def _add_curvature(space, q, cone_weight, basis, hessian, work):
                     if j < k:
                         hessian[j, k] += add
         return
-    _weighted_gradient(space, q, cone_weight, work, here)
+    _weighted_gradient(space, q, cone_weight, contacts, work, here)
     for k in range(count):
         for d in range(dof):
             moved[d] = q[d] + _DIFFERENCE * basis[d, k]
-        _weighted_gradient(space, moved, cone_weight, work, there)
+        _weighted_gradient(space, moved, cone_weight, contacts, work, there)
         for j in range(count):
             value = 0.0
             for d in range(dof):
@@ -375,12 +392,12 @@ def reduced(space, q, gradient, basis, hessian, onto, work):
     size = _gather(space, q, work)
     size = _let_go(work.active, size, gradient, node.normal, work.here, onto)
     count = _null_space(work.active.rows, size, node.left, basis)
-    cone_weight, curved = _weigh(work.active, size, work)
+    cone_weight, contacts, curved = _weigh(work.active, size, work)
     for k in range(count):
         for j in range(count):
             hessian[k, j] = 2.0 if k == j else 0.0
     if curved:
-        _add_curvature(space, q, cone_weight, basis[:, :count], hessian, work)
+        _add_curvature(space, q, cone_weight, contacts, basis[:, :count], hessian, work)
     return count
 
 
@@ -453,10 +470,36 @@ def gradient_of(nodes, i, d):
 
 
 @njit(**COMPILE)
-def relax_band(space, nodes, iterations, accuracy, largest):
+def _hold_back(space, nodes, trial, work):
+    """Leave nodes where they were, `nodes`, if the line from or to where they would be, `trial`,
+    runs into something.
+    """
+    n = nodes.shape[0] - 1
+    unseen = np.ones(n, dtype=np.bool_)
+    i = 0
+    while i < n:
+        if not unseen[i] or is_free(space, trial[i], trial[i + 1], work):
+            unseen[i] = False
+            i += 1
+            continue
+        trial[i], trial[i + 1] = nodes[i], nodes[i + 1]
+        # the line between two nodes that stay is one of before
+        unseen[i] = False
+        if i + 1 < n:
+            unseen[i + 1] = True
+        if i > 0:
+            unseen[i - 1] = True
+            i -= 1
+        else:
+            i += 1
+
+
+@njit(**COMPILE)
+def relax_band(space, nodes, iterations, accuracy, largest, guarded):
     """Shorten a band (n + 1, D) in place; returns (what remains of the violation, iterations used,
     converged).
 
+    guarded: lines between its nodes that touch nothing keep that.
     accuracy: relative decrease of the energy predicted by Newton's step below which the band has
     converged.
     largest: longest step of a node [rad].
@@ -526,6 +569,8 @@ def relax_band(space, nodes, iterations, accuracy, largest):
                     trial[i, d] = nodes[i, d] + scale * steps[i - 1, d]
                 left = project_node(space, trial[i], 6, work.node)
                 left_over = max(left_over, left)
+            if guarded:
+                _hold_back(space, nodes, trial, work.node)
             after = band_energy(trial)
             if after < energy and left_over <= max(worst, 1e-6):
                 improved = True

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.problem import Status
-from constraint_geodesics.scene.clearance import ClearanceModel, clearance_batch
+from constraint_geodesics.scene.clearance import ClearanceModel, path_stays_clear
 from constraint_geodesics.search.band import BandCurve, BandSettings, relax, step_lengths
 from constraint_geodesics.search.roadmap import Joined, Roadmap, join, resample, shortest_way
 from constraint_geodesics.search.space import Space, space_of
@@ -63,7 +63,7 @@ ALL_PARTS = Parts()
 @dataclass(frozen=True)
 class Task:
     """One constraint, prepared: the space of its configurations with and without the workcell's
-    boxes, its graph.
+    clearance, its graph.
 
     roadmap: the graph, made when it is first asked for; None where there is none.
     """
@@ -146,7 +146,7 @@ def candidates(
         answer = yield from _over_graph(task, start, goal, parts.refinement, blocked is not None)
     if blocked is not None and parts.refinement:
         assert isinstance(blocked.curve, BandCurve)
-        pushed = _relaxed(task, "straight", blocked.curve.nodes, task.settings, boxes=True)
+        pushed = _relaxed(task, "straight", blocked.curve.nodes, task.settings, clear=True)
         if pushed is not None and _is_clear(task, pushed.points):
             yield pushed
     if parts.tree and answer.status != "not_connected":
@@ -174,7 +174,7 @@ def improvements(
     nodes = np.empty((0, len(start))) if roadmap is None else roadmap.joints
     seed = TREES
     if parts.straight:
-        yield refined(task, "straight", line, boxes=True)
+        yield refined(task, "straight", line, clear=True)
     while parts.tree or len(nodes):
         for _ in range(BENDS if len(nodes) else 0):
             bend = rng.uniform() * (nodes[rng.integers(len(nodes))] - 0.5 * (start + goal))
@@ -191,9 +191,11 @@ def _over_graph(
     start: Float[np.ndarray, "D"],
     goal: Float[np.ndarray, "D"],
     refine: bool,
-    boxes: bool,
+    clear: bool,
 ) -> Generator[Candidate, None, Answer]:
-    """The relaxed way over the graph; returns `connection`.  boxes: whether some are in the way."""
+    """The relaxed way over the graph; returns `connection`.  clear: whether it has
+    to be pushed clear of something.
+    """
     answer, roadmap = connection(task, start, goal), task.roadmap()
     if answer.status == "not_connected" or roadmap is None:
         return answer
@@ -201,7 +203,7 @@ def _over_graph(
     assert answer.at_goal is not None
     corners = shortest_way(roadmap, start, goal, answer.at_start, answer.at_goal, task.clear)
     if corners is not None:
-        yield from _along(task, "graph", corners, refine, boxes)
+        yield from _along(task, "graph", corners, refine, clear)
     return answer
 
 
@@ -223,38 +225,41 @@ def _over_tree(
 ) -> Iterator[Candidate]:
     corners = tree_way(task.clear, start, goal, seed)
     if corners is not None:
-        yield from _along(task, "tree", corners, refine, boxes=True)
+        yield from _along(task, "tree", corners, refine, clear=True)
 
 
 def _along(
-    task: Task, source: Source, corners: Float[np.ndarray, "k D"], refine: bool, boxes: bool
+    task: Task, source: Source, corners: Float[np.ndarray, "k D"], refine: bool, clear: bool
 ) -> Iterator[Candidate]:
-    """The relaxed way over a graph or tree, with more nodes where fewer jump; then less and less
-    relaxed, since the graph's own edges are free of collisions that a band knows nothing of, those
-    of the arm with itself.
+    """The relaxed way over a graph or tree, with more nodes where fewer jump; then one that is held
+    back from what is thinner than the distance of its nodes, and then less and less relaxed.
     """
     segments = task.settings.segments
     if refine:
         for pieces in (segments, 2 * segments, 4 * segments):
-            found = refined(task, source, resample(corners, pieces + 1), boxes=boxes)
+            found = refined(task, source, resample(corners, pieces + 1), clear=clear)
             if found is not None:
                 yield found
                 break
     nodes = resample(corners, 4 * segments + 1)
-    yield from less_and_less_relaxed(task, source, nodes, boxes, PARTLY_RELAXED if refine else (0,))
+    if refine:
+        found = _relaxed(task, source, nodes, task.settings, clear=True, guarded=True)
+        if found is not None and _is_clear(task, found.points):
+            yield found
+    yield from less_and_less_relaxed(task, source, nodes, clear, PARTLY_RELAXED if refine else (0,))
 
 
 def less_and_less_relaxed(
     task: Task,
     source: Source,
     nodes: Float[np.ndarray, "n D"],
-    boxes: bool = False,
+    clear: bool = False,
     iterations: Iterable[int] = PARTLY_RELAXED,
 ) -> Iterator[Candidate]:
     """Sound curves of a band that must stay near where it began."""
     for most in iterations:
         partly = replace(task, settings=replace(task.settings, iterations=most))
-        found = refined(partly, source, nodes, boxes=boxes)
+        found = refined(partly, source, nodes, clear=clear)
         if found is not None:
             yield found
 
@@ -264,21 +269,21 @@ def refined(
     source: Source,
     nodes: Float[np.ndarray, "n D"],
     refine: bool = True,
-    boxes: bool = False,
+    clear: bool = False,
 ) -> Candidate | None:
     """The curve through the relaxed nodes; None if it jumps, leaves the limits or runs into a box.
 
     Most curves never meet a box: they are relaxed without, and again with them only where they do.
-    boxes: take them into account at once.
+    clear: keep it clear of what may meet at once.
     """
     settings = _settings(task, refine)
-    if not boxes:
+    if not clear:
         found = _relaxed(task, source, nodes, settings)
         if found is not None and _is_clear(task, found.points):
             return found
         if found is None and source not in ("graph", "tree"):
             return None
-    found = _relaxed(task, source, nodes, settings, boxes=True)
+    found = _relaxed(task, source, nodes, settings, clear=True)
     return found if found is not None and _is_clear(task, found.points) else None
 
 
@@ -291,13 +296,14 @@ def _relaxed(
     source: Source,
     nodes: Float[np.ndarray, "n D"],
     settings: BandSettings,
-    boxes: bool = False,
+    clear: bool = False,
+    guarded: bool = False,
 ) -> Candidate | None:
     """The curve through relaxed nodes, whether or not it runs into a box; None if its points leave
     the constraint or the limits, or jump.
     """
-    space = task.clear if boxes else task.open
-    band = relax(space, nodes, settings)
+    space = task.clear if clear else task.open
+    band = relax(space, nodes, settings, guarded)
     curve = BandCurve.through(space, band.nodes)
     if curve is None:
         return None
@@ -311,13 +317,8 @@ def _relaxed(
 
 
 def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
-    if not len(task.clearance.points):
-        return True
-    smallest = np.empty(len(points))
-    robot, margin = task.manifold.robot, task.settings.clearance_m
-    clearance_batch(robot.chain, task.clear.clearance, 2.0 * margin, points, smallest)
-    # the ends are what they are; PyBullet has the last word on them
-    return bool(smallest[1:-1].min(initial=np.inf) >= 0.5 * margin)
+    model = task.clearance.arrays
+    return not model.top or path_stays_clear(task.manifold.robot.chain, model, points)
 
 
 def rows_of(

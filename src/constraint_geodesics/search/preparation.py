@@ -1,6 +1,6 @@
 """What is prepared once for each constraint and kept for the next query: its space and roadmap."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
 
@@ -45,12 +45,17 @@ class Preparation:
     """
 
     def __init__(
-        self, scene: Scene, world: World, settings: PlannerParams, draw: Draw | None = None
+        self,
+        scene: Scene,
+        world: World,
+        settings: PlannerParams,
+        draw: Draw | None = None,
+        apart: Collection[tuple[int, int]] = (),
     ) -> None:
         self.scene, self.world, self.settings = scene, world, settings
         self.draw = draw or scene.robot.sample
         self.band = band_settings(settings)
-        self._clearance = clearance_model(scene.robot, scene.workcell)
+        self._clearance = clearance_model(scene.robot, scene.workcell, apart)
         self._tasks: dict[tuple, Task] = {}
         self._roadmaps: dict[tuple, Roadmap | None] = {}
         self._named: frozenset[tuple] = frozenset()

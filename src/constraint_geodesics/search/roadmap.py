@@ -4,7 +4,7 @@ graph leads round.
 The graph with a query's two ends joined to it, searched by
 A* [Hart et al. 1968] with the straight joint distance as the bound from below.  Compiled; PyBullet
 checked the graph's own edges when it was made; the edges to a query's ends, and those of the way
-that is found, are checked here for jumps, limits and the workcell's boxes and spheres.
+that is found, are checked here for jumps, limits and what they touch.
 """
 
 import heapq
@@ -17,7 +17,7 @@ from numba import njit
 
 from constraint_geodesics.constraints.kernels import COMPILE
 from constraint_geodesics.geometry.graph import components, nearest_neighbour_edges
-from constraint_geodesics.search.space import Space, project_node, workspace
+from constraint_geodesics.search.space import Space, is_free, project_node, workspace
 
 NEAREST = 32
 """Nodes that an end is tried to be joined to, the nearest first."""
@@ -166,7 +166,7 @@ def edge_length(space, first, second, work):
         for d in range(dof):
             step += (point[d] - before[d]) ** 2
         step = np.sqrt(step)
-        if not step <= allowed:
+        if not step <= allowed or not is_free(space, before, point, work):
             return np.inf
         total += step
         before[:] = point

@@ -13,15 +13,21 @@ from constraint_geodesics.constraints.kernels import COMPILE, excess_of, lineari
 from constraint_geodesics.constraints.projection import normal_matrix, solve_normal
 from constraint_geodesics.robot.kinematics import ChainArrays
 from constraint_geodesics.scene.clearance import (
+    DISTANCE,
+    NO_CLEARANCE,
     ClearanceArrays,
     ClearanceModel,
-    clearance_row,
-    link_clearances,
-    no_clearance,
+    Contacts,
+    contact_row,
+    near_contacts,
+    new_contacts,
+    stays_clear,
 )
 
 NEAR = 0.05
 """Bounds so near [rad or m] are looked at."""
+CLOSE = 0.03
+"""So are bodies that are so close beyond their margin [m]."""
 _REACHED = 1e-9
 _LONGEST_STEP = 0.6
 _RIDGE = 1e-9
@@ -45,29 +51,15 @@ def space_of(
 ) -> Space:
     """The space of a constraint manifold, by default in an empty workcell."""
     robot = manifold.robot
-    model = no_clearance(robot.dof) if clearance is None else clearance
     limits = np.stack([robot.lower, robot.upper])
-    return Space(*manifold.arrays, limits, model.arrays, margin_m)
-
-
-class Links(NamedTuple):
-    """Of the links that each joint carries: distance (D,) [m] to the nearest shape, the direction
-    (D, 3) away from it and the nearest point (D, 3), in the base frame; joint origins and axes (D,
-    3).
-    """
-
-    distances: np.ndarray
-    normals: np.ndarray
-    nearest: np.ndarray
-    origins: np.ndarray
-    axes: np.ndarray
+    return Space(*manifold.arrays, limits, (clearance or NO_CLEARANCE).arrays, margin_m)
 
 
 class Workspace(NamedTuple):
     """What the kernels write into, allocated once.
 
     constraint: what its kind needs; residual, excess, active, weights (m,) and jacobian (m, D) of
-    its rows; links; rows, normal, left (D, D); right, squares (D,).
+    its rows; contacts; rows, normal, left (D, D); right, squares (D,).
     """
 
     constraint: Any
@@ -76,7 +68,7 @@ class Workspace(NamedTuple):
     active: np.ndarray
     weights: np.ndarray
     jacobian: np.ndarray
-    links: Links
+    contacts: Contacts
     rows: np.ndarray
     normal: np.ndarray
     left: np.ndarray
@@ -88,13 +80,6 @@ class Workspace(NamedTuple):
 def workspace(space):
     """A workspace for the kernels of this space."""
     dof, count = space.limits.shape[1], space.constraint.rows.held.shape[0]
-    links = Links(
-        np.empty(dof),
-        np.empty((dof, 3)),
-        np.empty((dof, 3)),
-        np.empty((dof, 3)),
-        np.empty((dof, 3)),
-    )
     return Workspace(
         scratch(space.constraint, dof),
         np.zeros(count),
@@ -102,36 +87,12 @@ def workspace(space):
         np.zeros(count, dtype=np.bool_),
         np.zeros(count),
         np.zeros((count, dof)),
-        links,
+        new_contacts(space.clearance, dof),
         np.empty((dof, dof)),
         np.empty((dof, dof)),
         np.empty((dof, dof)),
         np.empty(dof),
         np.empty(dof),
-    )
-
-
-@njit(**COMPILE)
-def measure_links(space, q, links):
-    """The links of one configuration, as far as they are near."""
-    link_clearances(
-        space.chain,
-        space.clearance,
-        space.margin + NEAR,
-        q,
-        links.distances,
-        links.normals,
-        links.nearest,
-        links.origins,
-        links.axes,
-    )
-
-
-@njit(**COMPILE)
-def link_row(space, link, links, row):
-    """Gradient (D,) of the distance of the links that a joint carries."""
-    clearance_row(
-        space.chain.prismatic, link, links.normals, links.nearest, links.origins, links.axes, row
     )
 
 
@@ -141,7 +102,7 @@ def _broken(space, q, work):
     worst [rad or m].
     """
     dof, limits = q.shape[0], space.limits
-    rows, right, links = work.rows, work.right, work.links
+    rows, right, contacts = work.rows, work.right, work.contacts
     residual, jacobian, excess, active = work.residual, work.jacobian, work.excess, work.active
     linearise(space, q, work.constraint, residual, jacobian)
     worst = excess_of(space.constraint.rows, residual, excess, active)
@@ -161,18 +122,24 @@ def _broken(space, q, work):
                 rows[size] = 0.0
                 rows[size, d] = 1.0
                 size += 1
-    if space.clearance.points.shape[0] > 0:
-        measure_links(space, q, links)
-        distances, margin = links.distances, space.margin
-        for d in range(dof):
-            short = margin - distances[d]
-            if short > 0.0:
-                worst = max(worst, short)
-                if size < dof:
-                    link_row(space, d, links, rows[size])
-                    right[size] = -short
-                    size += 1
+    if space.clearance.top > 0:
+        near = near_contacts(space.chain, space.clearance, q, space.margin, contacts)
+        for c in range(near):
+            short = space.margin - contacts.found[c, DISTANCE]
+            worst = max(worst, short)
+            if size < dof:
+                contact_row(space.chain.prismatic, contacts, c, rows[size])
+                right[size] = -short
+                size += 1
     return size, worst
+
+
+@njit(inline="always", **COMPILE)
+def is_free(space, first, second, work):
+    """Whether the straight joint line between two configurations touches nothing."""
+    return space.clearance.top == 0 or stays_clear(
+        space.chain, space.clearance, first, second, work.contacts
+    )
 
 
 @njit(**COMPILE)

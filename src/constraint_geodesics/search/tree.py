@@ -2,9 +2,9 @@
 constraint.
 
 Constrained bidirectional rapidly-exploring random trees [Berenson et al. 2009; Kuffner and LaValle
-2000], compiled. Every step of a tree is projected onto the constraint, into the limits and off the
-workcell's boxes and spheres; the way that is found is shortened by random shortcuts and left to the
-elastic band.  The same seed gives the same way.
+2000], compiled.  Every step of a tree is projected onto the constraint, into the limits and out of
+what it overlaps, and looked at as a whole; the way that is found is shortened by random shortcuts
+and left to the elastic band.  The same seed gives the same way.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from numba import njit
 
 from constraint_geodesics.constraints.kernels import COMPILE
 from constraint_geodesics.search.roadmap import edge_length
-from constraint_geodesics.search.space import Space, project_node, workspace
+from constraint_geodesics.search.space import Space, is_free, project_node, workspace
 
 _PROJECTIONS = 12
 _LEFT = 1e-6
@@ -100,6 +100,8 @@ def _extended(space, nodes, parents, count, node, target, step, work, point):
         after, moved = np.sqrt(after), np.sqrt(moved)
         reached = share == 1.0 and after < _LEFT
         if moved > 2.0 * step or (not reached and before - after < _PROGRESS * step):
+            return count, node, False
+        if not is_free(space, nodes[node], target if reached else point, work):
             return count, node, False
         for d in range(dof):
             nodes[count, d] = target[d] if reached else point[d]

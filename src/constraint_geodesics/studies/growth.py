@@ -310,8 +310,8 @@ class _Asked:
 
     def problems(self, world: World, certifier: Certifier) -> list[PlanningProblem]:
         """As the planners are asked; world and certifier: of the same scene."""
-        clearance = clearance_model(self.scene.robot, self.scene.workcell)
-        _ = clearance.arrays  # made once for a workcell, not once a query
+        apart = certifier.collisions.apart
+        clearance = clearance_model(self.scene.robot, self.scene.workcell, apart)
         ends = zip(self.queries.starts, self.queries.goals, strict=True)
         known = world.is_free, clearance, certifier.collisions.is_clear
         return [PlanningProblem(start, goal, self.manifold, *known) for start, goal in ends]

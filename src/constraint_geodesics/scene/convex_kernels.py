@@ -1,0 +1,277 @@
+"""Compiled distance of two convex pieces, of which a table holds many: for the search, which wants
+the direction as well, and for the proof that they stay apart.
+
+A piece is all points within a rounding r of the hull of its corners, carried by a frame.  For a
+unit vector n the gap g = min_b n·p − max_a n·p of the pieces a and b bounds the distance of their
+hulls from below; the vectors that Gilbert, Johnson and Keerthi's method (1988) goes through make it
+the distance itself.  A proof needs the gap alone, however the vector was found.
+
+Frames (F, 12): position [m], then rotation by rows.  `at` is the first index of frames (·, F, 12).
+"""
+
+import numpy as np
+from numba import njit
+
+_COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
+
+# columns of a node
+FRAME, ROUNDING = 0, 1
+CORNER = 2
+"""Where a piece's first corner is among the hulls."""
+BALL = 4
+"""Centre (3) and radius of a ball around it."""
+BOX = 8
+"""Half edges (3) and turn (9) of the box that it is, rounding apart; half edges below 0: it is
+none.
+"""
+PLACE = 20
+"""Where the ball's centre is in the base frame (3)."""
+REACH = 24
+"""How far its points get from the axis of each joint at most (D) [m], 1 for a prismatic joint."""
+# columns of a pair
+VECTOR = 4
+"""The last gap's, in the first's frame (3); 0 at first."""
+CORNERS = 7
+"""Where the two pieces' corners (2) that were furthest out last are among the hulls."""
+PAIR = 9
+"""How many columns a pair has."""
+
+_ITERATIONS = 48
+_CONVERGED = 1e-7
+# rows of what a distance writes into: four corners, the point nearest to the origin, another
+NEAREST, _SPARE = 4, 5
+SIMPLEX = (6, 6)
+"""Shape of that: each point is a difference (3) of one of the second piece, which follows (3), and
+one of the first, in the base frame [m].
+"""
+
+
+@njit(inline="always", **_COMPILE)
+def into(frames, at, f, n0, n1, n2):
+    """A direction of the base frame in frame f of a place."""
+    return (
+        n0 * frames[at, f, 3] + n1 * frames[at, f, 6] + n2 * frames[at, f, 9],
+        n0 * frames[at, f, 4] + n1 * frames[at, f, 7] + n2 * frames[at, f, 10],
+        n0 * frames[at, f, 5] + n1 * frames[at, f, 8] + n2 * frames[at, f, 11],
+    )
+
+
+@njit(inline="always", **_COMPILE)
+def turned(frames, at, f, x, y, z):
+    """A direction of frame f in the base frame."""
+    return (
+        frames[at, f, 3] * x + frames[at, f, 4] * y + frames[at, f, 5] * z,
+        frames[at, f, 6] * x + frames[at, f, 7] * y + frames[at, f, 8] * z,
+        frames[at, f, 9] * x + frames[at, f, 10] * y + frames[at, f, 11] * z,
+    )
+
+
+@njit(**_COMPILE)
+def furthest(hulls, corner, x, y, z):
+    """The corner of a piece that lies furthest along a direction of its frame, from any of its
+    corners on from neighbour to neighbour, and how far.
+    """
+    most = x * hulls[corner] + y * hulls[corner + 1] + z * hulls[corner + 2]
+    rises = True
+    while rises:
+        rises = False
+        beside = corner + 4
+        for e in range(beside, beside + int(hulls[corner + 3])):
+            k = int(hulls[e])
+            value = x * hulls[k] + y * hulls[k + 1] + z * hulls[k + 2]
+            if value > most:
+                most, corner, rises = value, k, True
+    return corner, most
+
+
+@njit(**_COMPILE)
+def gap_along(bodies, frames, at, p, n):
+    """How far the second piece of a pair lies beyond the first along a unit vector of the base
+    frame; the corners that count become the pair's.
+    """
+    hulls, nodes, pairs = bodies
+    gap, sign = 0.0, 1.0
+    for side in range(2):
+        f = int(nodes[int(pairs[p, side]), FRAME])
+        x, y, z = into(frames, at, f, sign * n[0], sign * n[1], sign * n[2])
+        corner, most = furthest(hulls, int(pairs[p, CORNERS + side]), x, y, z)
+        pairs[p, CORNERS + side] = corner
+        place = n[0] * frames[at, f, 0] + n[1] * frames[at, f, 1] + n[2] * frames[at, f, 2]
+        gap -= most + sign * place
+        sign = -1.0
+    return gap
+
+
+@njit(**_COMPILE)
+def _nearest_of_triangle(s, i, j, k):
+    """The point of a triangle that is nearest to the origin into row _SPARE; which corners it hangs
+    on, as bits.  After Ericson's regions (Real-Time Collision Detection, 2005).
+    """
+    a0, a1, a2 = s[i, 0], s[i, 1], s[i, 2]
+    u0, u1, u2 = s[j, 0] - a0, s[j, 1] - a1, s[j, 2] - a2
+    v0, v1, v2 = s[k, 0] - a0, s[k, 1] - a1, s[k, 2] - a2
+    ua, va = -(u0 * a0 + u1 * a1 + u2 * a2), -(v0 * a0 + v1 * a1 + v2 * a2)
+    ub = -(u0 * s[j, 0] + u1 * s[j, 1] + u2 * s[j, 2])
+    vb = -(v0 * s[j, 0] + v1 * s[j, 1] + v2 * s[j, 2])
+    uc = -(u0 * s[k, 0] + u1 * s[k, 1] + u2 * s[k, 2])
+    vc = -(v0 * s[k, 0] + v1 * s[k, 1] + v2 * s[k, 2])
+    to_c, to_b, to_a = ua * vb - ub * va, uc * va - ua * vc, ub * vc - uc * vb
+    # shares of the edges u and v; the corners' regions first, then the edges', then the face
+    mask, share_u, share_v = 1 << i | 1 << j | 1 << k, 0.0, 0.0
+    if ua <= 0.0 and va <= 0.0:
+        mask = 1 << i
+    elif ub >= 0.0 and vb <= ub:
+        mask, share_u = 1 << j, 1.0
+    elif vc >= 0.0 and uc <= vc:
+        mask, share_v = 1 << k, 1.0
+    elif to_c <= 0.0 and ua >= 0.0 and ub <= 0.0:
+        mask, share_u = 1 << i | 1 << j, ua / max(ua - ub, 1e-300)
+    elif to_b <= 0.0 and va >= 0.0 and vc <= 0.0:
+        mask, share_v = 1 << i | 1 << k, va / max(va - vc, 1e-300)
+    elif to_a <= 0.0 and vb >= ub and uc >= vc:
+        mask, share_v = 1 << j | 1 << k, (vb - ub) / max((vb - ub) + (uc - vc), 1e-300)
+        share_u = 1.0 - share_v
+    else:
+        total = max(to_a + to_b + to_c, 1e-300)
+        share_u, share_v = to_b / total, to_c / total
+    for d in range(6):
+        own = s[i, d]
+        s[_SPARE, d] = own + share_u * (s[j, d] - own) + share_v * (s[k, d] - own)
+    return mask
+
+
+@njit(**_COMPILE)
+def _lies_beyond(s, i, j, k, other):
+    """Whether the origin lies on the other side of a triangle's plane than the fourth corner, or
+    that lies in it.
+    """
+    u0, u1, u2 = s[j, 0] - s[i, 0], s[j, 1] - s[i, 1], s[j, 2] - s[i, 2]
+    v0, v1, v2 = s[k, 0] - s[i, 0], s[k, 1] - s[i, 1], s[k, 2] - s[i, 2]
+    n0, n1, n2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+    origin = -(s[i, 0] * n0 + s[i, 1] * n1 + s[i, 2] * n2)
+    fourth = (s[other, 0] - s[i, 0]) * n0 + (s[other, 1] - s[i, 1]) * n1
+    fourth += (s[other, 2] - s[i, 2]) * n2
+    return origin * fourth < 0.0 or abs(fourth) < 1e-18
+
+
+@njit(**_COMPILE)
+def _nearest_of_simplex(s, size):
+    """The point of the leading corners' simplex that is nearest to the origin into row NEAREST;
+    only the corners that it hangs on stay.  Returns how many: 4 where the origin is inside.
+    """
+    mask = 1
+    if size <= 2:
+        k = size - 1
+        d0, d1, d2 = s[k, 0] - s[0, 0], s[k, 1] - s[0, 1], s[k, 2] - s[0, 2]
+        square = d0 * d0 + d1 * d1 + d2 * d2
+        share = -(s[0, 0] * d0 + s[0, 1] * d1 + s[0, 2] * d2)
+        if share >= square and size == 2:
+            mask, share = 2, 1.0
+        elif share > 0.0 and size == 2:
+            mask, share = 3, share / square
+        else:
+            share = 0.0
+        for d in range(6):
+            s[NEAREST, d] = s[0, d] + share * (s[k, d] - s[0, d])
+    else:
+        least, mask = np.inf, 15
+        for other in range(4 if size == 4 else 1):
+            i, j, k = (other + 1) % size, (other + 2) % size, (other + 3) % size
+            if size == 4 and not _lies_beyond(s, i, j, k, other):
+                continue
+            found = _nearest_of_triangle(s, i, j, k)
+            square = s[_SPARE, 0] ** 2 + s[_SPARE, 1] ** 2 + s[_SPARE, 2] ** 2
+            if square < least:
+                least, mask = square, found
+                for d in range(6):
+                    s[NEAREST, d] = s[_SPARE, d]
+        if mask == 15:
+            return 4
+    kept = 0
+    for i in range(size):
+        if mask >> i & 1:
+            for d in range(6):
+                s[kept, d] = s[i, d]
+            kept += 1
+    return kept
+
+
+@njit(**_COMPILE)
+def distance(bodies, frames, at, p, wanted, simplex):
+    """Bounds (lower, upper) of the distance [m] of a pair of pieces at one place, without their
+    roundings, both 0 or less where they overlap.
+
+    It begins with the pair's vector, which becomes that of `lower`.  wanted: (enough, too little):
+    it ends once lower is above the one or upper below the other.
+    """
+    hulls, nodes, pairs = bodies
+    f, g = int(nodes[int(pairs[p, 0]), FRAME]), int(nodes[int(pairs[p, 1]), FRAME])
+    x, y, z = pairs[p, VECTOR], pairs[p, VECTOR + 1], pairs[p, VECTOR + 2]
+    if x == 0.0 and y == 0.0 and z == 0.0:
+        z = 1.0
+    d0, d1, d2 = turned(frames, at, f, x, y, z)
+    length = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+    best = (d0 / length, d1 / length, d2 / length)
+    n, size, lower, upper = best, 0, -np.inf, np.inf
+    for _ in range(_ITERATIONS):
+        gap = gap_along(bodies, frames, at, p, n)
+        if gap > lower:
+            lower, best = gap, n
+        if lower > wanted[0] or upper < wanted[1] or upper - lower < _CONVERGED:
+            break
+        a, b = int(pairs[p, CORNERS]), int(pairs[p, CORNERS + 1])
+        x, y, z = turned(frames, at, f, hulls[a], hulls[a + 1], hulls[a + 2])
+        u, v, w = turned(frames, at, g, hulls[b], hulls[b + 1], hulls[b + 2])
+        u, v, w = u + frames[at, g, 0], v + frames[at, g, 1], w + frames[at, g, 2]
+        simplex[size, 0] = u - x - frames[at, f, 0]
+        simplex[size, 1] = v - y - frames[at, f, 1]
+        simplex[size, 2] = w - z - frames[at, f, 2]
+        simplex[size, 3], simplex[size, 4], simplex[size, 5] = u, v, w
+        size = _nearest_of_simplex(simplex, size + 1)
+        d0, d1, d2 = simplex[NEAREST, 0], simplex[NEAREST, 1], simplex[NEAREST, 2]
+        length = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+        if size == 4 or length < _CONVERGED:
+            upper = 0.0
+            break
+        if length >= upper:
+            break
+        upper, n = length, (d0 / length, d1 / length, d2 / length)
+    x, y, z = into(frames, at, f, best[0], best[1], best[2])
+    pairs[p, VECTOR], pairs[p, VECTOR + 1], pairs[p, VECTOR + 2] = x, y, z
+    return lower, upper
+
+
+@njit(inline="always", **_COMPILE)
+def pieces_of(pairs, body):
+    """Where the pairs of pieces of a pair of bodies are: the first, and the one after the last."""
+    first, last = int(pairs[body, 2]), int(pairs[body, 3])
+    return (first, last) if first < last else (body, body + 1)
+
+
+@njit(**_COMPILE)
+def place_balls(nodes, frames, at):
+    """The balls' centres into `nodes`."""
+    for i in range(nodes.shape[0]):
+        f = int(nodes[i, FRAME])
+        x, y, z = turned(frames, at, f, nodes[i, BALL], nodes[i, BALL + 1], nodes[i, BALL + 2])
+        nodes[i, PLACE] = frames[at, f, 0] + x
+        nodes[i, PLACE + 1] = frames[at, f, 1] + y
+        nodes[i, PLACE + 2] = frames[at, f, 2] + z
+
+
+@njit(inline="always", **_COMPILE)
+def roughly_apart(nodes, a, b):
+    """How far two nodes are apart at least, roundings taken off: by balls around them, or by the
+    box that the first is.
+    """
+    x = nodes[b, PLACE] - nodes[a, PLACE]
+    y = nodes[b, PLACE + 1] - nodes[a, PLACE + 1]
+    z = nodes[b, PLACE + 2] - nodes[a, PLACE + 2]
+    if nodes[a, BOX] < 0.0:
+        return np.sqrt(x * x + y * y + z * z) - nodes[a, BALL + 3] - nodes[b, BALL + 3]
+    u = abs(x * nodes[a, BOX + 3] + y * nodes[a, BOX + 6] + z * nodes[a, BOX + 9])
+    v = abs(x * nodes[a, BOX + 4] + y * nodes[a, BOX + 7] + z * nodes[a, BOX + 10])
+    w = abs(x * nodes[a, BOX + 5] + y * nodes[a, BOX + 8] + z * nodes[a, BOX + 11])
+    u, v, w = u - nodes[a, BOX], v - nodes[a, BOX + 1], w - nodes[a, BOX + 2]
+    u, v, w = max(u, 0.0), max(v, 0.0), max(w, 0.0)
+    return np.sqrt(u * u + v * v + w * w) - nodes[a, ROUNDING] - nodes[b, BALL + 3]
