@@ -19,7 +19,7 @@ from constraint_geodesics.constraints.constraint import (
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.params import Params
 from constraint_geodesics.scene.box import Box
-from constraint_geodesics.scene.clearance import ClearanceModel, clearance_model
+from constraint_geodesics.scene.clearance import ClearanceModel, clearance_model, path_stays_clear
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search import band_kernels
 from constraint_geodesics.search.band import BandCurve, BandSettings, project, relax
@@ -434,3 +434,19 @@ def test_points_are_projected_from_beside_the_space(spaces) -> None:
         again = moved.copy()
         project(space, again)
         np.testing.assert_allclose(again, moved, atol=1e-7)
+
+
+def test_a_guarded_band_ends_where_its_lines_are_blocked_at_first(spaces) -> None:
+    """Lines that touch something from the start are left as they are; the others keep clear."""
+    manifold, rng = spaces.manifolds["free"], np.random.default_rng(7)
+    robot, tried = manifold.robot, 0
+    model = clearance_model(robot, (Box("wall", (0.5, 0.0, 0.15), (0.2, 2.0, 0.3)),))
+    space = space_of(manifold, model, MARGIN)
+    while tried < 5:
+        line = straight(*robot.sample(2, rng), 8)
+        free = [path_stays_clear(robot.chain, model.arrays, line[k : k + 2]) for k in range(8)]
+        if sum(free) > 6:
+            continue
+        band = relax(space, line, BandSettings(iterations=5), guarded=True)
+        assert np.isfinite(band.nodes).all()
+        tried += 1

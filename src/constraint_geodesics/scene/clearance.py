@@ -190,13 +190,19 @@ def _shallowest(bodies, frames, p, simplex):
     x = nodes[b, PLACE] - nodes[a, PLACE]
     y = nodes[b, PLACE + 1] - nodes[a, PLACE + 1]
     z = nodes[b, PLACE + 2] - nodes[a, PLACE + 2]
-    length = max(np.sqrt(x * x + y * y + z * z), 1e-12)
-    n = (x / length, y / length, z / length)
-    best, most = n, gap_along(bodies, frames, 0, p, n)
+    length = np.sqrt(x * x + y * y + z * z)
+    # the vector that they touched along first, so that the depth begins at 0
+    u, v, w = pairs[p, VECTOR], pairs[p, VECTOR + 1], pairs[p, VECTOR + 2]
+    best = turned(frames, 0, f, u, v, w)
+    most = gap_along(bodies, frames, 0, p, best)
     box = nodes[a, BOX] >= 0.0
     count = _TRIED.shape[0]
-    for k in range(count + 6 if box else count):
-        if k < count:
+    for k in range(-1, count + 6 if box else count):
+        if k < 0:
+            if length < _OVERLAPPING:
+                continue
+            n = (x / length, y / length, z / length)
+        elif k < count:
             n = (_TRIED[k, 0], _TRIED[k, 1], _TRIED[k, 2])
         else:
             at, sign = BOX + 3 + (k - count) // 2, 1.0 if k % 2 == 0 else -1.0
@@ -228,6 +234,8 @@ def _measure(bodies, frames, simplex, p, far, contact):
         return False
     if upper < _OVERLAPPING:
         lower = _shallowest(bodies, frames, p, simplex)
+        if lower - rounding >= far:
+            return False
     x, y, z = pairs[p, VECTOR], pairs[p, VECTOR + 1], pairs[p, VECTOR + 2]
     x, y, z = turned(frames, 0, int(nodes[a, FRAME]), x, y, z)
     contact[DISTANCE], contact[PAIR] = lower - rounding, p
@@ -295,7 +303,7 @@ def _apart(bodies, frames, simplex, p, motion):
 @njit(**_COMPILE)
 def stays_clear(chain, model, first, second, room):
     """Whether nothing overlaps on the straight joint line between two configurations, but for parts
-    over which nothing moves by more than FINEST_M.
+    over which nothing moves by more than FINEST_M from their middle.
     """
     nodes, pairs, frames, simplex = room.nodes, room.pairs, room.frames, room.simplex
     bodies, found, dof = (model.hulls, room.nodes, room.pairs), room.found, first.shape[0]

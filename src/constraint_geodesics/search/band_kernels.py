@@ -45,6 +45,7 @@ from constraint_geodesics.search.space import (
 
 _DIFFERENCE = 1e-5
 _SMALLEST_PIVOT = 1e-12
+_STILL = 1e-9  # a contact whose distance no joint changes by more [m/rad] is none to be kept
 _ON_BOUND = 1e-6  # an inequality so near is on its bound; one that is NEAR is taken into the step,
 # which then ends on it, not beyond
 _LEAST_CONE = 1e-3
@@ -206,7 +207,9 @@ def _gather(space, q, work):
             for j in range(dof):
                 length += rows[size, j] ** 2
             length = np.sqrt(length)
-            slack[size] = (found[c, DISTANCE] - space.margin) / max(length, 1e-12)
+            if length < _STILL:
+                continue
+            slack[size] = (found[c, DISTANCE] - space.margin) / length
             # whether the joints get so far in a step is told in their own units
             if slack[size] > NEAR:
                 continue
@@ -475,23 +478,21 @@ def _hold_back(space, nodes, trial, work):
     runs into something.
     """
     n = nodes.shape[0] - 1
-    unseen = np.ones(n, dtype=np.bool_)
+    held = np.zeros(n + 1, dtype=np.bool_)
+    held[0] = held[n] = True
     i = 0
     while i < n:
-        if not unseen[i] or is_free(space, trial[i], trial[i + 1], work):
-            unseen[i] = False
+        # the line between two nodes that are held is one of before, whatever it touches
+        if (held[i] and held[i + 1]) or is_free(space, trial[i], trial[i + 1], work):
             i += 1
             continue
-        trial[i], trial[i + 1] = nodes[i], nodes[i + 1]
-        # the line between two nodes that stay is one of before
-        unseen[i] = False
-        if i + 1 < n:
-            unseen[i + 1] = True
-        if i > 0:
-            unseen[i - 1] = True
-            i -= 1
-        else:
-            i += 1
+        back = not held[i] and i > 0
+        for k in (i, i + 1):
+            held[k] = True
+            for d in range(nodes.shape[1]):
+                trial[k, d] = nodes[k, d]
+        # the line before ends elsewhere now
+        i = i - 1 if back else i + 1
 
 
 @njit(**COMPILE)

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, Int
 
+from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.geometry.graph import components
@@ -105,8 +106,9 @@ def named_roadmaps(
     hardly any configuration keeps.
     """
     found = {}
-    with scene.world() as world:
-        preparation = Preparation(scene, world, settings)
+    with scene.world() as world, Certifier(scene) as certifier:
+        apart = certifier.collisions.apart
+        preparation = Preparation(scene, world, settings, apart=apart)
         for name, constraint in constraints.items():
             task, rng = preparation.task(constraint), np.random.default_rng(settings.seed)
             count, draw = settings.roadmap_nodes, scene.robot.sample
