@@ -1,5 +1,6 @@
 """A change of a compiled kernel reaches all kernels that call it, in other files too."""
 
+import gc
 import os
 import shutil
 import subprocess
@@ -7,8 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from numba.core.runtime import _nrt_python, rtsys
 
-from constraint_geodesics import kernel_digest
+from constraint_geodesics import Planner, kernel_digest
 from constraint_geodesics.kernel_digest import (
     PACKAGE,
     ROOMS,
@@ -86,3 +88,20 @@ def test_the_first_call_is_known_by_the_kernels_that_are_not_compiled(tmp_path: 
         file.write("# another kernel\n")
     kernel_digest.kernels_digest.cache_clear()
     assert not are_compiled(tmp_path)
+
+
+def test_kernels_that_count_no_references_lose_no_memory() -> None:
+    # a kernel of `compiled.LEAF` that called what returns an array would never free it
+    with Planner.load() as planner:
+        start, goal = planner.nodes("level_cup")[[0, -1]]
+        planner.plan(start, goal, "level_cup")
+        _nrt_python.memsys_enable_stats()
+        try:
+            before = rtsys.get_allocation_stats()
+            planner.plan(start, goal, "level_cup", budget_s=0.2)
+            gc.collect()
+            after = rtsys.get_allocation_stats()
+        finally:
+            _nrt_python.memsys_disable_stats()
+    assert after.alloc - before.alloc > 100
+    assert after.alloc - before.alloc == after.free - before.free

@@ -30,6 +30,7 @@ import numpy as np
 from numba import njit
 
 from constraint_geodesics.certification.kernels import BASE, next_frame
+from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.scene.convex_kernels import (
     FRAME,
     REACH,
@@ -43,8 +44,6 @@ from constraint_geodesics.scene.convex_kernels import (
     roughly_apart,
     turned,
 )
-
-_COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 
 # entries of a level
 PROVEN, ATTAINED, ASKED, MARGIN, HERE = 0, 1, 2, 3, 4
@@ -78,7 +77,7 @@ class Bodies(NamedTuple):
     top: int
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def joint_frames(chain, q, frames):
     """Frames (D + 1, 12) of one configuration: position [m], then rotation by rows."""
     turns, offsets, prismatic, _ = chain
@@ -101,7 +100,7 @@ def joint_frames(chain, q, frames):
         frames[f, 5], frames[f, 8], frames[f, 11] = a0, a1, a2
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _attained(level, value):
     """A distance that two pieces have somewhere: no more than it can be proven, so a share of it is
     asked for, as long as that is above the margin.
@@ -112,7 +111,7 @@ def _attained(level, value):
         level[ASKED] = max(level[MARGIN], SHARE * value)
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _nearest(bodies, top, frames, at, level, simplex):
     """The least distance of any pair at one place into `level`; returns that pair, −1 where another
     place has less.
@@ -138,7 +137,7 @@ def _nearest(bodies, top, frames, at, level, simplex):
     return nearest
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _measure(rows, travelled, interval, steps):
     """What an interval of rows (first, middle, last) amounts to, into steps (3, D): how far each
     joint travels from the middle at most, its increment, and how far it gets off the straight line.
@@ -157,7 +156,7 @@ def _measure(rows, travelled, interval, steps):
             steps[2, d] = max(steps[2, d], off)
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _bounds_of_motion(nodes, a, b, steps):
     """How far b's points move from the middle of an interval at most, seen from a: Σ ρ_j v_j; and
     how far they get off their way's ends: ⅛ Σ |d_j| ρ_j (|d_j| + 2 Σ |d_h|) + Σ ρ_j e_j.
@@ -172,7 +171,7 @@ def _bounds_of_motion(nodes, a, b, steps):
     return motion, 0.125 * bend + off
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _is_proven(bodies, frames, places, p, level, steps, simplex):
     """Whether one pair of pieces is free on an interval; places: of its ends and its middle.  Where
     it is not, level[HERE] is a distance that it has in the middle, inf where that is not known.
@@ -209,7 +208,7 @@ def _is_proven(bodies, frames, places, p, level, steps, simplex):
     return False
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _sift(bodies, frames, interval, todo, level, steps, simplex):
     """Leave the pairs of an interval of rows that are not proven free in todo (P + 1,), their
     number first; a pair of bodies that are close is replaced by the pairs of their pieces.
@@ -244,7 +243,7 @@ def _sift(bodies, frames, interval, todo, level, steps, simplex):
     todo[0] = kept
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def _place(chain, rows, i, share, frames):
     """Frames (D + 1, 12) on the line from row i to the next."""
     q = np.empty(rows.shape[1])
@@ -253,7 +252,7 @@ def _place(chain, rows, i, share, frames):
     joint_frames(chain, q, frames)
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def nearest_pair(bodies, q, most):
     """The least distance [m] of any two bodies that may meet at one configuration, and which pair
     it is: `most` and −1 where that is more.
@@ -267,7 +266,7 @@ def nearest_pair(bodies, q, most):
     return level[ATTAINED], nearest
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def prove_apart(bodies, rows, margin, undecided):
     """Prove that all pairs of bodies stay further apart than `margin` [m] on the lines between rows
     (T, D).
@@ -345,7 +344,7 @@ def prove_apart(bodies, rows, margin, undecided):
     return level[PROVEN], level[ATTAINED], missing
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def never_meets(bodies, body, limits, margin, cells):
     """Whether a pair of bodies is proven to stay further apart than `margin` [m] at all joint
     values within limits (2, D), by halving the box of those that move it; False where that takes

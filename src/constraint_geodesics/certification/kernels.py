@@ -51,7 +51,7 @@ attained. Rounding is not proven; `ROUNDING` is a thousand times what it amounts
 import numpy as np
 from numba import njit
 
-_COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
+from constraint_geodesics.compiled import COMPILE, LEAF
 
 SWING, ROTATION, TWIST, POSITION = 0, 1, 2, 3
 SIZE = 0
@@ -67,7 +67,7 @@ BASE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 # inlined, and with few arrays: each one that is passed counts references in every turn of a loop
-@njit(inline="always", **_COMPILE)
+@njit(inline="always", **COMPILE)
 def next_frame(turns, offsets, j, angle, slide, frame):
     """Frame j, turned by an angle about its z axis and moved along it, from the frame before, both
     as quaternion (w, x, y, z) and position; then its z axis.
@@ -92,7 +92,7 @@ def next_frame(turns, offsets, j, angle, slide, frame):
     return w, x, y, z, p0 + slide * a0, p1 + slide * a1, p2 + slide * a2, a0, a1, a2
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _pose(chain, q, axes, origins):
     """Tool quaternion (w, x, y, z) and position in the base frame; every joint's axis and origin
     (D, 3).
@@ -111,7 +111,7 @@ def _pose(chain, q, axes, origins):
     return frame
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def poses(chain, q, out):
     """Tool poses of q (n, D) into out (n, 7): position [m], then quaternion (x, y, z, w)."""
     axes, origins = np.empty((q.shape[1], 3)), np.empty((q.shape[1], 3))
@@ -121,7 +121,7 @@ def poses(chain, q, out):
         out[n, 3], out[n, 4], out[n, 5], out[n, 6] = x, y, z, w
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _derivative_bounds(chain, q0, q1):
     """W [rad] of one piece, and the bound of |p⁗| [m]."""
     _, _, prismatic, lengths = chain
@@ -138,7 +138,7 @@ def _derivative_bounds(chain, q0, q1):
     return turned, fourth
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def count_pieces(chain, rows, wanted, most, counts):
     """Pieces (T − 1,) each segment is cut into, so that ε stays below `wanted` [rad and m]; `most`
     at most.
@@ -155,7 +155,7 @@ def count_pieces(chain, rows, wanted, most, counts):
     return total
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def cut(chain, rows, counts, stations, segments, turned, fourth):
     """The stations (S, D), rows among them; each piece's segment, W [rad] and bound of |p⁗| [m], (S
     − 1,) each.
@@ -168,12 +168,13 @@ def cut(chain, rows, counts, stations, segments, turned, fourth):
                 stations[s, j] = rows[i, j] + share * (rows[i + 1, j] - rows[i, j])
             segments[s] = i
             s += 1
-    stations[s] = rows[-1]
+    for j in range(rows.shape[1]):
+        stations[s, j] = rows[-1, j]
     for n in range(s):
         turned[n], fourth[n] = _derivative_bounds(chain, stations[n], stations[n + 1])
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _turned(kind, k, s, w, out):
     """The derivative of x to an angular velocity w, for the x that `_curve_point` writes."""
     if kind == SWING:
@@ -194,7 +195,7 @@ def _turned(kind, k, s, w, out):
         out[2] = out[3] = 0.0
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _curve_point(kind, k, anchor, w, x, y, z, s, out):
     """Write x of one tool quaternion; s (4,) gets the vector or quaternion that it is read from.
 
@@ -221,7 +222,7 @@ def _curve_point(kind, k, anchor, w, x, y, z, s, out):
         out[1], out[2], out[3] = s[1 + k], 0.0, 0.0
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def trace(chain, kind, k, anchor, place, q, turn, turn_out, turn_in, shift, shift_out, shift_in):
     """Write x and its derivatives at stations q (S, D): angles into turn, positions into shift, (S,
     4) each.
@@ -269,10 +270,10 @@ def trace(chain, kind, k, anchor, place, q, turn, turn_out, turn_in, shift, shif
             if positions:
                 target = shift_out[n] if side == 0 else shift_in[n]
                 target[0] = 0.0
-                target[1:] = linear
+                target[1], target[2], target[3] = linear[0], linear[1], linear[2]
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _angle(x, sign):
     """Angle [rad] between x (4,) and the first axis times `sign`; either way along it, for sign
     0.
@@ -281,7 +282,7 @@ def _angle(x, sign):
     return np.arctan2(np.sqrt(x[1] * x[1] + x[2] * x[2] + x[3] * x[3]), first)
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _value(kind, entry, x, sign):
     """The size [rad or m] of what is held, or of one of its entries 1 to 3."""
     if kind == POSITION:
@@ -293,14 +294,14 @@ def _value(kind, entry, x, sign):
     return theta if kind == SWING else 2.0 * theta
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def values(kind, entry, x, out):
     """What is held at each station, from x (S, 4) into out (S,), as `_value` has it."""
     for n in range(x.shape[0]):
         out[n] = _value(kind, entry, x[n], 1.0 if kind == SWING else 0.0)
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _interval_bound(kind, entry, xa, xb, sign, curvature, h, omega, error):
     """The module's bound over one interval, from H at its ends, max|H″|, its length h, ω and ε."""
     if kind == POSITION:
@@ -339,7 +340,7 @@ def _interval_bound(kind, entry, xa, xb, sign, curvature, h, omega, error):
     return bound if bound < cap else cap
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _cubic(x0, x1, m0, m1, t, out):
     """H(t) (4,) from values and derivatives at both ends."""
     u = 1.0 - t
@@ -349,7 +350,7 @@ def _cubic(x0, x1, m0, m1, t, out):
         out[i] = a0 * x0[i] + a1 * x1[i] + b0 * m0[i] + b1 * m1[i]
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _curvature(kind, entry, x0, x1, m0, m1, t):
     """|H″(t)|, or of one coordinate for a position."""
     square = 0.0
@@ -363,7 +364,7 @@ def _curvature(kind, entry, x0, x1, m0, m1, t):
     return np.sqrt(square)
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _enough(best, tolerance, limit):
     """A bound that need not be improved, given a value that is attained; it never decides that
     `limit` is passed.
@@ -372,7 +373,7 @@ def _enough(best, tolerance, limit):
     return limit if best <= limit < enough else enough
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def bound_pieces(kind, entry, tolerance, limit, x, x_out, x_in, turned, fourth, segments):
     """Bound of what is held over all pieces, by the module's equations.
 

@@ -19,8 +19,9 @@ from llvmlite import ir
 from numba import carray, cfunc, njit, types
 from numba.extending import intrinsic
 
+from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintError, Series
-from constraint_geodesics.constraints.kernels import COMPILE, Rows, register
+from constraint_geodesics.constraints.kernels import Rows, register
 from constraint_geodesics.robot.kernels import new_posture, pose_of
 from constraint_geodesics.robot.kinematics import SerialRobot
 
@@ -243,18 +244,18 @@ def _compiled(residual: Writes, jacobian: Writes, count: int) -> tuple[Any, Any]
     return cfunc(signature)(write_residual), cfunc(signature)(write_jacobian)
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _values(address, q, out):
     for n in range(q.shape[0]):
         _call(address, q[n].ctypes.data, out[n].ctypes.data, q.shape[1])
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _no_scratch(constraint, dof):
     return dof
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _linearise(manifold, q, own, residual, jacobian):
     about = manifold.constraint
     _call(about.residual, q.ctypes.data, residual.ctypes.data, q.shape[0])

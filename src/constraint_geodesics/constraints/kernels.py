@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from numba import njit
 from numba.extending import overload
 
-COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
+from constraint_geodesics.compiled import COMPILE, LEAF
 
 
 class Rows(NamedTuple):
@@ -74,7 +74,7 @@ def curvature(manifold: Any, weights: Any, own: Any, full: Any) -> bool:
     raise NotImplementedError("only inside compiled code")
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _no_closed_form(manifold, weights, own, full):
     return False
 
@@ -104,13 +104,13 @@ def _linearise(manifold, q, own, residual, jacobian):
     return _kind(_field(manifold, "constraint")).linearise.py_func
 
 
-@overload(curvature)
+@overload(curvature, jit_options={"_nrt": False})
 def _curvature(manifold, weights, own, full):
     chosen = _kind(_field(manifold, "constraint")).curvature
     return lambda manifold, weights, own, full: chosen(manifold, weights, own, full)
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def shared_tolerance(rows):
     """The tolerance of the rows that are bounded together; −1 if there are none."""
     _, tolerance, together = rows
@@ -120,7 +120,7 @@ def shared_tolerance(rows):
     return -1.0
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def excess_of(rows, residual, excess, active):
     """What of the residual (m,) lies outside the tolerance, signed, eq. 7; marks the rows a step
     must correct.  Returns the largest.
@@ -172,7 +172,7 @@ def excess_batch(rows, residuals, excesses, worst):
         worst[b] = excess_of(rows, residuals[b], excesses[b], active)
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def cholesky(matrix, size, smallest):
     """Lower Cholesky factor of the leading `size` rows, in place; False if a pivot is not above
     `smallest`.
@@ -191,7 +191,7 @@ def cholesky(matrix, size, smallest):
     return True
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def forward(factor, size, right):
     """Solve L x = right in place, with the factor L of `cholesky`."""
     for i in range(size):
@@ -200,7 +200,7 @@ def forward(factor, size, right):
         right[i] /= factor[i, i]
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def backward(factor, size, right):
     """Solve Lᵀ x = right in place, with the factor L of `cholesky`."""
     for i in range(size - 1, -1, -1):
@@ -209,7 +209,7 @@ def backward(factor, size, right):
         right[i] /= factor[i, i]
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def append_normal(row, rows, size):
     """Gram-Schmidt: `row` (D,), made orthogonal to the first `size` of `rows`, becomes the next
     one; the new size.

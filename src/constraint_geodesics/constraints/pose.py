@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
+from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintError, Pose, Series
-from constraint_geodesics.constraints.kernels import COMPILE, Rows, register
+from constraint_geodesics.constraints.kernels import Rows, register
 from constraint_geodesics.robot.kernels import Posture, geometric_jacobian, new_posture, pose_of
 from constraint_geodesics.robot.kinematics import SerialRobot
 
@@ -185,7 +186,7 @@ class PoseConstraint(Constraint):
 KIND = PoseConstraint
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _quaternion(a, b):
     """Unit quaternion (w ≥ 0, x, y, z) of the rotation E = A Bᵀ, by Shepperd's branch with the
     largest component.
@@ -217,7 +218,7 @@ def _quaternion(a, b):
     return w, x, y, z
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _swing(w, k, residual, linear):
     """Swing from e_k to the unit vector w into residual[3:], and its derivative (3, 3) to ω, where
     ẇ = ω × w.
@@ -250,7 +251,7 @@ def _swing(w, k, residual, linear):
         linear[j, a] = g * dsj + dg * dtheta * sj
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _rotation_vector(quaternion, residual, linear):
     """Rotation vector of a unit quaternion into residual[3:], and the inverse left Jacobian of
     SO(3), its derivative to ω.
@@ -284,7 +285,7 @@ def _rotation_vector(quaternion, residual, linear):
     )
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _twist(quaternion, k, residual, linear):
     """Twist about e_k into residual[3 + k], and its derivative to ω into row k of `linear`."""
     w, i, j = quaternion[0], (k + 1) % 3, (k + 2) % 3
@@ -298,7 +299,7 @@ def _twist(quaternion, k, residual, linear):
     linear[k, j] = (-w * vi + vk * vj) / square
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _residual(constraint, position, rotation, residual, linear):
     """Residual (6,) [m, rad] of one tool pose, and the (3, 3) matrix that turns ω into its
     orientation part.
@@ -353,7 +354,7 @@ def _new_scratch(constraint, dof):
     return _Scratch(new_posture(dof), np.empty((3, 3)), np.empty((6, dof)))
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _linearise(manifold, q, own, residual, jacobian):
     posture, linear, geometric = own
     chain, constraint = manifold.chain, manifold.constraint
@@ -374,7 +375,7 @@ def _linearise(manifold, q, own, residual, jacobian):
             jacobian[i, d] = value
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _curvature(manifold, weights, own, full):
     """Σ λ_j ∇²r_j into `full` (D, D), for positions, and two or three angles held exactly, without
     prismatic joints.  With the joints' axes a and origins o in the base frame, i ≤ j: ∂²p/∂q_i∂q_j
@@ -389,8 +390,9 @@ def _curvature(manifold, weights, own, full):
             exact = exact and tolerance[i] == 0.0
     if (weights[3] != 0.0 or weights[4] != 0.0 or weights[5] != 0.0) and (angles < 2 or not exact):
         return False
-    if manifold.chain.prismatic.any():
-        return False
+    for j in range(full.shape[0]):
+        if manifold.chain.prismatic[j]:
+            return False
     position, joint_origins, joint_axes = (
         own.posture.position,
         own.posture.origins,

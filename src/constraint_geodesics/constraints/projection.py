@@ -3,15 +3,15 @@ kinematics.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numba import njit
 
+from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.kernels import (
-    COMPILE,
     Rows,
     backward,
     cholesky,
@@ -65,7 +65,7 @@ def retract(
     )
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def normal_matrix(rows, size, normal):
     """Lower half of J Jᵀ of the leading `size` rows of J (m, D); returns its trace."""
     trace = 0.0
@@ -79,7 +79,7 @@ def normal_matrix(rows, size, normal):
     return trace
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def solve_normal(normal, size, right, smallest_pivot):
     """(J Jᵀ)⁻¹ right into `right` (m,): the weights of J's rows in the shortest step with J step =
     right; False where J Jᵀ, of `normal_matrix` and overwritten, is singular.
@@ -91,48 +91,89 @@ def solve_normal(normal, size, right, smallest_pivot):
     return True
 
 
+class RetractionRoom(NamedTuple):
+    """What the projection writes into: what the constraint's kind needs, residual, excess, right,
+    active (m,), jacobian, rows (m, D), normal (m, m), step (D,).
+    """
+
+    own: Any
+    residual: np.ndarray
+    excess: np.ndarray
+    right: np.ndarray
+    active: np.ndarray
+    jacobian: np.ndarray
+    rows: np.ndarray
+    normal: np.ndarray
+    step: np.ndarray
+
+
+@njit(**COMPILE)
+def new_room(constraint, dof):
+    """Room for the projections of one constraint."""
+    count = constraint.rows.held.shape[0]
+    return RetractionRoom(
+        scratch(constraint, dof),
+        np.zeros(count),
+        np.empty(count),
+        np.empty(count),
+        np.empty(count, dtype=np.bool_),
+        np.empty((count, dof)),
+        np.empty((count, dof)),
+        np.empty((count, count)),
+        np.empty(dof),
+    )
+
+
+@njit(**LEAF)
+def retract_one(manifold, bounds, q, settings, room):
+    """Gauss-Newton onto the constraint, in place: q ← q − Jᵀ(JJᵀ)⁻¹ ι(q) until |ι| ≤ accuracy, for
+    q (D,); returns the remaining excess.
+
+    bounds: how the rows are bounded.  A step is never longer than `largest_step` [rad], so that a
+    point far away walks to its own branch instead of jumping to another.
+    """
+    _, residual, excess, right, active, jacobian, rows, normal, step = room
+    count, dof = residual.shape[0], q.shape[0]
+    worst = np.inf
+    for iteration in range(settings.iterations + 1):
+        linearise(manifold, q, room.own, residual, jacobian)
+        worst = excess_of(bounds, residual, excess, active)
+        if not worst > settings.accuracy or iteration == settings.iterations:
+            break
+        size = 0
+        for i in range(count):
+            if active[i]:
+                for d in range(dof):
+                    rows[size, d] = jacobian[i, d]
+                right[size] = excess[i]
+                size += 1
+        trace = normal_matrix(rows, size, normal)
+        for i in range(size):
+            normal[i, i] += 1e-10 * trace + 1e-300
+        if not solve_normal(normal, size, right, 0.0):
+            break
+        length = 0.0
+        for d in range(dof):
+            step[d] = 0.0
+            for i in range(size):
+                step[d] += rows[i, d] * right[i]
+            length += step[d] * step[d]
+        length = np.sqrt(length)
+        scale = 1.0 if length <= settings.largest_step else settings.largest_step / length
+        for d in range(dof):
+            q[d] -= scale * step[d]
+    return worst
+
+
 @njit(**COMPILE)
 def retract_batch(manifold, shares, q, settings, worst):
-    """Gauss-Newton onto the constraint, in place: q ← q − Jᵀ(JJᵀ)⁻¹ ι(q) until |ι| ≤ accuracy, for
-    q (B, D).
-
-    shares (B,): of the tolerance, that each configuration may use.  A step is never longer than
-    `largest_step` [rad], so that a point far away walks to its own branch instead of jumping to
-    another.  worst (B,) gets the remaining excess.
+    """`retract_one` for each of q (B, D), in place.  shares (B,): of the tolerance, that each may
+    use.  worst (B,) gets the remaining excesses.
     """
     bounds = manifold.constraint.rows
-    count, dof = bounds.held.shape[0], q.shape[1]
-    own = scratch(manifold.constraint, dof)
-    residual, excess, right = np.empty(count), np.empty(count), np.empty(count)
-    active = np.empty(count, dtype=np.bool_)
-    jacobian, rows = np.empty((count, dof)), np.empty((count, dof))
-    normal, step = np.empty((count, count)), np.empty(dof)
-    residual[:] = 0.0
+    room, tolerance = new_room(manifold.constraint, q.shape[1]), bounds.tolerance.copy()
+    narrow = Rows(bounds.held, tolerance, bounds.together)
     for b in range(q.shape[0]):
-        narrow = Rows(bounds.held, shares[b] * bounds.tolerance, bounds.together)
-        for iteration in range(settings.iterations + 1):
-            linearise(manifold, q[b], own, residual, jacobian)
-            worst[b] = excess_of(narrow, residual, excess, active)
-            if not worst[b] > settings.accuracy or iteration == settings.iterations:
-                break
-            size = 0
-            for i in range(count):
-                if active[i]:
-                    rows[size] = jacobian[i]
-                    right[size] = excess[i]
-                    size += 1
-            trace = normal_matrix(rows, size, normal)
-            for i in range(size):
-                normal[i, i] += 1e-10 * trace + 1e-300
-            if not solve_normal(normal, size, right, 0.0):
-                break
-            length = 0.0
-            for d in range(dof):
-                step[d] = 0.0
-                for i in range(size):
-                    step[d] += rows[i, d] * right[i]
-                length += step[d] * step[d]
-            length = np.sqrt(length)
-            scale = 1.0 if length <= settings.largest_step else settings.largest_step / length
-            for d in range(dof):
-                q[b, d] -= scale * step[d]
+        for i in range(tolerance.shape[0]):
+            tolerance[i] = shares[b] * bounds.tolerance[i]
+        worst[b] = retract_one(manifold, narrow, q[b], settings, room)

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.kernels import (
-    COMPILE,
     append_normal,
     linearise,
     scratch,
@@ -24,7 +24,7 @@ class Bounds(NamedTuple):
     touching: float
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _append_across(row, gradient, rows, size):
     """The inequality's `row` becomes a normal if the gradient leads across it; the new size."""
     across = 0.0

@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
+from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.geometry.errors import GeometryError, NonFiniteError
 
 COINCIDENT = 1e-9
@@ -42,7 +43,6 @@ _NUDGE = 1e-3
 _SECTIONS = 20
 """Golden sections of an interval of ratios: they leave less than 1e-4 of it."""
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
-_COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 
 
 class _Step(NamedTuple):
@@ -107,7 +107,7 @@ def _limit(limit: np.ndarray, dim: int, what: str) -> np.ndarray:
     return values
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def _times(q, spacing, velocity, acceleration, times):
     """Writes the times (T,) of the rows q (T, D) with the given distances (T-1,)."""
     steps = spacing.shape[0]
@@ -148,7 +148,7 @@ def _times(q, spacing, velocity, acceleration, times):
         used = _used(q, times, velocity, acceleration)
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _controllable(directions, spacing, acceleration, fastest, ratios):
     """Lowers `fastest` (T-1,) to the largest speeds from which the goal can be reached, backward.
 
@@ -175,7 +175,7 @@ def _controllable(directions, spacing, acceleration, fastest, ratios):
         ratios[i] = ratio
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _ratio_window(s, s_next):
     """Smallest and largest ratio of a step's speed to the one before, at constant acceleration.
 
@@ -185,7 +185,7 @@ def _ratio_window(s, s_next):
     return 1.0 / (1.0 + np.sqrt(1.0 + s / s_next)), 1.0 + np.sqrt(1.0 + s_next / s)
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _speed_at_ratio(ratio, step, behind, acceleration):
     """Largest speed of a step if that of the one behind is `ratio` times it; both within theirs."""
     square = min(step.speed, behind.speed / ratio) ** 2
@@ -197,7 +197,7 @@ def _speed_at_ratio(ratio, step, behind, acceleration):
     return np.sqrt(square)
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _best_ratio(low, high, step, behind, acceleration):
     """Ratio between low and high with the largest `_speed_at_ratio`, by golden sections."""
     inner, outer = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
@@ -215,7 +215,7 @@ def _best_ratio(low, high, step, behind, acceleration):
     return inner if at_inner > at_outer else outer
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _fastest_next_to(known, step, acceleration):
     """Largest speed y of a step, up to its own, next to one of known speed x.
 
@@ -246,7 +246,7 @@ def _fastest_next_to(known, step, acceleration):
     return y
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _used(q, times, velocity, acceleration):
     """Factor by which times may shrink, or must grow if above 1, to keep the limits everywhere."""
     worst = 0.0

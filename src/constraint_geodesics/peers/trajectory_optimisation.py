@@ -337,7 +337,7 @@ def _clearances(task: Task, nodes: Nodes) -> tuple[np.ndarray, np.ndarray]:
     return values - task.settings.clearance_m, gradients
 
 
-@njit(cache=True, fastmath={"contract"}, error_model="numpy", nogil=True)
+@njit(**COMPILE)
 def _link_clearances(chain, model, q, values, gradients):  # type: ignore[no-untyped-def]
     """The smallest distance of the links that each joint carries, of q (B, D) into values (B, D),
     at most FAR, and their gradients (B, D, D).

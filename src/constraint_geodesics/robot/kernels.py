@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-_COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
+from constraint_geodesics.compiled import COMPILE, LEAF
 
 
 # A frame is a tuple of scalars, its position and its rotation by rows: an allocation costs more
 # than the arithmetic of a joint.  The three functions below are inlined, since passing a frame
 # through a call is slower.
-@njit(**_COMPILE, inline="always")
+@njit(**COMPILE, inline="always")
 def frame_of(m):
     """The frame that a transform (4, 4) leads to from the base."""
     return (
@@ -37,7 +37,7 @@ def frame_of(m):
     )
 
 
-@njit(**_COMPILE, inline="always")
+@njit(**COMPILE, inline="always")
 def moved_frame(frame, m):
     """The frame that a transform (4, 4) leads to from `frame`."""
     p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = frame
@@ -57,7 +57,7 @@ def moved_frame(frame, m):
     )
 
 
-@njit(**_COMPILE, inline="always")
+@njit(**COMPILE, inline="always")
 def joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes):
     """The frame that joint j carries, from that of the joint before; writes the joint's origin and
     axis.
@@ -105,13 +105,13 @@ class Posture(NamedTuple):
     axes: np.ndarray
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def new_posture(dof):
     """Arrays that `pose_of` writes."""
     return Posture(np.empty(3), np.empty((3, 3)), np.empty((dof, 3)), np.empty((dof, 3)))
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def pose_of(chain, q, posture):
     """Write the posture of one configuration."""
     # taken apart once: a field that is read in a loop counts its array's references each time
@@ -127,7 +127,7 @@ def pose_of(chain, q, posture):
     rotation[2, 0], rotation[2, 1], rotation[2, 2] = r20, r21, r22
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def forward_batch(chain, q, positions, rotations):
     """Tool poses of q (B, D) into positions (B, 3) and rotations (B, 3, 3)."""
     own = new_posture(q.shape[1])
@@ -135,7 +135,7 @@ def forward_batch(chain, q, positions, rotations):
         pose_of(chain, q[b], Posture(positions[b], rotations[b], own.origins, own.axes))
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def geometric_jacobian(prismatic, posture, jacobian):
     """Geometric Jacobian (6, D) of one posture in the base frame: linear rows [m], then angular
     rows [rad].
@@ -156,7 +156,7 @@ def geometric_jacobian(prismatic, posture, jacobian):
         jacobian[3, j], jacobian[4, j], jacobian[5, j] = a0, a1, a2
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def jacobian_batch(chain, q, jacobians):
     """Geometric Jacobians of q (B, D) into jacobians (B, 6, D)."""
     posture = new_posture(q.shape[1])
@@ -165,7 +165,7 @@ def jacobian_batch(chain, q, jacobians):
         geometric_jacobian(chain.prismatic, posture, jacobians[b])
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def skeleton_batch(chain, q, points):
     """Base, joint origins and tool of q (B, D) into points (B, D + 2, 3)."""
     dof = q.shape[1]

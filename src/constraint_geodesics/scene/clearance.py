@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
+from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.robot.kernels import frame_of, joint_frame
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene import convex_kernels
@@ -52,7 +53,6 @@ _DEEPEST = 32
 _SIGNS = [(x, y, z) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) for z in (-1.0, 0.0, 1.0)]
 _TRIED = np.array([np.divide(s, np.linalg.norm(s)) for s in _SIGNS if any(s)])
 """Directions (26, 3) in which overlapping pieces are looked at."""
-_COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 
 
 class ClearanceArrays(NamedTuple):
@@ -68,7 +68,8 @@ class ClearanceArrays(NamedTuple):
 
 class Contacts(NamedTuple):
     """What the kernels write into: nodes and pairs of their own, frames (1, D + 1, 12), joint
-    origins and axes (D, 3), and `found` (P, 8), the contacts by the columns above.
+    origins and axes (D, 3), and `found` (P, 8), the contacts by the columns above; a point (D,) of
+    a line, and its parts that are still looked at.
     """
 
     nodes: np.ndarray
@@ -78,6 +79,8 @@ class Contacts(NamedTuple):
     axes: np.ndarray
     simplex: np.ndarray
     found: np.ndarray
+    point: np.ndarray
+    parts: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -139,7 +142,7 @@ def _reaches(
     return reach
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def new_contacts(model, dof):
     """What the kernels write into."""
     return Contacts(
@@ -150,10 +153,12 @@ def new_contacts(model, dof):
         np.empty((dof, 3)),
         np.empty(SIMPLEX),
         np.empty((max(model.pairs.shape[0], 1), _CONTACT)),
+        np.empty(dof),
+        np.empty((_DEEPEST, 2)),
     )
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _place(chain, q, frames, joint_origins, joint_axes):
     """Frames (1, D + 1, 12) of one configuration, joint origins and axes (D, 3)."""
     origins, axes, prismatic, base, _ = chain
@@ -171,14 +176,14 @@ def _place(chain, q, frames, joint_origins, joint_axes):
         own[9], own[10], own[11] = r20, r21, r22
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def _frames(chain, q):
     frames, dof = np.empty((1, q.shape[0] + 1, 12)), q.shape[0]
     _place(chain, q, frames, np.empty((dof, 3)), np.empty((dof, 3)))
     return frames
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _shallowest(bodies, frames, p, simplex):
     """How deep a pair of pieces overlaps, as a distance below 0, in the direction in which it is
     least of those that are tried, which becomes the pair's; the second's deepest point into
@@ -221,7 +226,7 @@ def _shallowest(bodies, frames, p, simplex):
     return most
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _measure(bodies, frames, simplex, p, far, contact):
     """The contact (8,) of one pair of pieces; False where they are further apart than `far` [m]."""
     _, nodes, pairs = bodies
@@ -245,7 +250,7 @@ def _measure(bodies, frames, simplex, p, far, contact):
     return True
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def near_contacts(chain, model, q, far, room):
     """The contacts of one configuration that are nearer than `far` [m] into `room`, the nearest
     first, one for each pair of bodies; returns how many.
@@ -274,7 +279,7 @@ def near_contacts(chain, model, q, far, room):
     return count
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _motion(nodes, pairs, p, first, second):
     """How far the second of a pair moves at most, seen from the first [m], over half a line."""
     a, b = int(pairs[p, 0]), int(pairs[p, 1])
@@ -284,7 +289,7 @@ def _motion(nodes, pairs, p, first, second):
     return 0.5 * motion
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _apart(bodies, frames, simplex, p, motion):
     """Whether a pair of pieces is further apart than `motion` [m]: 1 for yes, −1 if it overlaps, 0
     else.
@@ -300,14 +305,14 @@ def _apart(bodies, frames, simplex, p, motion):
     return -1 if upper <= rounding else 0
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def stays_clear(chain, model, first, second, room):
     """Whether nothing overlaps on the straight joint line between two configurations, but for parts
     over which nothing moves by more than FINEST_M from their middle.
     """
     nodes, pairs, frames, simplex = room.nodes, room.pairs, room.frames, room.simplex
     bodies, found, dof = (model.hulls, room.nodes, room.pairs), room.found, first.shape[0]
-    q, parts = np.empty(dof), np.empty((_DEEPEST, 2))
+    q, parts = room.point, room.parts
     for d in range(dof):
         q[d] = 0.5 * (first[d] + second[d])
     _place(chain, q, frames, room.origins, room.axes)
@@ -348,7 +353,7 @@ def stays_clear(chain, model, first, second, room):
     return True
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def same_contacts(chain, model, q, count, room):
     """The contacts of the same pairs of pieces at another configuration, as near or not."""
     simplex, bodies = room.simplex, (model.hulls, room.nodes, room.pairs)
@@ -358,13 +363,13 @@ def same_contacts(chain, model, q, count, room):
         _measure(bodies, room.frames, simplex, int(room.found[c, PAIR]), np.inf, room.found[c])
 
 
-@njit(inline="always", **_COMPILE)
+@njit(inline="always", **COMPILE)
 def second_frame(room, c):
     """The frame that carries the second body of a contact; joint j carries frame j + 1."""
     return int(room.nodes[int(room.pairs[int(room.found[c, PAIR]), 1]), FRAME])
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def contact_row(prismatic, room, c, row):
     """Gradient (D,) of a contact's distance."""
     nodes, pairs, found, axes, origins = room.nodes, room.pairs, room.found, room.axes, room.origins
@@ -382,7 +387,7 @@ def contact_row(prismatic, room, c, row):
         row[j] = n0 * (a1 * z - a2 * y) + n1 * (a2 * x - a0 * z) + n2 * (a0 * y - a1 * x)
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def clearance_batch(chain, model, far, q, smallest):
     """Smallest distance of any two bodies that must not touch, of q (B, D) into smallest (B,), at
     most `far`.
@@ -394,7 +399,7 @@ def clearance_batch(chain, model, far, q, smallest):
             smallest[b] = room.found[0, DISTANCE]
 
 
-@njit(**_COMPILE)
+@njit(**COMPILE)
 def path_stays_clear(chain, model, q):
     """Whether nothing overlaps on the straight joint lines between configurations (T, D)."""
     room = new_contacts(model, q.shape[1])

@@ -12,7 +12,7 @@ Frames (F, 12): position [m], then rotation by rows.  `at` is the first index of
 import numpy as np
 from numba import njit
 
-_COMPILE = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
+from constraint_geodesics.compiled import COMPILE, LEAF
 
 # columns of a node
 FRAME, ROUNDING = 0, 1
@@ -46,7 +46,7 @@ one of the first, in the base frame [m].
 """
 
 
-@njit(inline="always", **_COMPILE)
+@njit(inline="always", **COMPILE)
 def into(frames, at, f, n0, n1, n2):
     """A direction of the base frame in frame f of a place."""
     return (
@@ -56,7 +56,7 @@ def into(frames, at, f, n0, n1, n2):
     )
 
 
-@njit(inline="always", **_COMPILE)
+@njit(inline="always", **COMPILE)
 def turned(frames, at, f, x, y, z):
     """A direction of frame f in the base frame."""
     return (
@@ -66,7 +66,7 @@ def turned(frames, at, f, x, y, z):
     )
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def furthest(hulls, corner, x, y, z):
     """The corner of a piece that lies furthest along a direction of its frame, from any of its
     corners on from neighbour to neighbour, and how far.
@@ -84,7 +84,7 @@ def furthest(hulls, corner, x, y, z):
     return corner, most
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def gap_along(bodies, frames, at, p, n):
     """How far the second piece of a pair lies beyond the first along a unit vector of the base
     frame; the corners that count become the pair's.
@@ -102,7 +102,7 @@ def gap_along(bodies, frames, at, p, n):
     return gap
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _nearest_of_triangle(s, i, j, k):
     """The point of a triangle that is nearest to the origin into row _SPARE; which corners it hangs
     on, as bits.  After Ericson's regions (Real-Time Collision Detection, 2005).
@@ -140,7 +140,7 @@ def _nearest_of_triangle(s, i, j, k):
     return mask
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _lies_beyond(s, i, j, k, other):
     """Whether the origin lies on the other side of a triangle's plane than the fourth corner, or
     that lies in it.
@@ -154,7 +154,7 @@ def _lies_beyond(s, i, j, k, other):
     return origin * fourth < 0.0 or abs(fourth) < 1e-18
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def _nearest_of_simplex(s, size):
     """The point of the leading corners' simplex that is nearest to the origin into row NEAREST;
     only the corners that it hangs on stay.  Returns how many: 4 where the origin is inside.
@@ -196,7 +196,7 @@ def _nearest_of_simplex(s, size):
     return kept
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def distance(bodies, frames, at, p, wanted, simplex):
     """Bounds (lower, upper) of the distance [m] of a pair of pieces at one place, without their
     roundings, both 0 or less where they overlap.
@@ -241,14 +241,14 @@ def distance(bodies, frames, at, p, wanted, simplex):
     return lower, upper
 
 
-@njit(inline="always", **_COMPILE)
+@njit(inline="always", **COMPILE)
 def pieces_of(pairs, body):
     """Where the pairs of pieces of a pair of bodies are: the first, and the one after the last."""
     first, last = int(pairs[body, 2]), int(pairs[body, 3])
     return (first, last) if first < last else (body, body + 1)
 
 
-@njit(**_COMPILE)
+@njit(**LEAF)
 def place_balls(nodes, frames, at):
     """The balls' centres into `nodes`."""
     for i in range(nodes.shape[0]):
@@ -259,7 +259,7 @@ def place_balls(nodes, frames, at):
         nodes[i, PLACE + 2] = frames[at, f, 2] + z
 
 
-@njit(inline="always", **_COMPILE)
+@njit(inline="always", **COMPILE)
 def roughly_apart(nodes, a, b):
     """How far two nodes are apart at least, roundings taken off: by balls around them, or by the
     box that the first is.

@@ -57,9 +57,8 @@ def relax(
     that touches nothing is moved into something.
     """
     moved = np.array(nodes, np.float64)
-    left, iterations, converged = band_kernels.relax_band(
-        space, moved, settings.iterations, settings.accuracy, settings.largest_step_rad, guarded
-    )
+    chosen = settings.iterations, settings.accuracy, settings.largest_step_rad, guarded
+    left, iterations, converged = band_kernels.relax_band(space, moved, chosen)
     return Band(moved, left, iterations, converged)
 
 

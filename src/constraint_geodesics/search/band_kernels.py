@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.kernels import (
-    COMPILE,
     backward,
     cholesky,
     curvature,
@@ -68,8 +68,8 @@ class _Active(NamedTuple):
 
 
 class _BandWork(NamedTuple):
-    """What the kernels of a band write into: contact_weights, here, there, moved, row (D,); the
-    second derivatives full (D, D).
+    """What the kernels of a band write into: contact_weights, here, there, moved, row, gradient
+    (D,); the second derivatives full (D, D).
     """
 
     node: Workspace
@@ -79,6 +79,7 @@ class _BandWork(NamedTuple):
     there: np.ndarray
     moved: np.ndarray
     row: np.ndarray
+    gradient: np.ndarray
     full: np.ndarray
 
 
@@ -103,11 +104,12 @@ def new_work(space):
         np.empty(dof),
         np.empty(dof),
         np.empty(dof),
+        np.empty(dof),
         np.empty((dof, dof)),
     )
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _size_together(bounds, residual):
     square = 0.0
     for i in range(residual.shape[0] - 1, -1, -1):
@@ -116,7 +118,7 @@ def _size_together(bounds, residual):
     return np.sqrt(square)
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _weighted_gradient(space, q, cone_weight, contacts, work, out):
     """Σ_j λ_j ∇c_j (D,) of one configuration: of the residual's rows, of the size of those that are
     bounded together, and of so many contacts.
@@ -144,7 +146,7 @@ def _weighted_gradient(space, q, cone_weight, contacts, work, out):
             out[d] -= work.contact_weights[c] * work.row[d]
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _gather(space, q, work):
     """The rows at q that count into `work.active`: exact ones, and inequalities that are near;
     returns how many.
@@ -220,7 +222,7 @@ def _gather(space, q, work):
     return size
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _let_go(active, size, gradient, normal, here, onto):
     """Drop inequalities, the worst first, until no multiplier would hold the node back; returns how
     many rows are left.
@@ -267,7 +269,7 @@ def _let_go(active, size, gradient, normal, here, onto):
     return size
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _null_space(rows, size, left, basis):
     """Orthonormal basis (D, k) of the null space of the leading rows, which are overwritten;
     returns k.
@@ -319,7 +321,7 @@ def _null_space(rows, size, left, basis):
     return count
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _weigh(active, size, work):
     """The multipliers as weights of the constraint's rows and of the contacts, those that count
     first; returns the weight of the rows bounded together, how many contacts count, and whether
@@ -345,12 +347,13 @@ def _weigh(active, size, work):
     return cone_weight, contacts, curved
 
 
-@njit(**COMPILE)
-def _add_curvature(space, q, cone_weight, contacts, basis, hessian, work):
-    """Add Nᵀ (Σ λ_j ∇²c_j) N to the leading (k, k) of `hessian`, N (D, k): in closed form where the
-    constraint's kind knows one, else by finite differences.
+@njit(**LEAF)
+def _add_curvature(space, q, weighed, basis, count, hessian, work):
+    """Add Nᵀ (Σ λ_j ∇²c_j) N to the leading (k, k) of `hessian`, N the leading k columns of
+    `basis`: in closed form where the kind knows one, else by finite differences.  weighed: the
+    weight of the rows bounded together, and how many contacts count.
     """
-    dof, count = basis.shape
+    dof, (cone_weight, contacts) = q.shape[0], weighed
     node, full, here, there, moved = work.node, work.full, work.here, work.there, work.moved
     if (
         cone_weight == 0.0
@@ -383,7 +386,7 @@ def _add_curvature(space, q, cone_weight, contacts, basis, hessian, work):
             hessian[j, k] += 0.5 * value / _DIFFERENCE
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def reduced(space, q, gradient, basis, hessian, onto, work):
     """Null space `basis` (D, k) of the active rows at q and the reduced Hessian (k, k); returns k.
 
@@ -400,28 +403,27 @@ def reduced(space, q, gradient, basis, hessian, onto, work):
         for j in range(count):
             hessian[k, j] = 2.0 if k == j else 0.0
     if curved:
-        _add_curvature(space, q, cone_weight, contacts, basis[:, :count], hessian, work)
+        _add_curvature(space, q, (cone_weight, contacts), basis, count, hessian, work)
     return count
 
 
-@njit(**COMPILE)
-def _newton(bases, counts, hessians, gradients, shift, steps):
-    """Solve the block-tridiagonal system for `steps` (m, D); False where it is not positive
-    definite.
-
-    bases (m, D, D), counts (m,), hessians (m, D, D), gradients (m, D) of the m inner nodes.
+@njit(**LEAF)
+def _newton(band, m, shift):
+    """Solve the block-tridiagonal system for `band.steps` of the m inner nodes; False where it is
+    not positive definite.
     """
-    m, dof = gradients.shape
-    factors = np.empty((m, dof, dof))
-    couplings = np.zeros((m, dof, dof))  # L_{i+1,i}: of node i + 1 to node i
-    right = -gradients
+    bases, counts, hessians, gradients = band.bases, band.counts, band.hessians, band.gradients
+    factors, couplings, right, steps = band.factors, band.couplings, band.right, band.steps
+    dof = gradients.shape[1]
     for i in range(m):
         size = counts[i]
         for a in range(size):
+            right[i, a] = -gradients[i, a]
             for b in range(size):
                 factors[i, a, b] = hessians[i, a, b]
             factors[i, a, a] += shift
         if i > 0:
+            # couplings[i]: L_{i,i−1}, of node i to node i − 1
             before = counts[i - 1]
             for a in range(size):
                 for b in range(before):
@@ -456,7 +458,7 @@ def _newton(bases, counts, hessians, gradients, shift, steps):
     return True
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def band_energy(nodes):
     """E = ½ Σ ‖q_{i+1} − q_i‖²."""
     total = 0.0
@@ -466,20 +468,20 @@ def band_energy(nodes):
     return total
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def gradient_of(nodes, i, d):
     """Component d of e_i = 2 q_i − q_{i−1} − q_{i+1}."""
     return 2.0 * nodes[i, d] - nodes[i - 1, d] - nodes[i + 1, d]
 
 
-@njit(**COMPILE)
-def _hold_back(space, nodes, trial, work):
+@njit(**LEAF)
+def _hold_back(space, nodes, trial, held, work):
     """Leave nodes where they were, `nodes`, if the line from or to where they would be, `trial`,
     runs into something.
     """
     n = nodes.shape[0] - 1
-    held = np.zeros(n + 1, dtype=np.bool_)
-    held[0] = held[n] = True
+    for k in range(n + 1):
+        held[k] = k == 0 or k == n
     i = 0
     while i < n:
         # the line between two nodes that are held is one of before, whatever it touches
@@ -495,96 +497,164 @@ def _hold_back(space, nodes, trial, work):
         i = i - 1 if back else i + 1
 
 
-@njit(**COMPILE)
-def relax_band(space, nodes, iterations, accuracy, largest, guarded):
-    """Shorten a band (n + 1, D) in place; returns (what remains of the violation, iterations used,
-    converged).
+class _Band(NamedTuple):
+    """What the m inner nodes of a band have: bases, hessians, factors, couplings (m, D, D), counts
+    (m,), gradients, right, steps, onto (m, D); trial (m + 2, D), held (m + 2,).
+    """
 
-    guarded: lines between its nodes that touch nothing keep that.
-    accuracy: relative decrease of the energy predicted by Newton's step below which the band has
-    converged.
-    largest: longest step of a node [rad].
+    bases: np.ndarray
+    hessians: np.ndarray
+    factors: np.ndarray
+    couplings: np.ndarray
+    counts: np.ndarray
+    gradients: np.ndarray
+    right: np.ndarray
+    steps: np.ndarray
+    onto: np.ndarray
+    trial: np.ndarray
+    held: np.ndarray
+
+
+@njit(**COMPILE)
+def new_band(most, dof):
+    """Room for bands of so many nodes at most."""
+    m = most - 2
+    return _Band(
+        np.empty((m, dof, dof)),
+        np.empty((m, dof, dof)),
+        np.empty((m, dof, dof)),
+        np.empty((m, dof, dof)),
+        np.zeros(m, dtype=np.int64),
+        np.empty((m, dof)),
+        np.empty((m, dof)),
+        np.empty((m, dof)),
+        np.empty((m, dof)),
+        np.empty((most, dof)),
+        np.zeros(most, dtype=np.bool_),
+    )
+
+
+@njit(**LEAF)
+def _linearise_band(space, nodes, band, work):
+    """The reduced problem of all inner nodes: bases, Hessians, and gradients where all steps onto
+    bounds are taken.
     """
     n, dof = nodes.shape[0] - 1, nodes.shape[1]
-    m = n - 1
-    work = new_work(space)
-    bases, hessians = np.zeros((m, dof, dof)), np.zeros((m, dof, dof))
-    counts = np.zeros(m, dtype=np.int64)
-    gradients, steps, onto = np.zeros((m, dof)), np.zeros((m, dof)), np.zeros((m, dof))
-    gradient = np.empty(dof)
-    trial = nodes.copy()
-    worst = 0.0
+    onto, gradient = band.onto, work.gradient
+    for i in range(n - 1):
+        for d in range(dof):
+            gradient[d] = gradient_of(nodes, i + 1, d)
+        band.counts[i] = reduced(
+            space, nodes[i + 1], gradient, band.bases[i], band.hessians[i], onto[i], work
+        )
+    for i in range(n - 1):
+        for d in range(dof):
+            gradient[d] = 2.0 * (nodes[i + 1, d] + onto[i, d]) - nodes[i, d] - nodes[i + 2, d]
+            if i > 0:
+                gradient[d] -= onto[i - 1, d]
+            if i < n - 2:
+                gradient[d] -= onto[i + 1, d]
+        for a in range(band.counts[i]):
+            value = 0.0
+            for d in range(dof):
+                value += band.bases[i, d, a] * gradient[d]
+            band.gradients[i, a] = value
+
+
+@njit(**LEAF)
+def _promise(nodes, band):
+    """Add the steps onto bounds to Newton's; returns by how much the energy is to decrease, and the
+    longest step.
+    """
+    n, dof = nodes.shape[0] - 1, nodes.shape[1]
+    promised, longest = 0.0, 0.0
+    for i in range(n - 1):
+        square = 0.0
+        for a in range(band.counts[i]):
+            value = 0.0
+            for d in range(dof):
+                value += band.bases[i, d, a] * band.steps[i, d]
+            promised -= 0.5 * band.gradients[i, a] * value
+        for d in range(dof):
+            band.steps[i, d] += band.onto[i, d]
+            square += band.steps[i, d] ** 2
+            promised += abs(gradient_of(nodes, i + 1, d) * band.onto[i, d])
+        longest = max(longest, np.sqrt(square))
+    return promised, longest
+
+
+@njit(**LEAF)
+def _moved(space, nodes, scale, band, work):
+    """The nodes after a share of the steps, projected, into `band.trial`; returns what remains of
+    the violation.
+    """
+    trial, worst = band.trial, 0.0
+    for i in range(1, nodes.shape[0] - 1):
+        for d in range(nodes.shape[1]):
+            trial[i, d] = nodes[i, d] + scale * band.steps[i - 1, d]
+        worst = max(worst, project_node(space, trial[i], 6, work))
+    return worst
+
+
+@njit(**LEAF)
+def shorten(space, nodes, settings, band, work):
+    """Shorten a band (n + 1, D) in place; returns (what remains of the violation, iterations used,
+    converged).  settings: see `relax_band`; band: of `new_band`; work: of `new_work`.
+    """
+    most, accuracy, largest, guarded = settings
+    n, dof = nodes.shape[0] - 1, nodes.shape[1]
+    trial = band.trial[: n + 1]
+    worst, used, converged = 0.0, 0, False
     for i in range(1, n):
-        left = project_node(space, nodes[i], 8, work.node)
-        worst = max(worst, left)
+        worst = max(worst, project_node(space, nodes[i], 8, work.node))
+    for i in (0, n):
+        for d in range(dof):
+            trial[i, d] = nodes[i, d]
     energy = band_energy(nodes)
-    used = 0
-    converged = False
-    for _ in range(iterations):
+    for _ in range(most):
         used += 1
-        for i in range(m):
-            for d in range(dof):
-                gradient[d] = 2.0 * nodes[i + 1, d] - nodes[i, d] - nodes[i + 2, d]
-            counts[i] = reduced(space, nodes[i + 1], gradient, bases[i], hessians[i], onto[i], work)
-        for i in range(m):
-            for d in range(dof):
-                gradient[d] = 2.0 * (nodes[i + 1, d] + onto[i, d]) - nodes[i, d] - nodes[i + 2, d]
-                if i > 0:
-                    gradient[d] -= onto[i - 1, d]
-                if i < m - 1:
-                    gradient[d] -= onto[i + 1, d]
-            for a in range(counts[i]):
-                value = 0.0
-                for d in range(dof):
-                    value += bases[i, d, a] * gradient[d]
-                gradients[i, a] = value
+        _linearise_band(space, nodes, band, work)
         shift = 0.0
-        while not _newton(bases, counts, hessians, gradients, shift, steps):
+        while not _newton(band, n - 1, shift):
             shift = 0.02 if shift == 0.0 else 4.0 * shift
             if shift > 1e4:
                 return worst, used, False
-        promised = 0.0
-        longest = 0.0
-        for i in range(m):
-            square = 0.0
-            for a in range(counts[i]):
-                value = 0.0
-                for d in range(dof):
-                    value += bases[i, d, a] * steps[i, d]
-                promised -= 0.5 * gradients[i, a] * value
-            for d in range(dof):
-                steps[i, d] += onto[i, d]
-                square += steps[i, d] ** 2
-                promised += abs(gradient_of(nodes, i + 1, d) * onto[i, d])
-            longest = max(longest, np.sqrt(square))
+        promised, longest = _promise(nodes, band)
         if promised <= accuracy * energy:
             converged = True
             if longest > 0.05:
                 break
-        scale = 1.0 if longest <= largest else largest / longest
-        improved = False
+        scale, improved = 1.0 if longest <= largest else largest / longest, False
         for _ in range(6):
-            left_over = 0.0
-            for i in range(1, n):
-                for d in range(dof):
-                    trial[i, d] = nodes[i, d] + scale * steps[i - 1, d]
-                left = project_node(space, trial[i], 6, work.node)
-                left_over = max(left_over, left)
+            left = _moved(space, nodes, scale, band, work.node)
             if guarded:
-                _hold_back(space, nodes, trial, work.node)
+                _hold_back(space, nodes, trial, band.held, work.node)
             after = band_energy(trial)
-            if after < energy and left_over <= max(worst, 1e-6):
+            if after < energy and left <= max(worst, 1e-6):
                 improved = True
                 break
             scale *= 0.4
         if not improved:
             break
-        nodes[:, :] = trial
-        energy = after
-        worst = left_over
+        for i in range(1, n):
+            for d in range(dof):
+                nodes[i, d] = trial[i, d]
+        energy, worst = after, left
         if converged:
             break
     return worst, used, converged
+
+
+@njit(**COMPILE)
+def relax_band(space, nodes, settings):
+    """`shorten` with room of its own.
+
+    settings: iterations at most; relative decrease of the energy predicted by Newton's step below
+    which the band has converged; longest step of a node [rad]; whether lines between its nodes that
+    touch nothing keep that.
+    """
+    band = new_band(nodes.shape[0], nodes.shape[1])
+    return shorten(space, nodes, settings, band, new_work(space))
 
 
 @njit(**COMPILE)
@@ -631,7 +701,7 @@ def spline_moments(knots, nodes):
     return moments
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def spline_points(knots, nodes, moments, at, points):
     """Points (T, D) of the spline at rising parameters (T,)."""
     i = 0

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
-from constraint_geodesics.constraints.kernels import COMPILE
+from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.geometry.graph import components, nearest_neighbour_edges
 from constraint_geodesics.search.space import Space, is_free, project_node, workspace
 
@@ -143,7 +143,7 @@ def resample(corners: Float[np.ndarray, "k D"], count: int) -> Float[np.ndarray,
     return points
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def edge_length(space, first, second, work):
     """Length [rad] of the straight joint line between two configurations, projected; inf where it
     jumps.
@@ -155,8 +155,9 @@ def edge_length(space, first, second, work):
     direct = np.sqrt(direct)
     pieces = int(np.ceil(direct / EDGE_STEP)) + 1
     allowed = 0.05 + 3.0 * direct / pieces
-    before, point = first.copy(), first.copy()
-    total = 0.0
+    before, point, total = work.before, work.point, 0.0
+    for d in range(dof):
+        before[d] = first[d]
     for k in range(1, pieces + 1):
         for d in range(dof):
             point[d] = first[d] + k / pieces * (second[d] - first[d])
@@ -169,7 +170,8 @@ def edge_length(space, first, second, work):
         if not step <= allowed or not is_free(space, before, point, work):
             return np.inf
         total += step
-        before[:] = point
+        for d in range(dof):
+            before[d] = point[d]
     return total
 
 

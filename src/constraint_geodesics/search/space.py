@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
+from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.constraints.kernels import COMPILE, excess_of, linearise, scratch
+from constraint_geodesics.constraints.kernels import excess_of, linearise, scratch
 from constraint_geodesics.constraints.projection import normal_matrix, solve_normal
 from constraint_geodesics.robot.kinematics import ChainArrays
 from constraint_geodesics.scene.clearance import (
@@ -59,7 +60,7 @@ class Workspace(NamedTuple):
     """What the kernels write into, allocated once.
 
     constraint: what its kind needs; residual, excess, active, weights (m,) and jacobian (m, D) of
-    its rows; contacts; rows, normal, left (D, D); right, squares (D,).
+    its rows; contacts; rows, normal, left (D, D); right, squares, before, point (D,).
     """
 
     constraint: Any
@@ -74,6 +75,8 @@ class Workspace(NamedTuple):
     left: np.ndarray
     right: np.ndarray
     squares: np.ndarray
+    before: np.ndarray
+    point: np.ndarray
 
 
 @njit(**COMPILE)
@@ -93,10 +96,12 @@ def workspace(space):
         np.empty((dof, dof)),
         np.empty(dof),
         np.empty(dof),
+        np.empty(dof),
+        np.empty(dof),
     )
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _broken(space, q, work):
     """What one configuration breaks, into `work.rows` and `work.right`: the number of rows, and the
     worst [rad or m].
@@ -142,7 +147,7 @@ def is_free(space, first, second, work):
     )
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def project_node(space, q, iterations, work):
     """Gauss-Newton of one configuration onto constraint, joint limits and clearance together, in
     place; returns what remains [rad or m].

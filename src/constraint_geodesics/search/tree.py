@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
-from constraint_geodesics.constraints.kernels import COMPILE
+from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.search.roadmap import edge_length
 from constraint_geodesics.search.space import Space, is_free, project_node, workspace
 
@@ -64,7 +64,7 @@ def tree_way(
     return corners if len(corners) else None
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _nearest(nodes, count, q):
     best, smallest = 0, np.inf
     for n in range(count):
@@ -76,7 +76,7 @@ def _nearest(nodes, count, q):
     return best
 
 
-@njit(**COMPILE)
+@njit(**LEAF)
 def _extended(space, nodes, parents, count, node, target, step, work, point):
     """Grow a tree from one of its nodes towards a configuration as far as it gets.
 
