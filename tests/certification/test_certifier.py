@@ -184,7 +184,7 @@ def test_it_shares_with_the_search_the_bodies_and_their_distance_alone() -> None
         "constraint_geodesics.scene.scene": {"Scene"},
         "constraint_geodesics.constraints.constraint": {"Constraint", "Pose"},
         "constraint_geodesics.scene.world": {"BodyKey", "LoadedChain", "World"},
-        "constraint_geodesics.scene.pieces": {"NOT_CONVEX", "prism"},
+        "constraint_geodesics.scene.pieces": {"NOT_CONVEX", "Piece", "prism"},
     }
     of_convex_kernels = {
         "REACH",

@@ -7,6 +7,7 @@ kinematics, with the direction in which it grows; where pieces overlap, how deep
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,8 @@ from numba import njit
 from constraint_geodesics.robot.kernels import frame_of, joint_frame
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene import convex_kernels as convex
-from constraint_geodesics.scene.bodies import Body, NodeTable, pairs_of, read_bodies
+from constraint_geodesics.scene.bodies import NodeTable, pairs_of, read_bodies
+from constraint_geodesics.scene.pieces import Piece
 from constraint_geodesics.scene.shape import Shape
 
 # columns of a contact
@@ -99,25 +101,20 @@ def clearance_model(
     if not pairs:
         return NO_CLEARANCE
     table = NodeTable(bodies)
-    nodes = np.concatenate([table.nodes, _reaches(robot, bodies, table)], axis=1)
+    nodes = table.with_reaches(robot.dof, partial(_reach, robot))
     return ClearanceModel(ClearanceArrays(table.hulls, nodes, table.pairs(pairs), len(pairs)))
 
 
-def _reaches(
-    robot: SerialRobot, bodies: Sequence[Body], table: NodeTable
-) -> Float[np.ndarray, "N D"]:
-    """How far points of each node get from each axis at most: along the links, stretched out."""
-    reach, prismatic = np.zeros((len(table.nodes), robot.dof)), robot.chain.prismatic
+def _reach(robot: SerialRobot, piece: Piece, frame: int) -> Float[np.ndarray, "D"]:
+    """How far a piece's points get from each axis at most: along the links, stretched out."""
+    reach, prismatic = np.zeros(robot.dof), robot.chain.prismatic
     extents = np.abs(np.stack([robot.lower, robot.upper])).max(axis=0) * prismatic
     lengths = np.linalg.norm(robot.chain.origins[:, :3, 3], axis=1)
-    for b, (body, nodes) in enumerate(zip(bodies, table.pieces, strict=True)):
-        for node, piece in zip(nodes, body.pieces, strict=True):
-            away = np.linalg.norm(piece.corners, axis=1).max() + piece.rounding
-            for j in range(body.frame - 1, -1, -1):
-                away += extents[j]
-                reach[node, j] = 1.0 if prismatic[j] else away
-                away += lengths[j]
-        reach[b] = reach[nodes].max(axis=0)
+    away = np.linalg.norm(piece.corners, axis=1).max() + piece.rounding
+    for j in range(frame - 1, -1, -1):
+        away += extents[j]
+        reach[j] = 1.0 if prismatic[j] else away
+        away += lengths[j]
     return reach
 
 
