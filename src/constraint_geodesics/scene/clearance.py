@@ -350,7 +350,7 @@ def frames_of(room, c):
 
 @njit(**_COMPILE)
 def contact_row(prismatic, room, c, row):
-    """Gradient (D,) of a contact's distance."""
+    """Gradient (D,) of a contact's distance into `row`; returns its length."""
     found, axes, origins = room.found, room.axes, room.origins
     first, last = frames_of(room, c)
     n0, n1, n2 = found[c, NORMAL], found[c, NORMAL + 1], found[c, NORMAL + 2]
@@ -363,6 +363,10 @@ def contact_row(prismatic, room, c, row):
             continue
         x, y, z = p0 - origins[j, 0], p1 - origins[j, 1], p2 - origins[j, 2]
         row[j] = n0 * (a1 * z - a2 * y) + n1 * (a2 * x - a0 * z) + n2 * (a0 * y - a1 * x)
+    square = 0.0
+    for j in range(first, last):
+        square += row[j] ** 2
+    return np.sqrt(square)
 
 
 @njit(**_COMPILE)

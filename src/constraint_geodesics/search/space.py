@@ -28,6 +28,8 @@ NEAR = 0.05
 """Bounds so near [rad or m] are looked at."""
 CLOSE = 0.03
 """So are bodies that are so close beyond their margin [m]."""
+STILL = 1e-9
+"""A contact whose distance no joint changes by more [m/rad] is none to be kept."""
 _REACHED = 1e-9
 _LONGEST_STEP = 0.6
 _RIDGE = 1e-9
@@ -128,7 +130,8 @@ def _broken(space, q, work):
             short = space.margin - contacts.found[c, DISTANCE]
             worst = max(worst, short)
             if size < dof:
-                contact_row(space.chain.prismatic, contacts, c, rows[size])
+                if contact_row(space.chain.prismatic, contacts, c, rows[size]) < STILL:
+                    continue
                 right[size] = -short
                 size += 1
     return size, worst
@@ -151,7 +154,7 @@ def project_node(space, q, iterations, work):
     worst = np.inf
     for iteration in range(iterations + 1):
         size, worst = _broken(space, q, work)
-        if worst <= _REACHED or iteration == iterations:
+        if worst <= _REACHED or size == 0 or iteration == iterations:
             break
         trace = normal_matrix(rows, size, normal)
         for i in range(size):
