@@ -54,9 +54,9 @@ class Bodies(NamedTuple):
 
     hulls (H,): of each corner of a piece x, y, z [m] in the frame that carries it, the number of
     corners beside it and where they are in `hulls`; nodes (N, REACH + D) and pairs (P, PAIR): the
-    columns above, those of a pair begin with two nodes, that of the lower frame first, and the
-    range of the pairs of their pieces, which is empty for pieces.  The first `top` pairs are of
-    bodies.
+    columns of convex_kernels.py, those of a pair begin with two nodes, that of the lower frame
+    first, and the range of the pairs of their pieces, which is empty for pieces.  The first `top`
+    pairs are of bodies.
     """
 
     chain: Any

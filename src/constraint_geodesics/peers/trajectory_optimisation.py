@@ -206,8 +206,8 @@ class TrajectoryOptimisation:
         yield bent_lines(problem, 2 * segments, 1, self.configurations, seed)[0]
 
     def _optimised(self, task: Task, line: Nodes) -> tuple[Nodes | None, int]:
-        """Waypoints from a line, and iterations.  Most never meet a limit or a box: those are added
-        where they do.
+        """Waypoints from a line, and iterations.  Most meet no limit and touch nothing: both
+        are asked for where they do.
         """
         beyond, near = np.zeros((2, task.manifold.robot.dof), bool), False
         spent = 0

@@ -1,5 +1,5 @@
 """The configurations that a search may use: on the constraint, within the joint limits, clear of
-the workcell.
+the workcell and of the arm itself.
 """
 
 from typing import Any, NamedTuple
@@ -38,7 +38,7 @@ _SMALLEST_PIVOT = 1e-12
 
 class Space(NamedTuple):
     """As the compiled search takes it.  constraint: of `Constraint.arrays`; limits (2, D): lower
-    and upper [rad or m]; margin: kept to the workcell's shapes [m].
+    and upper [rad or m]; margin: kept by bodies that may meet [m].
     """
 
     chain: ChainArrays
@@ -51,7 +51,7 @@ class Space(NamedTuple):
 def space_of(
     manifold: ConstraintManifold, clearance: ClearanceModel | None = None, margin_m: float = 0.0
 ) -> Space:
-    """The space of a constraint manifold, by default in an empty workcell."""
+    """The space of a constraint manifold, by default one in which nothing can meet."""
     robot = manifold.robot
     limits = np.stack([robot.lower, robot.upper])
     return Space(*manifold.arrays, limits, (clearance or NO_CLEARANCE).arrays, margin_m)
