@@ -2,7 +2,7 @@
 the joints' axes, and which pairs of bodies need a look.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from jaxtyping import Float
 from constraint_geodesics.certification import collision_kernels as kernels
 from constraint_geodesics.certification.chain import Chain, rotated
 from constraint_geodesics.scene.bodies import Body, NodeTable, pairs_of, read_bodies
-from constraint_geodesics.scene.pieces import NOT_CONVEX, prism
+from constraint_geodesics.scene.pieces import NOT_CONVEX, Piece, prism
 from constraint_geodesics.scene.scene import Scene
 
 _SIDES = 256
@@ -61,8 +61,7 @@ def collider(scene: Scene, chain: Chain, margin: float, beyond: float) -> Collid
     kernels.joint_frames(chain, np.zeros(robot.dof), frames)
     bodies = read_bodies(robot, scene.workcell, frames)
     table = NodeTable(bodies)
-    reach = _reaches(bodies, table, chain, limits)
-    nodes = np.concatenate([table.nodes, reach], axis=1)
+    nodes = table.with_reaches(robot.dof, _reach_on(chain, limits))
 
     def arrays(wanted: Sequence[tuple[int, int]], top: int) -> kernels.Bodies:
         return kernels.Bodies(chain, table.hulls, nodes, table.pairs(wanted), top)
@@ -80,27 +79,27 @@ def collider(scene: Scene, chain: Chain, margin: float, beyond: float) -> Collid
     return Collider(tuple(bodies), limits, tuple(moving), tuple(rigid), tuple(apart), looked_at)
 
 
-def _reaches(
-    bodies: Sequence[Body], table: NodeTable, chain: Chain, limits: Float[np.ndarray, "2 D"]
-) -> Float[np.ndarray, "N D"]:
-    """How far points of each node get from each axis at most."""
+def _reach_on(
+    chain: Chain, limits: Float[np.ndarray, "2 D"]
+) -> Callable[[Piece, int], Float[np.ndarray, "D"]]:
+    """What tells how far the points of a piece, carried by a frame, get from each axis at most."""
     # rows: where the axes of the frame before are turned to
     turns = [np.array([rotated(q, axis) for axis in np.eye(3)]) for q in chain.turns]
-    reach = np.zeros((len(table.nodes), limits.shape[1]))
-    for b, (body, nodes) in enumerate(zip(bodies, table.pieces, strict=True)):
-        for node, piece in zip(nodes, body.pieces, strict=True):
-            points = piece.corners
-            # wherever the joints after an axis are: of a cylinder about that axis, in the frame
-            # before, those of a cylinder about the axis before, …
-            for j in range(body.frame - 1, -1, -1):
-                if chain.prismatic[j]:
-                    points, reach[node, j] = np.concatenate([points, points]), 1.0
-                    points[: len(points) // 2, 2] += limits[0, j]
-                    points[len(points) // 2 :, 2] += limits[1, j]
-                else:
-                    radius = np.linalg.norm(points[:, :2], axis=1).max()
-                    reach[node, j] = radius + piece.rounding
-                    points = prism(_SIDES, radius, points[:, 2].min(), points[:, 2].max())
-                points = points @ turns[j] + chain.offsets[j]
-        reach[b] = reach[nodes].max(axis=0)
+
+    def reach(piece: Piece, frame: int) -> Float[np.ndarray, "D"]:
+        found, points = np.zeros(limits.shape[1]), piece.corners
+        # wherever the joints after an axis are: of a cylinder about that axis, in the frame before,
+        # those of a cylinder about the axis before, …
+        for j in range(frame - 1, -1, -1):
+            if chain.prismatic[j]:
+                points, found[j] = np.concatenate([points, points]), 1.0
+                points[: len(points) // 2, 2] += limits[0, j]
+                points[len(points) // 2 :, 2] += limits[1, j]
+            else:
+                radius = np.linalg.norm(points[:, :2], axis=1).max()
+                found[j] = radius + piece.rounding
+                points = prism(_SIDES, radius, points[:, 2].min(), points[:, 2].max())
+            points = points @ turns[j] + chain.offsets[j]
+        return found
+
     return reach

@@ -31,19 +31,7 @@ from numba import njit
 
 from constraint_geodesics.certification.kernels import BASE, next_frame
 from constraint_geodesics.compiled import COMPILE, LEAF
-from constraint_geodesics.scene.convex_kernels import (
-    FRAME,
-    REACH,
-    ROUNDING,
-    SIMPLEX,
-    VECTOR,
-    distance,
-    gap_along,
-    pieces_of,
-    place_balls,
-    roughly_apart,
-    turned,
-)
+from constraint_geodesics.scene import convex_kernels as convex
 
 # entries of a level
 PROVEN, ATTAINED, ASKED, MARGIN, HERE = 0, 1, 2, 3, 4
@@ -65,9 +53,9 @@ class Bodies(NamedTuple):
 
     hulls (H,): of each corner of a piece x, y, z [m] in the frame that carries it, the number of
     corners beside it and where they are in `hulls`; nodes (N, REACH + D) and pairs (P, PAIR): the
-    columns above, those of a pair begin with two nodes, that of the lower frame first, and the
-    range of the pairs of their pieces, which is empty for pieces.  The first `top` pairs are of
-    bodies.
+    columns of convex_kernels.py, those of a pair begin with two nodes, that of the lower frame
+    first, and the range of the pairs of their pieces, which is empty for pieces.  The first `top`
+    pairs are of bodies.
     """
 
     chain: Any
@@ -117,20 +105,20 @@ def _nearest(bodies, top, frames, at, level, simplex):
     place has less.
     """
     _, nodes, pairs = bodies
-    place_balls(nodes, frames, at)
+    convex.place_balls(nodes, frames, at)
     nearest = -1
     for body in range(top):
         a, b = int(pairs[body, 0]), int(pairs[body, 1])
-        if roughly_apart(nodes, a, b) >= level[ATTAINED]:
+        if convex.roughly_apart(nodes, a, b) >= level[ATTAINED]:
             continue
-        first, last = pieces_of(pairs, body)
+        first, last = convex.pieces_of(pairs, body)
         for p in range(first, last):
             a, b = int(pairs[p, 0]), int(pairs[p, 1])
-            if roughly_apart(nodes, a, b) >= level[ATTAINED]:
+            if convex.roughly_apart(nodes, a, b) >= level[ATTAINED]:
                 continue
-            rounding = nodes[a, ROUNDING] + nodes[b, ROUNDING]
+            rounding = nodes[a, convex.ROUNDING] + nodes[b, convex.ROUNDING]
             wanted = (level[ATTAINED] + rounding, -np.inf)
-            lower, _ = distance(bodies, frames, at, p, wanted, simplex)
+            lower, _ = convex.distance(bodies, frames, at, p, wanted, simplex)
             if max(lower, 0.0) - rounding < level[ATTAINED]:
                 nearest = p
             _attained(level, max(lower, 0.0) - rounding)
@@ -162,8 +150,8 @@ def _bounds_of_motion(nodes, a, b, steps):
     how far they get off their way's ends: ⅛ Σ |d_j| ρ_j (|d_j| + 2 Σ |d_h|) + Σ ρ_j e_j.
     """
     motion, bend, off, before = 0.0, 0.0, 0.0, 0.0
-    for j in range(int(nodes[a, FRAME]), int(nodes[b, FRAME])):
-        reach, step = nodes[b, REACH + j], steps[1, j]
+    for j in range(int(nodes[a, convex.FRAME]), int(nodes[b, convex.FRAME])):
+        reach, step = nodes[b, convex.REACH + j], steps[1, j]
         motion += reach * steps[0, j]
         bend += step * reach * (step + 2.0 * before)
         off += reach * steps[2, j]
@@ -178,26 +166,26 @@ def _is_proven(bodies, frames, places, p, level, steps, simplex):
     """
     _, nodes, pairs = bodies
     a, b = int(pairs[p, 0]), int(pairs[p, 1])
-    f, rounding = int(nodes[a, FRAME]), nodes[a, ROUNDING] + nodes[b, ROUNDING]
+    f, rounding = int(nodes[a, convex.FRAME]), nodes[a, convex.ROUNDING] + nodes[b, convex.ROUNDING]
     motion, bend = _bounds_of_motion(nodes, a, b, steps)
     level[HERE] = np.inf
     if min(motion, bend) > _CLOSE:
         return False
     for attempt in range(2):
         bound = -np.inf
-        x, y, z = pairs[p, VECTOR], pairs[p, VECTOR + 1], pairs[p, VECTOR + 2]
+        x, y, z = pairs[p, convex.VECTOR], pairs[p, convex.VECTOR + 1], pairs[p, convex.VECTOR + 2]
         if bend < motion and (x != 0.0 or y != 0.0 or z != 0.0):
             gap, enough = np.inf, level[ASKED] + rounding + bend
             for end in range(2):
                 if gap > enough:
-                    n = turned(frames, places[end], f, x, y, z)
-                    gap = min(gap, gap_along(bodies, frames, places[end], p, n))
+                    n = convex.turned(frames, places[end], f, x, y, z)
+                    gap = min(gap, convex.gap_along(bodies, frames, places[end], p, n))
             if gap > enough:  # at both ends
                 bound = gap - bend
         if attempt == 0 and bound - rounding <= level[ASKED]:
             too_little = level[MARGIN] + rounding + min(motion, bend)
             wanted = (level[ASKED] + rounding + motion, too_little)
-            lower, upper = distance(bodies, frames, places[2], p, wanted, simplex)
+            lower, upper = convex.distance(bodies, frames, places[2], p, wanted, simplex)
             _attained(level, upper - rounding)
             bound = lower - motion
         if bound - rounding > level[ASKED]:
@@ -215,7 +203,7 @@ def _sift(bodies, frames, interval, todo, level, steps, simplex):
     """
     i, m, k = interval
     _, nodes, pairs = bodies
-    place_balls(nodes, frames, m)
+    convex.place_balls(nodes, frames, m)
     count, kept, c = todo[0], 0, 0
     while c < count:
         c += 1
@@ -223,7 +211,7 @@ def _sift(bodies, frames, interval, todo, level, steps, simplex):
         a, b = int(pairs[p, 0]), int(pairs[p, 1])
         first, last = int(pairs[p, 2]), int(pairs[p, 3])
         motion, _ = _bounds_of_motion(nodes, a, b, steps)
-        free = roughly_apart(nodes, a, b) - motion
+        free = convex.roughly_apart(nodes, a, b) - motion
         if free > level[ASKED]:
             level[PROVEN] = min(level[PROVEN], free)
             continue
@@ -257,7 +245,8 @@ def nearest_pair(bodies, q, most):
     """The least distance [m] of any two bodies that may meet at one configuration, and which pair
     it is: `most` and −1 where that is more.
     """
-    frames, simplex, level = np.empty((1, q.shape[0] + 1, 12)), np.empty(SIMPLEX), np.empty(5)
+    frames, simplex = np.empty((1, q.shape[0] + 1, 12)), np.empty(convex.SIMPLEX)
+    level = np.empty(5)
     for i in range(5):
         level[i] = most
     joint_frames(bodies.chain, q, frames[0])
@@ -280,7 +269,8 @@ def prove_apart(bodies, rows, margin, undecided):
     own = (bodies.hulls, bodies.nodes.copy(), bodies.pairs.copy())
     # after the rows' frames come those of three places on a line
     frames, known = np.empty((count + 3, dof + 1, 12)), np.zeros(count, dtype=np.bool_)
-    travelled, steps, simplex = np.zeros((count, dof + 1)), np.empty((3, dof)), np.empty(SIMPLEX)
+    travelled, steps = np.zeros((count, dof + 1)), np.empty((3, dof))
+    simplex = np.empty(convex.SIMPLEX)
     level = np.array([np.inf, np.inf, margin, margin, np.inf])
     for i in range(1, count):
         travelled[i, dof] = travelled[i - 1, dof]
@@ -354,9 +344,9 @@ def never_meets(bodies, body, limits, margin, cells):
     _, nodes, pairs = own
     dof = limits.shape[1]
     a, b = int(pairs[body, 0]), int(pairs[body, 1])
-    first, last = pieces_of(pairs, body)
-    lo, hi = int(nodes[a, FRAME]), int(nodes[b, FRAME])
-    frames, simplex = np.empty((1, dof + 1, 12)), np.empty(SIMPLEX)
+    first, last = convex.pieces_of(pairs, body)
+    lo, hi = int(nodes[a, convex.FRAME]), int(nodes[b, convex.FRAME])
+    frames, simplex = np.empty((1, dof + 1, 12)), np.empty(convex.SIMPLEX)
     waiting = np.empty((_DEEPEST, 2, dof))
     q = np.empty(dof)
     for j in range(dof):
@@ -372,16 +362,16 @@ def never_meets(bodies, body, limits, margin, cells):
         joint_frames(bodies.chain, q, frames[0])
         widest, most, motion = lo, -1.0, 0.0
         for j in range(lo, hi):
-            share = (waiting[left, 1, j] - q[j]) * nodes[b, REACH + j]
+            share = (waiting[left, 1, j] - q[j]) * nodes[b, convex.REACH + j]
             motion += share
             if share > most:
                 widest, most = j, share
         free = True
         for p in range(first, last):
             c, d = int(pairs[p, 0]), int(pairs[p, 1])
-            rounding = nodes[c, ROUNDING] + nodes[d, ROUNDING]
+            rounding = nodes[c, convex.ROUNDING] + nodes[d, convex.ROUNDING]
             wanted = (margin + rounding + motion, margin + rounding + motion)
-            lower, upper = distance(own, frames, 0, p, wanted, simplex)
+            lower, upper = convex.distance(own, frames, 0, p, wanted, simplex)
             if upper - rounding <= margin:
                 return False
             if lower <= margin + rounding + motion:

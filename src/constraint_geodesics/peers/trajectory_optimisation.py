@@ -39,9 +39,9 @@ from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.scene.clearance import (
     DISTANCE,
     contact_row,
+    frames_of,
     near_contacts,
     new_contacts,
-    second_frame,
 )
 from constraint_geodesics.search.band import BandSettings
 from constraint_geodesics.search.candidates import Task, refined
@@ -206,8 +206,8 @@ class TrajectoryOptimisation:
         yield bent_lines(problem, 2 * segments, 1, self.configurations, seed)[0]
 
     def _optimised(self, task: Task, line: Nodes) -> tuple[Nodes | None, int]:
-        """Waypoints from a line, and iterations.  Most never meet a limit or a box: those are added
-        where they do.
+        """Waypoints from a line, and iterations.  Most meet no limit and touch nothing: both
+        are asked for where they do.
         """
         beyond, near = np.zeros((2, task.manifold.robot.dof), bool), False
         spent = 0
@@ -346,7 +346,7 @@ def _link_clearances(chain, model, q, values, gradients):  # type: ignore[no-unt
     for b in range(q.shape[0]):
         values[b], gradients[b] = FAR, 0.0
         for c in range(near_contacts(chain, model, q[b], FAR, contacts)):
-            link = second_frame(contacts, c) - 1
+            link = frames_of(contacts, c)[1] - 1
             if contacts.found[c, DISTANCE] < values[b, link]:
                 values[b, link] = contacts.found[c, DISTANCE]
                 contact_row(chain.prismatic, contacts, c, gradients[b, link])

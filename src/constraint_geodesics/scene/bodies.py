@@ -3,7 +3,7 @@ pairs of bodies that move relative to each other, as convex_kernels.py takes the
 """
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,6 +87,7 @@ class NodeTable:
     """Bodies and their pieces as nodes (N, REACH): first all bodies, then all pieces."""
 
     def __init__(self, bodies: Sequence[Body]) -> None:
+        self._bodies = bodies
         self._pieces: list[np.ndarray] = []
         self._ranges: list[range] = []
         self._hulls: list[float] = []
@@ -126,6 +127,19 @@ class NodeTable:
             row[kernels.BALL : kernels.BALL + 3] = piece.box[:3]
             row[kernels.BOX : kernels.PLACE] = piece.box[3:]
         self._pieces.append(row)
+
+    def with_reaches(
+        self, dof: int, reach: Callable[[Piece, int], Float[np.ndarray, "D"]]
+    ) -> Float[np.ndarray, "N REACH+D"]:
+        """The nodes with how far their points get from each joint's axis at most.  reach: how far a
+        piece's do, given the frame that carries it.
+        """
+        reaches = np.zeros((len(self.nodes), dof))
+        for b, (body, nodes) in enumerate(zip(self._bodies, self.pieces, strict=True)):
+            for node, piece in zip(nodes, body.pieces, strict=True):
+                reaches[node] = reach(piece, body.frame)
+            reaches[b] = reaches[nodes].max(axis=0)
+        return np.concatenate([self.nodes, reaches], axis=1)
 
     def pairs(self, bodies: Sequence[tuple[int, int]]) -> Float[np.ndarray, "P 9"]:
         """The table of these pairs of bodies, and behind them those of their pieces."""

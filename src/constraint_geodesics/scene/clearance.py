@@ -7,6 +7,7 @@ kinematics, with the direction in which it grows; where pieces overlap, how deep
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -16,26 +17,9 @@ from numba import njit
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.robot.kernels import frame_of, joint_frame
 from constraint_geodesics.robot.kinematics import SerialRobot
-from constraint_geodesics.scene import convex_kernels
-from constraint_geodesics.scene.bodies import Body, NodeTable, pairs_of, read_bodies
-from constraint_geodesics.scene.convex_kernels import (
-    BOX,
-    CORNERS,
-    FRAME,
-    NEAREST,
-    PLACE,
-    REACH,
-    ROUNDING,
-    SIMPLEX,
-    VECTOR,
-    distance,
-    gap_along,
-    into,
-    pieces_of,
-    place_balls,
-    roughly_apart,
-    turned,
-)
+from constraint_geodesics.scene import convex_kernels as convex
+from constraint_geodesics.scene.bodies import NodeTable, pairs_of, read_bodies
+from constraint_geodesics.scene.pieces import Piece
 from constraint_geodesics.scene.shape import Shape
 
 # columns of a contact
@@ -101,7 +85,7 @@ class ClearanceModel:
         return smallest.reshape(q.shape[:-1])
 
 
-_NOTHING = np.empty(0), np.empty((0, REACH)), np.empty((0, convex_kernels.PAIR))
+_NOTHING = np.empty(0), np.empty((0, convex.REACH)), np.empty((0, convex.PAIR))
 NO_CLEARANCE = ClearanceModel(ClearanceArrays(*_NOTHING, 0))
 """Where nothing can meet."""
 
@@ -120,25 +104,20 @@ def clearance_model(
     if not pairs:
         return NO_CLEARANCE
     table = NodeTable(bodies)
-    nodes = np.concatenate([table.nodes, _reaches(robot, bodies, table)], axis=1)
+    nodes = table.with_reaches(robot.dof, partial(_reach, robot))
     return ClearanceModel(ClearanceArrays(table.hulls, nodes, table.pairs(pairs), len(pairs)))
 
 
-def _reaches(
-    robot: SerialRobot, bodies: Sequence[Body], table: NodeTable
-) -> Float[np.ndarray, "N D"]:
-    """How far points of each node get from each axis at most: along the links, stretched out."""
-    reach, prismatic = np.zeros((len(table.nodes), robot.dof)), robot.chain.prismatic
+def _reach(robot: SerialRobot, piece: Piece, frame: int) -> Float[np.ndarray, "D"]:
+    """How far a piece's points get from each axis at most: along the links, stretched out."""
+    reach, prismatic = np.zeros(robot.dof), robot.chain.prismatic
     extents = np.abs(np.stack([robot.lower, robot.upper])).max(axis=0) * prismatic
     lengths = np.linalg.norm(robot.chain.origins[:, :3, 3], axis=1)
-    for b, (body, nodes) in enumerate(zip(bodies, table.pieces, strict=True)):
-        for node, piece in zip(nodes, body.pieces, strict=True):
-            away = np.linalg.norm(piece.corners, axis=1).max() + piece.rounding
-            for j in range(body.frame - 1, -1, -1):
-                away += extents[j]
-                reach[node, j] = 1.0 if prismatic[j] else away
-                away += lengths[j]
-        reach[b] = reach[nodes].max(axis=0)
+    away = np.linalg.norm(piece.corners, axis=1).max() + piece.rounding
+    for j in range(frame - 1, -1, -1):
+        away += extents[j]
+        reach[j] = 1.0 if prismatic[j] else away
+        away += lengths[j]
     return reach
 
 
@@ -151,7 +130,7 @@ def new_contacts(model, dof):
         np.empty((1, dof + 1, 12)),
         np.empty((dof, 3)),
         np.empty((dof, 3)),
-        np.empty(SIMPLEX),
+        np.empty(convex.SIMPLEX),
         np.empty((max(model.pairs.shape[0], 1), _CONTACT)),
         np.empty(dof),
         np.empty((_DEEPEST, 2)),
@@ -159,7 +138,7 @@ def new_contacts(model, dof):
 
 
 @njit(**LEAF)
-def _place(chain, q, frames, joint_origins, joint_axes):
+def _place_frames(chain, q, frames, joint_origins, joint_axes):
     """Frames (1, D + 1, 12) of one configuration, joint origins and axes (D, 3)."""
     origins, axes, prismatic, base, _ = chain
     # the base's frame is where its links are read
@@ -179,8 +158,15 @@ def _place(chain, q, frames, joint_origins, joint_axes):
 @njit(**COMPILE)
 def _frames(chain, q):
     frames, dof = np.empty((1, q.shape[0] + 1, 12)), q.shape[0]
-    _place(chain, q, frames, np.empty((dof, 3)), np.empty((dof, 3)))
+    _place_frames(chain, q, frames, np.empty((dof, 3)), np.empty((dof, 3)))
     return frames
+
+
+@njit(**LEAF)
+def _place(chain, q, room):
+    """Frames, joint origins, axes and the nodes' balls of one configuration into `room`."""
+    _place_frames(chain, q, room.frames, room.origins, room.axes)
+    convex.place_balls(room.nodes, room.frames, 0)
 
 
 @njit(**LEAF)
@@ -191,16 +177,16 @@ def _shallowest(bodies, frames, p, simplex):
     """
     hulls, nodes, pairs = bodies
     a, b = int(pairs[p, 0]), int(pairs[p, 1])
-    f, g = int(nodes[a, FRAME]), int(nodes[b, FRAME])
-    x = nodes[b, PLACE] - nodes[a, PLACE]
-    y = nodes[b, PLACE + 1] - nodes[a, PLACE + 1]
-    z = nodes[b, PLACE + 2] - nodes[a, PLACE + 2]
+    f, g = int(nodes[a, convex.FRAME]), int(nodes[b, convex.FRAME])
+    x = nodes[b, convex.PLACE] - nodes[a, convex.PLACE]
+    y = nodes[b, convex.PLACE + 1] - nodes[a, convex.PLACE + 1]
+    z = nodes[b, convex.PLACE + 2] - nodes[a, convex.PLACE + 2]
     length = np.sqrt(x * x + y * y + z * z)
     # the vector that they touched along first, so that the depth begins at 0
-    u, v, w = pairs[p, VECTOR], pairs[p, VECTOR + 1], pairs[p, VECTOR + 2]
-    best = turned(frames, 0, f, u, v, w)
-    most = gap_along(bodies, frames, 0, p, best)
-    box = nodes[a, BOX] >= 0.0
+    u, v, w = pairs[p, convex.VECTOR], pairs[p, convex.VECTOR + 1], pairs[p, convex.VECTOR + 2]
+    best = convex.turned(frames, 0, f, u, v, w)
+    most = convex.gap_along(bodies, frames, 0, p, best)
+    box = nodes[a, convex.BOX] >= 0.0
     count = _TRIED.shape[0]
     for k in range(-1, count + 6 if box else count):
         if k < 0:
@@ -210,19 +196,19 @@ def _shallowest(bodies, frames, p, simplex):
         elif k < count:
             n = (_TRIED[k, 0], _TRIED[k, 1], _TRIED[k, 2])
         else:
-            at, sign = BOX + 3 + (k - count) // 2, 1.0 if k % 2 == 0 else -1.0
+            at, sign = convex.BOX + 3 + (k - count) // 2, 1.0 if k % 2 == 0 else -1.0
             n = (sign * nodes[a, at], sign * nodes[a, at + 3], sign * nodes[a, at + 6])
-        value = gap_along(bodies, frames, 0, p, n)
+        value = convex.gap_along(bodies, frames, 0, p, n)
         if value > most:
             best, most = n, value
-    most = gap_along(bodies, frames, 0, p, best)  # once more, for its corners
-    corner = int(pairs[p, CORNERS + 1])
-    x, y, z = turned(frames, 0, g, hulls[corner], hulls[corner + 1], hulls[corner + 2])
-    simplex[NEAREST, 3] = x + frames[0, g, 0]
-    simplex[NEAREST, 4] = y + frames[0, g, 1]
-    simplex[NEAREST, 5] = z + frames[0, g, 2]
-    x, y, z = into(frames, 0, f, best[0], best[1], best[2])
-    pairs[p, VECTOR], pairs[p, VECTOR + 1], pairs[p, VECTOR + 2] = x, y, z
+    most = convex.gap_along(bodies, frames, 0, p, best)  # once more, for its corners
+    corner = int(pairs[p, convex.CORNERS + 1])
+    x, y, z = convex.turned(frames, 0, g, hulls[corner], hulls[corner + 1], hulls[corner + 2])
+    simplex[convex.NEAREST, 3] = x + frames[0, g, 0]
+    simplex[convex.NEAREST, 4] = y + frames[0, g, 1]
+    simplex[convex.NEAREST, 5] = z + frames[0, g, 2]
+    x, y, z = convex.into(frames, 0, f, best[0], best[1], best[2])
+    pairs[p, convex.VECTOR], pairs[p, convex.VECTOR + 1], pairs[p, convex.VECTOR + 2] = x, y, z
     return most
 
 
@@ -231,22 +217,22 @@ def _measure(bodies, frames, simplex, p, far, contact):
     """The contact (8,) of one pair of pieces; False where they are further apart than `far` [m]."""
     _, nodes, pairs = bodies
     a, b = int(pairs[p, 0]), int(pairs[p, 1])
-    if roughly_apart(nodes, a, b) >= far:
+    if convex.roughly_apart(nodes, a, b) >= far:
         return False
-    rounding = nodes[a, ROUNDING] + nodes[b, ROUNDING]
-    lower, upper = distance(bodies, frames, 0, p, (far + rounding, -np.inf), simplex)
+    rounding = nodes[a, convex.ROUNDING] + nodes[b, convex.ROUNDING]
+    lower, upper = convex.distance(bodies, frames, 0, p, (far + rounding, -np.inf), simplex)
     if lower - rounding >= far:
         return False
     if upper < _OVERLAPPING:
         lower = _shallowest(bodies, frames, p, simplex)
         if lower - rounding >= far:
             return False
-    x, y, z = pairs[p, VECTOR], pairs[p, VECTOR + 1], pairs[p, VECTOR + 2]
-    x, y, z = turned(frames, 0, int(nodes[a, FRAME]), x, y, z)
+    x, y, z = pairs[p, convex.VECTOR], pairs[p, convex.VECTOR + 1], pairs[p, convex.VECTOR + 2]
+    x, y, z = convex.turned(frames, 0, int(nodes[a, convex.FRAME]), x, y, z)
     contact[DISTANCE], contact[PAIR] = lower - rounding, p
     contact[NORMAL], contact[NORMAL + 1], contact[NORMAL + 2] = x, y, z
     for d in range(3):
-        contact[POINT + d] = simplex[NEAREST, 3 + d]
+        contact[POINT + d] = simplex[convex.NEAREST, 3 + d]
     return True
 
 
@@ -257,14 +243,13 @@ def near_contacts(chain, model, q, far, room):
     """
     nodes, pairs, frames, found = room.nodes, room.pairs, room.frames, room.found
     simplex, bodies = room.simplex, (model.hulls, room.nodes, room.pairs)
-    _place(chain, q, frames, room.origins, room.axes)
-    place_balls(nodes, frames, 0)
+    _place(chain, q, room)
     count = 0
     for body in range(model.top):
-        if roughly_apart(nodes, int(pairs[body, 0]), int(pairs[body, 1])) >= far:
+        if convex.roughly_apart(nodes, int(pairs[body, 0]), int(pairs[body, 1])) >= far:
             continue
         least = far
-        first, last = pieces_of(pairs, body)
+        first, last = convex.pieces_of(pairs, body)
         for p in range(first, last):
             if _measure(bodies, frames, simplex, p, least, found[count]):
                 least = found[count, DISTANCE]
@@ -284,8 +269,8 @@ def _motion(nodes, pairs, p, first, second):
     """How far the second of a pair moves at most, seen from the first [m], over half a line."""
     a, b = int(pairs[p, 0]), int(pairs[p, 1])
     motion = 0.0
-    for j in range(int(nodes[a, FRAME]), int(nodes[b, FRAME])):
-        motion += abs(second[j] - first[j]) * nodes[b, REACH + j]
+    for j in range(int(nodes[a, convex.FRAME]), int(nodes[b, convex.FRAME])):
+        motion += abs(second[j] - first[j]) * nodes[b, convex.REACH + j]
     return 0.5 * motion
 
 
@@ -296,10 +281,10 @@ def _apart(bodies, frames, simplex, p, motion):
     """
     _, nodes, pairs = bodies
     a, b = int(pairs[p, 0]), int(pairs[p, 1])
-    if roughly_apart(nodes, a, b) > motion:
+    if convex.roughly_apart(nodes, a, b) > motion:
         return 1
-    rounding = nodes[a, ROUNDING] + nodes[b, ROUNDING]
-    lower, upper = distance(bodies, frames, 0, p, (motion + rounding, rounding), simplex)
+    rounding = nodes[a, convex.ROUNDING] + nodes[b, convex.ROUNDING]
+    lower, upper = convex.distance(bodies, frames, 0, p, (motion + rounding, rounding), simplex)
     if lower - rounding > motion:
         return 1
     return -1 if upper <= rounding else 0
@@ -315,14 +300,13 @@ def stays_clear(chain, model, first, second, room):
     q, parts = room.point, room.parts
     for d in range(dof):
         q[d] = 0.5 * (first[d] + second[d])
-    _place(chain, q, frames, room.origins, room.axes)
-    place_balls(nodes, frames, 0)
+    _place(chain, q, room)
     count = 0
     for body in range(model.top):
         a, b = int(pairs[body, 0]), int(pairs[body, 1])
-        if roughly_apart(nodes, a, b) > _motion(nodes, pairs, body, first, second):
+        if convex.roughly_apart(nodes, a, b) > _motion(nodes, pairs, body, first, second):
             continue
-        begin, end = pieces_of(pairs, body)
+        begin, end = convex.pieces_of(pairs, body)
         for p in range(begin, end):
             motion = _motion(nodes, pairs, p, first, second)
             apart = _apart(bodies, frames, simplex, p, motion)
@@ -341,8 +325,7 @@ def stays_clear(chain, model, first, second, room):
             middle, moves = 0.5 * (start + end), motion * (end - start)
             for d in range(dof):
                 q[d] = first[d] + middle * (second[d] - first[d])
-            _place(chain, q, frames, room.origins, room.axes)
-            place_balls(nodes, frames, 0)
+            _place(chain, q, room)
             apart = _apart(bodies, frames, simplex, p, moves)
             if apart < 0:
                 return False
@@ -357,24 +340,24 @@ def stays_clear(chain, model, first, second, room):
 def same_contacts(chain, model, q, count, room):
     """The contacts of the same pairs of pieces at another configuration, as near or not."""
     simplex, bodies = room.simplex, (model.hulls, room.nodes, room.pairs)
-    _place(chain, q, room.frames, room.origins, room.axes)
-    place_balls(room.nodes, room.frames, 0)
+    _place(chain, q, room)
     for c in range(count):
         _measure(bodies, room.frames, simplex, int(room.found[c, PAIR]), np.inf, room.found[c])
 
 
 @njit(inline="always", **COMPILE)
-def second_frame(room, c):
-    """The frame that carries the second body of a contact; joint j carries frame j + 1."""
-    return int(room.nodes[int(room.pairs[int(room.found[c, PAIR]), 1]), FRAME])
+def frames_of(room, c):
+    """The frames that carry the two bodies of a contact; joint j carries frame j + 1."""
+    p = int(room.found[c, PAIR])
+    a, b = int(room.pairs[p, 0]), int(room.pairs[p, 1])
+    return int(room.nodes[a, convex.FRAME]), int(room.nodes[b, convex.FRAME])
 
 
 @njit(**LEAF)
 def contact_row(prismatic, room, c, row):
-    """Gradient (D,) of a contact's distance."""
-    nodes, pairs, found, axes, origins = room.nodes, room.pairs, room.found, room.axes, room.origins
-    p = int(found[c, PAIR])
-    first, last = int(nodes[int(pairs[p, 0]), FRAME]), int(nodes[int(pairs[p, 1]), FRAME])
+    """Gradient (D,) of a contact's distance into `row`; returns its length."""
+    found, axes, origins = room.found, room.axes, room.origins
+    first, last = frames_of(room, c)
     n0, n1, n2 = found[c, NORMAL], found[c, NORMAL + 1], found[c, NORMAL + 2]
     p0, p1, p2 = found[c, POINT], found[c, POINT + 1], found[c, POINT + 2]
     row[:] = 0.0
@@ -385,6 +368,10 @@ def contact_row(prismatic, room, c, row):
             continue
         x, y, z = p0 - origins[j, 0], p1 - origins[j, 1], p2 - origins[j, 2]
         row[j] = n0 * (a1 * z - a2 * y) + n1 * (a2 * x - a0 * z) + n2 * (a0 * y - a1 * x)
+    square = 0.0
+    for j in range(first, last):
+        square += row[j] ** 2
+    return np.sqrt(square)
 
 
 @njit(**COMPILE)

@@ -37,6 +37,7 @@ from constraint_geodesics.scene.clearance import (
 from constraint_geodesics.search.space import (
     CLOSE,
     NEAR,
+    STILL,
     Workspace,
     is_free,
     project_node,
@@ -45,7 +46,6 @@ from constraint_geodesics.search.space import (
 
 _DIFFERENCE = 1e-5
 _SMALLEST_PIVOT = 1e-12
-_STILL = 1e-9  # a contact whose distance no joint changes by more [m/rad] is none to be kept
 _ON_BOUND = 1e-6  # an inequality so near is on its bound; one that is NEAR is taken into the step,
 # which then ends on it, not beyond
 _LEAST_CONE = 1e-3
@@ -204,12 +204,8 @@ def _gather(space, q, work):
         for c in range(near):
             if size == dof:
                 break
-            contact_row(space.chain.prismatic, node.contacts, c, rows[size])
-            length = 0.0
-            for j in range(dof):
-                length += rows[size, j] ** 2
-            length = np.sqrt(length)
-            if length < _STILL:
+            length = contact_row(space.chain.prismatic, node.contacts, c, rows[size])
+            if length < STILL:
                 continue
             slack[size] = (found[c, DISTANCE] - space.margin) / length
             # whether the joints get so far in a step is told in their own units

@@ -3,10 +3,10 @@ band.
 
 Proposals are tried in the order of what they cost: the straight joint line, the way over the
 constraint's graph, two trees grown towards each other.  Each is relaxed by Newton's method on the
-exact constraint; one that is continuous, within the limits and clear of the workcell's shapes is
-drawn as rows so close together that the straight lines between them keep the constraint, and goes
-to the caller, who has it certified.  Curves of another kind come from a method of their own
-(methods.py), through `refined` or not.
+exact constraint; one that is continuous, within the limits and clear of the workcell's shapes and
+of the arm itself is drawn as rows so close together that the straight lines between them keep the
+constraint, and goes to the caller, who has it certified.  Curves of another kind come from a method
+of their own (methods.py), through `refined` or not.
 """
 
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -62,8 +62,8 @@ ALL_PARTS = Parts()
 
 @dataclass(frozen=True)
 class Task:
-    """One constraint, prepared: the space of its configurations with and without the workcell's
-    clearance, its graph.
+    """One constraint, prepared: the space of its configurations with and without the clearance of
+    what may meet, its graph.
 
     roadmap: the graph, made when it is first asked for; None where there is none.
     """
@@ -124,8 +124,8 @@ def candidates(
     """Sound curves from the cheapest proposals to the dearest, of one kind the shortest first; an
     Answer ends them.
 
-    A straight start that leads through a box is pushed out of it only after the graph was asked:
-    that takes longer.  Trees come last, and not where the graph holds the ends to be unconnected.
+    A straight start that touches something is pushed out of it only after the graph was asked: that
+    takes longer.  Trees come last, and not where the graph holds the ends to be unconnected.
     """
     segments = task.settings.segments
     blocked = None
@@ -271,10 +271,10 @@ def refined(
     refine: bool = True,
     clear: bool = False,
 ) -> Candidate | None:
-    """The curve through the relaxed nodes; None if it jumps, leaves the limits or runs into a box.
+    """The curve through the relaxed nodes; None if it jumps, leaves the limits or meets something.
 
-    Most curves never meet a box: they are relaxed without, and again with them only where they do.
-    clear: keep it clear of what may meet at once.
+    Most curves meet nothing: they are relaxed as if nothing were there, and again with it only
+    where they do.  clear: keep it clear of what may meet at once.
     """
     settings = _settings(task, refine)
     if not clear:
@@ -299,7 +299,7 @@ def _relaxed(
     clear: bool = False,
     guarded: bool = False,
 ) -> Candidate | None:
-    """The curve through relaxed nodes, whether or not it runs into a box; None if its points leave
+    """The curve through relaxed nodes, whether or not it meets something; None if its points leave
     the constraint or the limits, or jump.
     """
     space = task.clear if clear else task.open

@@ -146,7 +146,7 @@ def resample(corners: Float[np.ndarray, "k D"], count: int) -> Float[np.ndarray,
 @njit(**LEAF)
 def edge_length(space, first, second, work):
     """Length [rad] of the straight joint line between two configurations, projected; inf where it
-    jumps.
+    jumps or touches something.
     """
     dof = first.shape[0]
     direct = 0.0

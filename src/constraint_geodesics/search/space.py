@@ -1,5 +1,5 @@
 """The configurations that a search may use: on the constraint, within the joint limits, clear of
-the workcell.
+the workcell and of the arm itself.
 """
 
 from typing import Any, NamedTuple
@@ -29,6 +29,8 @@ NEAR = 0.05
 """Bounds so near [rad or m] are looked at."""
 CLOSE = 0.03
 """So are bodies that are so close beyond their margin [m]."""
+STILL = 1e-9
+"""A contact whose distance no joint changes by more [m/rad] is none to be kept."""
 _REACHED = 1e-9
 _LONGEST_STEP = 0.6
 _RIDGE = 1e-9
@@ -37,7 +39,7 @@ _SMALLEST_PIVOT = 1e-12
 
 class Space(NamedTuple):
     """As the compiled search takes it.  constraint: of `Constraint.arrays`; limits (2, D): lower
-    and upper [rad or m]; margin: kept to the workcell's shapes [m].
+    and upper [rad or m]; margin: kept by bodies that may meet [m].
     """
 
     chain: ChainArrays
@@ -50,7 +52,7 @@ class Space(NamedTuple):
 def space_of(
     manifold: ConstraintManifold, clearance: ClearanceModel | None = None, margin_m: float = 0.0
 ) -> Space:
-    """The space of a constraint manifold, by default in an empty workcell."""
+    """The space of a constraint manifold, by default one in which nothing can meet."""
     robot = manifold.robot
     limits = np.stack([robot.lower, robot.upper])
     return Space(*manifold.arrays, limits, (clearance or NO_CLEARANCE).arrays, margin_m)
@@ -133,7 +135,8 @@ def _broken(space, q, work):
             short = space.margin - contacts.found[c, DISTANCE]
             worst = max(worst, short)
             if size < dof:
-                contact_row(space.chain.prismatic, contacts, c, rows[size])
+                if contact_row(space.chain.prismatic, contacts, c, rows[size]) < STILL:
+                    continue
                 right[size] = -short
                 size += 1
     return size, worst
@@ -156,7 +159,7 @@ def project_node(space, q, iterations, work):
     worst = np.inf
     for iteration in range(iterations + 1):
         size, worst = _broken(space, q, work)
-        if worst <= _REACHED or iteration == iterations:
+        if worst <= _REACHED or size == 0 or iteration == iterations:
             break
         trace = normal_matrix(rows, size, normal)
         for i in range(size):
