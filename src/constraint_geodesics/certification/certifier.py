@@ -43,27 +43,30 @@ _POSES = 24
 
 class _Path(NamedTuple):
     """A path's rows (T, D), the lengths of its steps (T − 1,) [rad], each row's distance to the
-    nearest limit (T,), and how the constraint is kept.
+    nearest limit (T,), its length, longest step and least distance, and how the constraint is kept.
     """
 
     rows: np.ndarray
     steps: np.ndarray
-    margin: np.ndarray
+    margins: np.ndarray
+    length: float
+    longest: float
+    least: float
     kept: Kept
 
     def measures(self) -> dict[str, float]:
         """What a certificate says of places."""
         attained, bound = self.kept.attained, self.kept.bound
         return {
-            "length_rad": float(self.steps.sum()),
-            "max_step_rad": float(self.steps.max()),
+            "length_rad": self.length,
+            "max_step_rad": self.longest,
             "max_violation": max(attained.values()),
             "violation_bound": max(bound.values()),
             "max_violation_rad": attained["rad"],
             "violation_bound_rad": bound["rad"],
             "max_violation_m": attained["m"],
             "violation_bound_m": bound["m"],
-            "limit_distance_rad": float(self.margin.min()),
+            "limit_distance_rad": self.least,
         }
 
 
@@ -79,7 +82,7 @@ class Certifier:
         self.limits = Limits() if limits is None else limits
         robot = scene.robot
         self._dof = len(robot.joint_names)
-        self._lower, self._upper = np.asarray(robot.lower, float), np.asarray(robot.upper, float)
+        self._limits = np.array([robot.lower, robot.upper], float)
         self._velocity = np.asarray(robot.velocity, float)
         wanted = self.limits.acceleration_rad_s2
         if wanted is not None and len(wanted) != self._dof:
@@ -136,14 +139,17 @@ class Certifier:
         rows, violation = self._as_rows(joints)
         if rows is None:
             return blank(violation, began)
+        steps, margins = np.empty(len(rows) - 1), np.empty(len(rows))
+        wrong, length, longest, least = kernels.measure(rows, self._limits, steps, margins)
+        if wrong >= 0:
+            text = f"row {wrong} is {rows[wrong].tolist()}: must be finite"
+            return blank(malformed("not_finite", wrong, text), began)
+        first = rows[0] if ends[0] is None else ends[0]
         with np.errstate(over="ignore", invalid="ignore"):
-            steps = np.sqrt(np.square(np.diff(rows, axis=0)).sum(axis=1))
-            margin = np.minimum(rows - self._lower, self._upper - rows).min(axis=1)
-            first = rows[0] if ends[0] is None else ends[0]
             kept = how_kept(Asked(self._chain, rows, constraint, first, self.limits))
         limits = MotionLimits(self._velocity, self.limits.acceleration_rad_s2)
         clock, duration = check_times(rows, times, limits)
-        path = _Path(rows, steps, margin, kept)
+        path = _Path(rows, steps, margins, length, longest, least, kept)
         violation = next(chain(self._broken(path, *ends), clock), self._wrong_pose)
         asked, apart = time.perf_counter(), Separation(violation)
         if violation is None and collisions:
@@ -162,21 +168,21 @@ class Certifier:
         )
 
     def _broken(
-        self, path: "_Path", start: np.ndarray | None, goal: np.ndarray | None
+        self, path: _Path, start: np.ndarray | None, goal: np.ndarray | None
     ) -> Iterator[Violation]:
         """The promises on places that are broken, in the order of the checks."""
         checks: tuple[Callable[[], Violation | None], ...] = (
             lambda: self._missed("start_missed", path.rows, 0, start),
             lambda: self._missed("goal_missed", path.rows, len(path.rows) - 1, goal),
-            lambda: self._outside(path.rows, path.margin),
-            lambda: self._jump(path.steps),
+            lambda: self._outside(path),
+            lambda: self._jump(path),
             lambda: path.kept.at_rows,
             lambda: path.kept.between_rows,
         )
         yield from (found for check in checks if (found := check()) is not None)
 
     def _as_rows(self, joints: Any) -> tuple[Float[np.ndarray, "T D"] | None, Violation | None]:
-        """The path as an array of at least two finite rows, or why it is none."""
+        """The path as an array of at least two rows, or why it is none."""
         table = real_array(joints)
         if table is None or table.ndim != 2 or table.shape[1] != self._dof:
             what = "no array of real numbers" if table is None else f"of shape {table.shape}"
@@ -186,12 +192,6 @@ class Certifier:
         if len(table) < 2:
             return None, malformed(
                 "too_short", None, f"the path has {len(table)} rows: at least 2 are needed"
-            )
-        finite = np.isfinite(table).all(axis=1)
-        if not finite.all():
-            row = int(np.argmin(finite))
-            return None, malformed(
-                "not_finite", row, f"row {row} is {table[row].tolist()}: must be finite"
             )
         return table, None
 
@@ -218,35 +218,31 @@ class Certifier:
         )
         return Violation(kind, row, value, allowed, f"{which}, {allowed:.3g} rad is allowed")
 
-    def _outside(self, rows: np.ndarray, margin: np.ndarray) -> Violation | None:
+    def _outside(self, path: _Path) -> Violation | None:
         allowed = self.limits.limit_tolerance_rad
-        wrong = margin < -allowed
-        if not wrong.any():
+        if path.least >= -allowed:
             return None
-        row = int(np.argmax(wrong))
-        joint = int(np.argmin(np.minimum(rows[row] - self._lower, self._upper - rows[row])))
-        limits = f"[{self._lower[joint]:.6g}, {self._upper[joint]:.6g}]"
-        text = (
-            f"joint {joint} of row {row} is {rows[row, joint]:.9g} rad, its limits are {limits} rad"
-        )
-        return Violation("joint_limits", row, float(-margin[row]), allowed, text)
+        row = int(np.argmax(path.margins < -allowed))
+        q, (lower, upper) = path.rows[row], self._limits
+        joint = int(np.argmin(np.minimum(q - lower, upper - q)))
+        limits = f"[{lower[joint]:.6g}, {upper[joint]:.6g}]"
+        text = f"joint {joint} of row {row} is {q[joint]:.9g} rad, its limits are {limits} rad"
+        return Violation("joint_limits", row, float(-path.margins[row]), allowed, text)
 
-    def _jump(self, steps: np.ndarray) -> Violation | None:
+    def _jump(self, path: _Path) -> Violation | None:
         allowed = self.limits.max_step_rad
-        wrong = ~(steps <= allowed)
-        if not wrong.any():
+        if path.longest <= allowed:
             return None
-        row = int(np.argmax(wrong))
-        text = (
-            f"rows {row} and {row + 1} are {steps[row]:.6g} rad apart, {allowed:.6g} rad is allowed"
-        )
-        return Violation("step", row, float(steps[row]), allowed, text)
+        row = int(np.argmax(~(path.steps <= allowed)))
+        step = float(path.steps[row])
+        text = f"rows {row} and {row + 1} are {step:.6g} rad apart, {allowed:.6g} rad is allowed"
+        return Violation("step", row, step, allowed, text)
 
     def _compared_with_pybullet(self) -> tuple[float, Violation | None]:
         """The certifier's kinematics against PyBullet's, of all links at configurations spread over
         the limits [rad or m, the larger]; what is wrong with a difference that is too large.
         """
-        low, high = np.maximum(self._lower, -np.pi), np.minimum(self._upper, np.pi)
+        low, high = np.clip(self._limits, -np.pi, np.pi)
         drawn = np.random.default_rng(0).uniform(low, high, (_POSES, self._dof))
         theirs, own = self._world.label(drawn), self.tool_poses(drawn)
         value = _largest(own, np.hstack([theirs.position, theirs.quaternion]))

@@ -48,6 +48,8 @@ Intervals are halved until their bound is within a hundredth of the excess of a 
 attained. Rounding is not proven; `ROUNDING` is a thousand times what it amounts to.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -61,6 +63,9 @@ ROUNDING = 1e-12
 _SHARPNESS = 2e-7
 _RELATIVE_SHARPNESS = 0.01
 _SHORTEST = 1.0 / 1024.0
+_VELOCITY_SLACK = 1e-9
+_ACCELERATION_SLACK = 1e-6
+_MOST_PIECES = 64
 _NEARLY_A_HALF_TURN = 3.0
 BASE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """The base's frame, as `next_frame` takes it."""
@@ -122,6 +127,70 @@ def poses(chain, q, out):
 
 
 @njit(**LEAF)
+def measure(rows, limits, steps, margins):
+    """The lengths (T − 1,) of a path's steps, and the distance (T,) of each of its rows (T, D) to
+    the nearest of the limits (2, D); returns the first row that is not finite, or −1, the path's
+    length, its longest step, and the smallest distance.
+    """
+    length, longest, least = 0.0, 0.0, np.inf
+    for i in range(rows.shape[0]):
+        margins[i] = np.inf
+        for j in range(rows.shape[1]):
+            if not np.isfinite(rows[i, j]):
+                return i, np.nan, np.nan, np.nan
+            margins[i] = min(margins[i], rows[i, j] - limits[0, j], limits[1, j] - rows[i, j])
+        least = min(least, margins[i])
+    for i in range(rows.shape[0] - 1):
+        square = 0.0
+        for j in range(rows.shape[1]):
+            square += (rows[i + 1, j] - rows[i, j]) ** 2
+        steps[i] = np.sqrt(square)
+        length += steps[i]
+        longest = max(longest, steps[i])
+    return -1, length, longest, least
+
+
+@njit(**LEAF)
+def not_rising(times):
+    """The first row whose time is not before the next one's; −1 for none."""
+    for i in range(times.shape[0] - 1):
+        if not times[i + 1] - times[i] > 0.0:
+            return i
+    return -1
+
+
+@njit(**LEAF)
+def too_fast(rows, times, most):
+    """The first line and joint whose velocity passes `most` (D,), and that velocity; −1, 0, 0 for
+    none.
+    """
+    for i in range(times.shape[0] - 1):
+        for j in range(rows.shape[1]):
+            value = abs((rows[i + 1, j] - rows[i, j]) / (times[i + 1] - times[i]))
+            if not value <= most[j] * (1.0 + _VELOCITY_SLACK):
+                return i, j, value
+    return -1, 0, 0.0
+
+
+@njit(**LEAF)
+def too_sudden(rows, times, most):
+    """The first row and joint whose acceleration passes `most` (D,), and that acceleration; −1, 0,
+    0 for none.  Before the first row and after the last one the arm rests.
+    """
+    last = times.shape[0] - 1
+    for i in range(last + 1):
+        before = times[i] - times[i - 1] if i > 0 else 0.0
+        after = times[i + 1] - times[i] if i < last else 0.0
+        for j in range(rows.shape[1]):
+            arriving = (rows[i, j] - rows[i - 1, j]) / before if i > 0 else 0.0
+            leaving = (rows[i + 1, j] - rows[i, j]) / after if i < last else 0.0
+            value = abs((leaving - arriving) / (0.5 * (before + after)))
+            if not value <= most[j] * (1.0 + _ACCELERATION_SLACK):
+                return i, j, value
+    return -1, 0, 0.0
+
+
+@njit(**LEAF)
 def _derivative_bounds(chain, q0, q1):
     """W [rad] of one piece, and the bound of |p⁗| [m]."""
     _, _, prismatic, lengths = chain
@@ -155,11 +224,18 @@ def count_pieces(chain, rows, wanted, most, counts):
     return total
 
 
+class _Pieces(NamedTuple):
+    """A path cut up: segment, W [rad] and bound of |p⁗| [m] of each piece, (S − 1,) each."""
+
+    segments: np.ndarray
+    turned: np.ndarray
+    fourth: np.ndarray
+
+
 @njit(**LEAF)
-def cut(chain, rows, counts, stations, segments, turned, fourth):
-    """The stations (S, D), rows among them; each piece's segment, W [rad] and bound of |p⁗| [m], (S
-    − 1,) each.
-    """
+def cut(chain, rows, counts, stations, pieces):
+    """The stations (S, D), rows among them, and the pieces between them."""
+    segments, turned, fourth = pieces
     s = 0
     for i in range(counts.shape[0]):
         for k in range(counts[i]):
@@ -222,27 +298,78 @@ def _curve_point(kind, k, anchor, w, x, y, z, s, out):
         out[1], out[2], out[3] = s[1 + k], 0.0, 0.0
 
 
-@njit(**COMPILE)
-def trace(chain, kind, k, anchor, place, q, turn, turn_out, turn_in, shift, shift_out, shift_in):
-    """Write x and its derivatives at stations q (S, D): angles into turn, positions into shift, (S,
-    4) each.
-
-    `_out` is the derivative along the piece that leaves a station, `_in` along the one that
-    arrives; t runs from 0 to 1 over each.  kind < 0: no angle is held.  shift (0, 4): no position
-    is.  place (3,): the reference position [m].
+class Held(NamedTuple):
+    """What a constraint holds.  kind: of its angles, < 0 for none; k: their axis; anchor (4,): for
+    a swing, e_k turned back into the tool's frame by the reference, and 0, else the conjugate of
+    the reference's quaternion; positions: whether any is held; place (3,): the reference's [m].
     """
-    dof = q.shape[1]
-    axes, origins = np.empty((dof, 3)), np.empty((dof, 3))
-    s, angular, linear = np.empty(4), np.empty(3), np.empty(3)
-    last = q.shape[0] - 1
-    positions = shift.shape[0] > 0
+
+    kind: int
+    k: int
+    anchor: np.ndarray
+    positions: bool
+    place: np.ndarray
+
+
+class _Room(NamedTuple):
+    """What the kernels write into: joint axes and origins (D, 3), vectors, and the ends of the
+    intervals that wait.
+    """
+
+    axes: np.ndarray
+    origins: np.ndarray
+    s: np.ndarray
+    angular: np.ndarray
+    linear: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+    xa: np.ndarray
+    xb: np.ndarray
+    middle: np.ndarray
+
+
+@njit(**COMPILE)
+def _new_room(dof):
+    return _Room(
+        np.empty((dof, 3)),
+        np.empty((dof, 3)),
+        np.empty(4),
+        np.empty(3),
+        np.empty(3),
+        np.empty(64),
+        np.empty(64),
+        np.empty(4),
+        np.empty(4),
+        np.empty(4),
+    )
+
+
+@njit(**LEAF)
+def _trace(chain, held, q, turn, shift, room):
+    """Write x and its derivatives at stations q (S, D): angles into turn, positions into shift, (3,
+    S, 4) each, or (3, 0, 4) for what is not held.
+
+    The second is the derivative along the piece that leaves a station, the third along the one that
+    arrives; t runs from 0 to 1 over each.
+    """
+    kind, k, anchor, positions, place = held
+    dof, axes, origins, s, angular, linear = (
+        q.shape[1],
+        room.axes,
+        room.origins,
+        room.s,
+        room.angular,
+        room.linear,
+    )
+    prismatic, last = chain[2], q.shape[0] - 1
     for n in range(q.shape[0]):
         w, x, y, z, p0, p1, p2 = _pose(chain, q[n], axes, origins)
         if kind >= 0:
-            _curve_point(kind, k, anchor, w, x, y, z, s, turn[n])
+            _curve_point(kind, k, anchor, w, x, y, z, s, turn[0, n])
         if positions:
-            shift[n, 0] = 0.0
-            shift[n, 1], shift[n, 2], shift[n, 3] = p0 - place[0], p1 - place[1], p2 - place[2]
+            shift[0, n, 0] = 0.0
+            shift[0, n, 1], shift[0, n, 2] = p0 - place[0], p1 - place[1]
+            shift[0, n, 3] = p2 - place[2]
         for side in range(2):
             if (side == 0 and n == last) or (side == 1 and n == 0):
                 continue
@@ -252,7 +379,7 @@ def trace(chain, kind, k, anchor, place, q, turn, turn_out, turn_in, shift, shif
             for j in range(dof):
                 d = q[other, j] - q[n, j] if side == 0 else q[n, j] - q[other, j]
                 a0, a1, a2 = d * axes[j, 0], d * axes[j, 1], d * axes[j, 2]
-                if chain[2][j]:
+                if prismatic[j]:
                     linear[0] += a0
                     linear[1] += a1
                     linear[2] += a2
@@ -266,11 +393,11 @@ def trace(chain, kind, k, anchor, place, q, turn, turn_out, turn_in, shift, shif
                     linear[1] += a2 * v0 - a0 * v2
                     linear[2] += a0 * v1 - a1 * v0
             if kind >= 0:
-                _turned(kind, k, s, angular, turn_out[n] if side == 0 else turn_in[n])
+                _turned(kind, k, s, angular, turn[1 + side, n])
             if positions:
-                target = shift_out[n] if side == 0 else shift_in[n]
-                target[0] = 0.0
-                target[1], target[2], target[3] = linear[0], linear[1], linear[2]
+                shift[1 + side, n, 0] = 0.0
+                for i in range(3):
+                    shift[1 + side, n, 1 + i] = linear[i]
 
 
 @njit(**LEAF)
@@ -292,13 +419,6 @@ def _value(kind, entry, x, sign):
         across = np.sqrt(x[1] * x[1] + x[2] * x[2] + x[3] * x[3])
         theta = 0.0 if across == 0.0 else theta * abs(x[entry]) / across
     return theta if kind == SWING else 2.0 * theta
-
-
-@njit(**LEAF)
-def values(kind, entry, x, out):
-    """What is held at each station, from x (S, 4) into out (S,), as `_value` has it."""
-    for n in range(x.shape[0]):
-        out[n] = _value(kind, entry, x[n], 1.0 if kind == SWING else 0.0)
 
 
 @njit(**LEAF)
@@ -373,24 +493,25 @@ def _enough(best, tolerance, limit):
     return limit if best <= limit < enough else enough
 
 
-@njit(**COMPILE)
-def bound_pieces(kind, entry, tolerance, limit, x, x_out, x_in, turned, fourth, segments):
+@njit(**LEAF)
+def _bound_pieces(channel, x, pieces, room):
     """Bound of what is held over all pieces, by the module's equations.
 
-    x, x_out, x_in (S, 4) from `trace`; turned (S − 1,) W of each piece; fourth (S − 1,) its bound
-    of |p⁗|.
+    channel: kind, entry, tolerance and limit; x (3, S, 4) from `_trace`.
     Returns the bound, the piece and t where the interpolant is largest, and the first segment whose
-    bound passes `limit` (−1: none does) with its bound; all sizes in rad or m, the tolerance not
+    bound passes the limit (−1: none does) with its bound; all sizes in rad or m, the tolerance not
     taken off.
     """
-    left, right = np.empty(64), np.empty(64)
-    xa, xb, middle = np.empty(4), np.empty(4), np.empty(4)
+    kind, entry, tolerance, limit = int(channel[0]), int(channel[1]), channel[2], channel[3]
+    limit -= ROUNDING
+    segments, turned, fourth = pieces
+    left, right, xa, xb, middle = room.left, room.right, room.xa, room.xb, room.middle
     top, best = 0.0, -1.0
     worst_piece, worst_t = 0, 0.0
     first, first_bound = -1, 0.0
     either = 1.0 if kind == SWING else 0.0
     for i in range(segments.shape[0]):
-        x0, x1, m0, m1 = x[i], x[i + 1], x_out[i], x_in[i + 1]
+        x0, x1, m0, m1 = x[0, i], x[0, i + 1], x[1, i], x[2, i + 1]
         sign = 1.0 if kind == SWING or x0[0] + x1[0] >= 0.0 else -1.0
         omega = turned[i] if kind == SWING else 0.5 * turned[i]
         error = (fourth[i] if kind == POSITION else omega**4) / 384.0
@@ -429,10 +550,71 @@ def bound_pieces(kind, entry, tolerance, limit, x, x_out, x_in, turned, fourth, 
         so_far = max(top, _enough(best, tolerance, limit))
         if first < 0 and so_far > limit:
             first, first_bound = segments[i], so_far + ROUNDING
-    return (
-        max(top, _enough(best, tolerance, limit)) + ROUNDING,
-        worst_piece,
-        worst_t,
-        first,
-        first_bound,
-    )
+    highest = max(top, _enough(best, tolerance, limit)) + ROUNDING
+    return highest, worst_piece, worst_t, first, first_bound
+
+
+# columns of what is found of a channel
+ATTAINED, BOUND = 0, 1
+"""The largest size [rad or m] at the rows and where the path is worst; proven for all of it."""
+ROW, AT_ROW, SEGMENT, ON_SEGMENT = 2, 3, 4, 5
+"""The first row and the first segment beyond the limit (−1: none is), and the sizes there."""
+FOUND = 6
+
+
+@njit(**LEAF)
+def _judge(channels, counts, curves, pieces, room, found):
+    """`found` but for what is attained between the rows; the worst places (C, 2), piece and t, into
+    the first two columns.
+    """
+    turn, shift, worst = curves
+    for c in range(channels.shape[0]):
+        channel, own = channels[c], found[c]
+        kind, entry, limit = int(channel[0]), int(channel[1]), channel[3]
+        x = shift if kind == POSITION else turn
+        own[ATTAINED], own[ROW], station = 0.0, -1.0, 0
+        for i in range(counts.shape[0] + 1):
+            size = _value(kind, entry, x[0, station], 1.0 if kind == SWING else 0.0)
+            if np.isnan(size):  # of joint values that overflow
+                size = np.inf
+            own[ATTAINED] = max(own[ATTAINED], size)
+            if own[ROW] < 0.0 and not size <= limit:
+                own[ROW], own[AT_ROW] = i, size
+            if i < counts.shape[0]:
+                station += counts[i]
+        own[BOUND], piece, t, segment, bound = _bound_pieces(channel, x, pieces, room)
+        own[SEGMENT], own[ON_SEGMENT] = segment, bound
+        worst[c, 0], worst[c, 1] = piece, t
+
+
+@njit(**COMPILE)
+def keep(chain, held, channels, rows, wanted, found):
+    """How well the straight joint lines between rows (T, D) keep what is held, into found (C,
+    FOUND).
+
+    channels (C, 4): kind, entry, tolerance and limit [rad or m] of each number that is held.
+    wanted: ε, below which pieces are short enough.
+    """
+    dof, count = rows.shape[1], channels.shape[0]
+    room, counts = _new_room(dof), np.empty(rows.shape[0] - 1, dtype=np.int64)
+    size = count_pieces(chain, rows, wanted, _MOST_PIECES, counts)
+    stations = np.empty((size + 1, dof))
+    pieces = _Pieces(np.empty(size, dtype=np.int64), np.empty(size), np.empty(size))
+    cut(chain, rows, counts, stations, pieces)
+    turn = np.empty((3, size + 1 if held.kind >= 0 else 0, 4))
+    shift = np.empty((3, size + 1 if held.positions else 0, 4))
+    _trace(chain, held, stations, turn, shift, room)
+    worst = np.empty((count, 2))
+    _judge(channels, counts, (turn, shift, worst), pieces, room, found)
+    # the interpolant says where the path is worst; what counts as attained is the true value there
+    place, turn, shift = np.empty((1, dof)), np.empty((3, 1, 4)), np.empty((3, 1, 4))
+    for c in range(count):
+        piece, t = int(worst[c, 0]), worst[c, 1]
+        for d in range(dof):
+            first = stations[piece, d]
+            place[0, d] = first + t * (stations[piece + 1, d] - first)
+        _trace(chain, held, place, turn, shift, room)
+        kind = int(channels[c, 0])
+        x = shift[0, 0] if kind == POSITION else turn[0, 0]
+        size = _value(kind, int(channels[c, 1]), x, 1.0 if kind == SWING else 0.0)
+        found[c, ATTAINED] = np.inf if np.isnan(size) else max(found[c, ATTAINED], size)

@@ -251,18 +251,18 @@ class ConstraintManifold:
         """Inclusion map ι_C of eqs. 7-8, in each row's unit: max(|C ⊙ x| − tolerance, 0), zero
         exactly where satisfied.
         """
-        return self._excess(q)[0]
-
-    def violation(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch"]:
-        """Largest excess over the tolerance [rad or m]; 0 where the constraint holds."""
-        return self._excess(q)[1]
-
-    def _excess(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         count = len(self.rows.held)
         residuals = self.residual(q).reshape(-1, count)
         excesses, worst = np.empty_like(residuals), np.empty(len(residuals))
         kernels.excess_batch(self.rows, residuals, excesses, worst)
-        return np.abs(excesses).reshape(*q.shape[:-1], count), worst.reshape(q.shape[:-1])
+        return np.abs(excesses).reshape(*q.shape[:-1], count)
+
+    def violation(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch"]:
+        """Largest excess over the tolerance [rad or m]; 0 where the constraint holds."""
+        flat = np.ascontiguousarray(q, dtype=np.float64).reshape(-1, self.robot.dof)
+        worst = np.empty(len(flat))
+        kernels.violation_batch(self.arrays, flat, worst)
+        return worst.reshape(q.shape[:-1])
 
     def amount(self, q: Float[np.ndarray, "D"]) -> str:
         """Excess of one configuration in the units people use."""

@@ -165,6 +165,18 @@ def residual_batch(manifold, q, residuals, jacobians):
 
 
 @njit(**COMPILE)
+def violation_batch(manifold, q, worst):
+    """The largest excess of each of q (B, D) into worst (B,)."""
+    dof, rows = q.shape[1], manifold.constraint.rows
+    count = rows.held.shape[0]
+    own, residual, excess = scratch(manifold.constraint, dof), np.zeros(count), np.empty(count)
+    jacobian, active = np.empty((count, dof)), np.empty(count, dtype=np.bool_)
+    for b in range(q.shape[0]):
+        linearise(manifold, q[b], own, residual, jacobian)
+        worst[b] = excess_of(rows, residual, excess, active)
+
+
+@njit(**COMPILE)
 def excess_batch(rows, residuals, excesses, worst):
     """Signed excesses (B, m) of residuals (B, m), and the largest of each row (B,)."""
     active = np.empty(residuals.shape[1], dtype=np.bool_)

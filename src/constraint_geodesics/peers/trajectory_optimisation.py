@@ -22,6 +22,7 @@ from jaxtyping import Float
 from numba import njit
 from scipy.optimize import BFGS, NonlinearConstraint, OptimizeResult, minimize
 
+from constraint_geodesics.compiled import COMPILE
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.fields import Count, Positive

@@ -11,11 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.constraints.kernels import ManifoldArrays
-from constraint_geodesics.constraints.projection import Retraction, retract_batch
-from constraint_geodesics.scene.clearance import clearance_batch
+from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.search import band_kernels
-from constraint_geodesics.search.space import Space, project_each
+from constraint_geodesics.search.space import Space, project_points
 
 ACCURACY = 1e-9
 """Violation [rad or m] that is left on a point of a curve, at most."""
@@ -94,8 +92,8 @@ class BandCurve:
         limits included.
         """
         points = np.empty((len(s), self.nodes.shape[1]))
-        band_kernels.spline_points(self.knots, self.nodes, self.moments, s * self.length, points)
-        left = project(self.space, points)
+        spline = self.knots, self.nodes, self.moments
+        left = band_kernels.curve_points(self.space, spline, s, _PROJECTION, points)
         points[s == 0.0], points[s == 1.0] = self.nodes[0], self.nodes[-1]
         return points, left
 
@@ -108,21 +106,5 @@ def step_lengths(points: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T-1"]:
 
 
 def project(space: Space, points: Float[np.ndarray, "n D"]) -> float:
-    """Move points onto the space, in place; returns what is left of the violation [rad or m].
-
-    The constraint alone is cheap; limits and clearance are taken together with it only where one of
-    them is broken.
-    """
-    worst = np.empty(len(points))
-    manifold = ManifoldArrays(space.chain, space.constraint)
-    retract_batch(manifold, np.ones(len(points)), points, _PROJECTION, worst)
-    beyond = ((points < space.limits[0]) | (points > space.limits[1])).any(axis=1)
-    if space.clearance.top:
-        smallest = np.empty(len(points))
-        clearance_batch(space.chain, space.clearance, 2.0 * space.margin, points, smallest)
-        beyond |= smallest < space.margin
-    if beyond.any():
-        moved = points[beyond]
-        worst[beyond] = project_each(space, moved, _PROJECTION.iterations)
-        points[beyond] = moved
-    return float(worst.max(initial=0.0))
+    """Move points onto the space, in place; returns what is left of the violation [rad or m]."""
+    return float(project_points(space, points, _PROJECTION))

@@ -41,6 +41,7 @@ from constraint_geodesics.search.space import (
     Workspace,
     is_free,
     project_node,
+    project_points,
     workspace,
 )
 
@@ -710,3 +711,13 @@ def spline_points(knots, nodes, moments, at, points):
         for d in range(nodes.shape[1]):
             bend = (a * a * a - a) * moments[i, d] + (b * b * b - b) * moments[i + 1, d]
             points[k, d] = a * nodes[i, d] + b * nodes[i + 1, d] + bend * h * h / 6.0
+
+
+@njit(**COMPILE)
+def curve_points(space, spline, shares, settings, points):
+    """Points (T, D) of the spline, knots, nodes and moments, at rising shares of its length (T,),
+    projected onto the space; returns what remains of the violation of the worst.
+    """
+    knots, nodes, moments = spline
+    spline_points(knots, nodes, moments, shares * knots[-1], points)
+    return project_points(space, points, settings)

@@ -11,7 +11,12 @@ from numba import njit
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.kernels import excess_of, linearise, scratch
-from constraint_geodesics.constraints.projection import normal_matrix, solve_normal
+from constraint_geodesics.constraints.projection import (
+    new_room,
+    normal_matrix,
+    retract_one,
+    solve_normal,
+)
 from constraint_geodesics.robot.kinematics import ChainArrays
 from constraint_geodesics.scene.clearance import (
     DISTANCE,
@@ -189,4 +194,33 @@ def project_each(space, points, iterations):
     worst = 0.0
     for i in range(points.shape[0]):
         worst = max(worst, project_node(space, points[i], iterations, work))
+    return worst
+
+
+@njit(**LEAF)
+def _is_within(space, q, work):
+    """Whether a configuration keeps joint limits and clearance."""
+    for d in range(q.shape[0]):
+        if q[d] < space.limits[0, d] or q[d] > space.limits[1, d]:
+            return False
+    if space.clearance.top == 0:
+        return True
+    contacts = work.contacts
+    near = near_contacts(space.chain, space.clearance, q, 2.0 * space.margin, contacts)
+    return near == 0 or contacts.found[0, DISTANCE] >= space.margin
+
+
+@njit(**COMPILE)
+def project_points(space, points, settings):
+    """Project points (T, D) in place: onto the constraint alone, which is cheap, and onto limits
+    and clearance together with it only where one of them is broken then; returns what remains of
+    the violation of the worst [rad or m].
+    """
+    room, work = new_room(space.constraint, points.shape[1]), workspace(space)
+    bounds, worst = space.constraint.rows, 0.0
+    for i in range(points.shape[0]):
+        left = retract_one(space, bounds, points[i], settings, room)
+        if not _is_within(space, points[i], work):
+            left = project_node(space, points[i], settings.iterations, work)
+        worst = max(worst, left)
     return worst
