@@ -31,7 +31,8 @@ from constraint_geodesics.scene.shapes import AnyShape
 
 
 class _Record(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    # a planner reads five of the records: the others' checks are built where they are needed
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class RobotParams(_Record):

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import ndimage, sparse
+from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
@@ -96,6 +96,8 @@ def components_on_grid(
     Cells that share a side are joined; wrap says along which axes the last cell is also next to the
     first. Components are numbered by size as in `components`, cells outside the set are OUTSIDE.
     """
+    from scipy import ndimage  # planning needs none of it
+
     pieces, count = ndimage.label(inside)
     seams = [
         np.stack([np.take(pieces, 0, axis), np.take(pieces, -1, axis)], axis=-1)
