@@ -21,7 +21,7 @@ help:  ## list the targets
 INSTALL := .venv/bin/python -m pip install --quiet --disable-pip-version-check
 
 .venv/planning: requirements.lock pyproject.toml | .venv/bin/python
-	$(INSTALL) --constraint requirements.lock --editable ".[record]"
+	$(INSTALL) --no-compile --constraint requirements.lock --editable ".[record]"  # Python compiles what it loads
 	@touch $@
 
 .venv/installed: requirements.lock pyproject.toml | .venv/bin/python

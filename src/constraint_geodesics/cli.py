@@ -1,5 +1,7 @@
 """The command `geodesics`."""
 
+import atexit
+import gc
 import json
 import math
 import os
@@ -43,6 +45,9 @@ def main() -> None:
     """Entry point of the command: an error of the user's is one line, not a traceback."""
     # before anything heavy is loaded: answers are the same whoever calls
     os.environ.update(ONE_THREAD)
+    atexit.register(
+        gc.freeze
+    )  # or Python looks for garbage in all that numba has loaded, for 0.4 s
     try:
         app()
     except (ValueError, OSError, RuntimeError, MissingExtraError) as error:
