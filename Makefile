@@ -13,18 +13,26 @@ FIRST_GOAL = 1.071549 -0.217480 -1.682647 -2.906655 -0.337949 1.348704
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
 
-.venv/installed: requirements.lock pyproject.toml
+.venv/bin/python:
 	@command -v $(PYTHON) >/dev/null || { echo "error: Python 3.11 is needed (PyBullet has no wheels for later ones); set PYTHON=..."; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { echo "error: $(PYTHON) is not Python 3.11, which PyBullet's wheels need"; exit 1; }
 	$(PYTHON) -m venv .venv
-	.venv/bin/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
-	.venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
-	.venv/bin/python -m pip check
+
+INSTALL := .venv/bin/python -m pip install --quiet --disable-pip-version-check
+
+.venv/planning: requirements.lock pyproject.toml | .venv/bin/python
+	$(INSTALL) --no-compile --constraint requirements.lock --editable ".[record]"  # Python compiles what it loads
 	@touch $@
 
-env: .venv/installed  ## make .venv with every pinned package
+.venv/installed: requirements.lock pyproject.toml | .venv/bin/python
+	$(INSTALL) -r requirements.lock
+	$(INSTALL) --no-deps --editable .
+	.venv/bin/python -m pip check
+	@touch .venv/planning $@
 
-plan: env  ## plan one path that keeps a cup level, at once: CSV, picture and recording in first_path/
+env: .venv/installed  ## make .venv with every pinned package, those of the pipeline and the tests too
+
+plan: .venv/planning  ## plan one path that keeps a cup level, at once: CSV, picture and recording in first_path/
 	geodesics plan --constraint level_cup \
 	  --start "$(FIRST_START)" --goal "$(FIRST_GOAL)" \
 	  --out first_path/path.csv --picture first_path/path.png --record first_path/path.rrd
@@ -65,7 +73,7 @@ test: env  ## run the tests, the whole pipeline on small parameters among them
 	python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 
 .venv/browser: tests/browser/requirements.lock .venv/installed
-	.venv/bin/python -m pip install --quiet --disable-pip-version-check -r tests/browser/requirements.lock
+	$(INSTALL) -r tests/browser/requirements.lock
 	@touch $@
 
 test-browser: env .venv/browser  ## MLflow's dashboard, Rerun's viewer and the report in headless Chromium (minutes)
@@ -117,7 +125,7 @@ experiments: env  ## run the experiments of docs/experiments.md in a copy and wr
 ui: env  ## MLflow's dashboard, on this machine only
 	geodesics ui
 
-replay: env  ## replay a path in Rerun: make replay FILE=data/recordings/...
+replay: .venv/planning  ## replay a path in Rerun: make replay FILE=data/recordings/...
 	geodesics replay $(FILE)
 
 clean:  ## remove unfinished work, not results

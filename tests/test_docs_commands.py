@@ -260,7 +260,8 @@ def test_completion_loads_nothing_heavy(folder) -> None:
         " COMP_WORDS='geodesics\\nplan\\n--constraint\\nlevel'); sys.argv = ['geodesics']\n"
         "from constraint_geodesics import cli\n"
         "try:\n    cli.main()\n"
-        "finally:\n    print(sorted({'torch', 'numpy', 'mlflow', 'pandas', 'rerun', 'dvc'} & "
+        "finally:\n    print(sorted({'torch', 'numpy', 'mlflow', 'pandas', 'rerun', 'dvc', "
+        "'rich', 'click', 'ruamel'} & "
         "set(sys.modules)))\n"
     )
     done = subprocess.run(

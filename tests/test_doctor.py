@@ -12,7 +12,7 @@ import sqlite3
 import subprocess
 import sys
 import venv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -80,13 +80,16 @@ def run(
     )
 
 
-def distribution(site: Path, name: str, version: str, url: str | None = None) -> None:
+def distribution(
+    site: Path, name: str, version: str, url: str | None = None, needs: Sequence[str] = ()
+) -> None:
     """What pip leaves of an installed package; url: of one that is installed from a folder, to be
-    changed there.
+    changed there; needs: its requirements.
     """
     folder = site / f"{name.replace('-', '_')}-{version}.dist-info"
     folder.mkdir(parents=True)
-    (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    lines = [f"Name: {name}", f"Version: {version}", *(f"Requires-Dist: {own}" for own in needs)]
+    (folder / "METADATA").write_text("\n".join(["Metadata-Version: 2.1", *lines, ""]))
     if url is not None:
         about = {"dir_info": {"editable": True}, "url": url}
         (folder / "direct_url.json").write_text(json.dumps(about))
@@ -100,16 +103,18 @@ def checkout(folder: Path) -> Path:
 # Python, packages, torch
 
 
-@pytest.mark.parametrize("version", [(3, 12, 1), (3, 10, 4), (3, 8, 0)])
-def test_another_python_is_named(tmp_path, version) -> None:
-    found = only(look("python", tmp_path, replace(HERE, python=version)), "problem")
+@pytest.mark.parametrize(
+    ("version", "status"), [((3, 12, 1), "note"), ((3, 10, 4), "problem"), ((3, 8, 0), "problem")]
+)
+def test_another_python_is_named(tmp_path, version, status) -> None:
+    found = only(look("python", tmp_path, replace(HERE, python=version)), status)
     assert found.message.startswith(f"this is Python {'.'.join(map(str, version))}; 3.11 is needed")
     assert "make env PYTHON=python3.11" in found.mend
 
 
 def test_the_checkouts_own_environment_is_pointed_at(tmp_path) -> None:
     venv.create(tmp_path / ".venv", with_pip=False)
-    found = only(look("python", tmp_path, replace(HERE, python=(3, 12, 1))), "problem")
+    found = only(look("python", tmp_path, replace(HERE, python=(3, 10, 1))), "problem")
     assert found.mend == "source .venv/bin/activate"
     found = only(look("python", tmp_path, replace(HERE, python=(3, 11, 9))), "ok")
     assert found.message == "3.11.9"
@@ -164,6 +169,22 @@ def test_packages_are_compared_with_the_lock(tmp_path) -> None:
     lock.write_text("torch==2.12.0\n")
     found = only(look("packages", tmp_path, here), "problem")
     assert "torch 2.13.0+cpu, not 2.12.0" in found.message
+
+
+def test_an_environment_for_planning_alone_lacks_nothing(tmp_path) -> None:
+    site, lock = tmp_path / "site", tmp_path / "requirements.lock"
+    needs = ("numba>=0.63", 'pybullet; python_version < "3.12"', 'dvc==3.67.1; extra == "pipeline"')
+    distribution(site, "constraint-geodesics", "0.1.0", needs=needs)
+    distribution(site, "numba", "0.68.0")
+    lock.write_text("numba==0.68.0\ndvc==3.67.1\n")
+
+    def here() -> Surroundings:
+        return replace(HERE, search=(str(site),), installed=versions_in([str(site)]))
+
+    found = only(look("packages", tmp_path, here()), "note")
+    assert found.message == "1 of 2 are missing, of the pipeline: dvc; planning works without"
+    shutil.rmtree(site / "numba-0.68.0.dist-info")
+    assert only(look("packages", tmp_path, here()), "problem").message.startswith("2 of 2")
 
 
 def test_of_two_versions_the_one_that_python_finds_counts(tmp_path) -> None:

@@ -1,5 +1,7 @@
 """The command `geodesics`."""
 
+import atexit
+import gc
 import json
 import math
 import os
@@ -11,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from constraint_geodesics import completion
-from constraint_geodesics.fields import ParamsError
+from constraint_geodesics.errors import ParamsError
+from constraint_geodesics.extras import MissingExtraError, require
 from constraint_geodesics.kernel_digest import are_compiled
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.progress import waiting
@@ -33,6 +36,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # plain help starts in half the time, and keeps the units' brackets
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
@@ -41,9 +45,12 @@ def main() -> None:
     """Entry point of the command: an error of the user's is one line, not a traceback."""
     # before anything heavy is loaded: answers are the same whoever calls
     os.environ.update(ONE_THREAD)
+    atexit.register(
+        gc.freeze
+    )  # or Python looks for garbage in all that numba has loaded, for 0.4 s
     try:
         app()
-    except (ValueError, OSError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError, MissingExtraError) as error:
         raise SystemExit(complain(error)) from None
 
 
@@ -72,6 +79,7 @@ def check_params(
 
     Exit code 0: good; 2: bad.
     """
+    require("bench")  # the settings of every planner in params.yaml are looked at
     from constraint_geodesics.gate import check_params as check
     from constraint_geodesics.params import load_params
 
@@ -157,6 +165,8 @@ def plan(
     from constraint_geodesics.bundle import BundleError
     from constraint_geodesics.planner import Planner, PlannerError
 
+    if record is not None:
+        require("record")
     try:
         first, last = _joints(start, "--start"), _joints(goal, "--goal")
         with waiting(what_takes_time()), Planner.load(planner, method) as loaded:
@@ -268,6 +278,7 @@ def bench(
     """Hold planners against each other on a few of the benchmark's queries; what is done is not
     done again.
     """
+    require("bench")
     from constraint_geodesics.benchmark.entries import answered, committed_run, fewer
     from constraint_geodesics.benchmark.row import write_table
     from constraint_geodesics.benchmark.statistics import all_constraints, benchmark_summary
@@ -304,6 +315,7 @@ def show_results(as_json: bool = JSON) -> None:
     if not table.is_file():
         raise FileNotFoundError(f"{table}: no results yet; run `make repro`")
     if as_json:
+        require("pipeline")
         import pandas as pd
 
         print(json.dumps({"rows": _records(pd.read_csv(table, float_precision="round_trip"))}))
@@ -347,6 +359,7 @@ def replay(
     files = _files(recordings or [], wanted, as_json)
     if not files:
         return
+    require("record")
     from constraint_geodesics.recording.viewer import open_recordings, save_recordings
 
     if save is not None:
@@ -431,6 +444,7 @@ def ui(
     """Open MLflow's dashboard for this checkout, on this machine only; it runs until it is
     stopped.
     """
+    require("pipeline")
     from constraint_geodesics.tracking.store import ui_command
 
     command, address = ui_command(Path().resolve(), port), f"http://127.0.0.1:{port}"

@@ -5,14 +5,20 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
-
-from click.shell_completion import CompletionItem
+from typing import Any, NamedTuple
 
 from constraint_geodesics.plugs import METHODS
 
 PIPELINE = Path("data") / "planner" / "planner.json"
 PACKAGED = Path(__file__).parent / "pretrained" / "planner.json"
+
+
+class Proposal(NamedTuple):
+    """As click's CompletionItem, which typer has in a copy of its own or from click itself."""
+
+    value: str
+    help: str
+    type: str = "plain"
 
 
 def planned_constraints(context: Any, parameter: Any, incomplete: str) -> list[Any]:
@@ -57,9 +63,9 @@ def _described(entries: Any) -> dict[str, str]:
     return {name: str(entry.get("description", "")) for name, entry in (entries or {}).items()}
 
 
-def _items(names: Mapping[str, str], incomplete: str) -> list[CompletionItem]:
+def _items(names: Mapping[str, str], incomplete: str) -> list[Proposal]:
     return [
-        CompletionItem(_typed(name), help=about)
+        Proposal(_typed(name), about)
         for name, about in names.items()
         if name.startswith(incomplete)
     ]

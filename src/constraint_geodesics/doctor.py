@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 PACKAGE = "constraint_geodesics"
 NEEDED_PYTHON = (3, 11)
+"""Planning works with later ones, without PyBullet."""
 NEW_ENVIRONMENT = "rm -rf .venv && make env"
 INSTALL_LOCK = "python -m pip install -r requirements.lock"
 ACTIVATE = "source .venv/bin/activate"
@@ -245,16 +246,18 @@ def _run(
 
 
 def check_python(root: Path, here: Surroundings) -> Answers:
-    """PyBullet has wheels for Python 3.11 and none for later ones."""
+    """PyBullet has wheels for Python 3.11 and none for later ones; the lock is for that one."""
     version, needed = ".".join(map(str, here.python)), ".".join(map(str, NEEDED_PYTHON))
     if here.python[:2] == NEEDED_PYTHON:
         return version
-    message = f"this is Python {version}; {needed} is needed"
+    answer, message = _problem, f"this is Python {version}; {needed} is needed"
+    if here.python > NEEDED_PYTHON:
+        answer, message = _note, f"{message} by PyBullet and the pipeline; planning works without"
     if _in_another_environment(root, here):
-        yield _problem(f"{message}, and .venv has its own", ACTIVATE)
+        yield answer(f"{message}, and .venv has its own", ACTIVATE)
     else:
         mend = f"install Python {needed}, then: {NEW_ENVIRONMENT} PYTHON=python{needed}"
-        yield _problem(f"{message} (PyBullet has no wheels for others)", mend)
+        yield answer(message, mend)
     return ""
 
 
@@ -271,11 +274,24 @@ def check_packages(root: Path, here: Surroundings) -> Answers:
         for name, version in found.items()
         if version is not None and not _same(version, wanted[name])
     ]
+    if missing and _for_planning_alone(here):
+        message = f"{len(missing)} of {len(wanted)} are missing, of the pipeline: {_few(missing)}"
+        yield _note(f"{message}; planning works without", "make env")
+        missing = []
     for names, what in ((missing, "missing"), (other, "of another version")):
         if names:
             message = f"{len(names)} of {len(wanted)} are {what}: {_few(names)}"
             yield _problem(message, _completing(root, here))
     return f"all {len(wanted)} of requirements.lock"
+
+
+def _for_planning_alone(here: Surroundings) -> bool:
+    """Whether the environment has all that planning needs and not what runs the pipeline."""
+    found = metadata.distributions(name=PACKAGE.replace("_", "-"), path=list(here.search))
+    needed = [line for own in found for line in own.requires or () if ";" not in line]
+    names = [re.split(r"[^\w.-]", line)[0] for line in needed]
+    there = [_normal(name) in here.installed for name in names]
+    return "dvc" not in here.installed and bool(there) and all(there)
 
 
 def _same(version: str, wanted: str) -> bool:

@@ -13,9 +13,3 @@ Seed = Annotated[int, Field(ge=0, lt=2**31)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 Vector3 = tuple[Finite, Finite, Finite]
 Bit = Literal[0, 1]
-
-
-class ParamsError(ValueError):
-    """params.yaml can't be used; the message is one line with the entry, its value and what is
-    allowed.
-    """

@@ -6,12 +6,21 @@ a digest of all kernel files, so that a kernel is compiled again when one that i
 
 import shutil
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from numba.core import caching
 
 from constraint_geodesics.kernel_digest import FOLDER, PACKAGE, folder_of, kernels_digest
+
+_READY: set[Path] = set()
+"""Folders that are made, and have no older ones beside them."""
+
+
+@cache
+def _inside(py_file: str) -> bool:
+    return Path(py_file).resolve().is_relative_to(PACKAGE.resolve())
 
 
 class _Own:
@@ -20,8 +29,7 @@ class _Own:
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> Any:
         """The place of one function, or None: ask the next class."""
-        inside = Path(py_file).resolve().is_relative_to(PACKAGE.resolve())
-        return super().from_function(py_func, py_file) if inside else None  # type: ignore[misc]
+        return super().from_function(py_func, py_file) if _inside(py_file) else None  # type: ignore[misc]
 
     def get_cache_path(self) -> str:
         """The folder of the kernels as they are now."""
@@ -29,8 +37,11 @@ class _Own:
 
     def ensure_cache_path(self) -> None:
         """Make the folder; those of kernels that have changed since go."""
-        super().ensure_cache_path()  # type: ignore[misc]
         own = Path(self.get_cache_path())
+        if own in _READY and own.is_dir():  # asked for once a kernel
+            return
+        super().ensure_cache_path()  # type: ignore[misc]
+        _READY.add(own)
         for other in own.parent.glob(f"{FOLDER}*"):
             if other != own:
                 shutil.rmtree(other, ignore_errors=True)

@@ -13,9 +13,8 @@ from pydantic import (
     ValidationError,
     model_validator,
 )
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
+from constraint_geodesics.errors import ParamsError as ParamsError
 from constraint_geodesics.fields import (
     Bit,
     Count,
@@ -27,13 +26,13 @@ from constraint_geodesics.fields import (
     Share,
     Vector3,
 )
-from constraint_geodesics.fields import ParamsError as ParamsError
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.shapes import AnyShape
 
 
 class _Record(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    # a planner reads five of the records: the others' checks are built where they are needed
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class RobotParams(_Record):
@@ -484,6 +483,8 @@ def load_params(path: Path = Path("params.yaml")) -> Params:
 
     Raises ParamsError, one line: the file, the entry, its value and what is allowed.
     """
+    from ruamel.yaml.error import YAMLError
+
     try:
         raw = _yaml(path.read_text())
     except OSError as error:
@@ -501,6 +502,8 @@ def _yaml(text: str) -> Any:
     """YAML 1.2, read as DVC reads and writes it: 2e-05 is a number there, which YAML 1.1 takes for
     a text.
     """
+    from ruamel.yaml import YAML
+
     return YAML(typ="safe", pure=True).load(text)
 
 

@@ -64,9 +64,10 @@ class Planner:
         dof, settings = self.scene.robot.dof, bundle.planner
         self._acceleration = np.full(dof, settings.acceleration_rad_s2)
         self._certifier = Certifier(self.scene, limits_of(settings, bundle.judge, dof))
-        self._world = self.scene.world()
-        apart = self._certifier.collisions.apart
-        self._preparation = Preparation(self.scene, self._world, settings, self.method.draw, apart)
+        checks = self._certifier.collisions
+        self._preparation = Preparation(
+            self.scene, checks, settings, self.method.draw, checks.apart
+        )
         roadmaps = bundle.roadmaps if self.method.roadmaps is None else self.method.roadmaps
         self._preparation.supply(self.constraints, roadmaps)
         self.band = self._preparation.band
@@ -93,10 +94,9 @@ class Planner:
         self.close()
 
     def close(self) -> None:
-        """Free the physics worlds; a closed planner answers no more."""
+        """Free the physics world; a closed planner answers no more."""
         self._closed = True
         self._certifier.close()
-        self._world.close()
 
     def _require_open(self) -> None:
         if self._closed:
@@ -217,7 +217,9 @@ class Planner:
                 return found if budget_s is None else self._improved(query, found, budget_s)
             problem = f"; the {candidate.source} curve fails: {found}"
         if end.status == "not_connected":
-            return self._nothing(query, end.status, not_connected(query, end, self._world))
+            return self._nothing(
+                query, end.status, not_connected(query, end, self._certifier.collisions)
+            )
         line = f"no curve tried is a path under {query.name}{problem}"
         return self._nothing(query, end.status, line)
 

@@ -3,18 +3,30 @@ nothing of the lab.
 """
 
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
-MLFLOW = "tracking.store:fetch_artifacts"
+from constraint_geodesics.extras import require
+
+
+class Plug(NamedTuple):
+    """A module and its attribute, and the extra that they need."""
+
+    address: str
+    extra: str | None = None
+
+
+MLFLOW = Plug("tracking.store:fetch_artifacts", "pipeline")
 METHODS = {
-    "planner": "methods:SearchMethod",
-    "learned": "geodesics.learned_method:LearnedMethod",
-    "learned+band": "geodesics.learned_method:RefinedLearnedMethod",
+    "planner": Plug("methods:SearchMethod"),
+    "learned": Plug("geodesics.learned_method:LearnedMethod", "pipeline"),
+    "learned+band": Plug("geodesics.learned_method:RefinedLearnedMethod", "pipeline"),
 }
 """How a planner may look for curves, each a class that `methods.Method` describes."""
 
 
-def plug(address: str) -> Any:
-    """The object at a module's attribute."""
-    module, attribute = address.split(":")
+def plug(wanted: Plug) -> Any:
+    """The object at a module's attribute.  Raises MissingExtraError where its extra is missing."""
+    if wanted.extra is not None:
+        require(wanted.extra)
+    module, attribute = wanted.address.split(":")
     return getattr(import_module(f"constraint_geodesics.{module}"), attribute)

@@ -17,6 +17,7 @@ from constraint_geodesics.constraints.constraint import (
     ConstraintManifold,
     constraint_from_json,
 )
+from constraint_geodesics.extras import require
 from constraint_geodesics.problem import PlannerError, Status
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.scene import Scene
@@ -167,7 +168,10 @@ class Trajectory:
         write_trajectory(Path(file), self.joints, self.times, self.constraint, names)
 
     def record(self, file: str | Path, frames: int = 100) -> None:
-        """Write a Rerun recording.  Raises PlannerError without a path."""
+        """Write a Rerun recording.  Raises PlannerError without a path, MissingExtraError without
+        the extra `record`.
+        """
+        require("record")
         from constraint_geodesics.recording.recording import PathRecord, record_path
 
         self._require_path("record")

@@ -82,7 +82,7 @@ class Certificate:
     at.  asked_pybullet: how
     many parts of the path come so close to something that the proof rests on PyBullet's distances
     there; clearance_m is 0 then.  rests_on: what was taken for the bodies.
-    largest_pose_difference: of all links from PyBullet's [rad or m].
+    largest_pose_difference: of all links from PyBullet's [rad or m]; nan without PyBullet.
     duration_s: nan without times.  time_s: what certification took, of which collision_time_s for
     collisions.
     """

@@ -4,7 +4,8 @@ What it takes from elsewhere are the robot's limits, the convex pieces of its li
 workcell with their distance (scene/bodies.py, scene/convex_kernels.py), and PyBullet's distances
 where two of them come closer than the proof's margin.  Its kinematics are unit quaternions along
 the chain that PyBullet itself loaded, not the project's reading of the URDF, and are compared with
-PyBullet's poses of all links once.
+PyBullet's poses of all links once.  Without PyBullet the chain is read by urdf_chain.py, nothing is
+compared, and paths on which bodies come closer than the margin are refused.
 A path is what an arm executes: straight joint lines between its rows.  The constraint is bounded
 along all of them, by the file of its kind here, and so is the distance of all bodies that may meet,
 by collision_kernels.py; joint limits hold between rows because they hold at both ends.
@@ -32,6 +33,7 @@ from constraint_geodesics.certification.chain import read_chain
 from constraint_geodesics.certification.collisions import CollisionCheck, Separation
 from constraint_geodesics.certification.kept import Asked, Kept, how_kept
 from constraint_geodesics.certification.motion import MotionLimits, check_times
+from constraint_geodesics.certification.urdf_chain import chain_of_urdf
 from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.scene.scene import Scene
 
@@ -71,7 +73,8 @@ class _Path(NamedTuple):
 
 
 class Certifier:
-    """Certifies paths of one robot in its workcell; holds a PyBullet world until it is closed.
+    """Certifies paths of one robot in its workcell; holds a PyBullet world, where PyBullet is
+    installed, until it is closed.
 
     Raises CertificationError if the limits do not fit the robot, or PyBullet's chain has a joint it
     can't follow, and RobotError if a collision shape can't be bounded.
@@ -89,8 +92,13 @@ class Certifier:
             raise CertificationError(
                 f"acceleration_rad_s2 has {len(wanted)} entries for {self._dof} joints"
             )
-        self._world = scene.world()
-        self._chain = read_chain(self._world.loaded_chain(), self._dof)
+        self._world = scene.world_if_installed()
+        loaded = (
+            chain_of_urdf(robot.urdf, robot.tool_link, robot.joint_names)
+            if self._world is None
+            else self._world.loaded_chain()
+        )
+        self._chain = read_chain(loaded, self._dof)
         self.collisions = CollisionCheck(
             scene, self._chain, self._world, self.limits.limit_tolerance_rad
         )
@@ -104,7 +112,8 @@ class Certifier:
 
     def close(self) -> None:
         """Free the PyBullet world."""
-        self._world.close()
+        if self._world is not None:
+            self._world.close()
 
     def tool_poses(self, joints: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "n 7"]:
         """Tool position [m] and quaternion (x, y, z, w) in the base frame, by the certifier's own
@@ -240,13 +249,16 @@ class Certifier:
 
     def _compared_with_pybullet(self) -> tuple[float, Violation | None]:
         """The certifier's kinematics against PyBullet's, of all links at configurations spread over
-        the limits [rad or m, the larger]; what is wrong with a difference that is too large.
+        the limits [rad or m, the larger], nan without PyBullet; what is wrong with a difference
+        that is too large.
         """
+        if self._world is None:
+            return np.nan, None
         low, high = np.clip(self._limits, -np.pi, np.pi)
         drawn = np.random.default_rng(0).uniform(low, high, (_POSES, self._dof))
         theirs, own = self._world.label(drawn), self.tool_poses(drawn)
         value = _largest(own, np.hstack([theirs.position, theirs.quaternion]))
-        value = max(value, self.collisions.pose_difference(drawn))
+        value = max(value, self.collisions.pose_difference(drawn, self._world))
         allowed = self.limits.pose_tolerance
         if value <= allowed:
             return value, None

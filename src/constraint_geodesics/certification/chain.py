@@ -1,5 +1,5 @@
-"""The chain that PyBullet itself loaded, as kernels.py describes it: unit quaternions along the
-joints, no reading of the URDF.
+"""The chain that PyBullet itself loaded, or without it the one of urdf_chain.py, as kernels.py
+describes it: unit quaternions along the joints.
 """
 
 from typing import NamedTuple
@@ -55,7 +55,7 @@ def read_chain(loaded: LoadedChain, dof: int) -> Chain:
             )
         arm = joint + rotated(turn, rotated(tool, np.array(link.inertial_position)))
     if len(turns) != dof:
-        raise CertificationError(f"PyBullet's chain has {len(turns)} joints, the robot has {dof}")
+        raise CertificationError(f"the chain has {len(turns)} joints, the robot has {dof}")
     turns.append(_product(turn, tool))
     offsets.append(joint)
     return Chain(

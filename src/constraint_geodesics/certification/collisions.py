@@ -5,7 +5,7 @@ distances where two bodies come closer than the proof's margin.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from constraint_geodesics.certification import collision_kernels as kernels
 from constraint_geodesics.certification.certificate import Violation, malformed
@@ -38,12 +38,13 @@ class Separation(NamedTuple):
 
 
 class CollisionCheck:
-    """Of one scene, in a PyBullet world that it does not own.
+    """Of one scene, in a PyBullet world that it does not own; without one, what the proof leaves
+    open is refused.
 
     Raises RobotError if a collision shape can't be bounded, naming it.
     """
 
-    def __init__(self, scene: Scene, chain: Chain, world: World, beyond_rad: float) -> None:
+    def __init__(self, scene: Scene, chain: Chain, world: World | None, beyond_rad: float) -> None:
         self._world = world
         self.collider = collider(scene, chain, MARGIN_M, beyond_rad)
         self._standing = self._rigid_contact(scene.robot.dof)
@@ -58,6 +59,8 @@ class CollisionCheck:
             line += f", hulls that cover more than the meshes of {', '.join(covered)}"
         if apart := len(self.collider.apart):
             line += f"; {apart} pairs that never meet within the joint limits"
+        if self._world is None:
+            line += "; no PyBullet, with which nothing was compared"
         return line
 
     @property
@@ -73,12 +76,21 @@ class CollisionCheck:
         inside = bool((q >= low).all() and (q <= high).all())
         if inside and self._standing is None and self._nearest(q, MARGIN_M) >= MARGIN_M:
             return True
-        return self._world.is_free(q)
+        return self._world is not None and self._world.is_free(q)
+
+    def free(self, q: Float[np.ndarray, "n D"]) -> Bool[np.ndarray, "n"]:
+        """Which configurations touch nothing, each as `is_free` says."""
+        return np.array([self.is_free(row) for row in q], dtype=bool)
 
     def what_touches(self, q: Float[np.ndarray, "D"]) -> str:
         """What a configuration touches that is not free."""
-        own = bool(self._world.label(q[None]).self_collision[0])
-        return "the arm itself" if own else "the workcell"
+        if self._standing is not None:
+            kind = self._standing[0]
+        else:
+            place = np.ascontiguousarray(q, float)
+            _, pair = kernels.nearest_pair(self.collider.arrays, place, np.inf)
+            kind = _kind(*self._named(pair))
+        return "the arm itself" if kind == "self_collision" else "the workcell"
 
     def clearance(self, q: Float[np.ndarray, "D"]) -> float:
         """The least distance of bodies that may meet [m], inf where none may; 0 or less where they
@@ -117,7 +129,7 @@ class CollisionCheck:
         text = f"bodies come closer than {1e3 * MARGIN_M} mm on more than {most} parts of the path"
         return Separation(malformed("clearance", None, text))
 
-    def pose_difference(self, q: Float[np.ndarray, "n D"]) -> float:
+    def pose_difference(self, q: Float[np.ndarray, "n D"], world: World) -> float:
         """How far any corner of a link's pieces is from where PyBullet has it at most [m]."""
         frames = np.empty((2, q.shape[1] + 1, 12))
         kernels.joint_frames(self.collider.arrays.chain, np.zeros(q.shape[1]), frames[0])
@@ -125,7 +137,7 @@ class CollisionCheck:
         largest = 0.0
         for row in q:
             kernels.joint_frames(self.collider.arrays.chain, row, frames[1])
-            theirs = self._world.link_poses(row, [body.name for body, _ in links])
+            theirs = world.link_poses(row, [body.name for body, _ in links])
             for (body, at_zero), pose in zip(links, theirs, strict=True):
                 corners = np.concatenate([piece.corners for piece in body.pieces])
                 own = _in_base(corners, frames[1, body.frame])
@@ -142,6 +154,8 @@ class CollisionCheck:
         """What PyBullet's distances say of a part of a line: between two places they change by no
         more than the bodies move.  Where bodies overlap by more than the margin, they touch.
         """
+        if self._world is None:
+            return self._unproven(int(row), 0.5 * (start + end), pair)
         first, second = self._named(pair)
         i, line = int(row), rows[int(row) + 1] - rows[int(row)]
         reach = self._reach(pair)
@@ -180,6 +194,9 @@ class CollisionCheck:
             alone = arrays._replace(pairs=_only(arrays.pairs, arrays.top + k), top=1)
             if kernels.nearest_pair(alone, zeros, MARGIN_M)[0] >= MARGIN_M:
                 continue
+            if self._world is None:
+                text = f"{second.name} and {first.name} are too close at every configuration"
+                return _kind(first, second), None, text
             if self._world.distance(zeros, first.key, second.key, MARGIN_M) < 0.0:
                 text = f"{second.name} and {first.name} touch at every configuration"
                 return _kind(first, second), None, text

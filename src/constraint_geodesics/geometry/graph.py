@@ -4,8 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import ndimage, sparse
-from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
 from constraint_geodesics.geometry.errors import GeometryError, NonFiniteError
@@ -53,10 +51,16 @@ def components(n: int, edges: Edges) -> Int[np.ndarray, "n"]:
 
     Raises GraphError with the first edge that names no node.
     """
-    _, labels = csgraph.connected_components(
-        _adjacency(n, edges, np.ones(len(edges))), directed=False
-    )
-    return _largest_first(labels)
+    _check(n, edges)
+    # the least node that is reached, handed on along edges and to all that hang on the same one
+    least, before = np.arange(n), np.full(n, OUTSIDE)
+    while (least != before).any():
+        before = least.copy()
+        for i, k in (edges.T, edges.T[::-1]):
+            np.minimum.at(least, least[i], least[k])
+        while (least != least[least]).any():
+            least = least[least]
+    return _largest_first(least)
 
 
 def shortest_path(
@@ -73,7 +77,12 @@ def shortest_path(
     for name, node in (("source", source), ("target", target)):
         if not 0 <= node < n:
             raise GraphError(f"{name} = {node}: the nodes are 0 to {n - 1}")
-    adjacency = _adjacency(n, edges, weights)
+    # imported here: where a planner comes with its roadmaps, it starts without
+    from scipy import sparse
+    from scipy.sparse import csgraph
+
+    _check(n, edges)
+    adjacency = sparse.csr_array((weights, (edges[:, 0], edges[:, 1])), shape=(n, n))
     if adjacency.nnz != len(edges):
         raise GraphError(f"edges name {len(edges) - adjacency.nnz} pairs twice: must be unique")
     lengths, before = csgraph.dijkstra(
@@ -96,6 +105,8 @@ def components_on_grid(
     Cells that share a side are joined; wrap says along which axes the last cell is also next to the
     first. Components are numbered by size as in `components`, cells outside the set are OUTSIDE.
     """
+    from scipy import ndimage  # planning needs none of it
+
     pieces, count = ndimage.label(inside)
     seams = [
         np.stack([np.take(pieces, 0, axis), np.take(pieces, -1, axis)], axis=-1)
@@ -109,11 +120,11 @@ def components_on_grid(
     return labels
 
 
-def _adjacency(n: int, edges: Edges, weights: np.ndarray) -> sparse.csr_array:
+def _check(n: int, edges: Edges) -> None:
+    """Raises GraphError with the first edge that names no node."""
     bad = np.flatnonzero(((edges < 0) | (edges >= n)).any(axis=1))
     if len(bad):
         raise GraphError(f"edges[{bad[0]}] = {edges[bad[0]].tolist()}: the nodes are 0 to {n - 1}")
-    return sparse.csr_array((weights, (edges[:, 0], edges[:, 1])), shape=(n, n))
 
 
 def _largest_first(labels: np.ndarray) -> np.ndarray:

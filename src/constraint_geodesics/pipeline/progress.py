@@ -5,16 +5,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-)
+if TYPE_CHECKING:  # Rich is loaded where there is a terminal, not for `geodesics --help`
+    from rich.progress import Progress
 
 LINE_EVERY_S = 15.0
 
@@ -40,6 +34,9 @@ def waiting(description: str) -> Iterator[None]:
     if not description or not sys.stderr.isatty():
         yield
         return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
     columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as line:
         line.add_task(description, total=None)
@@ -50,7 +47,7 @@ def waiting(description: str) -> Iterator[None]:
             _waiting.remove(line)
 
 
-_waiting: list[Progress] = []
+_waiting: list["Progress"] = []
 """The lines that are shown now: a terminal has one bottom, which the bar within them needs."""
 
 
@@ -68,6 +65,9 @@ def _given_way() -> Iterator[None]:
 
 @contextmanager
 def _bar(description: str, total: int) -> Iterator[Callable[[], None]]:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),

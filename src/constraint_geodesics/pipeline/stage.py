@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from constraint_geodesics.fields import ParamsError
+from constraint_geodesics.errors import ParamsError
+from constraint_geodesics.extras import MissingExtraError
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.threads import one_thread
@@ -59,7 +60,7 @@ def complain(error: Exception, code: int | None = None) -> int:
     print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
     if code is not None:
         return code
-    return WRONG_USAGE if isinstance(error, ParamsError) else 1
+    return WRONG_USAGE if isinstance(error, ParamsError | MissingExtraError) else 1
 
 
 def _check_names(params: "Params", stage: Callable[..., None], arguments: Sequence[str]) -> None:

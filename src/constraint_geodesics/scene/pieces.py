@@ -8,6 +8,7 @@ exact shape, but for the edges of a box, which it rounds off.
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -156,8 +157,13 @@ def _cylinder(shape: ElementTree.Element, _: Path) -> Iterator[Piece]:
 def _mesh(shape: ElementTree.Element, urdf: Path) -> Iterator[Piece]:
     file = _mesh_file(shape.get("filename", ""), urdf)
     scale = _numbers(shape, "scale", "1 1 1")
-    for points in read_mesh(file):
-        yield mesh_piece(points * scale)
+    yield from _mesh_pieces(file, file.stat().st_mtime_ns, tuple(scale))
+
+
+@lru_cache(maxsize=256)
+def _mesh_pieces(file: Path, _changed_ns: int, scale: tuple[float, ...]) -> tuple[Piece, ...]:
+    """Search and certificate ask for the same meshes; a changed file is read again."""
+    return tuple(mesh_piece(points * np.array(scale)) for points in read_mesh(file))
 
 
 _KINDS = {"mesh": _mesh, "box": _box, "sphere": _sphere, "cylinder": _cylinder, "capsule": _capsule}

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from constraint_geodesics.params import Params, RobotParams, WorkcellParams
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
 from constraint_geodesics.scene.shape import Shape
-from constraint_geodesics.scene.urdf import find_urdf
+from constraint_geodesics.scene.urdf import find_urdf, has_pybullet
 from constraint_geodesics.scene.world import World
 
 
@@ -24,6 +24,10 @@ class Scene:
     def world(self) -> World:
         """A fresh PyBullet world; close it, or use it as a context manager."""
         return World(self.robot, self.workcell)
+
+    def world_if_installed(self) -> World | None:
+        """The same; None where there is no PyBullet."""
+        return self.world() if has_pybullet() else None
 
 
 def robot_from(params: RobotParams) -> SerialRobot:

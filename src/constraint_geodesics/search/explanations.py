@@ -7,7 +7,6 @@ from constraint_geodesics.certification.collisions import CollisionCheck
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.problem import Status, ends_refused
-from constraint_geodesics.scene.world import World
 from constraint_geodesics.search.candidates import Answer
 from constraint_geodesics.search.preparation import Query
 from constraint_geodesics.search.roadmap import Roadmap, join
@@ -40,7 +39,7 @@ def _limit(manifold: ConstraintManifold, end: str, q: Float[np.ndarray, "D"]) ->
     return ""
 
 
-def not_connected(query: Query, answer: Answer, world: World) -> str:
+def not_connected(query: Query, answer: Answer, collisions: CollisionCheck) -> str:
     """That start and goal are not joined, and the nearest goal that the start can reach instead."""
     line = f"start and goal lie in different components of {query.name}'s graph"
     roadmap = query.task.roadmap()
@@ -51,7 +50,7 @@ def not_connected(query: Query, answer: Answer, world: World) -> str:
     nodes = nodes[np.argsort(np.linalg.norm(nodes - query.goal, axis=1))]
     seeds = nodes[:: max(len(nodes) // ALTERNATIVES, 1)]
     for q in _same_pose(query, seeds):
-        if world.is_free(q) and _component(query, roadmap, q) & reached:
+        if collisions.is_free(q) and _component(query, roadmap, q) & reached:
             return f"{line}; the goal's tool pose can be reached from the start as {_listed(q)} rad"
     away = float(np.linalg.norm(nodes[0] - query.goal))
     nearest = f"the nearest configuration that the start can reach, {away:.2f} rad away"

@@ -3,9 +3,10 @@
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
@@ -23,6 +24,15 @@ from constraint_geodesics.search.space import Space
 KEPT_TASKS = 64
 """Constraints without a name that are remembered, with their roadmaps."""
 _ROUNDS = 20
+
+
+class Freedom(Protocol):
+    """Says which configurations are free: the certificate's check of collisions, or PyBullet."""
+
+    def free(self, q: Float[np.ndarray, "n D"]) -> Bool[np.ndarray, "n"]:
+        """Which of n configurations touch nothing."""
+        ...
+
 
 Draw = Callable[[int, np.random.Generator], Float[np.ndarray, "n D"]]
 """Configurations [rad], on the constraint or not."""
@@ -48,12 +58,12 @@ class Preparation:
     def __init__(
         self,
         scene: Scene,
-        world: World,
+        freedom: Freedom,
         settings: PlannerParams,
         draw: Draw | None = None,
         apart: Collection[tuple[int, int]] = (),
     ) -> None:
-        self.scene, self.world, self.settings = scene, world, settings
+        self.scene, self.freedom, self.settings = scene, freedom, settings
         self.draw = draw or scene.robot.sample
         self.band = band_settings(settings)
         self._clearance = clearance_model(scene.robot, scene.workcell, apart)
@@ -90,7 +100,7 @@ class Preparation:
             settings = self.settings
             rng = np.random.default_rng(settings.seed)
             nodes = free_configurations(
-                manifold, self.world, self.draw, settings.roadmap_nodes, rng
+                manifold, self.freedom, self.draw, settings.roadmap_nodes, rng
             )
             space = self._tasks[key].clear
             self._roadmaps[key] = (
@@ -149,7 +159,7 @@ def edge_points(
 
 
 def free_configurations(
-    manifold: ConstraintManifold, world: World, draw: Draw, count: int, rng: np.random.Generator
+    manifold: ConstraintManifold, freedom: Freedom, draw: Draw, count: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "n D"]:
     """Configurations on the constraint, within the limits and free of collision: drawn, then
     projected; fewer than `count` if there are few.
@@ -162,7 +172,7 @@ def free_configurations(
         result = retract(manifold, drawn, Retraction(), band=share)
         good = result.joints[result.converged & (robot.limit_distance(result.joints) >= 0.0)]
         good = good[: count - found]
-        kept.append(good[world.free(good)])
+        kept.append(good[freedom.free(good)])
         found += len(kept[-1])
         if found >= count:
             break
