@@ -2,6 +2,7 @@
 distances where two bodies come closer than the proof's margin.
 """
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +50,7 @@ class CollisionCheck:
         self.collider = collider(scene, chain, MARGIN_M, beyond_rad)
         self._standing = self._rigid_contact(scene.robot.dof)
 
-    @property
+    @cached_property
     def rests_on(self) -> str:
         """What was taken for the bodies, and what was left out."""
         bodies = self.collider.bodies
