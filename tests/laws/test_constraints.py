@@ -21,7 +21,7 @@ from constraint_geodesics.constraints.constraint import (
     constraint_from_json,
 )
 from constraint_geodesics.constraints.functions import FunctionsConstraint, RowBound, made_by
-from constraint_geodesics.constraints.kernels import curvature, linearise, scratch
+from constraint_geodesics.constraints.kernels import curvature, linearise
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.params import FunctionsConstraintParams
 from constraint_geodesics.scene.scene import Scene
@@ -201,7 +201,7 @@ def test_projection_ends_where_nothing_is_violated(manifold) -> None:
 
 @njit
 def closed_form(arrays, weights, q):
-    own = scratch(arrays.constraint, q.shape[0])
+    own = np.empty(arrays.constraint.room)
     residual = np.zeros(weights.shape[0])
     jacobian = np.zeros((weights.shape[0], q.shape[0]))
     full = np.zeros((q.shape[0], q.shape[0]))

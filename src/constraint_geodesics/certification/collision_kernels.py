@@ -100,12 +100,12 @@ def _attained(level, value):
 
 
 @njit(**LEAF)
-def _nearest(bodies, top, frames, at, level, simplex):
+def _nearest(bodies, top, frames, level, simplex):
     """The least distance of any pair at one place into `level`; returns that pair, −1 where another
     place has less.
     """
     _, nodes, pairs = bodies
-    convex.place_balls(nodes, frames, at)
+    convex.place_balls(nodes, frames)
     nearest = -1
     for body in range(top):
         a, b = int(pairs[body, 0]), int(pairs[body, 1])
@@ -118,7 +118,7 @@ def _nearest(bodies, top, frames, at, level, simplex):
                 continue
             rounding = nodes[a, convex.ROUNDING] + nodes[b, convex.ROUNDING]
             wanted = (level[ATTAINED] + rounding, -np.inf)
-            lower, _ = convex.distance(bodies, frames, at, p, wanted, simplex)
+            lower, _ = convex.distance(bodies, frames, p, wanted, simplex)
             if max(lower, 0.0) - rounding < level[ATTAINED]:
                 nearest = p
             _attained(level, max(lower, 0.0) - rounding)
@@ -178,14 +178,14 @@ def _is_proven(bodies, frames, places, p, level, steps, simplex):
             gap, enough = np.inf, level[ASKED] + rounding + bend
             for end in range(2):
                 if gap > enough:
-                    n = convex.turned(frames, places[end], f, x, y, z)
-                    gap = min(gap, convex.gap_along(bodies, frames, places[end], p, n))
+                    n = convex.turned(frames[places[end]], f, x, y, z)
+                    gap = min(gap, convex.gap_along(bodies, frames[places[end]], p, n))
             if gap > enough:  # at both ends
                 bound = gap - bend
         if attempt == 0 and bound - rounding <= level[ASKED]:
             too_little = level[MARGIN] + rounding + min(motion, bend)
             wanted = (level[ASKED] + rounding + motion, too_little)
-            lower, upper = convex.distance(bodies, frames, places[2], p, wanted, simplex)
+            lower, upper = convex.distance(bodies, frames[places[2]], p, wanted, simplex)
             _attained(level, upper - rounding)
             bound = lower - motion
         if bound - rounding > level[ASKED]:
@@ -203,7 +203,7 @@ def _sift(bodies, frames, interval, todo, level, steps, simplex):
     """
     i, m, k = interval
     _, nodes, pairs = bodies
-    convex.place_balls(nodes, frames, m)
+    convex.place_balls(nodes, frames[m])
     count, kept, c = todo[0], 0, 0
     while c < count:
         c += 1
@@ -231,10 +231,9 @@ def _sift(bodies, frames, interval, todo, level, steps, simplex):
     todo[0] = kept
 
 
-@njit(**COMPILE)
-def _place(chain, rows, i, share, frames):
-    """Frames (D + 1, 12) on the line from row i to the next."""
-    q = np.empty(rows.shape[1])
+@njit(**LEAF)
+def _place(chain, rows, i, share, q, frames):
+    """Configuration (D,) and frames (D + 1, 12) on the line from row i to the next."""
     for d in range(rows.shape[1]):
         q[d] = rows[i, d] + share * (rows[i + 1, d] - rows[i, d])
     joint_frames(chain, q, frames)
@@ -245,13 +244,13 @@ def nearest_pair(bodies, q, most):
     """The least distance [m] of any two bodies that may meet at one configuration, and which pair
     it is: `most` and −1 where that is more.
     """
-    frames, simplex = np.empty((1, q.shape[0] + 1, 12)), np.empty(convex.SIMPLEX)
+    frames, simplex = np.empty((q.shape[0] + 1, 12)), np.empty(convex.SIMPLEX)
     level = np.empty(5)
     for i in range(5):
         level[i] = most
-    joint_frames(bodies.chain, q, frames[0])
+    joint_frames(bodies.chain, q, frames)
     own = (bodies.hulls, bodies.nodes.copy(), bodies.pairs.copy())
-    nearest = _nearest(own, bodies.top, frames, 0, level, simplex)
+    nearest = _nearest(own, bodies.top, frames, level, simplex)
     return level[ATTAINED], nearest
 
 
@@ -270,7 +269,7 @@ def prove_apart(bodies, rows, margin, undecided):
     # after the rows' frames come those of three places on a line
     frames, known = np.empty((count + 3, dof + 1, 12)), np.zeros(count, dtype=np.bool_)
     travelled, steps = np.zeros((count, dof + 1)), np.empty((3, dof))
-    simplex = np.empty(convex.SIMPLEX)
+    simplex, q = np.empty(convex.SIMPLEX), np.empty(dof)
     level = np.array([np.inf, np.inf, margin, margin, np.inf])
     for i in range(1, count):
         travelled[i, dof] = travelled[i - 1, dof]
@@ -281,7 +280,7 @@ def prove_apart(bodies, rows, margin, undecided):
     for i in (0, count - 1):
         joint_frames(chain, rows[i], frames[i])
         known[i] = True
-        _nearest(own, top, frames, i, level, simplex)
+        _nearest(own, top, frames[i], level, simplex)
     lists = np.empty((_DEEPEST, own[2].shape[0] + 1), dtype=np.int64)
     spans, parts = np.empty((_DEEPEST, 2), dtype=np.int64), np.empty((_DEEPEST, 2))
     spans[0, 0], spans[0, 1], lists[0, 0] = 0, count - 1, top
@@ -312,9 +311,9 @@ def prove_apart(bodies, rows, margin, undecided):
                 left -= 1
                 start, end = parts[left, 0], parts[left, 1]
                 middle, shortest = 0.5 * (start + end), True
-                _place(chain, rows, i, start, frames[count])
-                _place(chain, rows, i, end, frames[count + 1])
-                _place(chain, rows, i, middle, frames[count + 2])
+                _place(chain, rows, i, start, q, frames[count])
+                _place(chain, rows, i, end, q, frames[count + 1])
+                _place(chain, rows, i, middle, q, frames[count + 2])
                 for d in range(dof):
                     steps[1, d] = (end - start) * abs(rows[k, d] - rows[i, d])
                     steps[0, d], steps[2, d] = 0.5 * steps[1, d], 0.0
@@ -346,7 +345,7 @@ def never_meets(bodies, body, limits, margin, cells):
     a, b = int(pairs[body, 0]), int(pairs[body, 1])
     first, last = convex.pieces_of(pairs, body)
     lo, hi = int(nodes[a, convex.FRAME]), int(nodes[b, convex.FRAME])
-    frames, simplex = np.empty((1, dof + 1, 12)), np.empty(convex.SIMPLEX)
+    frames, simplex = np.empty((dof + 1, 12)), np.empty(convex.SIMPLEX)
     waiting = np.empty((_DEEPEST, 2, dof))
     q = np.empty(dof)
     for j in range(dof):
@@ -359,7 +358,7 @@ def never_meets(bodies, body, limits, margin, cells):
             return False
         for j in range(dof):
             q[j] = 0.5 * (waiting[left, 0, j] + waiting[left, 1, j])
-        joint_frames(bodies.chain, q, frames[0])
+        joint_frames(bodies.chain, q, frames)
         widest, most, motion = lo, -1.0, 0.0
         for j in range(lo, hi):
             share = (waiting[left, 1, j] - q[j]) * nodes[b, convex.REACH + j]
@@ -371,7 +370,7 @@ def never_meets(bodies, body, limits, margin, cells):
             c, d = int(pairs[p, 0]), int(pairs[p, 1])
             rounding = nodes[c, convex.ROUNDING] + nodes[d, convex.ROUNDING]
             wanted = (margin + rounding + motion, margin + rounding + motion)
-            lower, upper = convex.distance(own, frames, 0, p, wanted, simplex)
+            lower, upper = convex.distance(own, frames, p, wanted, simplex)
             if upper - rounding <= margin:
                 return False
             if lower <= margin + rounding + motion:

@@ -15,13 +15,11 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from llvmlite import ir
 from numba import carray, cfunc, njit, types
-from numba.extending import intrinsic
 
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintError, Series
-from constraint_geodesics.constraints.kernels import Rows, register
+from constraint_geodesics.constraints.kernels import ConstraintArrays, Rows, call, floats
 from constraint_geodesics.robot.kernels import new_posture, pose_of
 from constraint_geodesics.robot.kinematics import SerialRobot
 
@@ -47,14 +45,6 @@ class Origin(NamedTuple):
     factory: str
     arguments: str
     robot: SerialRobot
-
-
-class FunctionArrays(NamedTuple):
-    """For the kernels: the rows, and the addresses of both functions."""
-
-    rows: Rows
-    residual: int
-    jacobian: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,14 +91,14 @@ class FunctionsConstraint(Constraint):
         """As the bounds say."""
         return tuple(bound.unit for bound in self.bounds)
 
-    def arrays(self, robot: SerialRobot) -> FunctionArrays:
+    def arrays(self, robot: SerialRobot) -> ConstraintArrays:
         """For the kernels."""
-        compiled = _compiled(self.residual, self.jacobian, len(self.bounds))
-        return FunctionArrays(self.rows, compiled[0].address, compiled[1].address)
+        both, _ = _compiled(self.residual, self.jacobian, len(self.bounds))
+        return ConstraintArrays(self.rows, np.empty(0), both.address, 0, 0)
 
     def values(self, q: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "n m"]:
         """The residuals of configurations."""
-        address = _compiled(self.residual, self.jacobian, len(self.bounds))[0].address
+        address = _compiled(self.residual, self.jacobian, len(self.bounds))[1].address
         out = np.empty((len(q), len(self.bounds)))
         _values(address, np.ascontiguousarray(q, np.float64), out)
         return out
@@ -205,64 +195,30 @@ def _made_again(origin: Origin, bounds: tuple[RowBound, ...]) -> FunctionsConstr
     return replace(made, bounds=bounds)
 
 
-@intrinsic
-def _pointer(typing, address):
-    def generate(context, builder, signature, values):
-        return builder.inttoptr(values[0], ir.DoubleType().as_pointer())
-
-    return types.CPointer(types.float64)(types.intp), generate
-
-
-@intrinsic
-def _call(typing, address, q, out, dof):
-    """Call a function of `_compiled` by its address, with those of q and out."""
-
-    def generate(context, builder, signature, values):
-        word = ir.IntType(64)
-        function = ir.FunctionType(ir.VoidType(), [word, word, word]).as_pointer()
-        builder.call(builder.inttoptr(values[0], function), values[1:])
-        return context.get_dummy_value()
-
-    return types.void(types.int64, types.int64, types.int64, types.int64), generate
-
-
 @cache
 def _compiled(residual: Writes, jacobian: Writes, count: int) -> tuple[Any, Any]:
-    """Both functions as C functions of the addresses of q and out and of D; kept, since the search
-    holds their addresses.
+    """Both functions as a C function for the search, and the residual as one of the addresses of q
+    and out and of D; kept, since the search holds their addresses.
     """
     options = {key: value for key, value in COMPILE.items() if key != "cache"}
     own_residual, own_jacobian = njit(**options)(residual), njit(**options)(jacobian)
-    signature = types.void(types.intp, types.intp, types.intp)
+
+    def write_both(origins, axes, prismatic, base, tool, data, q, room, value, slope, dof, rows):
+        place = carray(floats(q), (dof,))
+        own_residual(place, carray(floats(value), (count,)))
+        own_jacobian(place, carray(floats(slope), (count, dof)))
 
     def write_residual(q, out, dof):
-        own_residual(carray(_pointer(q), (dof,)), carray(_pointer(out), (count,)))
+        own_residual(carray(floats(q), (dof,)), carray(floats(out), (count,)))
 
-    def write_jacobian(q, out, dof):
-        own_jacobian(carray(_pointer(q), (dof,)), carray(_pointer(out), (count, dof)))
-
-    return cfunc(signature)(write_residual), cfunc(signature)(write_jacobian)
+    words = [types.void(*(types.intp,) * number) for number in (12, 3)]
+    return cfunc(words[0])(write_both), cfunc(words[1])(write_residual)
 
 
 @njit(**LEAF)
 def _values(address, q, out):
     for n in range(q.shape[0]):
-        _call(address, q[n].ctypes.data, out[n].ctypes.data, q.shape[1])
-
-
-@njit(**LEAF)
-def _no_scratch(constraint, dof):
-    return dof
-
-
-@njit(**LEAF)
-def _linearise(manifold, q, own, residual, jacobian):
-    about = manifold.constraint
-    _call(about.residual, q.ctypes.data, residual.ctypes.data, q.shape[0])
-    _call(about.jacobian, q.ctypes.data, jacobian.ctypes.data, q.shape[0])
-
-
-register(FunctionArrays, _no_scratch, _linearise)
+        call(address, (q[n].ctypes.data, out[n].ctypes.data, q.shape[1]))
 
 
 @constraint_factory

@@ -1,19 +1,21 @@
 """What the compiled search asks of a constraint, whatever its kind, one configuration at a time.
 
-A kind brings a NamedTuple of arrays whose first field is `rows` (Rows), and registers what is
-compiled for it with `register`: `scratch`, `linearise` and, if it knows one, a closed form of the
-`curvature`.  Calls are bound when a kernel is compiled, so a further kind changes nothing in the
-search and costs nothing at run time.  Shapes: D joints, m rows of the residual.
+A kind brings C functions by their addresses, and numbers that they take (`ConstraintArrays`), so
+that the search is compiled once for all kinds.  Shapes: D joints, m rows of the residual.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
-from numba.extending import overload
+from llvmlite import ir
+from numba import carray, cfunc, njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from constraint_geodesics.compiled import COMPILE, LEAF
+from constraint_geodesics.robot.kinematics import ChainArrays
 
 
 class Rows(NamedTuple):
@@ -48,66 +50,127 @@ class ManifoldArrays(NamedTuple):
     constraint: Any
 
 
-class _Kind(NamedTuple):
-    scratch: Any
-    linearise: Any
-    curvature: Any
+class ConstraintArrays(NamedTuple):
+    """A constraint of any kind, as the kernels take it.
 
-
-_KINDS: dict[type, _Kind] = {}
-
-
-def scratch(constraint: Any, dof: int) -> Any:
-    """What `linearise` of this kind writes besides its results, allocated once."""
-    raise NotImplementedError("only inside compiled code")
-
-
-def linearise(manifold: Any, q: Any, own: Any, residual: Any, jacobian: Any) -> None:
-    """Residual (m,) and its Jacobian (m, D) of one configuration; rows that are not held are left
-    alone.  own: of `scratch`.
+    data (n,): the kind's own numbers.  linearise, curvature: addresses of what `c_function` made,
+    the second 0 where there is no closed form.  room: how many numbers the two need to write into;
+    what the first leaves there is the second's.
     """
-    raise NotImplementedError("only inside compiled code")
+
+    rows: Rows
+    data: Float[np.ndarray, "n"]
+    linearise: int
+    curvature: int
+    room: int
 
 
-def curvature(manifold: Any, weights: Any, own: Any, full: Any) -> bool:
+LINEARISE = "origins, axes, prismatic, base, tool, data, q, room, residual, jacobian, dof, count"
+"""What `linearise` of a kind is called with: addresses of the chain's arrays, and of what
+`linearise` here has, then D and m.
+"""
+CURVATURE = "prismatic, data, room, weights, full, dof"
+"""What `curvature` of a kind is called with; it returns whether there was a closed form."""
+
+
+def c_function(function: Callable[..., Any], answers: bool = False) -> int:
+    """The address of a function of the arguments above, compiled and kept in numba's cache; the
+    caller keeps what is returned beside it alive by asking once.  answers: whether it returns.
+    """
+    count = function.__code__.co_argcount
+    returned = types.intp if answers else types.void
+    compiled = cfunc(returned(*(types.intp,) * count), **COMPILE)(function)
+    _KEPT.append(compiled)
+    address: int = compiled.address
+    return address
+
+
+_KEPT: list[Any] = []
+
+
+@intrinsic
+def floats(typing, address):
+    """A pointer for `carray` to numbers at an address."""
+
+    def generate(context, builder, signature, values):
+        return builder.inttoptr(values[0], ir.DoubleType().as_pointer())
+
+    return types.CPointer(types.float64)(types.intp), generate
+
+
+@intrinsic
+def flags(typing, address):
+    """A pointer for `carray` to booleans at an address."""
+
+    def generate(context, builder, signature, values):
+        return builder.inttoptr(values[0], ir.IntType(8).as_pointer())
+
+    return types.CPointer(types.boolean)(types.intp), generate
+
+
+@intrinsic
+def call(typing, address, words):
+    """The answer of a C function at an address to a tuple of integers."""
+
+    def generate(context, builder, signature, values):
+        word = ir.IntType(64)
+        own = cgutils.unpack_tuple(builder, values[1])
+        function = ir.FunctionType(word, [word] * len(own)).as_pointer()
+        return builder.call(builder.inttoptr(values[0], function), own)
+
+    return types.intp(types.intp, words), generate
+
+
+@njit(inline="always", **COMPILE)
+def chain_at(origins, axes, prismatic, base, tool, dof):
+    """A robot's chain from the addresses of its arrays."""
+    return ChainArrays(
+        carray(floats(origins), (dof, 4, 4)),
+        carray(floats(axes), (dof, 3)),
+        carray(flags(prismatic), (dof,)),
+        carray(floats(base), (4, 4)),
+        carray(floats(tool), (4, 4)),
+    )
+
+
+@njit(inline="always", **LEAF)
+def linearise(manifold, q, room, residual, jacobian):
+    """Residual (m,) and its Jacobian (m, D) of one configuration; rows that are not held are left
+    alone.  room: of `ConstraintArrays.room` numbers.
+    """
+    chain, own = manifold.chain, manifold.constraint
+    words = (
+        chain.origins.ctypes.data,
+        chain.axes.ctypes.data,
+        chain.prismatic.ctypes.data,
+        chain.base.ctypes.data,
+        chain.tool.ctypes.data,
+        own.data.ctypes.data,
+        q.ctypes.data,
+        room.ctypes.data,
+        residual.ctypes.data,
+        jacobian.ctypes.data,
+        q.shape[0],
+        residual.shape[0],
+    )
+    call(own.linearise, words)
+
+
+@njit(inline="always", **LEAF)
+def curvature(manifold, weights, room, full):
     """Σ λ_j ∇²r_j (D, D) where `linearise` was called last; False where there is no closed form."""
-    raise NotImplementedError("only inside compiled code")
-
-
-@njit(**LEAF)
-def _no_closed_form(manifold, weights, own, full):
-    return False
-
-
-def register(arrays: type, scratch: Any, linearise: Any, curvature: Any = _no_closed_form) -> None:
-    """Say what is compiled for constraints whose arrays are of this NamedTuple."""
-    _KINDS[arrays] = _Kind(scratch, linearise, curvature)
-
-
-def _kind(arrays: Any) -> _Kind:
-    return _KINDS[arrays.instance_class]
-
-
-def _field(arrays: Any, name: str) -> Any:
-    """Numba's type of one field of a NamedTuple."""
-    return arrays.types[arrays.fields.index(name)]
-
-
-@overload(scratch)
-def _scratch(constraint, dof):
-    chosen = _kind(constraint).scratch
-    return lambda constraint, dof: chosen(constraint, dof)
-
-
-@overload(linearise, inline="always")  # a call counts the references of every array it is given
-def _linearise(manifold, q, own, residual, jacobian):
-    return _kind(_field(manifold, "constraint")).linearise.py_func
-
-
-@overload(curvature, jit_options={"_nrt": False})
-def _curvature(manifold, weights, own, full):
-    chosen = _kind(_field(manifold, "constraint")).curvature
-    return lambda manifold, weights, own, full: chosen(manifold, weights, own, full)
+    chain, own = manifold.chain, manifold.constraint
+    if own.curvature == 0:
+        return False
+    words = (
+        chain.prismatic.ctypes.data,
+        own.data.ctypes.data,
+        room.ctypes.data,
+        weights.ctypes.data,
+        full.ctypes.data,
+        full.shape[0],
+    )
+    return call(own.curvature, words) != 0
 
 
 @njit(**LEAF)
@@ -157,7 +220,7 @@ def residual_batch(manifold, q, residuals, jacobians):
     """Residuals (B, m) and their Jacobians (B, m, D) of q (B, D); rows that are not held are
     zero.
     """
-    own = scratch(manifold.constraint, q.shape[1])
+    own = np.empty(manifold.constraint.room)
     residuals[:] = 0.0
     jacobians[:] = 0.0
     for b in range(q.shape[0]):
@@ -169,7 +232,7 @@ def violation_batch(manifold, q, worst):
     """The largest excess of each of q (B, D) into worst (B,)."""
     dof, rows = q.shape[1], manifold.constraint.rows
     count = rows.held.shape[0]
-    own, residual, excess = scratch(manifold.constraint, dof), np.zeros(count), np.empty(count)
+    own, residual, excess = np.empty(manifold.constraint.room), np.zeros(count), np.empty(count)
     jacobian, active = np.empty((count, dof)), np.empty(count, dtype=np.bool_)
     for b in range(q.shape[0]):
         linearise(manifold, q[b], own, residual, jacobian)

@@ -11,30 +11,30 @@ axis alone would vanish upside down too.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
+from numba import carray, njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintError, Pose, Series
-from constraint_geodesics.constraints.kernels import Rows, register
-from constraint_geodesics.robot.kernels import Posture, geometric_jacobian, new_posture, pose_of
+from constraint_geodesics.constraints.kernels import (
+    ConstraintArrays,
+    Rows,
+    c_function,
+    chain_at,
+    flags,
+    floats,
+)
+from constraint_geodesics.robot.kernels import Posture, geometric_jacobian, pose_of
 from constraint_geodesics.robot.kinematics import SerialRobot
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 SEEN_TOLERANCE = 0.2
 """Tolerance [rad or m] that a policy sees as 1."""
 _SMALL = 1e-9
-
-
-class PoseArrays(NamedTuple):
-    """For the kernels: the six rows x y z roll pitch yaw [m, rad] and the reference pose."""
-
-    rows: Rows
-    position: Float[np.ndarray, "3"]
-    rotation: Float[np.ndarray, "3 3"]
 
 
 @dataclass(frozen=True)
@@ -88,12 +88,11 @@ class PoseConstraint(Constraint):
         """Metres, then radians."""
         return ("m",) * 3 + ("rad",) * 3
 
-    def arrays(self, robot: SerialRobot) -> PoseArrays:
+    def arrays(self, robot: SerialRobot) -> ConstraintArrays:
         """For the kernels."""
-        pose = self.reference or Pose(np.zeros(3), np.eye(3))
-        return PoseArrays(
-            self.rows, np.ascontiguousarray(pose.position), np.ascontiguousarray(pose.rotation)
-        )
+        pose, rows = self.reference or Pose(np.zeros(3), np.eye(3)), self.rows
+        data = [rows.held, rows.tolerance, pose.position, np.ravel(pose.rotation)]
+        return ConstraintArrays(rows, np.concatenate(data), *_addresses(), _LINEAR + 15 * robot.dof)
 
     @property
     def is_placed(self) -> bool:
@@ -300,28 +299,35 @@ def _twist(quaternion, k, residual, linear):
 
 
 @njit(**LEAF)
-def _residual(constraint, position, rotation, residual, linear):
+def _last_angle(held, wanted):
+    """The last of the three angles that is held (1.0), or is not (0.0)."""
+    axis = 0
+    for i in range(3):
+        if held[3 + i] == wanted:
+            axis = i
+    return axis
+
+
+@njit(**LEAF)
+def _residual(about, position, rotation, residual, linear):
     """Residual (6,) [m, rad] of one tool pose, and the (3, 3) matrix that turns ω into its
     orientation part.
 
     Entries of axes that are not held are zero.
     """
-    rows, place, reference = constraint
-    held = rows.held
+    held, place, reference = about.held, about.position, about.rotation
     for i in range(3):
         residual[i] = position[i] - place[i] if held[i] else 0.0
         residual[3 + i] = 0.0
     linear[:, :] = 0.0
     count = 0
     for i in range(3):
-        count += held[3 + i]
+        if held[3 + i]:
+            count += 1
     if count == 0:
         return
     if count == 2:
-        free = 0
-        for i in range(3):
-            if not held[3 + i]:
-                free = i
+        free = _last_angle(held, 0.0)
         v0, v1, v2 = reference[free, 0], reference[free, 1], reference[free, 2]
         w = (
             rotation[0, 0] * v0 + rotation[0, 1] * v1 + rotation[0, 2] * v2,
@@ -334,55 +340,89 @@ def _residual(constraint, position, rotation, residual, linear):
     if count == 3:
         _rotation_vector(quaternion, residual, linear)
         return
-    axis = 0
-    for i in range(3):
-        if held[3 + i]:
-            axis = i
-    _twist(quaternion, axis, residual, linear)
+    _twist(quaternion, _last_angle(held, 1.0), residual, linear)
 
 
-class _Scratch(NamedTuple):
-    """The arm's posture, ω to orientation residual (3, 3), geometric Jacobian (6, D)."""
+class _About(NamedTuple):
+    """What of the six axes is held (1 or 0) and how loosely, and the reference pose."""
 
-    posture: Posture
-    linear: np.ndarray
-    geometric: np.ndarray
-
-
-@njit(**COMPILE)
-def _new_scratch(constraint, dof):
-    return _Scratch(new_posture(dof), np.empty((3, 3)), np.empty((6, dof)))
+    held: np.ndarray
+    tolerance: np.ndarray
+    position: np.ndarray
+    rotation: np.ndarray
 
 
-@njit(**LEAF)
-def _linearise(manifold, q, own, residual, jacobian):
-    posture, linear, geometric = own
-    chain, constraint = manifold.chain, manifold.constraint
-    held = constraint.rows.held
-    pose_of(chain, q, posture)
-    _residual(constraint, posture.position, posture.rotation, residual, linear)
+_LINEAR = 21
+"""Numbers of the room that are not for the joints."""
+
+
+@njit(inline="always", **COMPILE)
+def _about_at(data):
+    return _About(
+        carray(floats(data), (6,)),
+        carray(floats(data + 48), (6,)),
+        carray(floats(data + 96), (3,)),
+        carray(floats(data + 120), (3, 3)),
+    )
+
+
+@njit(inline="always", **COMPILE)
+def _posture_at(room, dof):
+    """The arm's posture, in the room behind ω to orientation residual (3, 3)."""
+    joints = room + 8 * _LINEAR
+    return Posture(
+        carray(floats(room + 72), (3,)),
+        carray(floats(room + 96), (3, 3)),
+        carray(floats(joints), (dof, 3)),
+        carray(floats(joints + 24 * dof), (dof, 3)),
+    )
+
+
+def _write(origins, axes, prismatic, base, tool, data, q, room, residual, jacobian, dof, count):
+    chain, about = chain_at(origins, axes, prismatic, base, tool, dof), _about_at(data)
+    posture, linear = _posture_at(room, dof), carray(floats(room), (3, 3))
+    geometric = carray(floats(room + 8 * (_LINEAR + 6 * dof)), (6, dof))
+    out = carray(floats(jacobian), (6, dof))
+    pose_of(chain, carray(floats(q), (dof,)), posture)
+    _residual(about, posture.position, posture.rotation, carray(floats(residual), (6,)), linear)
     geometric_jacobian(chain.prismatic, posture, geometric)
     for i in range(6):
-        if not held[i]:
+        if not about.held[i]:
             continue
-        for d in range(q.shape[0]):
+        for d in range(dof):
             value = 0.0
             if i < 3:
                 value = geometric[i, d]
             else:
                 for a in range(3):
                     value += linear[i - 3, a] * geometric[3 + a, d]
-            jacobian[i, d] = value
+            out[i, d] = value
+
+
+def _bend(prismatic, data, room, weights, full, dof):
+    known = _curvature(
+        carray(flags(prismatic), (dof,)),
+        _about_at(data),
+        _posture_at(room, dof),
+        carray(floats(weights), (6,)),
+        carray(floats(full), (dof, dof)),
+    )
+    return 1 if known else 0
+
+
+@cache
+def _addresses() -> tuple[int, int]:
+    return c_function(_write), c_function(_bend, answers=True)
 
 
 @njit(**LEAF)
-def _curvature(manifold, weights, own, full):
+def _curvature(prismatic, about, posture, weights, full):
     """Σ λ_j ∇²r_j into `full` (D, D), for positions, and two or three angles held exactly, without
     prismatic joints.  With the joints' axes a and origins o in the base frame, i ≤ j: ∂²p/∂q_i∂q_j
     = a_i × (a_j × (p − o_j)); of a rotation vector ½ a_i × a_j; of the swing e_k × (a_i × (a_j ×
     e_k)).
     """
-    held, tolerance = manifold.constraint.rows.held, manifold.constraint.rows.tolerance
+    held, tolerance = about.held, about.tolerance
     angles, exact = 0, True
     for i in range(3, 6):
         if held[i]:
@@ -391,13 +431,9 @@ def _curvature(manifold, weights, own, full):
     if (weights[3] != 0.0 or weights[4] != 0.0 or weights[5] != 0.0) and (angles < 2 or not exact):
         return False
     for j in range(full.shape[0]):
-        if manifold.chain.prismatic[j]:
+        if prismatic[j]:
             return False
-    position, joint_origins, joint_axes = (
-        own.posture.position,
-        own.posture.origins,
-        own.posture.axes,
-    )
+    position, joint_origins, joint_axes = posture.position, posture.origins, posture.axes
     l0, l1, l2 = weights[3], weights[4], weights[5]
     free = -1
     for i in range(3, 6):
@@ -432,6 +468,3 @@ def _curvature(manifold, weights, own, full):
                 )
             full[i, j] = full[j, i] = value
     return True
-
-
-register(PoseArrays, _new_scratch, _linearise, _curvature)

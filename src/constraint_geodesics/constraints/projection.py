@@ -18,7 +18,6 @@ from constraint_geodesics.constraints.kernels import (
     excess_of,
     forward,
     linearise,
-    scratch,
 )
 
 
@@ -112,7 +111,7 @@ def new_room(constraint, dof):
     """Room for the projections of one constraint."""
     count = constraint.rows.held.shape[0]
     return RetractionRoom(
-        scratch(constraint, dof),
+        np.empty(constraint.room),
         np.zeros(count),
         np.empty(count),
         np.empty(count),
@@ -125,6 +124,19 @@ def new_room(constraint, dof):
 
 
 @njit(**LEAF)
+def _gathered(active, excess, jacobian, right, rows):
+    """The active rows with their excesses, one after another; returns how many."""
+    size = 0
+    for i in range(active.shape[0]):
+        if active[i]:
+            for d in range(jacobian.shape[1]):
+                rows[size, d] = jacobian[i, d]
+            right[size] = excess[i]
+            size += 1
+    return size
+
+
+@njit(**LEAF)
 def retract_one(manifold, bounds, q, settings, room):
     """Gauss-Newton onto the constraint, in place: q ← q − Jᵀ(JJᵀ)⁻¹ ι(q) until |ι| ≤ accuracy, for
     q (D,); returns the remaining excess.
@@ -133,20 +145,13 @@ def retract_one(manifold, bounds, q, settings, room):
     point far away walks to its own branch instead of jumping to another.
     """
     _, residual, excess, right, active, jacobian, rows, normal, step = room
-    count, dof = residual.shape[0], q.shape[0]
-    worst = np.inf
+    dof, worst = q.shape[0], np.inf
     for iteration in range(settings.iterations + 1):
         linearise(manifold, q, room.own, residual, jacobian)
         worst = excess_of(bounds, residual, excess, active)
         if not worst > settings.accuracy or iteration == settings.iterations:
             break
-        size = 0
-        for i in range(count):
-            if active[i]:
-                for d in range(dof):
-                    rows[size, d] = jacobian[i, d]
-                right[size] = excess[i]
-                size += 1
+        size = _gathered(active, excess, jacobian, right, rows)
         trace = normal_matrix(rows, size, normal)
         for i in range(size):
             normal[i, i] += 1e-10 * trace + 1e-300

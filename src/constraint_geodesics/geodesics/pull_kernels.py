@@ -8,12 +8,7 @@ import numpy as np
 from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
-from constraint_geodesics.constraints.kernels import (
-    append_normal,
-    linearise,
-    scratch,
-    shared_tolerance,
-)
+from constraint_geodesics.constraints.kernels import append_normal, linearise, shared_tolerance
 
 
 class Bounds(NamedTuple):
@@ -82,7 +77,7 @@ def tangential_gradient(manifold, limits, times, joints, gradients):
     dof = joints.shape[2]
     last = joints.shape[1] - 1
     bounds, touching = manifold.constraint.rows, limits.touching
-    own = scratch(manifold.constraint, dof)
+    own = np.empty(manifold.constraint.room)
     residual, jacobian = np.zeros(bounds.held.shape[0]), np.zeros((bounds.held.shape[0], dof))
     rows, row = np.empty((dof, dof)), np.empty(dof)
     any_held = bounds.held.any()

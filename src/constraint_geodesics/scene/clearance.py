@@ -51,7 +51,7 @@ class ClearanceArrays(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """What the kernels write into: nodes and pairs of their own, frames (1, D + 1, 12), joint
+    """What the kernels write into: nodes and pairs of their own, frames (D + 1, 12), joint
     origins and axes (D, 3), and `found` (P, 8), the contacts by the columns above; a point (D,) of
     a line, and its parts that are still looked at.
     """
@@ -98,7 +98,7 @@ def clearance_model(
     it.
     """
     frames = _frames(robot.chain, np.zeros(robot.dof))
-    bodies = read_bodies(robot, workcell, frames[0])
+    bodies = read_bodies(robot, workcell, frames)
     moving = ((a, b) for a, b in pairs_of(bodies) if bodies[a].frame != bodies[b].frame)
     pairs = [pair for pair in moving if pair not in apart]
     if not pairs:
@@ -127,7 +127,7 @@ def new_contacts(model, dof):
     return Contacts(
         model.nodes.copy(),
         model.pairs.copy(),
-        np.empty((1, dof + 1, 12)),
+        np.empty((dof + 1, 12)),
         np.empty((dof, 3)),
         np.empty((dof, 3)),
         np.empty(convex.SIMPLEX),
@@ -139,16 +139,16 @@ def new_contacts(model, dof):
 
 @njit(**LEAF)
 def _place_frames(chain, q, frames, joint_origins, joint_axes):
-    """Frames (1, D + 1, 12) of one configuration, joint origins and axes (D, 3)."""
+    """Frames (D + 1, 12) of one configuration, joint origins and axes (D, 3)."""
     origins, axes, prismatic, base, _ = chain
     # the base's frame is where its links are read
-    frames[0, 0] = 0.0
-    frames[0, 0, 3] = frames[0, 0, 7] = frames[0, 0, 11] = 1.0
+    frames[0] = 0.0
+    frames[0, 3] = frames[0, 7] = frames[0, 11] = 1.0
     frame = frame_of(base)
     for j in range(q.shape[0]):
         frame = joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes)
         p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = frame
-        own = frames[0, j + 1]
+        own = frames[j + 1]
         own[0], own[1], own[2] = p0, p1, p2
         own[3], own[4], own[5] = r00, r01, r02
         own[6], own[7], own[8] = r10, r11, r12
@@ -157,7 +157,7 @@ def _place_frames(chain, q, frames, joint_origins, joint_axes):
 
 @njit(**COMPILE)
 def _frames(chain, q):
-    frames, dof = np.empty((1, q.shape[0] + 1, 12)), q.shape[0]
+    frames, dof = np.empty((q.shape[0] + 1, 12)), q.shape[0]
     _place_frames(chain, q, frames, np.empty((dof, 3)), np.empty((dof, 3)))
     return frames
 
@@ -166,7 +166,7 @@ def _frames(chain, q):
 def _place(chain, q, room):
     """Frames, joint origins, axes and the nodes' balls of one configuration into `room`."""
     _place_frames(chain, q, room.frames, room.origins, room.axes)
-    convex.place_balls(room.nodes, room.frames, 0)
+    convex.place_balls(room.nodes, room.frames)
 
 
 @njit(**LEAF)
@@ -184,8 +184,8 @@ def _shallowest(bodies, frames, p, simplex):
     length = np.sqrt(x * x + y * y + z * z)
     # the vector that they touched along first, so that the depth begins at 0
     u, v, w = pairs[p, convex.VECTOR], pairs[p, convex.VECTOR + 1], pairs[p, convex.VECTOR + 2]
-    best = convex.turned(frames, 0, f, u, v, w)
-    most = convex.gap_along(bodies, frames, 0, p, best)
+    best = convex.turned(frames, f, u, v, w)
+    most = convex.gap_along(bodies, frames, p, best)
     box = nodes[a, convex.BOX] >= 0.0
     count = _TRIED.shape[0]
     for k in range(-1, count + 6 if box else count):
@@ -198,16 +198,16 @@ def _shallowest(bodies, frames, p, simplex):
         else:
             at, sign = convex.BOX + 3 + (k - count) // 2, 1.0 if k % 2 == 0 else -1.0
             n = (sign * nodes[a, at], sign * nodes[a, at + 3], sign * nodes[a, at + 6])
-        value = convex.gap_along(bodies, frames, 0, p, n)
+        value = convex.gap_along(bodies, frames, p, n)
         if value > most:
             best, most = n, value
-    most = convex.gap_along(bodies, frames, 0, p, best)  # once more, for its corners
+    most = convex.gap_along(bodies, frames, p, best)  # once more, for its corners
     corner = int(pairs[p, convex.CORNERS + 1])
-    x, y, z = convex.turned(frames, 0, g, hulls[corner], hulls[corner + 1], hulls[corner + 2])
-    simplex[convex.NEAREST, 3] = x + frames[0, g, 0]
-    simplex[convex.NEAREST, 4] = y + frames[0, g, 1]
-    simplex[convex.NEAREST, 5] = z + frames[0, g, 2]
-    x, y, z = convex.into(frames, 0, f, best[0], best[1], best[2])
+    x, y, z = convex.turned(frames, g, hulls[corner], hulls[corner + 1], hulls[corner + 2])
+    simplex[convex.NEAREST, 3] = x + frames[g, 0]
+    simplex[convex.NEAREST, 4] = y + frames[g, 1]
+    simplex[convex.NEAREST, 5] = z + frames[g, 2]
+    x, y, z = convex.into(frames, f, best[0], best[1], best[2])
     pairs[p, convex.VECTOR], pairs[p, convex.VECTOR + 1], pairs[p, convex.VECTOR + 2] = x, y, z
     return most
 
@@ -220,7 +220,7 @@ def _measure(bodies, frames, simplex, p, far, contact):
     if convex.roughly_apart(nodes, a, b) >= far:
         return False
     rounding = nodes[a, convex.ROUNDING] + nodes[b, convex.ROUNDING]
-    lower, upper = convex.distance(bodies, frames, 0, p, (far + rounding, -np.inf), simplex)
+    lower, upper = convex.distance(bodies, frames, p, (far + rounding, -np.inf), simplex)
     if lower - rounding >= far:
         return False
     if upper < _OVERLAPPING:
@@ -228,7 +228,7 @@ def _measure(bodies, frames, simplex, p, far, contact):
         if lower - rounding >= far:
             return False
     x, y, z = pairs[p, convex.VECTOR], pairs[p, convex.VECTOR + 1], pairs[p, convex.VECTOR + 2]
-    x, y, z = convex.turned(frames, 0, int(nodes[a, convex.FRAME]), x, y, z)
+    x, y, z = convex.turned(frames, int(nodes[a, convex.FRAME]), x, y, z)
     contact[DISTANCE], contact[PAIR] = lower - rounding, p
     contact[NORMAL], contact[NORMAL + 1], contact[NORMAL + 2] = x, y, z
     for d in range(3):
@@ -284,7 +284,7 @@ def _apart(bodies, frames, simplex, p, motion):
     if convex.roughly_apart(nodes, a, b) > motion:
         return 1
     rounding = nodes[a, convex.ROUNDING] + nodes[b, convex.ROUNDING]
-    lower, upper = convex.distance(bodies, frames, 0, p, (motion + rounding, rounding), simplex)
+    lower, upper = convex.distance(bodies, frames, p, (motion + rounding, rounding), simplex)
     if lower - rounding > motion:
         return 1
     return -1 if upper <= rounding else 0

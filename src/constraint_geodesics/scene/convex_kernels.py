@@ -6,7 +6,7 @@ unit vector n the gap g = min_b n·p − max_a n·p of the pieces a and b bounds
 hulls from below; the vectors that Gilbert, Johnson and Keerthi's method (1988) goes through make it
 the distance itself.  A proof needs the gap alone, however the vector was found.
 
-Frames (F, 12): position [m], then rotation by rows.  `at` is the first index of frames (·, F, 12).
+Frames (F, 12): position [m], then rotation by rows.
 """
 
 import numpy as np
@@ -47,22 +47,22 @@ one of the first, in the base frame [m].
 
 
 @njit(inline="always", **COMPILE)
-def into(frames, at, f, n0, n1, n2):
+def into(frames, f, n0, n1, n2):
     """A direction of the base frame in frame f of a place."""
     return (
-        n0 * frames[at, f, 3] + n1 * frames[at, f, 6] + n2 * frames[at, f, 9],
-        n0 * frames[at, f, 4] + n1 * frames[at, f, 7] + n2 * frames[at, f, 10],
-        n0 * frames[at, f, 5] + n1 * frames[at, f, 8] + n2 * frames[at, f, 11],
+        n0 * frames[f, 3] + n1 * frames[f, 6] + n2 * frames[f, 9],
+        n0 * frames[f, 4] + n1 * frames[f, 7] + n2 * frames[f, 10],
+        n0 * frames[f, 5] + n1 * frames[f, 8] + n2 * frames[f, 11],
     )
 
 
 @njit(inline="always", **COMPILE)
-def turned(frames, at, f, x, y, z):
+def turned(frames, f, x, y, z):
     """A direction of frame f in the base frame."""
     return (
-        frames[at, f, 3] * x + frames[at, f, 4] * y + frames[at, f, 5] * z,
-        frames[at, f, 6] * x + frames[at, f, 7] * y + frames[at, f, 8] * z,
-        frames[at, f, 9] * x + frames[at, f, 10] * y + frames[at, f, 11] * z,
+        frames[f, 3] * x + frames[f, 4] * y + frames[f, 5] * z,
+        frames[f, 6] * x + frames[f, 7] * y + frames[f, 8] * z,
+        frames[f, 9] * x + frames[f, 10] * y + frames[f, 11] * z,
     )
 
 
@@ -85,7 +85,7 @@ def furthest(hulls, corner, x, y, z):
 
 
 @njit(**LEAF)
-def gap_along(bodies, frames, at, p, n):
+def gap_along(bodies, frames, p, n):
     """How far the second piece of a pair lies beyond the first along a unit vector of the base
     frame; the corners that count become the pair's.
     """
@@ -93,10 +93,10 @@ def gap_along(bodies, frames, at, p, n):
     gap, sign = 0.0, 1.0
     for side in range(2):
         f = int(nodes[int(pairs[p, side]), FRAME])
-        x, y, z = into(frames, at, f, sign * n[0], sign * n[1], sign * n[2])
+        x, y, z = into(frames, f, sign * n[0], sign * n[1], sign * n[2])
         corner, most = furthest(hulls, int(pairs[p, CORNERS + side]), x, y, z)
         pairs[p, CORNERS + side] = corner
-        place = n[0] * frames[at, f, 0] + n[1] * frames[at, f, 1] + n[2] * frames[at, f, 2]
+        place = n[0] * frames[f, 0] + n[1] * frames[f, 1] + n[2] * frames[f, 2]
         gap -= most + sign * place
         sign = -1.0
     return gap
@@ -197,7 +197,7 @@ def _nearest_of_simplex(s, size):
 
 
 @njit(**LEAF)
-def distance(bodies, frames, at, p, wanted, simplex):
+def distance(bodies, frames, p, wanted, simplex):
     """Bounds (lower, upper) of the distance [m] of a pair of pieces at one place, without their
     roundings, both 0 or less where they overlap.
 
@@ -209,23 +209,23 @@ def distance(bodies, frames, at, p, wanted, simplex):
     x, y, z = pairs[p, VECTOR], pairs[p, VECTOR + 1], pairs[p, VECTOR + 2]
     if x == 0.0 and y == 0.0 and z == 0.0:
         z = 1.0
-    d0, d1, d2 = turned(frames, at, f, x, y, z)
+    d0, d1, d2 = turned(frames, f, x, y, z)
     length = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
     best = (d0 / length, d1 / length, d2 / length)
     n, size, lower, upper = best, 0, -np.inf, np.inf
     for _ in range(_ITERATIONS):
-        gap = gap_along(bodies, frames, at, p, n)
+        gap = gap_along(bodies, frames, p, n)
         if gap > lower:
             lower, best = gap, n
         if lower > wanted[0] or upper < wanted[1] or upper - lower < _CONVERGED:
             break
         a, b = int(pairs[p, CORNERS]), int(pairs[p, CORNERS + 1])
-        x, y, z = turned(frames, at, f, hulls[a], hulls[a + 1], hulls[a + 2])
-        u, v, w = turned(frames, at, g, hulls[b], hulls[b + 1], hulls[b + 2])
-        u, v, w = u + frames[at, g, 0], v + frames[at, g, 1], w + frames[at, g, 2]
-        simplex[size, 0] = u - x - frames[at, f, 0]
-        simplex[size, 1] = v - y - frames[at, f, 1]
-        simplex[size, 2] = w - z - frames[at, f, 2]
+        x, y, z = turned(frames, f, hulls[a], hulls[a + 1], hulls[a + 2])
+        u, v, w = turned(frames, g, hulls[b], hulls[b + 1], hulls[b + 2])
+        u, v, w = u + frames[g, 0], v + frames[g, 1], w + frames[g, 2]
+        simplex[size, 0] = u - x - frames[f, 0]
+        simplex[size, 1] = v - y - frames[f, 1]
+        simplex[size, 2] = w - z - frames[f, 2]
         simplex[size, 3], simplex[size, 4], simplex[size, 5] = u, v, w
         size = _nearest_of_simplex(simplex, size + 1)
         d0, d1, d2 = simplex[NEAREST, 0], simplex[NEAREST, 1], simplex[NEAREST, 2]
@@ -236,7 +236,7 @@ def distance(bodies, frames, at, p, wanted, simplex):
         if length >= upper:
             break
         upper, n = length, (d0 / length, d1 / length, d2 / length)
-    x, y, z = into(frames, at, f, best[0], best[1], best[2])
+    x, y, z = into(frames, f, best[0], best[1], best[2])
     pairs[p, VECTOR], pairs[p, VECTOR + 1], pairs[p, VECTOR + 2] = x, y, z
     return lower, upper
 
@@ -249,14 +249,14 @@ def pieces_of(pairs, body):
 
 
 @njit(**LEAF)
-def place_balls(nodes, frames, at):
+def place_balls(nodes, frames):
     """The balls' centres into `nodes`."""
     for i in range(nodes.shape[0]):
         f = int(nodes[i, FRAME])
-        x, y, z = turned(frames, at, f, nodes[i, BALL], nodes[i, BALL + 1], nodes[i, BALL + 2])
-        nodes[i, PLACE] = frames[at, f, 0] + x
-        nodes[i, PLACE + 1] = frames[at, f, 1] + y
-        nodes[i, PLACE + 2] = frames[at, f, 2] + z
+        x, y, z = turned(frames, f, nodes[i, BALL], nodes[i, BALL + 1], nodes[i, BALL + 2])
+        nodes[i, PLACE] = frames[f, 0] + x
+        nodes[i, PLACE + 1] = frames[f, 1] + y
+        nodes[i, PLACE + 2] = frames[f, 2] + z
 
 
 @njit(inline="always", **COMPILE)

@@ -18,6 +18,8 @@ from constraint_geodesics.search.space import Space, project_points
 ACCURACY = 1e-9
 """Violation [rad or m] that is left on a point of a curve, at most."""
 _PROJECTION = Retraction(ACCURACY, iterations=12, largest_step=0.6)
+_PROJECTIONS = 6
+"""Iterations of a node's projection at most, after a step of the band."""
 _COINCIDENT = 1e-12
 _ZERO = np.zeros(1)
 
@@ -55,8 +57,8 @@ def relax(
     that touches nothing is moved into something.
     """
     moved = np.array(nodes, np.float64)
-    chosen = settings.iterations, settings.accuracy, settings.largest_step_rad, guarded
-    left, iterations, converged = band_kernels.relax_band(space, moved, chosen)
+    steps = settings.iterations, _PROJECTIONS, settings.accuracy, settings.largest_step_rad, guarded
+    left, iterations, converged = band_kernels.relax_band(space, moved, steps)
     return Band(moved, left, iterations, converged)
 
 
@@ -92,8 +94,8 @@ class BandCurve:
         limits included.
         """
         points = np.empty((len(s), self.nodes.shape[1]))
-        spline = self.knots, self.nodes, self.moments
-        left = band_kernels.curve_points(self.space, spline, s, _PROJECTION, points)
+        band_kernels.spline_points(self.knots, self.nodes, self.moments, s * self.length, points)
+        left = project(self.space, points)
         points[s == 0.0], points[s == 1.0] = self.nodes[0], self.nodes[-1]
         return points, left
 

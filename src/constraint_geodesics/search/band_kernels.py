@@ -41,7 +41,6 @@ from constraint_geodesics.search.space import (
     Workspace,
     is_free,
     project_node,
-    project_points,
     workspace,
 )
 
@@ -471,7 +470,7 @@ def gradient_of(nodes, i, d):
     return 2.0 * nodes[i, d] - nodes[i - 1, d] - nodes[i + 1, d]
 
 
-@njit(**LEAF)
+@njit(inline="always", **LEAF)
 def _hold_back(space, nodes, trial, held, work):
     """Leave nodes where they were, `nodes`, if the line from or to where they would be, `trial`,
     runs into something.
@@ -513,9 +512,9 @@ class _Band(NamedTuple):
 
 
 @njit(**COMPILE)
-def new_band(most, dof):
-    """Room for bands of so many nodes at most."""
-    m = most - 2
+def _new_band(nodes):
+    """What a band of these nodes needs."""
+    m, dof = nodes.shape[0] - 2, nodes.shape[1]
     return _Band(
         np.empty((m, dof, dof)),
         np.empty((m, dof, dof)),
@@ -526,12 +525,12 @@ def new_band(most, dof):
         np.empty((m, dof)),
         np.empty((m, dof)),
         np.empty((m, dof)),
-        np.empty((most, dof)),
-        np.zeros(most, dtype=np.bool_),
+        nodes.copy(),
+        np.zeros(m + 2, dtype=np.bool_),
     )
 
 
-@njit(**LEAF)
+@njit(inline="always", **LEAF)
 def _linearise_band(space, nodes, band, work):
     """The reduced problem of all inner nodes: bases, Hessians, and gradients where all steps onto
     bounds are taken.
@@ -558,7 +557,7 @@ def _linearise_band(space, nodes, band, work):
             band.gradients[i, a] = value
 
 
-@njit(**LEAF)
+@njit(inline="always", **LEAF)
 def _promise(nodes, band):
     """Add the steps onto bounds to Newton's; returns by how much the energy is to decrease, and the
     longest step.
@@ -580,8 +579,8 @@ def _promise(nodes, band):
     return promised, longest
 
 
-@njit(**LEAF)
-def _moved(space, nodes, scale, band, work):
+@njit(inline="always", **LEAF)
+def _moved(space, nodes, scale, iterations, band, work):
     """The nodes after a share of the steps, projected, into `band.trial`; returns what remains of
     the violation.
     """
@@ -589,24 +588,26 @@ def _moved(space, nodes, scale, band, work):
     for i in range(1, nodes.shape[0] - 1):
         for d in range(nodes.shape[1]):
             trial[i, d] = nodes[i, d] + scale * band.steps[i - 1, d]
-        worst = max(worst, project_node(space, trial[i], 6, work))
+        worst = max(worst, project_node(space, trial[i], iterations, work))
     return worst
 
 
-@njit(**LEAF)
-def shorten(space, nodes, settings, band, work):
+@njit(**COMPILE)
+def relax_band(space, nodes, settings):
     """Shorten a band (n + 1, D) in place; returns (what remains of the violation, iterations used,
-    converged).  settings: see `relax_band`; band: of `new_band`; work: of `new_work`.
+    converged).
+
+    settings: iterations at most, and those of a node's projection; relative decrease of the energy
+    predicted by Newton's step below which the band has converged; longest step of a node [rad];
+    whether lines between its nodes that touch nothing keep that.
     """
-    most, accuracy, largest, guarded = settings
-    n, dof = nodes.shape[0] - 1, nodes.shape[1]
-    trial = band.trial[: n + 1]
+    most, projections, accuracy, largest, guarded = settings
+    n = nodes.shape[0] - 1
+    work, band = new_work(space), _new_band(nodes)
+    trial = band.trial
     worst, used, converged = 0.0, 0, False
     for i in range(1, n):
-        worst = max(worst, project_node(space, nodes[i], 8, work.node))
-    for i in (0, n):
-        for d in range(dof):
-            trial[i, d] = nodes[i, d]
+        worst = max(worst, project_node(space, nodes[i], space.iterations, work.node))
     energy = band_energy(nodes)
     for _ in range(most):
         used += 1
@@ -623,7 +624,7 @@ def shorten(space, nodes, settings, band, work):
                 break
         scale, improved = 1.0 if longest <= largest else largest / longest, False
         for _ in range(6):
-            left = _moved(space, nodes, scale, band, work.node)
+            left = _moved(space, nodes, scale, projections, band, work.node)
             if guarded:
                 _hold_back(space, nodes, trial, band.held, work.node)
             after = band_energy(trial)
@@ -633,25 +634,11 @@ def shorten(space, nodes, settings, band, work):
             scale *= 0.4
         if not improved:
             break
-        for i in range(1, n):
-            for d in range(dof):
-                nodes[i, d] = trial[i, d]
+        nodes[:, :] = trial
         energy, worst = after, left
         if converged:
             break
     return worst, used, converged
-
-
-@njit(**COMPILE)
-def relax_band(space, nodes, settings):
-    """`shorten` with room of its own.
-
-    settings: iterations at most; relative decrease of the energy predicted by Newton's step below
-    which the band has converged; longest step of a node [rad]; whether lines between its nodes that
-    touch nothing keep that.
-    """
-    band = new_band(nodes.shape[0], nodes.shape[1])
-    return shorten(space, nodes, settings, band, new_work(space))
 
 
 @njit(**COMPILE)
@@ -711,13 +698,3 @@ def spline_points(knots, nodes, moments, at, points):
         for d in range(nodes.shape[1]):
             bend = (a * a * a - a) * moments[i, d] + (b * b * b - b) * moments[i + 1, d]
             points[k, d] = a * nodes[i, d] + b * nodes[i + 1, d] + bend * h * h / 6.0
-
-
-@njit(**COMPILE)
-def curve_points(space, spline, shares, settings, points):
-    """Points (T, D) of the spline, knots, nodes and moments, at rising shares of its length (T,),
-    projected onto the space; returns what remains of the violation of the worst.
-    """
-    knots, nodes, moments = spline
-    spline_points(knots, nodes, moments, shares * knots[-1], points)
-    return project_points(space, points, settings)

@@ -79,7 +79,6 @@ class Preparation:
         for name, roadmap in roadmaps.items():
             # the nodes are written in single precision, which may lie beyond a limit
             inside = np.clip(roadmap.joints, self.scene.robot.lower, self.scene.robot.upper)
-            inside.setflags(write=False)
             self._roadmaps[constraints[name].key] = replace(roadmap, joints=inside)
 
     def task(self, constraint: Constraint) -> Task:

@@ -10,7 +10,7 @@ from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.constraints.kernels import excess_of, linearise, scratch
+from constraint_geodesics.constraints.kernels import ManifoldArrays, excess_of, linearise
 from constraint_geodesics.constraints.projection import (
     new_room,
     normal_matrix,
@@ -52,6 +52,7 @@ class Space(NamedTuple):
     limits: Float[np.ndarray, "2 D"]
     clearance: ClearanceArrays
     margin: float
+    iterations: int = 12
 
 
 def space_of(
@@ -91,7 +92,7 @@ def workspace(space):
     """A workspace for the kernels of this space."""
     dof, count = space.limits.shape[1], space.constraint.rows.held.shape[0]
     return Workspace(
-        scratch(space.constraint, dof),
+        np.empty(space.constraint.room),
         np.zeros(count),
         np.zeros(count),
         np.zeros(count, dtype=np.bool_),
@@ -217,9 +218,10 @@ def project_points(space, points, settings):
     the violation of the worst [rad or m].
     """
     room, work = new_room(space.constraint, points.shape[1]), workspace(space)
+    manifold = ManifoldArrays(space.chain, space.constraint)
     bounds, worst = space.constraint.rows, 0.0
     for i in range(points.shape[0]):
-        left = retract_one(space, bounds, points[i], settings, room)
+        left = retract_one(manifold, bounds, points[i], settings, room)
         if not _is_within(space, points[i], work):
             left = project_node(space, points[i], settings.iterations, work)
         worst = max(worst, left)

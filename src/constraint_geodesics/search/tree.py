@@ -17,7 +17,6 @@ from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.search.roadmap import edge_length
 from constraint_geodesics.search.space import Space, is_free, project_node, workspace
 
-_PROJECTIONS = 12
 _LEFT = 1e-6
 """Violation [rad or m] of a node, at most."""
 _PROGRESS = 0.2
@@ -91,7 +90,7 @@ def _extended(space, nodes, parents, count, node, target, step, work, point):
         share = 1.0 if before <= step else step / before
         for d in range(dof):
             point[d] = nodes[node, d] + share * (target[d] - nodes[node, d])
-        if project_node(space, point, _PROJECTIONS, work) > _LEFT:
+        if project_node(space, point, space.iterations, work) > _LEFT:
             return count, node, False
         after, moved = 0.0, 0.0
         for d in range(dof):
