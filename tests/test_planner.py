@@ -825,7 +825,7 @@ def test_rows_are_so_close_that_lines_between_them_keep_the_constraint(planner) 
     line = np.linspace(0.0, 1.0, 17)[:, None] * (goal - start) + start
     candidate = refined(task, "straight", line)
     for allowed in (1e-3, 1e-4, 1e-5):
-        shares, rows = rows_of(task, candidate, allowed)
+        shares, rows = rows_of(candidate, allowed)
         assert shares[0] == 0.0
         assert shares[-1] == 1.0
         assert (np.diff(shares) > 0.0).all()

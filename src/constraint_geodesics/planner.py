@@ -243,7 +243,7 @@ class Planner:
         robot, constraint = self.scene.robot, query.task.manifold.constraint
         allowed = self._certifier.limits.violation_tolerance
         for share in _TIGHTENED:
-            _, joints = rows_of(query.task, candidate, share * allowed)
+            _, joints = rows_of(candidate, share * allowed)
             try:
                 times = time_parametrisation(joints, robot.velocity, self._acceleration)
             except GeometryError as error:

@@ -34,9 +34,8 @@ from constraint_geodesics.learning.inference import FrozenManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import jump_excess
 from constraint_geodesics.params import GeodesicParams, RobotParams
-from constraint_geodesics.search.band import ACCURACY, step_lengths
+from constraint_geodesics.search.band import ACCURACY, BandCurve, step_lengths
 from constraint_geodesics.search.candidates import (
-    CHECK_STEP,
     Answer,
     Candidate,
     Parts,
@@ -44,6 +43,7 @@ from constraint_geodesics.search.candidates import (
     connection,
     refined,
 )
+from constraint_geodesics.search.curve_kernels import CHECK_STEP
 from constraint_geodesics.search.roadmap import Roadmap
 
 FORMAT = 1
@@ -209,7 +209,7 @@ class LearnedMethod:
 
     def sound(self, task: Task, curves: Sequence[LatentCurve]) -> list[Candidate]:
         """Curves that are continuous and within the limits, in their order."""
-        found = (sampled(curve) for curve in curves)
+        found = (sampled(task, curve) for curve in curves)
         return [candidate for candidate in found if candidate is not None]
 
     def improvements(
@@ -233,9 +233,9 @@ class RefinedLearnedMethod(LearnedMethod):
         return sorted((c for c in found if c is not None), key=lambda c: c.length)
 
 
-def sampled(curve: LatentCurve) -> Candidate | None:
-    """The curve with points about CHECK_STEP apart; None where it jumps, leaves the constraint or
-    the joint limits.
+def sampled(task: Task, curve: LatentCurve) -> Candidate | None:
+    """The curve through its points about CHECK_STEP apart; None where it jumps, leaves the
+    constraint or the joint limits.
     """
     shares = np.linspace(0.0, 1.0, _FIRST_POINTS)
     points, left = curve.at(shares)
@@ -248,5 +248,8 @@ def sampled(curve: LatentCurve) -> Candidate | None:
     inside = robot.limit_distance(points).min() >= -_SLACK_RAD
     if not (left <= 1e3 * ACCURACY and inside and jump_excess(points, shares) == 0.0):
         return None
-    length = float(step_lengths(points).sum())
-    return Candidate("policy", curve, length, shares, points, 0)
+    through = BandCurve.through(task.open, points)
+    if through is None:
+        return None
+    knots = through.spline.knots
+    return Candidate("policy", through, through.length, knots / knots[-1], points, 0)

@@ -18,14 +18,8 @@ from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.problem import SATISFIED, PlanningProblem, Solution, Status, refusal
 from constraint_geodesics.scene.clearance import NO_CLEARANCE
 from constraint_geodesics.search.band import BandSettings, project, step_lengths
-from constraint_geodesics.search.candidates import (
-    HALVINGS,
-    LONGEST_ROW_STEP,
-    ROW_SAFETY,
-    Candidate,
-    Task,
-    rows_of,
-)
+from constraint_geodesics.search.candidates import ROW_SAFETY, Candidate, Task, rows_of
+from constraint_geodesics.search.curve_kernels import HALVINGS, LONGEST_ROW_STEP
 from constraint_geodesics.search.space import space_of
 
 ROW_SPACING = 0.04
@@ -169,25 +163,23 @@ def without_path(
 
 
 def first_free(
-    problem: PlanningProblem, task: Task, curves: Iterable[Candidate | None]
+    problem: PlanningProblem, curves: Iterable[Candidate | None]
 ) -> tuple[Float[np.ndarray, "T D"] | None, int]:
     """`free_rows` of the first curve that has some, and how many curves were looked at."""
     tried = 0
     for tried, candidate in enumerate(curves, 1):
-        rows = None if candidate is None else free_rows(problem, task, candidate)
+        rows = None if candidate is None else free_rows(problem, candidate)
         if rows is not None:
             return rows, tried
     return None, tried
 
 
-def free_rows(
-    problem: PlanningProblem, task: Task, candidate: Candidate
-) -> Float[np.ndarray, "T D"] | None:
+def free_rows(problem: PlanningProblem, candidate: Candidate) -> Float[np.ndarray, "T D"] | None:
     """The candidate's rows, or None if it touches something.
 
     Where a curve is pushed past the corner of a box, its projection has a kink that no more of its
     points bridge: there the rows in between know nothing of clearance, but are checked like all
     others.
     """
-    rows = halved(problem.manifold, rows_of(task, candidate, SATISFIED)[1])
+    rows = halved(problem.manifold, rows_of(candidate, SATISFIED)[1])
     return rows if problem.keeps_clear(rows) else None

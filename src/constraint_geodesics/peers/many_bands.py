@@ -69,7 +69,7 @@ class MultiStartBand:
         lines = bent_lines(problem, self.settings.segments, self.starts, self.configurations, seed)
         found = [refined(task, "straight", line) for line in lines]
         shortest_first = sorted((c for c in found if c is not None), key=lambda c: c.length)
-        rows, _ = first_free(problem, task, shortest_first)
+        rows, _ = first_free(problem, shortest_first)
         return answer(rows, problem, began, len(found))
 
 

@@ -48,7 +48,7 @@ class StraightBand:
         straight = np.stack([problem.start, problem.goal])
         lines = (resample(straight, self.settings.segments * finer + 1) for finer in FINER)
         curves = (refined(task, "straight", line) for line in lines)
-        rows, tried = first_free(problem, task, curves)
+        rows, tried = first_free(problem, curves)
         return answer(rows, problem, began, tried)
 
 

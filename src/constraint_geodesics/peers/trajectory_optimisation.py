@@ -186,7 +186,7 @@ class TrajectoryOptimisation:
             # zero iterations of a band: the curve through the waypoints, looked at for jumps, and
             # its rows
             candidate = None if nodes is None else refined(task, "straight", nodes, refine=False)
-            rows = None if candidate is None else free_rows(problem, task, candidate)
+            rows = None if candidate is None else free_rows(problem, candidate)
             if candidate is not None and rows is not None:
                 found.append((candidate.length, rows))
             if len(found) >= self.settings.wanted:

@@ -104,7 +104,7 @@ def band_after(problem: PlanningProblem, planned: Solution, settings: BandSettin
     for candidate in _bands_along(task, planned.joints):
         iterations += candidate.iterations
         if candidate.length < longest:
-            relaxed = free_rows(problem, task, candidate)
+            relaxed = free_rows(problem, candidate)
             if relaxed is not None:
                 rows = relaxed
                 break

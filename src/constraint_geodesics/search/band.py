@@ -12,16 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints.projection import Retraction
-from constraint_geodesics.search import band_kernels
+from constraint_geodesics.search import band_kernels, curve_kernels
 from constraint_geodesics.search.space import Space, project_points
 
 ACCURACY = 1e-9
 """Violation [rad or m] that is left on a point of a curve, at most."""
-_PROJECTION = Retraction(ACCURACY, iterations=12, largest_step=0.6)
+PROJECTION = Retraction(ACCURACY, iterations=12, largest_step=0.6)
 _PROJECTIONS = 6
 """Iterations of a node's projection at most, after a step of the band."""
-_COINCIDENT = 1e-12
-_ZERO = np.zeros(1)
 
 
 @dataclass(frozen=True)
@@ -36,6 +34,10 @@ class BandSettings:
     accuracy: float = 1e-5
     largest_step_rad: float = 0.5
     clearance_m: float = 0.006
+
+    def steps(self, guarded: bool) -> tuple[int, int, float, float, bool]:
+        """As `relax_band` takes them."""
+        return self.iterations, _PROJECTIONS, self.accuracy, self.largest_step_rad, guarded
 
 
 @dataclass(frozen=True)
@@ -57,8 +59,7 @@ def relax(
     that touches nothing is moved into something.
     """
     moved = np.array(nodes, np.float64)
-    steps = settings.iterations, _PROJECTIONS, settings.accuracy, settings.largest_step_rad, guarded
-    left, iterations, converged = band_kernels.relax_band(space, moved, steps)
+    left, iterations, converged = band_kernels.relax_band(space, moved, settings.steps(guarded))
     return Band(moved, left, iterations, converged)
 
 
@@ -71,33 +72,30 @@ class BandCurve:
     """
 
     space: Space
-    nodes: Float[np.ndarray, "n D"]
-    knots: Float[np.ndarray, "n"]
-    moments: Float[np.ndarray, "n D"]
+    spline: curve_kernels.Spline
 
     @classmethod
     def through(cls, space: Space, nodes: Float[np.ndarray, "n D"]) -> "BandCurve | None":
         """None where nodes coincide or are not finite, so that there is no curve."""
-        steps = step_lengths(nodes)
-        if not (np.isfinite(steps).all() and steps.min(initial=np.inf) > _COINCIDENT):
-            return None
-        knots = np.concatenate([_ZERO, np.cumsum(steps)])
-        return cls(space, nodes, knots, band_kernels.spline_moments(knots, nodes))
+        spline, sound = curve_kernels.spline_through(np.array(nodes, np.float64))
+        return cls(space, spline) if sound else None
+
+    @property
+    def nodes(self) -> Float[np.ndarray, "n D"]:
+        """Of the band [rad]."""
+        return self.spline.nodes
 
     @property
     def length(self) -> float:
         """Of the band [rad]: the range of the spline's parameter."""
-        return float(self.knots[-1])
+        return float(self.spline.knots[-1])
 
     def at(self, s: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n D"], float]:
         """Points at shares of the way from 0 to 1, rising [rad], and what is left of the violation,
         limits included.
         """
-        points = np.empty((len(s), self.nodes.shape[1]))
-        band_kernels.spline_points(self.knots, self.nodes, self.moments, s * self.length, points)
-        left = project(self.space, points)
-        points[s == 0.0], points[s == 1.0] = self.nodes[0], self.nodes[-1]
-        return points, left
+        points, left = curve_kernels.curve_points(self.space, self.spline, s, PROJECTION)
+        return points, float(left)
 
 
 def step_lengths(points: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T-1"]:
@@ -109,4 +107,4 @@ def step_lengths(points: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T-1"]:
 
 def project(space: Space, points: Float[np.ndarray, "n D"]) -> float:
     """Move points onto the space, in place; returns what is left of the violation [rad or m]."""
-    return float(project_points(space, points, _PROJECTION))
+    return float(project_points(space, points, PROJECTION))

@@ -11,7 +11,7 @@ of their own (methods.py), through `refined` or not.
 
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -19,27 +19,18 @@ from jaxtyping import Float
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.problem import Status
 from constraint_geodesics.scene.clearance import ClearanceModel, path_stays_clear
-from constraint_geodesics.search.band import BandCurve, BandSettings, relax, step_lengths
+from constraint_geodesics.search.band import PROJECTION, BandCurve, BandSettings
+from constraint_geodesics.search.curve_kernels import relaxed_curve, rows_along
 from constraint_geodesics.search.roadmap import Joined, Roadmap, join, resample, shortest_way
 from constraint_geodesics.search.space import Space, space_of
 from constraint_geodesics.search.tree import tree_way
 
 Source = Literal["straight", "policy", "graph", "tree", "bend"]
 
-CHECK_STEP = 0.1
-"""Distance of the points at which a relaxed curve is first looked at [rad]."""
-JUMP = 3.0
-"""A step between two of these points longer than so many times CHECK_STEP is a jump to another
-branch.
-"""
 ROW_SAFETY = 0.8
 """Share of the allowed violation between two rows that their distance is chosen for."""
 PARTLY_RELAXED = (3, 1, 0)
 """Iterations of a band that must stay near the graph."""
-HALVINGS = 8
-"""Times that rows are drawn closer where the lines between them still leave the constraint."""
-LONGEST_ROW_STEP = 0.08
-"""Distance of two rows at most [rad], however flat the path."""
 TREES = 4
 """Pairs of trees that are grown where all else failed."""
 BENDS = 4
@@ -82,14 +73,6 @@ class Task:
     open: Space = field(init=False, repr=False)
 
 
-class Curve(Protocol):
-    """A curve in joint space from start to goal."""
-
-    def at(self, s: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n D"], float]:
-        """Points at shares from 0 to 1, rising [rad], and what is left of the violation."""
-        ...
-
-
 @dataclass(frozen=True)
 class Candidate:
     """A curve that looks sound: where it came from, its length [rad], and points about CHECK_STEP
@@ -97,7 +80,7 @@ class Candidate:
     """
 
     source: Source
-    curve: Curve
+    curve: BandCurve
     length: float
     shares: Float[np.ndarray, "n"]
     points: Float[np.ndarray, "n D"]
@@ -145,7 +128,6 @@ def candidates(
     if parts.graph:
         answer = yield from _over_graph(task, start, goal, parts.refinement, blocked is not None)
     if blocked is not None and parts.refinement:
-        assert isinstance(blocked.curve, BandCurve)
         pushed = _relaxed(task, "straight", blocked.curve.nodes, task.settings, clear=True)
         if pushed is not None and _is_clear(task, pushed.points):
             yield pushed
@@ -303,17 +285,11 @@ def _relaxed(
     the constraint or the limits, or jump.
     """
     space = task.clear if clear else task.open
-    band = relax(space, nodes, settings, guarded)
-    curve = BandCurve.through(space, band.nodes)
-    if curve is None:
-        return None
-    shares = np.linspace(0.0, 1.0, max(int(np.ceil(curve.length / CHECK_STEP)), 2) + 1)
-    points, left = curve.at(shares)
-    steps = step_lengths(points)
-    longest = JUMP * curve.length / (len(shares) - 1)
-    if left > 1e-6 or steps.max() > longest:
-        return None
-    return Candidate(source, curve, float(steps.sum()), shares, points, band.iterations)
+    sound, spline, shares, points, length, iterations = relaxed_curve(
+        space, np.ascontiguousarray(nodes), settings.steps(guarded), PROJECTION
+    )
+    curve = BandCurve(space, spline)
+    return Candidate(source, curve, length, shares, points, iterations) if sound else None
 
 
 def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
@@ -322,36 +298,12 @@ def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
 
 
 def rows_of(
-    task: Task, candidate: Candidate, violation: float
+    candidate: Candidate, violation: float
 ) -> tuple[Float[np.ndarray, "T"], Float[np.ndarray, "T D"]]:
     """Rows so close that straight joint lines between them leave the constraint by less than
-    `violation` [rad or m].
-
-    Between two points h apart a straight line is off by r''h²/8; halfway it is measured, and h
-    chosen from it.  Near a singular configuration r'' changes faster than that: lines that are
-    still off are halved.
-    Returns the shares of the way and the rows (T, D).
+    `violation` [rad or m]: the shares of the way and the rows (T, D).
     """
-    allowed = ROW_SAFETY * violation
-    points = candidate.points
-    steps = step_lengths(points)
-    pieces = np.maximum(np.sqrt(_halfway(task, points) / allowed), steps / LONGEST_ROW_STEP)
-    pieces = np.maximum(np.ceil(pieces), 1.0).astype(int)
-    shares = np.concatenate(
-        [[0.0], np.cumsum(np.repeat(np.diff(candidate.shares) / pieces, pieces))]
-    )
-    shares[-1] = 1.0
-    rows, _ = candidate.curve.at(shares)
-    for _ in range(HALVINGS):
-        steps = step_lengths(rows)
-        off = np.flatnonzero((_halfway(task, rows) > allowed) | (steps > 1.1 * LONGEST_ROW_STEP))
-        if not len(off):
-            break
-        between = 0.5 * (shares[off] + shares[off + 1])
-        new, _ = candidate.curve.at(between)
-        shares, rows = np.insert(shares, off + 1, between), np.insert(rows, off + 1, new, axis=0)
+    curve, allowed = candidate.curve, ROW_SAFETY * violation
+    along = curve.spline, candidate.shares, candidate.points
+    shares, rows = rows_along(curve.space, along, allowed, PROJECTION)
     return shares, rows
-
-
-def _halfway(task: Task, points: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T-1"]:
-    return task.manifold.violation(0.5 * (points[1:] + points[:-1]))

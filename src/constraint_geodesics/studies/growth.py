@@ -185,7 +185,7 @@ class BandAndTrees:
         task = task_of(problem, self.settings)
         found = candidates(task, problem.start, problem.goal)
         curves = (candidate for candidate in found if isinstance(candidate, Candidate))
-        rows, tried = first_free(problem, task, curves)
+        rows, tried = first_free(problem, curves)
         return answer(rows, problem, began, tried)
 
 

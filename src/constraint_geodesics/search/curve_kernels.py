@@ -1,0 +1,234 @@
+"""Compiled curves: the spline through a band, its points on the constraint, and rows along it so
+close together that the straight lines between them keep the constraint.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from constraint_geodesics.compiled import COMPILE, LEAF
+from constraint_geodesics.constraints.kernels import ManifoldArrays, violation_batch
+from constraint_geodesics.search.band_kernels import relax_band
+from constraint_geodesics.search.space import project_points
+
+CHECK_STEP = 0.1
+"""Distance of the points at which a relaxed curve is first looked at [rad]."""
+JUMP = 3.0
+"""A step between two of these points longer than so many times CHECK_STEP is a jump to another
+branch.
+"""
+HALVINGS = 8
+"""Times that rows are drawn closer where the lines between them still leave the constraint."""
+LONGEST_ROW_STEP = 0.08
+"""Distance of two rows at most [rad], however flat the path."""
+_LEFT = 1e-6
+_COINCIDENT = 1e-12
+
+
+class Spline(NamedTuple):
+    """A cubic spline over arc length through nodes (n + 1, D) at knots (n + 1,), with its second
+    derivatives there.
+    """
+
+    knots: np.ndarray
+    nodes: np.ndarray
+    moments: np.ndarray
+
+
+@njit(**LEAF)
+def step_lengths(points, steps):
+    """Distances between neighbouring points (T, D) into steps (T − 1,); returns their sum and the
+    longest.
+    """
+    total, longest = 0.0, 0.0
+    for i in range(points.shape[0] - 1):
+        square = 0.0
+        for d in range(points.shape[1]):
+            square += (points[i + 1, d] - points[i, d]) ** 2
+        steps[i] = np.sqrt(square)
+        total += steps[i]
+        longest = max(longest, steps[i])
+    return total, longest
+
+
+@njit(**LEAF)
+def _spline(nodes, h, moments, above, below):
+    """Second derivatives (n + 1, D) of the cubic spline through nodes whose knots are h (n,) apart,
+    not-a-knot at both ends.
+    """
+    n, dof = nodes.shape[0] - 1, nodes.shape[1]
+    moments[:, :] = 0.0
+    if n < 3:
+        return
+    # h_{i−1} M_{i−1} + 2 (h_{i−1} + h_i) M_i + h_i M_{i+1} = 6 (slope_i − slope_{i−1}) for 0 < i <
+    # n, with M_0 and M_n from the third derivative's continuity at knots 1 and n − 1
+    for i in range(1, n):
+        diagonal, lower, upper = 2.0 * (h[i - 1] + h[i]), h[i - 1], h[i]
+        if i == 1:
+            diagonal += h[0] * (1.0 + h[0] / h[1])
+            upper -= h[0] * h[0] / h[1]
+            lower = 0.0
+        if i == n - 1:
+            diagonal += h[n - 1] * (1.0 + h[n - 1] / h[n - 2])
+            lower -= h[n - 1] * h[n - 1] / h[n - 2]
+            upper = 0.0
+        factor = lower / below[i - 1] if i > 1 else 0.0
+        below[i] = diagonal - (factor * above[i - 1] if i > 1 else 0.0)
+        above[i] = upper
+        for d in range(dof):
+            right = 6.0 * (
+                (nodes[i + 1, d] - nodes[i, d]) / h[i] - (nodes[i, d] - nodes[i - 1, d]) / h[i - 1]
+            )
+            moments[i, d] = right - (factor * moments[i - 1, d] if i > 1 else 0.0)
+    for i in range(n - 1, 0, -1):
+        for d in range(dof):
+            if i < n - 1:
+                moments[i, d] -= above[i] * moments[i + 1, d]
+            moments[i, d] /= below[i]
+    for d in range(dof):
+        moments[0, d] = moments[1, d] + h[0] / h[1] * (moments[1, d] - moments[2, d])
+        moments[n, d] = moments[n - 1, d] + h[n - 1] / h[n - 2] * (
+            moments[n - 1, d] - moments[n - 2, d]
+        )
+
+
+@njit(**LEAF)
+def _along(curve, shares, points):
+    """Points (T, D) of the spline at rising shares (T,) of its length."""
+    knots, nodes, moments = curve
+    i, last = 0, knots.shape[0] - 1
+    for k in range(shares.shape[0]):
+        at = shares[k] * knots[last]
+        while i < last - 1 and at > knots[i + 1]:
+            i += 1
+        h = knots[i + 1] - knots[i]
+        b = (at - knots[i]) / h
+        a = 1.0 - b
+        for d in range(nodes.shape[1]):
+            bend = (a * a * a - a) * moments[i, d] + (b * b * b - b) * moments[i + 1, d]
+            points[k, d] = a * nodes[i, d] + b * nodes[i + 1, d] + bend * h * h / 6.0
+
+
+@njit(**COMPILE)
+def spline_through(nodes):
+    """The spline through nodes, and whether there is one: not where nodes coincide or are not
+    finite.
+    """
+    n = nodes.shape[0] - 1
+    h, knots, moments = np.empty(n), np.zeros(n + 1), np.empty(nodes.shape)
+    step_lengths(nodes, h)
+    curve = Spline(knots, nodes, moments)
+    for i in range(n):
+        if not (np.isfinite(h[i]) and h[i] > _COINCIDENT):
+            return curve, False
+        knots[i + 1] = knots[i] + h[i]
+    _spline(nodes, h, moments, np.empty(n), np.empty(n))
+    return curve, True
+
+
+@njit(**COMPILE)
+def curve_points(space, curve, shares, settings):
+    """Points (T, D) at rising shares of the way, from 0 to 1, projected onto the space, but for
+    both ends, which are the nodes' to the bit; and what remains of the violation of the worst.
+    """
+    points = np.empty((shares.shape[0], curve.nodes.shape[1]))
+    _along(curve, shares, points)
+    left = project_points(space, points, settings)
+    for k in range(shares.shape[0]):
+        if shares[k] == 0.0:
+            points[k] = curve.nodes[0]
+        if shares[k] == 1.0:
+            points[k] = curve.nodes[-1]
+    return points, left
+
+
+@njit(**COMPILE)
+def relaxed_curve(space, nodes, steps, settings):
+    """The curve through a relaxed band, with points about CHECK_STEP apart.
+
+    steps: of `relax_band`; settings: of the projection.  Returns whether it is sound: its points
+    are on the space, and none jumps; the spline, shares and points, their length and the
+    iterations.
+    """
+    moved = nodes.copy()
+    _, used, _ = relax_band(space, moved, steps)
+    curve, sound = spline_through(moved)
+    length = curve.knots[-1]
+    count = max(int(np.ceil(length / CHECK_STEP)), 2) if sound else 1
+    shares = np.empty(count + 1)
+    for k in range(count + 1):
+        shares[k] = k / count
+    if not sound:
+        return False, curve, shares, moved, 0.0, used
+    points, left = curve_points(space, curve, shares, settings)
+    total, longest = step_lengths(points, np.empty(count))
+    sound = not (left > _LEFT or longest > JUMP * length / count)
+    return sound, curve, shares, points, total, used
+
+
+@njit(**COMPILE)
+def _halfway(space, points):
+    """The violation of the middle of each line between points (T, D)."""
+    worst = np.empty(points.shape[0] - 1)
+    manifold = ManifoldArrays(space.chain, space.constraint)
+    violation_batch(manifold, 0.5 * (points[1:] + points[:-1]), worst)
+    return worst
+
+
+@njit(**COMPILE)
+def rows_along(space, candidate, allowed, settings):
+    """Rows so close that straight joint lines between them leave the constraint by at most
+    `allowed` [rad or m]; and their shares of the way.
+
+    candidate: a spline, and shares and points of it.  Between two points h apart a straight line is
+    off by r''h²/8; halfway it is measured, and h chosen from it.  Near a singular configuration r''
+    changes faster than that: lines that are still off are halved.
+    """
+    curve, looked_at, points = candidate
+    count = looked_at.shape[0] - 1
+    steps, halfway = np.empty(count), _halfway(space, points)
+    step_lengths(points, steps)
+    pieces, total = np.empty(count, dtype=np.int64), 0
+    for i in range(count):
+        wanted = max(np.sqrt(halfway[i] / allowed), steps[i] / LONGEST_ROW_STEP)
+        pieces[i] = max(int(np.ceil(wanted)), 1)
+        total += pieces[i]
+    shares, k = np.zeros(total + 1), 0
+    for i in range(count):
+        step = (looked_at[i + 1] - looked_at[i]) / pieces[i]
+        for _ in range(pieces[i]):
+            shares[k + 1] = shares[k] + step
+            k += 1
+    shares[total] = 1.0
+    rows, _ = curve_points(space, curve, shares, settings)
+    for _ in range(HALVINGS):
+        steps, halfway = np.empty(rows.shape[0] - 1), _halfway(space, rows)
+        step_lengths(rows, steps)
+        off = (halfway > allowed) | (steps > 1.1 * LONGEST_ROW_STEP)
+        extra = np.sum(off)
+        if extra == 0:
+            break
+        between, k = np.empty(extra), 0
+        for i in range(off.shape[0]):
+            if off[i]:
+                between[k] = 0.5 * (shares[i] + shares[i + 1])
+                k += 1
+        new, _ = curve_points(space, curve, between, settings)
+        shares, rows = _inserted(off, shares, rows, between, new)
+    return shares, rows
+
+
+@njit(**COMPILE)
+def _inserted(off, shares, rows, between, new):
+    """Shares and rows with the new ones on the lines that are off."""
+    size = shares.shape[0] + between.shape[0]
+    all_shares, all_rows = np.empty(size), np.empty((size, rows.shape[1]))
+    k, n = 0, 0
+    for i in range(shares.shape[0]):
+        all_shares[k], all_rows[k] = shares[i], rows[i]
+        k += 1
+        if i < off.shape[0] and off[i]:
+            all_shares[k], all_rows[k] = between[n], new[n]
+            k, n = k + 1, n + 1
+    return all_shares, all_rows
