@@ -5,6 +5,7 @@ pairs of bodies that move relative to each other, as convex_kernels.py takes the
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -166,6 +167,12 @@ def _with_neighbours(
     """Corners of a convex hull, and for each those beside it: that share a face, or all others
     where a way along edges might end before the corner that lies furthest out.
     """
+    return _hull(np.ascontiguousarray(points, float).tobytes())
+
+
+@lru_cache(maxsize=4096)  # certificate and search ask the same, and so does every further scene
+def _hull(data: bytes) -> tuple[Float[np.ndarray, "m 3"], list[Int[np.ndarray, "k"]]]:
+    points = np.frombuffer(data).reshape(-1, 3)
     if len(points) >= _MIXED:
         with contextlib.suppress(QhullError):  # flat
             hull = ConvexHull(points)
