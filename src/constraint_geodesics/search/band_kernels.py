@@ -597,8 +597,8 @@ def relax_band(space, nodes, settings):
     """Shorten a band (n + 1, D) in place; returns (what remains of the violation, iterations used,
     converged).
 
-    settings: iterations at most, and those of a node's projection; relative decrease of the energy
-    predicted by Newton's step below which the band has converged; longest step of a node [rad];
+    settings: iterations at most, and those of a node's projection; relative decrease of energy,
+    predicted by Newton's step or made, below which it has converged; longest step of a node [rad];
     whether lines between its nodes that touch nothing keep that.
     """
     most, projections, accuracy, largest, guarded = settings
@@ -635,6 +635,8 @@ def relax_band(space, nodes, settings):
         if not improved:
             break
         nodes[:, :] = trial
+        # between two kinks of a contact no step promises little, and none gains much
+        converged = converged or energy - after <= accuracy * energy
         energy, worst = after, left
         if converged:
             break
