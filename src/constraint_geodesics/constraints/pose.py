@@ -95,6 +95,11 @@ class PoseConstraint(Constraint):
         return ConstraintArrays(rows, np.concatenate(data), *_addresses(), _LINEAR + 15 * robot.dof)
 
     @property
+    def is_free(self) -> bool:
+        """Whether no axis is held."""
+        return not any(self.axes)
+
+    @property
     def is_placed(self) -> bool:
         """Whether it has a reference, or needs none."""
         return self.reference is not None or self.is_free
