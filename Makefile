@@ -30,9 +30,11 @@ INSTALL := .venv/bin/python -m pip install --quiet --disable-pip-version-check
 	.venv/bin/python -m pip check
 	@touch .venv/planning $@
 
-env: .venv/installed  ## make .venv with every pinned package, those of the pipeline and the tests too
+env: .venv/installed  ## make .venv with every pinned package, those of the pipeline and the tests too, and compile the kernels
+	@geodesics warmup
 
 plan: .venv/planning  ## plan one path that keeps a cup level, at once: CSV, picture and recording in first_path/
+	geodesics warmup
 	geodesics plan --constraint level_cup \
 	  --start "$(FIRST_START)" --goal "$(FIRST_GOAL)" \
 	  --out first_path/path.csv --picture first_path/path.png --record first_path/path.rrd

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from constraint_geodesics import warmup
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import ShardTask, draw_free
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
@@ -16,15 +17,14 @@ from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.urdf import data_path
-from tests.kernels import compile_kernels
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Before several workers start."""
+    """Before several workers start, each of which would wait for it."""
     if getattr(session.config.option, "numprocesses", None):
-        compile_kernels()
+        warmup.ensure()
 
 
 SLOW_FIRST = ("pipeline", "report", "laws", "constraints", "geodesics", "tracking", "studies")

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from constraint_geodesics import bundle, cli
+from constraint_geodesics import bundle
 from tests.planner_fixtures import packaged_planner
 from tests.test_cli_plan import called
 from tests.test_docs import ROOT, words_of
@@ -31,6 +31,7 @@ EXPERIMENT = "tests/pipeline/test_experiment.py"
 REGISTRY = "tests/tracking/test_registry.py"
 COVERED: dict[str, str | tuple[str, str]] = {
     "geodesics constraints": HERE,
+    "geodesics warmup": HERE,
     "geodesics plan": HERE,
     "geodesics check": HERE,
     "geodesics params": HERE,
@@ -140,6 +141,7 @@ def test_a_command_of_ours_does_what_its_page_says(words, folder, monkeypatch, c
         if option in given:
             assert (folder / given[given.index(option) + 1]).stat().st_size > 1000
     expected = {
+        "warmup": "compiled",
         "constraints": "level_cup",
         "plan": "solved",
         "check": "valid",
@@ -282,13 +284,3 @@ def test_completion_installs_itself(tmp_path) -> None:
         "_geodesics_completion"
         in subprocess.run(shown, env=environment, capture_output=True, text=True, check=True).stdout
     )
-
-
-# The first call
-
-
-def test_after_a_plan_its_kernels_are_compiled() -> None:
-    packaged_planner().plan(
-        *([float(word) for word in text.split()] for text in ELLIPSIS.values()), "level_cup"
-    )
-    assert cli.what_takes_time() == "loading the planner"

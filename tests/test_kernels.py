@@ -10,14 +10,8 @@ from pathlib import Path
 import pytest
 from numba.core.runtime import _nrt_python, rtsys
 
-from constraint_geodesics import Planner, kernel_digest
-from constraint_geodesics.kernel_digest import (
-    PACKAGE,
-    ROOMS,
-    are_compiled,
-    folder_of,
-    kernels_digest,
-)
+from constraint_geodesics import Planner
+from constraint_geodesics.kernel_digest import PACKAGE
 
 INNER = "from numba import njit\n\n\n@njit(cache=True)\ndef inner(x):\n    return x + {}\n"
 OUTER = (
@@ -69,25 +63,6 @@ def test_a_moved_checkout_keeps_what_is_compiled(package: Path, tmp_path: Path) 
     answer(package)
     moved = shutil.copytree(tmp_path / "src", tmp_path / "moved")
     assert answer(moved / "constraint_geodesics") == (20, 1)
-
-
-def test_the_first_call_is_known_by_the_kernels_that_are_not_compiled(tmp_path: Path) -> None:
-    for room in ROOMS:
-        assert any(b"njit" in file.read_bytes() for file in (PACKAGE / room).glob("*.py")), room
-        (tmp_path / room / "__pycache__").mkdir(parents=True)
-        shutil.copytree(PACKAGE / room, tmp_path / room, dirs_exist_ok=True)
-    for cache in tmp_path.rglob("*.nbi"):
-        cache.unlink()
-    assert not are_compiled(tmp_path)
-    for room in ROOMS:
-        folder = tmp_path / room / "__pycache__" / folder_of(kernels_digest(tmp_path))
-        folder.mkdir()
-        (folder / "kernels.some-1.py311.nbi").touch()
-    assert are_compiled(tmp_path)
-    with (tmp_path / ROOMS[0] / "kernels.py").open("a") as file:
-        file.write("# another kernel\n")
-    kernel_digest.kernels_digest.cache_clear()
-    assert not are_compiled(tmp_path)
 
 
 def test_kernels_that_count_no_references_lose_no_memory() -> None:

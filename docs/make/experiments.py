@@ -110,17 +110,11 @@ def sources_of(checkout: Path) -> str:
 
 
 def take_compiled_kernels() -> None:
-    """Numba knows a cache by its source's time and size: where the sources agree, this checkout's
-    are taken.
+    """A folder of kernels is named by the contents of their sources: where they agree, this
+    checkout's are used.
     """
-    for source in (CLONE / "src").rglob("*.py"):
-        own = ROOT / source.relative_to(CLONE)
-        if own.is_file() and own.read_bytes() == source.read_bytes():
-            shutil.copystat(own, source)
-            for compiled in (own.parent / "__pycache__").glob(f"{own.stem}.*.nb[ic]"):
-                target = source.parent / "__pycache__" / compiled.name
-                target.parent.mkdir(exist_ok=True)
-                shutil.copy2(compiled, target)
+    for folder in (ROOT / "src").rglob("kernels-*"):
+        shutil.copytree(folder, CLONE / folder.relative_to(ROOT), dirs_exist_ok=True)
 
 
 def run(section: Section) -> dict[str, str]:

@@ -6,7 +6,9 @@ import json
 import math
 import os
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,9 +17,8 @@ import typer
 from constraint_geodesics import completion
 from constraint_geodesics.errors import ParamsError
 from constraint_geodesics.extras import MissingExtraError, require
-from constraint_geodesics.kernel_digest import are_compiled
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.progress import waiting
+from constraint_geodesics.pipeline.progress import progress, waiting
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
 from constraint_geodesics.pipeline.threads import ONE_THREAD
 
@@ -120,6 +121,34 @@ def list_constraints(
         print(f"{name:20s} {constraint.summary}  {constraint.description}")
 
 
+@app.command("warmup")
+def warm_up(
+    jobs: int | None = typer.Option(None, help="Processes; by default one a core.", min=1),
+    as_json: bool = JSON,
+) -> None:
+    """Compile all kernels now, once for this environment, so that no plan waits for it."""
+    from constraint_geodesics import warmup
+
+    began, done_before = time.perf_counter(), warmup.is_done()
+    if not done_before:
+        on_terminal = sys.stderr.isatty()
+        with progress("compiling" if on_terminal else "", warmup.pieces()) as advance:
+
+            def tell(name: str, seconds: float) -> None:
+                if not on_terminal:
+                    print(f"{name}: {seconds:.1f} s", file=sys.stderr, flush=True)
+                advance()
+
+            warmup.ensure(jobs, tell)
+    seconds = time.perf_counter() - began
+    if as_json:
+        print(json.dumps({"compiled": not done_before, "seconds": round(seconds, 1)}))
+    elif done_before:
+        print("all is compiled already")
+    else:
+        print(f"compiled in {seconds:.0f} s; the next plan starts at once")
+
+
 @app.command("plan", context_settings={"allow_extra_args": False})
 def plan(
     start: Annotated[
@@ -169,7 +198,7 @@ def plan(
         require("record")
     try:
         first, last = _joints(start, "--start"), _joints(goal, "--goal")
-        with waiting(what_takes_time()), Planner.load(planner, method) as loaded:
+        with _loading(), Planner.load(planner, method) as loaded:
             path = loaded.plan(first, last, constraint, budget_s=budget)
             source = loaded.source
     except (BundleError, PlannerError) as error:
@@ -212,7 +241,7 @@ def check(
     from constraint_geodesics.planner import PlannerError, check_trajectory
 
     try:
-        with waiting(what_takes_time()):
+        with _loading():
             certificate = check_trajectory(file, constraint, planner)
     except (BundleError, PlannerError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
@@ -245,11 +274,18 @@ def _clearance(certificate: "Certificate") -> str:
     return f"at least {1e3 * certificate.clearance_m:.1f} mm from any collision"
 
 
-def what_takes_time() -> str:
-    """What a planner's user waits for: the compiler where a kernel has no compiled code yet."""
-    if are_compiled():
-        return "loading the planner"
-    return "compiling the numerical kernels, once for this environment: a minute or two"
+@contextmanager
+def _loading() -> Iterator[None]:
+    """Say what a planner's user waits for: the compiler where it was not asked before."""
+    from constraint_geodesics import warmup
+
+    what = "loading the planner"
+    if not warmup.is_done():
+        what = "compiling the kernels, once for this environment: a minute or two"
+        if not sys.stderr.isatty():
+            print(what, file=sys.stderr, flush=True)
+    with waiting(what):
+        yield
 
 
 def _joints(text: str, option: str) -> list[float]:

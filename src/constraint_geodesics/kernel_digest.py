@@ -20,8 +20,6 @@ LOCATORS = ",".join(
 """What numba asks where a compiled function is kept: this package's own first, then numba's."""
 FOLDER = "kernels-"
 """What the name of a folder with compiled kernels begins with."""
-ROOMS = ("certification", "constraints", "geometry", "robot", "scene", "search")
-"""Rooms whose kernels are compiled before the first path is there."""
 
 
 @cache
@@ -38,9 +36,3 @@ def kernels_digest(package: Path = PACKAGE) -> bytes:
 def folder_of(digest: bytes) -> str:
     """Name of the folder of what was compiled from these files."""
     return f"{FOLDER}{digest.hex()[:12]}"
-
-
-def are_compiled(package: Path = PACKAGE) -> bool:
-    """Whether what the planner needs has been compiled from the kernels as they are."""
-    folder = folder_of(kernels_digest(package))
-    return all(any((package / room / "__pycache__" / folder).glob("*.nbi")) for room in ROOMS)

@@ -14,6 +14,7 @@ from typing import Self
 import numpy as np
 from jaxtyping import Float
 
+from constraint_geodesics import warmup
 from constraint_geodesics.bundle import Bundle, open_bundle
 from constraint_geodesics.certification.certifier import Certificate, Certifier, Limits
 from constraint_geodesics.constraints.constraint import Constraint, Pose, constraint_from
@@ -54,6 +55,7 @@ class Planner:
     """
 
     def __init__(self, bundle: Bundle, source: str, method: Method | None = None) -> None:
+        warmup.ensure()
         self._closed = False
         self.source, self.bundle = source, bundle
         self.scene = Scene(robot_from(bundle.robot), workcell_from(bundle.workcell))
@@ -124,7 +126,9 @@ class Planner:
         if not given.is_placed:
             raise PlannerError(f"{name} has no reference pose: use constraint.relative_to(pose)")
         roadmap = self._preparation.task(given).roadmap()
-        return np.empty((0, self.scene.robot.dof)) if roadmap is None else roadmap.joints
+        nodes = np.empty((0, self.scene.robot.dof)) if roadmap is None else roadmap.joints.view()
+        nodes.flags.writeable = False
+        return nodes
 
     def plan(
         self,
@@ -141,17 +145,19 @@ class Planner:
 
         parts: of the planner to use, for comparisons.  budget_s: by default the first path that is
         certified is the answer; with a budget shorter ones, round the other side of something, are
-        looked for until so many seconds have passed since the call.
+        looked for until so many seconds have passed since the call; functions of a constraint's own
+        are compiled before.
         Raises PlannerError if an end has the wrong shape or is not finite, the name is unknown, or
         the budget is no positive number.
         """
-        began = time.perf_counter()
         self._require_open()
+        given, name = self._named(constraint)
+        given.arrays(self.scene.robot)  # functions of the user's own are compiled by this
+        began = time.perf_counter()
         if budget_s is not None and not (np.isfinite(budget_s) and budget_s > 0.0):
             raise PlannerError(f"budget_s = {budget_s}: must be a positive number of seconds")
         dof = self.scene.robot.dof
         q_start, wanted = checked_configuration(start, dof, "start"), as_goal(goal, dof)
-        given, name = self._named(constraint)
         task = self._preparation.task(self._held_at(given, q_start))
         answers: list[Trajectory] = []
         for q_goal in wanted.configurations(task.manifold, q_start):
@@ -322,6 +328,7 @@ def check_trajectory(
     Raises PlannerError if the file can't be read, or neither names a constraint that exists.
     """
     bundle, _ = open_bundle(source)
+    warmup.ensure()
     scene = Scene(robot_from(bundle.robot), workcell_from(bundle.workcell))
     joints, times, own = read_trajectory(Path(file), scene.robot.joint_names, scene.robot)
     if constraint is not None:

@@ -16,6 +16,8 @@ class Plug(NamedTuple):
 
 
 MLFLOW = Plug("tracking.store:fetch_artifacts", "pipeline")
+PULL = Plug("geodesics.pull_kernels:tangential_gradient")
+PULL_BOUNDS = Plug("geodesics.pull_kernels:Bounds")
 METHODS = {
     "planner": Plug("methods:SearchMethod"),
     "learned": Plug("geodesics.learned_method:LearnedMethod", "pipeline"),

@@ -135,9 +135,11 @@ def malformed(kind: str, row: int | None, message: str) -> Violation:
 
 
 def real_array(values: Any) -> np.ndarray | None:
-    """Real numbers as a float64 array, or None."""
+    """Real numbers as a float64 array that could be written to, or None: the kernels are compiled
+    for no others.
+    """
     try:
         table = np.asarray(values)
     except ValueError:  # rows of unequal length
         return None
-    return np.ascontiguousarray(table, dtype=np.float64) if table.dtype.kind in "fiu" else None
+    return np.require(table, np.float64, ("C", "W")) if table.dtype.kind in "fiu" else None

@@ -241,7 +241,7 @@ class ConstraintManifold:
     ) -> tuple[Float[np.ndarray, "*batch m"], Float[np.ndarray, "*batch m D"]]:
         """Residual and Jacobian from one pass over the kinematics."""
         dof, count = self.robot.dof, len(self.rows.held)
-        flat = np.ascontiguousarray(q, dtype=np.float64).reshape(-1, dof)
+        flat = np.require(q, np.float64, ("C", "W")).reshape(-1, dof)
         residuals, jacobians = np.empty((len(flat), count)), np.empty((len(flat), count, dof))
         kernels.residual_batch(self.arrays, flat, residuals, jacobians)
         batch = q.shape[:-1]
@@ -259,7 +259,7 @@ class ConstraintManifold:
 
     def violation(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch"]:
         """Largest excess over the tolerance [rad or m]; 0 where the constraint holds."""
-        flat = np.ascontiguousarray(q, dtype=np.float64).reshape(-1, self.robot.dof)
+        flat = np.require(q, np.float64, ("C", "W")).reshape(-1, self.robot.dof)
         worst = np.empty(len(flat))
         kernels.violation_batch(self.arrays, flat, worst)
         return worst.reshape(q.shape[:-1])

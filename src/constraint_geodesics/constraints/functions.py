@@ -100,7 +100,7 @@ class FunctionsConstraint(Constraint):
         """The residuals of configurations."""
         address = _compiled(self.residual, self.jacobian, len(self.bounds))[1].address
         out = np.empty((len(q), len(self.bounds)))
-        _values(address, np.ascontiguousarray(q, np.float64), out)
+        values_batch(address, np.require(q, np.float64, ("C", "W")), out)
         return out
 
     def loosened(self, least: Mapping[str, float]) -> "FunctionsConstraint":
@@ -216,7 +216,8 @@ def _compiled(residual: Writes, jacobian: Writes, count: int) -> tuple[Any, Any]
 
 
 @njit(**LEAF)
-def _values(address, q, out):
+def values_batch(address, q, out):
+    """Residuals (B, m) of q (B, D), by the C function at an address."""
     for n in range(q.shape[0]):
         call(address, (q[n].ctypes.data, out[n].ctypes.data, q.shape[1]))
 
@@ -242,13 +243,13 @@ def tip_on_sphere(
     prismatic, dof = chain.prismatic, robot.dof
 
     def residual(q: np.ndarray, out: np.ndarray) -> None:
-        posture = new_posture(dof)
+        posture = new_posture(q.shape[0])
         pose_of(chain, q, posture)
         v = posture.position - centre
         out[0] = 0.5 * (v[0] * v[0] + v[1] * v[1] + v[2] * v[2] - radius * radius) / radius
 
     def jacobian(q: np.ndarray, out: np.ndarray) -> None:
-        posture = new_posture(dof)
+        posture = new_posture(q.shape[0])
         pose_of(chain, q, posture)
         v = posture.position - centre
         for j in range(dof):

@@ -87,7 +87,8 @@ class SerialRobot:
             raise RobotError(
                 f"{self.name} has {self.dof} joints, but the configurations have {q.shape[-1]}"
             )
-        return np.ascontiguousarray(q, dtype=np.float64).reshape(-1, self.dof)
+        # the kernels are compiled for arrays that could be written to alone
+        return np.require(q, np.float64, ("C", "W")).reshape(-1, self.dof)
 
 
 def load_robot(
