@@ -25,7 +25,8 @@ from constraint_geodesics.scene import convex_kernels as convex
 from constraint_geodesics.scene.clearance import clearance_model, path_stays_clear
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere
-from constraint_geodesics.search.band import BandCurve, BandSettings, project, relax
+from constraint_geodesics.search.band import BandCurve, project
+from constraint_geodesics.search.candidates import Task, refined, rows_of
 from constraint_geodesics.search.roadmap import build_roadmap, join, shortest_way
 from constraint_geodesics.search.space import Space, space_of
 from constraint_geodesics.search.tree import tree_way
@@ -95,7 +96,11 @@ def _constraints_and_times() -> None:
 
 
 def _band() -> None:
-    relax(_space(), _ROWS, BandSettings())
+    model = clearance_model(_scene().robot, _scene().workcell)
+    task = Task(ConstraintManifold(_scene().robot, _level()), model, lambda: None)
+    found = refined(task, "straight", _ROWS)
+    assert found is not None
+    rows_of(found, 1e-4)
 
 
 def _roadmap() -> None:
