@@ -341,9 +341,11 @@ def test_params_name_a_factory(kuka) -> None:
 
 FILES = {
     "Pose": {"params.py", "constraints/constraint.py", "constraints/pose.py"},
-    "Functions": {"params.py", "constraints/functions.py"},
+    "Functions": {"params.py", "constraints/functions.py", "kernel_jobs.py"},
 }
-"""Where the class of a kind, its arrays and its record may be named."""
+"""Where the class of a kind, its arrays and its record may be named; the warm-up compiles what
+calls functions.
+"""
 
 
 @pytest.mark.parametrize("kind", FILES)

@@ -205,11 +205,11 @@ def test_several_shapes_leave_the_smallest_distance() -> None:
 
 
 def test_a_kind_is_known_in_its_own_file_and_among_the_shapes() -> None:
-    """A new kind takes two files.  The benchmarks choose a sphere as what stands in the way, and
-    the proof of collisions is tried among spheres and boxes.
+    """A new kind takes two files.  The benchmarks choose a sphere as what stands in the way, so
+    does the warm-up, and the proof of collisions is tried among spheres and boxes.
     """
     package = Path(__file__).resolve().parents[2] / "src" / "constraint_geodesics"
-    chosen = {"benchmark/queries.py", "benchmark/runner.py", "studies/growth.py"}
+    chosen = {"benchmark/queries.py", "benchmark/runner.py", "studies/growth.py", "kernel_jobs.py"}
     tried = {"studies/collision_proof.py"}
     others = {Sphere: chosen | tried, Box: tried}
     for kind in (Box, Sphere, Capsule, Body):

@@ -98,10 +98,21 @@ def _new_version(
     return str(client.create_model_version(PLANNER_MODEL, address, run.run_id, tags).version)
 
 
+_EXTRAS = ("", "record", "pipeline")
+"""Of this package, that a served model needs."""
+
+
 def installed_requirements() -> list[str]:
-    """The packages that this one needs, as they are installed; not itself, which no index has."""
-    needed = (Requirement(text) for text in metadata.requires("constraint-geodesics") or ())
-    return [f"{each.name}=={metadata.version(each.name)}" for each in needed if not each.marker]
+    """The packages that this one and its learning need, as they are installed; not itself, which no
+    index has.
+    """
+    own = "constraint-geodesics"
+    named = {
+        each.name
+        for each in (Requirement(text) for text in metadata.requires(own) or ())
+        if each.marker is None or any(each.marker.evaluate({"extra": extra}) for extra in _EXTRAS)
+    }
+    return [f"{name}=={metadata.version(name)}" for name in sorted(named - {own})]
 
 
 def folder_digest(folder: Path) -> str:
