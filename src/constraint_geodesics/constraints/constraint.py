@@ -211,6 +211,10 @@ class ConstraintManifold:
                 "the constraint has no reference pose: use constraint.relative_to(start pose)"
             )
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the arrays: they hold addresses, which another process has not."""
+        return {"robot": self.robot, "constraint": self.constraint}
+
     @property
     def codim(self) -> int:
         """Codimension in joint space."""
