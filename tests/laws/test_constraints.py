@@ -358,3 +358,8 @@ def test_a_kind_is_named_in_its_own_files_alone(kind) -> None:
         if any(word in file.read_text() for word in words)
     }
     assert named <= FILES[kind] | {f"certification/{kind.lower()}.py"}
+
+
+def test_another_process_gets_no_address(manifold) -> None:
+    assert manifold.arrays.constraint.linearise
+    assert set(vars(pickle.loads(pickle.dumps(manifold)))) == {"robot", "constraint"}
