@@ -15,11 +15,18 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from numba import carray, cfunc, njit, types
+from numba import carray, njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintError, Series
-from constraint_geodesics.constraints.kernels import ConstraintArrays, Rows, call, floats
+from constraint_geodesics.constraints.kernels import (
+    LINEARISE_WORDS,
+    ConstraintArrays,
+    Rows,
+    c_function,
+    call,
+    floats,
+)
 from constraint_geodesics.robot.kernels import new_posture, pose_of
 from constraint_geodesics.robot.kinematics import SerialRobot
 
@@ -207,12 +214,14 @@ def _compiled(residual: Writes, jacobian: Writes, count: int) -> tuple[Any, Any]
         place = carray(floats(q), (dof,))
         own_residual(place, carray(floats(value), (count,)))
         own_jacobian(place, carray(floats(slope), (count, dof)))
+        return 0
 
     def write_residual(q, out, dof):
         own_residual(carray(floats(q), (dof,)), carray(floats(out), (count,)))
+        return 0
 
-    words = [types.void(*(types.intp,) * number) for number in (12, 3)]
-    return cfunc(words[0])(write_both), cfunc(words[1])(write_residual)
+    both = c_function(write_both, LINEARISE_WORDS, cache=False)
+    return both, c_function(write_residual, 3, cache=False)
 
 
 @njit(**LEAF)

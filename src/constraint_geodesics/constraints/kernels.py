@@ -50,12 +50,19 @@ class ManifoldArrays(NamedTuple):
     constraint: Any
 
 
+LINEARISE_WORDS = 12
+"""Addresses of the chain's arrays, then of data, q, room, residual and Jacobian; D and m."""
+CURVATURE_WORDS = 6
+"""Addresses of the chain's prismatic, data, room, weights and of the matrix to fill; D."""
+
+
 class ConstraintArrays(NamedTuple):
     """A constraint of any kind, as the kernels take it.
 
-    data (n,): the kind's own numbers.  linearise, curvature: addresses of what `c_function` made,
-    the second 0 where there is no closed form.  room: how many numbers the two need to write into;
-    what the first leaves there is the second's.
+    data (n,): the kind's own numbers.  linearise, curvature: addresses of what `c_function` made of
+    functions of LINEARISE_WORDS and CURVATURE_WORDS integers, which `linearise` and `curvature`
+    here call; the second 0 where there is no closed form, and its answer 0 where it finds none.
+    room: how many numbers the two need to write into; what the first leaves there is the second's.
     """
 
     rows: Rows
@@ -65,27 +72,12 @@ class ConstraintArrays(NamedTuple):
     room: int
 
 
-LINEARISE = "origins, axes, prismatic, base, tool, data, q, room, residual, jacobian, dof, count"
-"""What `linearise` of a kind is called with: addresses of the chain's arrays, and of what
-`linearise` here has, then D and m.
-"""
-CURVATURE = "prismatic, data, room, weights, full, dof"
-"""What `curvature` of a kind is called with; it returns whether there was a closed form."""
-
-
-def c_function(function: Callable[..., Any], answers: bool = False) -> int:
-    """The address of a function of the arguments above, compiled and kept in numba's cache; the
-    caller keeps what is returned beside it alive by asking once.  answers: whether it returns.
+def c_function(function: Callable[..., int], words: int, cache: bool = True) -> Any:
+    """A C function of that many 64-bit integers that returns one; its `.address` is good while it
+    lives.  cache: whether numba's cache keeps it, which a closure can't use.
     """
-    count = function.__code__.co_argcount
-    returned = types.intp if answers else types.void
-    compiled = cfunc(returned(*(types.intp,) * count), **COMPILE)(function)
-    _KEPT.append(compiled)
-    address: int = compiled.address
-    return address
-
-
-_KEPT: list[Any] = []
+    options = {**COMPILE, "cache": cache}
+    return cfunc(types.intp(*(types.intp,) * words), **options)(function)
 
 
 @intrinsic

@@ -21,6 +21,8 @@ from numba import carray, njit
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintError, Pose, Series
 from constraint_geodesics.constraints.kernels import (
+    CURVATURE_WORDS,
+    LINEARISE_WORDS,
     ConstraintArrays,
     Rows,
     c_function,
@@ -92,7 +94,8 @@ class PoseConstraint(Constraint):
         """For the kernels."""
         pose, rows = self.reference or Pose(np.zeros(3), np.eye(3)), self.rows
         data = [rows.held, rows.tolerance, pose.position, np.ravel(pose.rotation)]
-        return ConstraintArrays(rows, np.concatenate(data), *_addresses(), _LINEAR + 15 * robot.dof)
+        addresses = (function.address for function in _compiled())
+        return ConstraintArrays(rows, np.concatenate(data), *addresses, _LINEAR + 15 * robot.dof)
 
     @property
     def is_free(self) -> bool:
@@ -402,6 +405,7 @@ def _write(origins, axes, prismatic, base, tool, data, q, room, residual, jacobi
                 for a in range(3):
                     value += linear[i - 3, a] * geometric[3 + a, d]
             out[i, d] = value
+    return 0
 
 
 def _bend(prismatic, data, room, weights, full, dof):
@@ -416,8 +420,8 @@ def _bend(prismatic, data, room, weights, full, dof):
 
 
 @cache
-def _addresses() -> tuple[int, int]:
-    return c_function(_write), c_function(_bend, answers=True)
+def _compiled() -> tuple[Any, Any]:
+    return c_function(_write, LINEARISE_WORDS), c_function(_bend, CURVATURE_WORDS)
 
 
 @njit(**LEAF)
