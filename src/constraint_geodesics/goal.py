@@ -7,9 +7,10 @@ to have an option for it, and its tests: planner, search, certification, recordi
 know configurations alone.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -20,7 +21,6 @@ from constraint_geodesics.problem import PlannerError
 ArrayLike = Float[np.ndarray, "D"] | Sequence[float]
 
 
-@runtime_checkable
 class Goal(Protocol):
     """A set of configurations, any of which may end the path."""
 
@@ -62,21 +62,23 @@ class ConfigurationGoal:
 
 def as_goal(goal: Goal | ArrayLike, dof: int) -> Goal:
     """A goal as it is; numbers are a configuration's.  Raises PlannerError if they are none."""
-    if isinstance(goal, Goal):
-        return goal
+    if hasattr(goal, "configurations"):  # asking for the protocol takes longer than a certificate
+        found: Goal = goal
+        return found
     return ConfigurationGoal(checked_configuration(goal, dof, "goal"))
 
 
 def checked_configuration(q: Any, dof: int, name: str) -> Float[np.ndarray, "D"]:
     """A copy of one configuration [rad].  Raises PlannerError with its name if it is none."""
     try:
-        if np.iscomplexobj(q):
+        given = np.asarray(q)
+        if given.dtype.kind == "c":
             raise TypeError("complex")
-        values = np.array(q, dtype=np.float64)
+        values = np.array(given, dtype=np.float64)
     except (TypeError, ValueError):
         raise PlannerError(f"{name} = {q}: must be {dof} numbers [rad]") from None
     if values.shape != (dof,):
         raise PlannerError(f"{name} has shape {values.shape}: must be ({dof},) [rad]")
-    if not np.isfinite(values).all():
+    if not all(map(math.isfinite, values.tolist())):
         raise PlannerError(f"{name}[{int(np.argmin(np.isfinite(values)))}] is not finite")
     return values

@@ -25,7 +25,7 @@ from constraint_geodesics.scene import convex_kernels as convex
 from constraint_geodesics.scene.clearance import clearance_model, path_stays_clear
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere
-from constraint_geodesics.search.band import BandCurve, project
+from constraint_geodesics.search.band import project
 from constraint_geodesics.search.candidates import Task, refined, rows_of
 from constraint_geodesics.search.roadmap import build_roadmap, join, shortest_way
 from constraint_geodesics.search.space import Space, space_of
@@ -73,6 +73,7 @@ def _kinematics() -> None:
 def _space_searched() -> None:
     own = _space()
     path_stays_clear(own.chain, own.clearance, _ROWS)
+    clearance_model(_scene().robot, _scene().workcell).clearance(_scene().robot, _ROWS)
     project(own, _ROWS.copy())
 
 
@@ -113,13 +114,6 @@ def _trees() -> None:
     tree_way(_space(), _ROWS[0], _ROWS[-1], 0)
 
 
-def _curves() -> None:
-    curve = BandCurve.through(_space(), _ROWS)
-    assert curve is not None
-    curve.at(np.linspace(0.0, 1.0, 5))
-    clearance_model(_scene().robot, _scene().workcell).clearance(_scene().robot, _ROWS)
-
-
 def _learned() -> None:
     robot, joints = _scene().robot, _ROWS[None].copy()
     bounds = plug(PULL_BOUNDS)(robot.lower, robot.upper, 1e-8)
@@ -143,7 +137,6 @@ JOBS = {
     "elastic band": Job(_band, ("space",)),
     "roadmap": Job(_roadmap, ("space",)),
     "trees": Job(_trees, ("roadmap",)),
-    "curves": Job(_curves, ("space",)),
     "learned method": Job(_learned, ("constraints and times",)),
 }
 """By their names, those that others wait for and the longest first."""

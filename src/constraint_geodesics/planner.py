@@ -249,7 +249,7 @@ class Planner:
         robot, constraint = self.scene.robot, query.task.manifold.constraint
         allowed = self._certifier.limits.violation_tolerance
         for share in _TIGHTENED:
-            _, joints = rows_of(candidate, share * allowed)
+            joints = rows_of(candidate, share * allowed)
             try:
                 times = time_parametrisation(joints, robot.velocity, self._acceleration)
             except GeometryError as error:

@@ -102,16 +102,19 @@ def quaternion_of(rotation: np.ndarray) -> np.ndarray:
     """The unit quaternion (w, x, y, z) whose rotation is nearest: Bar-Itzhack's symmetric
     eigenvector (2000).
     """
-    if rotation.shape != (3, 3) or not np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-6:
-        raise CertificationError(
-            f"the reference's rotation is {rotation.tolist()}: must be orthonormal"
-        )
+    if rotation.shape != (3, 3):
+        raise CertificationError(f"the reference's rotation has shape {rotation.shape}: not (3, 3)")
     return np.array(_nearest_quaternion(rotation.tobytes()))
 
 
 @lru_cache(maxsize=1024)
-def _nearest_quaternion(rotation: bytes) -> tuple[float, float, float, float]:
-    (a, b, c), (d, e, f), (g, h, i) = np.frombuffer(rotation).reshape(3, 3)
+def _nearest_quaternion(entries: bytes) -> tuple[float, float, float, float]:
+    rotation = np.frombuffer(entries).reshape(3, 3)
+    if not np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-6:
+        raise CertificationError(
+            f"the reference's rotation is {rotation.tolist()}: must be orthonormal"
+        )
+    (a, b, c), (d, e, f), (g, h, i) = rotation
     k = np.array(
         [
             [a - e - i, b + d, c + g, h - f],

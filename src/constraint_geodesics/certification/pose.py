@@ -1,7 +1,8 @@
 """Axes of the tool's pose, bounded along straight joint lines; proof in kernels.py."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,11 +33,8 @@ def kept(asked: Asked) -> Kept:
     """How well the constraint is kept at the rows and on the whole path."""
     attained, bound = nothing_exceeds()
     constraint, allowed = asked.constraint, asked.limits.violation_tolerance
-    place, quaternion = _reference(asked)
-    positions = any(constraint.axes[:3])
-    held = kernels.Held(*_angles_held(constraint, quaternion), positions, place)
-    channels = list(_channels(constraint, held.kind, held.k))
-    table = np.array([(c.kind, c.entry, c.tolerance, c.tolerance + allowed) for c in channels])
+    own = _Axes(tuple(constraint.axes), tuple(constraint.tolerance))
+    held, channels, table = _demanded(own, *_reference(asked), allowed)
     found = np.empty((len(channels), kernels.FOUND))
     wanted = max(_INTERPOLATION_SHARE * allowed, 1e-9)
     kernels.keep(asked.chain, held, table, asked.rows, wanted, found)
@@ -52,21 +50,41 @@ def kept(asked: Asked) -> Kept:
     return summed_up(attained, bound, at_rows, between, asked.limits)
 
 
-def _reference(asked: Asked) -> tuple[np.ndarray, np.ndarray]:
+class _Axes(NamedTuple):
+    """Which of the six are held, and how loosely."""
+
+    axes: tuple[int, ...]
+    tolerance: tuple[float, ...]
+
+
+@lru_cache(maxsize=256)
+def _demanded(
+    own: _Axes, place: bytes, turn: bytes, allowed: float
+) -> tuple[kernels.Held, list[_Channel], np.ndarray]:
+    """What is held, as numbers that have a tolerance, and their table for `kernels.keep`; of a
+    reference's position and quaternion, as bytes.
+    """
+    angles = _angles_held(own, np.frombuffer(turn).copy())
+    held = kernels.Held(*angles, any(own.axes[:3]), np.frombuffer(place).copy())
+    channels = list(_channels(own, held.kind, held.k))
+    table = np.array([(c.kind, c.entry, c.tolerance, c.tolerance + allowed) for c in channels])
+    return held, channels, table
+
+
+def _reference(asked: Asked) -> tuple[bytes, bytes]:
     """Position (3,) [m] and quaternion (w, x, y, z) of the reference: the constraint's, or that of
     `first`.
     """
     pose = asked.constraint.reference
     if pose is not None:
-        return np.ascontiguousarray(pose.position, np.float64), quaternion_of(
-            np.asarray(pose.rotation, float)
-        )
+        turn = quaternion_of(np.asarray(pose.rotation, float))
+        return np.asarray(pose.position, float).tobytes(), turn.tobytes()
     own = np.empty((1, 7))
     kernels.poses(asked.chain, np.ascontiguousarray(asked.first[None]), own)
-    return own[0, :3], own[0, [6, 3, 4, 5]]
+    return own[0, :3].tobytes(), own[0, [6, 3, 4, 5]].tobytes()
 
 
-def _angles_held(constraint: Any, reference: np.ndarray) -> tuple[int, int, np.ndarray]:
+def _angles_held(constraint: _Axes, reference: np.ndarray) -> tuple[int, int, np.ndarray]:
     """Kind, axis and anchor as `kernels.Held` has them, from the reference's quaternion; kind −1
     for no angle.
     """
@@ -80,7 +98,7 @@ def _angles_held(constraint: Any, reference: np.ndarray) -> tuple[int, int, np.n
     return (kernels.ROTATION if all(held) else -1), 0, back
 
 
-def _channels(constraint: Any, kind: int, k: int) -> Iterator[_Channel]:
+def _channels(constraint: _Axes, kind: int, k: int) -> Iterator[_Channel]:
     """What is held: the angles together where they share one tolerance, else each; and each
     position.
     """

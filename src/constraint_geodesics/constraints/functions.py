@@ -100,12 +100,12 @@ class FunctionsConstraint(Constraint):
 
     def arrays(self, robot: SerialRobot) -> ConstraintArrays:
         """For the kernels."""
-        both, _ = _compiled(self.residual, self.jacobian, len(self.bounds))
+        both = _compiled(self.residual, self.jacobian, len(self.bounds))
         return ConstraintArrays(self.rows, np.empty(0), both.address, 0, 0)
 
     def values(self, q: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "n m"]:
         """The residuals of configurations."""
-        address = _compiled(self.residual, self.jacobian, len(self.bounds))[1].address
+        address = _compiled(self.residual, self.jacobian, len(self.bounds)).address
         out = np.empty((len(q), len(self.bounds)))
         values_batch(address, np.require(q, np.float64, ("C", "W")), out)
         return out
@@ -203,32 +203,27 @@ def _made_again(origin: Origin, bounds: tuple[RowBound, ...]) -> FunctionsConstr
 
 
 @cache
-def _compiled(residual: Writes, jacobian: Writes, count: int) -> tuple[Any, Any]:
-    """Both functions as a C function for the search, and the residual as one of the addresses of q
-    and out and of D; kept, since the search holds their addresses.
-    """
+def _compiled(residual: Writes, jacobian: Writes, count: int) -> Any:
+    """Both functions as a C function for the search; kept, since the search holds its address."""
     options = {key: value for key, value in COMPILE.items() if key != "cache"}
     own_residual, own_jacobian = njit(**options)(residual), njit(**options)(jacobian)
 
-    def write_both(origins, axes, prismatic, base, tool, data, q, room, value, slope, dof, rows):
+    def write(origins, axes, prismatic, base, tool, data, q, room, value, slope, dof, rows):
         place = carray(floats(q), (dof,))
         own_residual(place, carray(floats(value), (count,)))
-        own_jacobian(place, carray(floats(slope), (count, dof)))
+        if slope != 0:
+            own_jacobian(place, carray(floats(slope), (count, dof)))
         return 0
 
-    def write_residual(q, out, dof):
-        own_residual(carray(floats(q), (dof,)), carray(floats(out), (count,)))
-        return 0
-
-    both = c_function(write_both, LINEARISE_WORDS, cache=False)
-    return both, c_function(write_residual, 3, cache=False)
+    return c_function(write, LINEARISE_WORDS, cache=False)
 
 
 @njit(**LEAF)
 def values_batch(address, q, out):
     """Residuals (B, m) of q (B, D), by the C function at an address."""
     for n in range(q.shape[0]):
-        call(address, (q[n].ctypes.data, out[n].ctypes.data, q.shape[1]))
+        place, value = q[n].ctypes.data, out[n].ctypes.data
+        call(address, (0, 0, 0, 0, 0, 0, place, 0, value, 0, q.shape[1], out.shape[1]))
 
 
 @constraint_factory

@@ -51,7 +51,9 @@ class ManifoldArrays(NamedTuple):
 
 
 LINEARISE_WORDS = 12
-"""Addresses of the chain's arrays, then of data, q, room, residual and Jacobian; D and m."""
+"""Addresses of the chain's arrays, then of data, q, room, residual and Jacobian, the last 0 where
+it is not asked for; D and m.
+"""
 CURVATURE_WORDS = 6
 """Addresses of the chain's prismatic, data, room, weights and of the matrix to fill; D."""
 
@@ -130,6 +132,17 @@ def linearise(manifold, q, room, residual, jacobian):
     """Residual (m,) and its Jacobian (m, D) of one configuration; rows that are not held are left
     alone.  room: of `ConstraintArrays.room` numbers.
     """
+    _ask(manifold, q, room, residual, jacobian.ctypes.data)
+
+
+@njit(inline="always", **LEAF)
+def residual_of(manifold, q, room, residual):
+    """As `linearise`, without the Jacobian."""
+    _ask(manifold, q, room, residual, 0)
+
+
+@njit(inline="always", **LEAF)
+def _ask(manifold, q, room, residual, jacobian):
     chain, own = manifold.chain, manifold.constraint
     words = (
         chain.origins.ctypes.data,
@@ -141,7 +154,7 @@ def linearise(manifold, q, room, residual, jacobian):
         q.ctypes.data,
         room.ctypes.data,
         residual.ctypes.data,
-        jacobian.ctypes.data,
+        jacobian,
         q.shape[0],
         residual.shape[0],
     )
@@ -222,12 +235,12 @@ def residual_batch(manifold, q, residuals, jacobians):
 @njit(**COMPILE)
 def violation_batch(manifold, q, worst):
     """The largest excess of each of q (B, D) into worst (B,)."""
-    dof, rows = q.shape[1], manifold.constraint.rows
+    rows = manifold.constraint.rows
     count = rows.held.shape[0]
     own, residual, excess = np.empty(manifold.constraint.room), np.zeros(count), np.empty(count)
-    jacobian, active = np.empty((count, dof)), np.empty(count, dtype=np.bool_)
+    active = np.empty(count, dtype=np.bool_)
     for b in range(q.shape[0]):
-        linearise(manifold, q[b], own, residual, jacobian)
+        residual_of(manifold, q[b], own, residual)
         worst[b] = excess_of(rows, residual, excess, active)
 
 

@@ -389,10 +389,12 @@ def _posture_at(room, dof):
 def _write(origins, axes, prismatic, base, tool, data, q, room, residual, jacobian, dof, count):
     chain, about = chain_at(origins, axes, prismatic, base, tool, dof), _about_at(data)
     posture, linear = _posture_at(room, dof), carray(floats(room), (3, 3))
-    geometric = carray(floats(room + 8 * (_LINEAR + 6 * dof)), (6, dof))
-    out = carray(floats(jacobian), (6, dof))
     pose_of(chain, carray(floats(q), (dof,)), posture)
     _residual(about, posture.position, posture.rotation, carray(floats(residual), (6,)), linear)
+    if jacobian == 0:
+        return 0
+    geometric = carray(floats(room + 8 * (_LINEAR + 6 * dof)), (6, dof))
+    out = carray(floats(jacobian), (6, dof))
     geometric_jacobian(chain.prismatic, posture, geometric)
     for i in range(6):
         if not about.held[i]:

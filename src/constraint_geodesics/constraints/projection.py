@@ -24,11 +24,15 @@ from constraint_geodesics.constraints.kernels import (
 class Retraction(NamedTuple):
     """Settings of the projection: accuracy asked for [rad or m], steps at most, longest step
     [rad].
+
+    last_step: a step shorter than this [rad] is the last.  What Newton's method leaves after it is
+    of its square, which is returned in place of a measured excess; 0 to measure always.
     """
 
     accuracy: float = 1e-9
     iterations: int = 50
     largest_step: float = 0.6
+    last_step: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -167,6 +171,8 @@ def retract_one(manifold, bounds, q, settings, room):
         scale = 1.0 if length <= settings.largest_step else settings.largest_step / length
         for d in range(dof):
             q[d] -= scale * step[d]
+        if length < settings.last_step:
+            return length * length
     return worst
 
 

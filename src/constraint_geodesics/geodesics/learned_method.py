@@ -34,7 +34,7 @@ from constraint_geodesics.learning.inference import FrozenManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import jump_excess
 from constraint_geodesics.params import GeodesicParams, RobotParams
-from constraint_geodesics.search.band import ACCURACY, BandCurve, step_lengths
+from constraint_geodesics.search.band import ACCURACY, step_lengths
 from constraint_geodesics.search.candidates import (
     Answer,
     Candidate,
@@ -248,8 +248,4 @@ def sampled(task: Task, curve: LatentCurve) -> Candidate | None:
     inside = robot.limit_distance(points).min() >= -_SLACK_RAD
     if not (left <= 1e3 * ACCURACY and inside and jump_excess(points, shares) == 0.0):
         return None
-    through = BandCurve.through(task.open, points)
-    if through is None:
-        return None
-    knots = through.spline.knots
-    return Candidate("policy", through, through.length, knots / knots[-1], points, 0)
+    return Candidate("policy", task.open, points, float(step_lengths(points).sum()), points)

@@ -19,6 +19,7 @@ Two neighbours that keep |a_i| ≤ A keep it at any common slower pace, so the s
 which the goal can be reached are an interval that begins at 0.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -80,20 +81,19 @@ def time_parametrisation(
         _limit(velocity, q.shape[1], "velocity"),
         _limit(acceleration, q.shape[1], "acceleration"),
     ]
-    if not np.isfinite(limits[1]).all():
+    if not all(map(math.isfinite, limits[1].tolist())):
         raise GeometryError(f"acceleration = {limits[1].tolist()}: must be finite")
+    times, spacing = np.empty(len(q)), np.empty(len(q) - 1)
+    if _spaced(q, spacing):
+        _times(q, spacing, *limits, times)
+        return times
     if not np.isfinite(q).all():
         row, joint = np.argwhere(~np.isfinite(q))[0]
         raise NonFiniteError("joints", (int(row), int(joint)), float(q[row, joint]))
-    spacing = np.linalg.norm(np.diff(q, axis=0), axis=1)
-    if not spacing.min() > COINCIDENT * spacing.sum():
-        row = int(spacing.argmin())
-        raise GeometryError(
-            f"joints[{row}] and joints[{row + 1}] coincide: neighbouring rows must differ"
-        )
-    times = np.empty(len(q))
-    _times(q, spacing, *limits, times)
-    return times
+    row = int(spacing.argmin())
+    raise GeometryError(
+        f"joints[{row}] and joints[{row + 1}] coincide: neighbouring rows must differ"
+    )
 
 
 def _limit(limit: np.ndarray, dim: int, what: str) -> np.ndarray:
@@ -102,9 +102,23 @@ def _limit(limit: np.ndarray, dim: int, what: str) -> np.ndarray:
         raise GeometryError(
             f"{what} has shape {values.shape}: must be ({dim},), one limit for each joint"
         )
-    if not (values > 0).all():
+    if not min(values.tolist()) > 0.0:
         raise GeometryError(f"{what} = {values.tolist()}: must be positive")
     return values
+
+
+@njit(**LEAF)
+def _spaced(q, spacing):
+    """Distances of neighbouring rows (T − 1,); whether all are finite and none coincide."""
+    total, least = 0.0, np.inf
+    for i in range(spacing.shape[0]):
+        square = 0.0
+        for d in range(q.shape[1]):
+            square += (q[i + 1, d] - q[i, d]) ** 2
+        spacing[i] = np.sqrt(square)
+        total += spacing[i]
+        least = min(least, spacing[i])
+    return np.isfinite(total) and least > COINCIDENT * total
 
 
 @njit(**COMPILE)

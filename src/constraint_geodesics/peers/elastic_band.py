@@ -181,5 +181,5 @@ def free_rows(problem: PlanningProblem, candidate: Candidate) -> Float[np.ndarra
     points bridge: there the rows in between know nothing of clearance, but are checked like all
     others.
     """
-    rows = halved(problem.manifold, rows_of(candidate, SATISFIED)[1])
+    rows = halved(problem.manifold, rows_of(candidate, SATISFIED))
     return rows if problem.keeps_clear(rows) else None

@@ -12,14 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints.projection import Retraction
-from constraint_geodesics.search import band_kernels, curve_kernels
+from constraint_geodesics.search import band_kernels
 from constraint_geodesics.search.space import Space, project_points
 
 ACCURACY = 1e-9
 """Violation [rad or m] that is left on a point of a curve, at most."""
-PROJECTION = Retraction(ACCURACY, iterations=12, largest_step=0.6)
-_PROJECTIONS = 6
-"""Iterations of a node's projection at most, after a step of the band."""
+PROJECTION = Retraction(ACCURACY, iterations=12, last_step=1e-5)
+_AFTER_STEP = PROJECTION._replace(iterations=6)
+"""The projection of a node after a step of the band."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class BandSettings:
     largest_step_rad: float = 0.5
     clearance_m: float = 0.006
 
-    def steps(self, guarded: bool) -> tuple[int, int, float, float, bool]:
+    def steps(self, guarded: bool) -> tuple[int, Retraction, float, float, bool]:
         """As `relax_band` takes them."""
-        return self.iterations, _PROJECTIONS, self.accuracy, self.largest_step_rad, guarded
+        return self.iterations, _AFTER_STEP, self.accuracy, self.largest_step_rad, guarded
 
 
 @dataclass(frozen=True)
@@ -63,41 +63,6 @@ def relax(
     return Band(moved, left, iterations, converged)
 
 
-@dataclass(frozen=True)
-class BandCurve:
-    """The continuous curve through a band: a cubic spline over arc length, every point projected
-    onto the space.
-
-    Both ends are the band's, to the bit.
-    """
-
-    space: Space
-    spline: curve_kernels.Spline
-
-    @classmethod
-    def through(cls, space: Space, nodes: Float[np.ndarray, "n D"]) -> "BandCurve | None":
-        """None where nodes coincide or are not finite, so that there is no curve."""
-        spline, sound = curve_kernels.spline_through(np.array(nodes, np.float64))
-        return cls(space, spline) if sound else None
-
-    @property
-    def nodes(self) -> Float[np.ndarray, "n D"]:
-        """Of the band [rad]."""
-        return self.spline.nodes
-
-    @property
-    def length(self) -> float:
-        """Of the band [rad]: the range of the spline's parameter."""
-        return float(self.spline.knots[-1])
-
-    def at(self, s: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n D"], float]:
-        """Points at shares of the way from 0 to 1, rising [rad], and what is left of the violation,
-        limits included.
-        """
-        points, left = curve_kernels.curve_points(self.space, self.spline, s, PROJECTION)
-        return points, float(left)
-
-
 def step_lengths(points: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T-1"]:
     """Distances between neighbouring points [rad]; `norm` and `diff` would cost as much again in
     calls.
@@ -107,4 +72,4 @@ def step_lengths(points: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T-1"]:
 
 def project(space: Space, points: Float[np.ndarray, "n D"]) -> float:
     """Move points onto the space, in place; returns what is left of the violation [rad or m]."""
-    return float(project_points(space, points, PROJECTION))
+    return float(project_points(space, points, np.ones(len(points), bool), PROJECTION))

@@ -580,7 +580,7 @@ def _promise(nodes, band):
 
 
 @njit(inline="always", **LEAF)
-def _moved(space, nodes, scale, iterations, band, work):
+def _moved(space, nodes, scale, projection, band, work):
     """The nodes after a share of the steps, projected, into `band.trial`; returns what remains of
     the violation.
     """
@@ -588,7 +588,7 @@ def _moved(space, nodes, scale, iterations, band, work):
     for i in range(1, nodes.shape[0] - 1):
         for d in range(nodes.shape[1]):
             trial[i, d] = nodes[i, d] + scale * band.steps[i - 1, d]
-        worst = max(worst, project_node(space, trial[i], iterations, work))
+        worst = max(worst, project_node(space, trial[i], projection, work))
     return worst
 
 
@@ -597,17 +597,17 @@ def relax_band(space, nodes, settings):
     """Shorten a band (n + 1, D) in place; returns (what remains of the violation, iterations used,
     converged).
 
-    settings: iterations at most, and those of a node's projection; relative decrease of energy,
+    settings: iterations at most; a node's projection after a step; relative decrease of energy,
     predicted by Newton's step or made, below which it has converged; longest step of a node [rad];
     whether lines between its nodes that touch nothing keep that.
     """
-    most, projections, accuracy, largest, guarded = settings
+    most, projection, accuracy, largest, guarded = settings
     n = nodes.shape[0] - 1
     work, band = new_work(space), _new_band(nodes)
     trial = band.trial
     worst, used, converged = 0.0, 0, False
     for i in range(1, n):
-        worst = max(worst, project_node(space, nodes[i], space.iterations, work.node))
+        worst = max(worst, project_node(space, nodes[i], space.projection, work.node))
     energy = band_energy(nodes)
     for _ in range(most):
         used += 1
@@ -624,7 +624,7 @@ def relax_band(space, nodes, settings):
                 break
         scale, improved = 1.0 if longest <= largest else largest / longest, False
         for _ in range(6):
-            left = _moved(space, nodes, scale, projections, band, work.node)
+            left = _moved(space, nodes, scale, projection, band, work.node)
             if guarded:
                 _hold_back(space, nodes, trial, band.held, work.node)
             after = band_energy(trial)

@@ -11,6 +11,7 @@ of their own (methods.py), through `refined` or not.
 
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -19,7 +20,7 @@ from jaxtyping import Float
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.problem import Status
 from constraint_geodesics.scene.clearance import ClearanceModel, path_stays_clear
-from constraint_geodesics.search.band import PROJECTION, BandCurve, BandSettings
+from constraint_geodesics.search.band import PROJECTION, BandSettings
 from constraint_geodesics.search.curve_kernels import relaxed_curve, rows_along
 from constraint_geodesics.search.roadmap import Joined, Roadmap, join, resample, shortest_way
 from constraint_geodesics.search.space import Space, space_of
@@ -75,16 +76,16 @@ class Task:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A curve that looks sound: where it came from, its length [rad], and points about CHECK_STEP
-    apart.
+    """A curve that looks sound: where it came from, the space that it is in, its points about
+    CHECK_STEP apart and their length [rad]; the nodes of its band, and the iterations that took.
     """
 
     source: Source
-    curve: BandCurve
+    space: Space
+    points: Float[np.ndarray, "T D"]
     length: float
-    shares: Float[np.ndarray, "n"]
-    points: Float[np.ndarray, "n D"]
-    iterations: int
+    nodes: Float[np.ndarray, "n D"]
+    iterations: int = 0
 
 
 @dataclass(frozen=True)
@@ -110,16 +111,11 @@ def candidates(
     A straight start that touches something is pushed out of it only after the graph was asked: that
     takes longer.  Trees come last, and not where the graph holds the ends to be unconnected.
     """
-    segments = task.settings.segments
     blocked = None
     if parts.straight:
-        share = np.linspace(0.0, 1.0, segments + 1)[:, None]
-        found = _relaxed(
-            task,
-            "straight",
-            (1.0 - share) * start + share * goal,
-            _settings(task, parts.refinement),
-        )
+        share = _shares(task.settings.segments)
+        line = (1.0 - share) * start + share * goal
+        found = _relaxed(task, "straight", line, _settings(task, parts.refinement))
         if found is not None and _is_clear(task, found.points):
             yield found
         else:
@@ -128,7 +124,7 @@ def candidates(
     if parts.graph:
         answer = yield from _over_graph(task, start, goal, parts.refinement, blocked is not None)
     if blocked is not None and parts.refinement:
-        pushed = _relaxed(task, "straight", blocked.curve.nodes, task.settings, clear=True)
+        pushed = _relaxed(task, "straight", blocked.nodes, task.settings, clear=True)
         if pushed is not None and _is_clear(task, pushed.points):
             yield pushed
     if parts.tree and answer.status != "not_connected":
@@ -149,8 +145,7 @@ def improvements(
 
     Which is tried when depends on nothing but the query.
     """
-    rng, segments = np.random.default_rng(0), task.settings.segments
-    t = np.linspace(0.0, 1.0, segments + 1)[:, None]
+    rng, t = np.random.default_rng(0), _shares(task.settings.segments)
     line = (1.0 - t) * start + t * goal
     roadmap = task.roadmap() if parts.graph else None
     nodes = np.empty((0, len(start))) if roadmap is None else roadmap.joints
@@ -269,6 +264,11 @@ def refined(
     return found if found is not None and _is_clear(task, found.points) else None
 
 
+@cache
+def _shares(segments: int) -> Float[np.ndarray, "n 1"]:
+    return np.linspace(0.0, 1.0, segments + 1)[:, None]
+
+
 def _settings(task: Task, refine: bool) -> BandSettings:
     return task.settings if refine else replace(task.settings, iterations=0)
 
@@ -285,11 +285,10 @@ def _relaxed(
     the constraint or the limits, or jump.
     """
     space = task.clear if clear else task.open
-    sound, spline, shares, points, length, iterations = relaxed_curve(
+    sound, relaxed, points, length, iterations = relaxed_curve(
         space, np.ascontiguousarray(nodes), settings.steps(guarded), PROJECTION
     )
-    curve = BandCurve(space, spline)
-    return Candidate(source, curve, length, shares, points, iterations) if sound else None
+    return Candidate(source, space, points, length, relaxed, iterations) if sound else None
 
 
 def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
@@ -297,13 +296,11 @@ def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
     return not model.top or path_stays_clear(task.manifold.robot.chain, model, points)
 
 
-def rows_of(
-    candidate: Candidate, violation: float
-) -> tuple[Float[np.ndarray, "T"], Float[np.ndarray, "T D"]]:
+def rows_of(candidate: Candidate, violation: float) -> Float[np.ndarray, "T D"]:
     """Rows so close that straight joint lines between them leave the constraint by less than
-    `violation` [rad or m]: the shares of the way and the rows (T, D).
+    `violation` [rad or m], the candidate's points among them.
     """
-    curve, allowed = candidate.curve, ROW_SAFETY * violation
-    along = curve.spline, candidate.shares, candidate.points
-    shares, rows = rows_along(curve.space, along, allowed, PROJECTION)
-    return shares, rows
+    rows: np.ndarray = rows_along(
+        candidate.space, candidate.points, ROW_SAFETY * violation, PROJECTION
+    )
+    return rows

@@ -132,39 +132,40 @@ def curve_points(space, curve, shares, settings):
     """Points (T, D) at rising shares of the way, from 0 to 1, projected onto the space, but for
     both ends, which are the nodes' to the bit; and what remains of the violation of the worst.
     """
-    points = np.empty((shares.shape[0], curve.nodes.shape[1]))
+    points, inner = (
+        np.empty((shares.shape[0], curve.nodes.shape[1])),
+        np.empty(shares.shape[0], np.bool_),
+    )
     _along(curve, shares, points)
-    left = project_points(space, points, settings)
     for k in range(shares.shape[0]):
-        if shares[k] == 0.0:
-            points[k] = curve.nodes[0]
-        if shares[k] == 1.0:
-            points[k] = curve.nodes[-1]
-    return points, left
+        inner[k] = 0.0 < shares[k] < 1.0
+        if not inner[k]:
+            points[k] = curve.nodes[0] if shares[k] == 0.0 else curve.nodes[-1]
+    return points, project_points(space, points, inner, settings)
 
 
 @njit(**COMPILE)
 def relaxed_curve(space, nodes, steps, settings):
-    """The curve through a relaxed band, with points about CHECK_STEP apart.
+    """The curve through a relaxed band, as points about CHECK_STEP apart.
 
     steps: of `relax_band`; settings: of the projection.  Returns whether it is sound: its points
-    are on the space, and none jumps; the spline, shares and points, their length and the
+    are on the space, and none jumps; the band's nodes, the points, their length and the
     iterations.
     """
     moved = nodes.copy()
     _, used, _ = relax_band(space, moved, steps)
     curve, sound = spline_through(moved)
+    if not sound:
+        return False, moved, moved, 0.0, used
     length = curve.knots[-1]
-    count = max(int(np.ceil(length / CHECK_STEP)), 2) if sound else 1
+    count = max(int(np.ceil(length / CHECK_STEP)), 2)
     shares = np.empty(count + 1)
     for k in range(count + 1):
         shares[k] = k / count
-    if not sound:
-        return False, curve, shares, moved, 0.0, used
     points, left = curve_points(space, curve, shares, settings)
     total, longest = step_lengths(points, np.empty(count))
     sound = not (left > _LEFT or longest > JUMP * length / count)
-    return sound, curve, shares, points, total, used
+    return sound, moved, points, total, used
 
 
 @njit(**COMPILE)
@@ -177,36 +178,35 @@ def _halfway(space, points):
 
 
 @njit(**COMPILE)
-def rows_along(space, candidate, allowed, settings):
-    """Rows so close that straight joint lines between them leave the constraint by at most
-    `allowed` [rad or m]; and their shares of the way.
+def rows_along(space, points, allowed, settings):
+    """Rows (T, D) on the curve through points of the space, these among them, so close that
+    straight joint lines between them leave the constraint by at most `allowed` [rad or m]; the
+    points alone where two of them coincide.
 
-    candidate: a spline, and shares and points of it.  Between two points h apart a straight line is
-    off by r''h²/8; halfway it is measured, and h chosen from it.  Near a singular configuration r''
-    changes faster than that: lines that are still off are halved.
+    The curve is the spline through the points, projected: so close to the constraint that a step or
+    two do.  Between two points h apart a straight line is off by r''h²/8; halfway it is measured,
+    and h chosen from it.  Near a singular configuration r'' changes faster than that: lines that
+    are still off are halved.
     """
-    curve, looked_at, points = candidate
-    count = looked_at.shape[0] - 1
-    steps, halfway = np.empty(count), _halfway(space, points)
-    step_lengths(points, steps)
-    pieces, total = np.empty(count, dtype=np.int64), 0
-    for i in range(count):
-        wanted = max(np.sqrt(halfway[i] / allowed), steps[i] / LONGEST_ROW_STEP)
-        pieces[i] = max(int(np.ceil(wanted)), 1)
-        total += pieces[i]
-    shares, k = np.zeros(total + 1), 0
-    for i in range(count):
-        step = (looked_at[i + 1] - looked_at[i]) / pieces[i]
-        for _ in range(pieces[i]):
-            shares[k + 1] = shares[k] + step
+    curve, sound = spline_through(points)
+    if not sound:
+        return points.copy()
+    shares, new = _drawn_closer(curve, _halfway(space, points), allowed)
+    rows = np.empty((shares.shape[0], points.shape[1]))
+    _along(curve, shares, rows)
+    k = 0
+    for i in range(shares.shape[0]):
+        if not new[i]:
+            rows[i] = points[k]
             k += 1
-    shares[total] = 1.0
-    rows, _ = curve_points(space, curve, shares, settings)
+    project_points(space, rows, new, settings)
     for _ in range(HALVINGS):
         steps, halfway = np.empty(rows.shape[0] - 1), _halfway(space, rows)
         step_lengths(rows, steps)
-        off = (halfway > allowed) | (steps > 1.1 * LONGEST_ROW_STEP)
-        extra = np.sum(off)
+        off, extra = np.empty(steps.shape[0], np.bool_), 0
+        for i in range(steps.shape[0]):
+            off[i] = halfway[i] > allowed or steps[i] > 1.1 * LONGEST_ROW_STEP
+            extra += off[i]
         if extra == 0:
             break
         between, k = np.empty(extra), 0
@@ -214,9 +214,31 @@ def rows_along(space, candidate, allowed, settings):
             if off[i]:
                 between[k] = 0.5 * (shares[i] + shares[i + 1])
                 k += 1
-        new, _ = curve_points(space, curve, between, settings)
-        shares, rows = _inserted(off, shares, rows, between, new)
-    return shares, rows
+        inserted, _ = curve_points(space, curve, between, settings)
+        shares, rows = _inserted(off, shares, rows, between, inserted)
+    return rows
+
+
+@njit(**COMPILE)
+def _drawn_closer(curve, halfway, allowed):
+    """Shares (T,) of the way whose lines are to be off by no more than is allowed, the curve's
+    knots among them, and which of them are new (T,).
+    """
+    knots, count = curve.knots, halfway.shape[0]
+    pieces, total = np.empty(count, dtype=np.int64), 0
+    for i in range(count):
+        step = knots[i + 1] - knots[i]
+        wanted = max(np.sqrt(halfway[i] / allowed), step / LONGEST_ROW_STEP)
+        pieces[i] = max(int(np.ceil(wanted)), 1)
+        total += pieces[i]
+    shares, new, k = np.empty(total + 1), np.ones(total + 1, np.bool_), 0
+    for i in range(count):
+        new[k] = False
+        for j in range(pieces[i]):
+            shares[k] = (knots[i] + j * (knots[i + 1] - knots[i]) / pieces[i]) / knots[-1]
+            k += 1
+    shares[total], new[total] = 1.0, False
+    return shares, new
 
 
 @njit(**COMPILE)

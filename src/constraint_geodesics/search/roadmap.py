@@ -161,7 +161,7 @@ def edge_length(space, first, second, work):
     for k in range(1, pieces + 1):
         for d in range(dof):
             point[d] = first[d] + k / pieces * (second[d] - first[d])
-        if k < pieces and project_node(space, point, space.iterations, work) > 1e-6:
+        if k < pieces and project_node(space, point, space.projection, work) > 1e-6:
             return np.inf
         step = 0.0
         for d in range(dof):
@@ -215,7 +215,7 @@ def _holds(space, joints, begins, leads, lengths, looked_at, way):
                 continue
             point = joints[there].copy()  # a node may lie in what the graph does not know
             holds = (
-                project_node(space, point, space.iterations, work) <= 1e-6
+                project_node(space, point, space.projection, work) <= 1e-6
                 and np.sum((point - joints[there]) ** 2) < EDGE_STEP**2
                 and edge_length(space, joints[here], joints[there], work) < np.inf
             )

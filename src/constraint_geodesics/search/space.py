@@ -12,6 +12,7 @@ from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.kernels import ManifoldArrays, excess_of, linearise
 from constraint_geodesics.constraints.projection import (
+    Retraction,
     new_room,
     normal_matrix,
     retract_one,
@@ -36,15 +37,13 @@ CLOSE = 0.03
 """So are bodies that are so close beyond their margin [m]."""
 STILL = 1e-9
 """A contact whose distance no joint changes by more [m/rad] is none to be kept."""
-_REACHED = 1e-9
-_LONGEST_STEP = 0.6
 _RIDGE = 1e-9
 _SMALLEST_PIVOT = 1e-12
 
 
 class Space(NamedTuple):
     """As the compiled search takes it.  constraint: of `Constraint.arrays`; limits (2, D): lower
-    and upper [rad or m]; margin: kept by bodies that may meet [m].
+    and upper [rad or m]; margin: kept by bodies that may meet [m]; projection: onto all of them.
     """
 
     chain: ChainArrays
@@ -52,7 +51,7 @@ class Space(NamedTuple):
     limits: Float[np.ndarray, "2 D"]
     clearance: ClearanceArrays
     margin: float
-    iterations: int = 12
+    projection: Retraction = Retraction(iterations=12)
 
 
 def space_of(
@@ -157,15 +156,15 @@ def is_free(space, first, second, work):
 
 
 @njit(**LEAF)
-def project_node(space, q, iterations, work):
+def project_node(space, q, settings, work):
     """Gauss-Newton of one configuration onto constraint, joint limits and clearance together, in
-    place; returns what remains [rad or m].
+    place; returns what remains [rad or m].  settings: a Retraction.
     """
     rows, right, normal, squares = work.rows, work.right, work.normal, work.squares
     worst = np.inf
-    for iteration in range(iterations + 1):
+    for iteration in range(settings.iterations + 1):
         size, worst = _broken(space, q, work)
-        if worst <= _REACHED or size == 0 or iteration == iterations:
+        if worst <= settings.accuracy or size == 0 or iteration == settings.iterations:
             break
         trace = normal_matrix(rows, size, normal)
         for i in range(size):
@@ -181,20 +180,23 @@ def project_node(space, q, iterations, work):
         square = 0.0
         for d in range(q.shape[0]):
             square += squares[d]
-        scale = 1.0 if square <= _LONGEST_STEP**2 else _LONGEST_STEP / np.sqrt(square)
+        longest = settings.largest_step
+        scale = 1.0 if square <= longest**2 else longest / np.sqrt(square)
         for d in range(q.shape[0]):
             for i in range(size):
                 q[d] -= scale * rows[i, d] * right[i]
+        if square < settings.last_step**2:
+            return square
     return worst
 
 
 @njit(**COMPILE)
-def project_each(space, points, iterations):
+def project_each(space, points, settings):
     """Project points (T, D) in place; returns what remains of the violation of the worst."""
     work = workspace(space)
     worst = 0.0
     for i in range(points.shape[0]):
-        worst = max(worst, project_node(space, points[i], iterations, work))
+        worst = max(worst, project_node(space, points[i], settings, work))
     return worst
 
 
@@ -212,17 +214,19 @@ def _is_within(space, q, work):
 
 
 @njit(**COMPILE)
-def project_points(space, points, settings):
-    """Project points (T, D) in place: onto the constraint alone, which is cheap, and onto limits
-    and clearance together with it only where one of them is broken then; returns what remains of
-    the violation of the worst [rad or m].
+def project_points(space, points, open_ones, settings):
+    """Project those points (T, D) that are marked (T,), in place: onto the constraint alone, which
+    is cheap, and onto limits and clearance together with it only where one of them is broken then;
+    returns what remains of the violation of the worst [rad or m].
     """
     room, work = new_room(space.constraint, points.shape[1]), workspace(space)
     manifold = ManifoldArrays(space.chain, space.constraint)
     bounds, worst = space.constraint.rows, 0.0
     for i in range(points.shape[0]):
+        if not open_ones[i]:
+            continue
         left = retract_one(manifold, bounds, points[i], settings, room)
         if not _is_within(space, points[i], work):
-            left = project_node(space, points[i], settings.iterations, work)
+            left = project_node(space, points[i], space.projection, work)
         worst = max(worst, left)
     return worst

@@ -90,7 +90,7 @@ def _extended(space, nodes, parents, count, node, target, step, work, point):
         share = 1.0 if before <= step else step / before
         for d in range(dof):
             point[d] = nodes[node, d] + share * (target[d] - nodes[node, d])
-        if project_node(space, point, space.iterations, work) > _LEFT:
+        if project_node(space, point, space.projection, work) > _LEFT:
             return count, node, False
         after, moved = 0.0, 0.0
         for d in range(dof):
