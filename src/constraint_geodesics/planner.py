@@ -152,7 +152,7 @@ class Planner:
         """
         self._require_open()
         given, name = self._named(constraint)
-        given.arrays(self.scene.robot)  # functions of the user's own are compiled by this
+        given.compile()
         began = time.perf_counter()
         if budget_s is not None and not (np.isfinite(budget_s) and budget_s > 0.0):
             raise PlannerError(f"budget_s = {budget_s}: must be a positive number of seconds")
