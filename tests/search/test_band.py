@@ -4,6 +4,7 @@ differences.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -22,8 +23,8 @@ from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.clearance import ClearanceModel, clearance_model, path_stays_clear
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search import band_kernels
-from constraint_geodesics.search.band import BandCurve, BandSettings, project, relax
-from constraint_geodesics.search.space import project_each, space_of
+from constraint_geodesics.search.band import BandCurve, BandSettings, project
+from constraint_geodesics.search.space import space_of
 
 MARGIN = 0.006
 HOME = np.array([-1.35, -0.47, -0.87, -2.28, 0.34, 0.74])
@@ -115,10 +116,27 @@ def pulls(nodes: np.ndarray) -> np.ndarray:
     return 2.0 * nodes[1:-1] - nodes[:-2] - nodes[2:]
 
 
+class Band(NamedTuple):
+    """A relaxed band: nodes (n + 1, D) [rad], what is left of the violation, iterations, and
+    whether it converged.
+    """
+
+    nodes: np.ndarray
+    violation: float
+    iterations: int
+    converged: bool
+
+
+def relax(space: tuple, nodes: np.ndarray, settings: BandSettings, guarded: bool = False) -> Band:
+    """The shortest band near the given one, its ends fixed."""
+    moved = np.array(nodes, np.float64)
+    return Band(moved, *band_kernels.relax_band(space, moved, settings.steps(guarded)))
+
+
 def projected(space: tuple, nodes: np.ndarray) -> tuple[np.ndarray, float]:
     """The band before any step is taken, and what its nodes leave of the violation."""
     band = relax(space, nodes, BandSettings(iterations=0))
-    return band.nodes, project_each(space, band.nodes[1:-1].copy(), 0)
+    return band.nodes, band.violation
 
 
 @pytest.mark.parametrize("name", EVERY)
