@@ -67,9 +67,7 @@ class Planner:
         self._acceleration = np.full(dof, settings.acceleration_rad_s2)
         self._certifier = Certifier(self.scene, limits_of(settings, bundle.judge, dof))
         checks = self._certifier.collisions
-        self._preparation = Preparation(
-            self.scene, checks, settings, self.method.draw, checks.apart
-        )
+        self._preparation = Preparation(self.scene, checks, settings, self.method.draw)
         roadmaps = bundle.roadmaps if self.method.roadmaps is None else self.method.roadmaps
         self._preparation.supply(self.constraints, roadmaps)
         self.band = self._preparation.band
