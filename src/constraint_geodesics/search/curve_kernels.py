@@ -37,7 +37,7 @@ class Spline(NamedTuple):
 
 
 @njit(**LEAF)
-def step_lengths(points, steps):
+def _write_steps(points, steps):
     """Distances between neighbouring points (T, D) into steps (T − 1,); returns their sum and the
     longest.
     """
@@ -117,7 +117,7 @@ def spline_through(nodes):
     """
     n = nodes.shape[0] - 1
     h, knots, moments = np.empty(n), np.zeros(n + 1), np.empty(nodes.shape)
-    step_lengths(nodes, h)
+    _write_steps(nodes, h)
     curve = Spline(knots, nodes, moments)
     for i in range(n):
         if not (np.isfinite(h[i]) and h[i] > _COINCIDENT):
@@ -162,7 +162,7 @@ def relaxed_curve(space, nodes, steps, settings):
     if not sound:
         return False, curve, shares, moved, 0.0, used
     points, left = curve_points(space, curve, shares, settings)
-    total, longest = step_lengths(points, np.empty(count))
+    total, longest = _write_steps(points, np.empty(count))
     sound = not (left > _LEFT or longest > JUMP * length / count)
     return sound, curve, shares, points, total, used
 
@@ -188,7 +188,7 @@ def rows_along(space, candidate, allowed, settings):
     curve, looked_at, points = candidate
     count = looked_at.shape[0] - 1
     steps, halfway = np.empty(count), _halfway(space, points)
-    step_lengths(points, steps)
+    _write_steps(points, steps)
     pieces, total = np.empty(count, dtype=np.int64), 0
     for i in range(count):
         wanted = max(np.sqrt(halfway[i] / allowed), steps[i] / LONGEST_ROW_STEP)
@@ -204,7 +204,7 @@ def rows_along(space, candidate, allowed, settings):
     rows, _ = curve_points(space, curve, shares, settings)
     for _ in range(HALVINGS):
         steps, halfway = np.empty(rows.shape[0] - 1), _halfway(space, rows)
-        step_lengths(rows, steps)
+        _write_steps(rows, steps)
         off = (halfway > allowed) | (steps > 1.1 * LONGEST_ROW_STEP)
         extra = np.sum(off)
         if extra == 0:
