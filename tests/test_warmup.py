@@ -153,6 +153,12 @@ def test_what_fails_is_one_line(monkeypatch) -> None:
         warmup._compile_all(2, lambda *_: None)
 
 
+def test_windows_has_no_lock_between_processes(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "fcntl", None)
+    with warmup._alone():
+        pass
+
+
 def test_every_piece_comes_after_some_that_exist() -> None:
     names = list(JOBS)
     for name, job in JOBS.items():

@@ -67,9 +67,7 @@ class Planner:
         self._acceleration = np.full(dof, settings.acceleration_rad_s2)
         self._certifier = Certifier(self.scene, limits_of(settings, bundle.judge, dof))
         checks = self._certifier.collisions
-        self._preparation = Preparation(
-            self.scene, checks, settings, self.method.draw, checks.apart
-        )
+        self._preparation = Preparation(self.scene, checks, settings, self.method.draw)
         roadmaps = bundle.roadmaps if self.method.roadmaps is None else self.method.roadmaps
         self._preparation.supply(self.constraints, roadmaps)
         self.band = self._preparation.band
@@ -152,7 +150,7 @@ class Planner:
         """
         self._require_open()
         given, name = self._named(constraint)
-        given.arrays(self.scene.robot)  # functions of the user's own are compiled by this
+        given.compile()
         began = time.perf_counter()
         if budget_s is not None and not (np.isfinite(budget_s) and budget_s > 0.0):
             raise PlannerError(f"budget_s = {budget_s}: must be a positive number of seconds")

@@ -3,7 +3,6 @@
 The kernels are kept in numba's cache (kernel_cache.py); a mark beside them says that all are there.
 """
 
-import fcntl
 import os
 import subprocess
 import sys
@@ -79,7 +78,10 @@ def _alone() -> Iterator[None]:
     folder = Path(forward_batch.stats.cache_path)
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "warmup.lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        with suppress(ImportError):  # on Windows, where two processes may compile the same
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
 

@@ -4,6 +4,7 @@ differences.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -22,8 +23,15 @@ from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.clearance import ClearanceModel, clearance_model, path_stays_clear
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search import band_kernels
-from constraint_geodesics.search.band import BandCurve, BandSettings, project, relax
-from constraint_geodesics.search.space import project_each, space_of
+from constraint_geodesics.search.band import PROJECTION, BandSettings, project
+from constraint_geodesics.search.curve_kernels import (
+    LONGEST_ROW_STEP,
+    curve_points,
+    relaxed_curve,
+    rows_along,
+    spline_through,
+)
+from constraint_geodesics.search.space import space_of
 
 MARGIN = 0.006
 HOME = np.array([-1.35, -0.47, -0.87, -2.28, 0.34, 0.74])
@@ -115,10 +123,27 @@ def pulls(nodes: np.ndarray) -> np.ndarray:
     return 2.0 * nodes[1:-1] - nodes[:-2] - nodes[2:]
 
 
+class Band(NamedTuple):
+    """A relaxed band: nodes (n + 1, D) [rad], what is left of the violation, iterations, and
+    whether it converged.
+    """
+
+    nodes: np.ndarray
+    violation: float
+    iterations: int
+    converged: bool
+
+
+def relax(space: tuple, nodes: np.ndarray, settings: BandSettings, guarded: bool = False) -> Band:
+    """The shortest band near the given one, its ends fixed."""
+    moved = np.array(nodes, np.float64)
+    return Band(moved, *band_kernels.relax_band(space, moved, settings.steps(guarded)))
+
+
 def projected(space: tuple, nodes: np.ndarray) -> tuple[np.ndarray, float]:
     """The band before any step is taken, and what its nodes leave of the violation."""
     band = relax(space, nodes, BandSettings(iterations=0))
-    return band.nodes, project_each(space, band.nodes[1:-1].copy(), 0)
+    return band.nodes, band.violation
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -379,7 +404,7 @@ def test_bands_of_one_segment_or_of_no_numbers_end(spaces) -> None:
         nodes[3, 2] = bad
         band = relax(space, nodes, BandSettings())
         assert not band.converged
-        assert BandCurve.through(space, band.nodes) is None
+        assert not spline_through(band.nodes)[1]
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -388,34 +413,62 @@ def test_a_curve_runs_through_its_ends_and_on_the_constraint(spaces, name) -> No
     robot, shares = manifold.robot, np.linspace(0.0, 1.0, 200)
     for nodes in spaces.lines(name, 16, 5, seed=9):
         band = relax(space, nodes, BandSettings())
-        curve = BandCurve.through(space, band.nodes)
-        if band.violation > 1e-6 or curve is None:
+        curve, sound = spline_through(band.nodes)
+        if band.violation > 1e-6 or not sound:
             continue
-        points, left = curve.at(shares)
+        points, left = curve_points(space, curve, shares, PROJECTION)
         assert points[0].tobytes() == nodes[0].tobytes()
         assert points[-1].tobytes() == nodes[-1].tobytes()
         assert left <= 1e-6
         assert manifold.violation(points).max() <= 1e-6
         assert robot.limit_distance(points).min() >= -1e-6
         assert spaces.model.clearance(robot, points).min() >= MARGIN - 1e-6
-        assert curve.length == pytest.approx(length(band.nodes), rel=1e-12)
+        whole = curve.knots[-1]
+        assert whole == pytest.approx(length(band.nodes), rel=1e-12)
         at_nodes = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(band.nodes, axis=0), axis=1))]
         )
-        again, _ = curve.at(np.minimum(at_nodes / curve.length, 1.0))
+        again, _ = curve_points(space, curve, np.minimum(at_nodes / whole, 1.0), PROJECTION)
         np.testing.assert_allclose(again, band.nodes, atol=1e-6)
-        assert length(points) == pytest.approx(curve.length, rel=0.05)
+        assert length(points) == pytest.approx(whole, rel=0.05)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_rows_lie_on_the_space_between_the_curves_points_and_keep_the_constraint_between_them(
+    spaces, name
+) -> None:
+    manifold, space = spaces.manifolds[name], spaces.clear(name)
+    tried = 0
+    for nodes in spaces.lines(name, 16, 5, seed=11):
+        sound, _, points, total, _ = relaxed_curve(
+            space, nodes, BandSettings().steps(False), PROJECTION
+        )
+        if not sound:
+            continue
+        tried += 1
+        rows = rows_along(space, points, 1e-4, PROJECTION)
+        at = [np.flatnonzero((rows == point).all(axis=1)) for point in points]
+        assert (np.diff([k[0] for k in at]) > 0).all()
+        assert manifold.violation(rows).max() <= 1e-6
+        assert manifold.robot.limit_distance(rows).min() >= -1e-6
+        assert length(rows) == pytest.approx(total, rel=0.01)
+        steps = np.linalg.norm(np.diff(rows, axis=0), axis=1)
+        assert steps.max() <= 1.1 * LONGEST_ROW_STEP
+        between = np.linspace(0.0, 1.0, 9)[:, None, None] * np.diff(rows, axis=0) + rows[:-1]
+        assert manifold.violation(between).max() <= 1.3e-4
+    assert tried > 0
 
 
 def test_there_is_no_curve_through_nodes_that_coincide_or_are_no_numbers(spaces) -> None:
     space = spaces.open("free")
     nodes = straight(HOME, HOME + 0.5, 8)
-    assert BandCurve.through(space, nodes) is not None
+    assert spline_through(nodes)[1]
     for row, value in ((0, HOME + 0.5 / 8), (4, nodes[3]), (8, nodes[7]), (5, np.nan), (5, np.inf)):
         broken = nodes.copy()
         broken[row] = value
-        assert BandCurve.through(space, broken) is None
-    assert BandCurve.through(space, np.tile(HOME, (9, 1))) is None
+        assert not spline_through(broken)[1]
+        np.testing.assert_array_equal(rows_along(space, broken, 1e-4, PROJECTION), broken)
+    assert not spline_through(np.tile(HOME, (9, 1)))[1]
 
 
 def test_points_are_projected_from_beside_the_space(spaces) -> None:

@@ -48,7 +48,7 @@ def test_contacts_that_no_joint_moves_leave_the_others_to_be_mended(turntable: S
     space = space_of(free, clearance_model(turntable, (*BLOCKS, POST)), MARGIN)
     post, q = clearance_model(turntable, (POST,)), np.zeros(2)
     assert post.clearance(turntable, q) == pytest.approx(0.003, abs=1e-9)
-    left = project_node(space, q, 12, workspace(space))
+    left = project_node(space, q, space.projection, workspace(space))
     assert post.clearance(turntable, q) == pytest.approx(MARGIN, abs=1e-6)
     assert left == pytest.approx(MARGIN - 0.001, abs=1e-9), "the blocks are as near as before"
 
@@ -56,6 +56,6 @@ def test_contacts_that_no_joint_moves_leave_the_others_to_be_mended(turntable: S
 def test_where_no_joint_moves_any_contact_nothing_is_moved(turntable: SerialRobot) -> None:
     free = ConstraintManifold(turntable, Constraint((0,) * 6))
     space = space_of(free, clearance_model(turntable, BLOCKS), MARGIN)
-    left = project_node(space, q := np.zeros(2), 12, workspace(space))
+    left = project_node(space, q := np.zeros(2), space.projection, workspace(space))
     np.testing.assert_array_equal(q, 0.0)
     assert left == pytest.approx(MARGIN - 0.001, abs=1e-9)

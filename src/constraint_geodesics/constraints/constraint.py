@@ -97,6 +97,9 @@ class Constraint:
         """What the compiled search takes: a NamedTuple that is registered in kernels.py."""
         raise NotImplementedError
 
+    def compile(self) -> None:
+        """Compile functions of its own, so that no query waits; nothing for a kind without any."""
+
     @property
     def codim(self) -> int:
         """Number of rows that leave no freedom: the codimension of the constraint manifold."""

@@ -100,15 +100,21 @@ class FunctionsConstraint(Constraint):
 
     def arrays(self, robot: SerialRobot) -> ConstraintArrays:
         """For the kernels."""
-        both = _compiled(self.residual, self.jacobian, len(self.bounds))
-        return ConstraintArrays(self.rows, np.empty(0), both.address, 0, 0)
+        return ConstraintArrays(self.rows, np.empty(0), self._function().address, 0, 0)
+
+    def compile(self) -> None:
+        """Both functions, once."""
+        self._function()
 
     def values(self, q: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "n m"]:
         """The residuals of configurations."""
-        address = _compiled(self.residual, self.jacobian, len(self.bounds)).address
+        address = self._function().address
         out = np.empty((len(q), len(self.bounds)))
         values_batch(address, np.require(q, np.float64, ("C", "W")), out)
         return out
+
+    def _function(self) -> Any:
+        return _compiled(self.residual, self.jacobian, len(self.bounds))
 
     def loosened(self, least: Mapping[str, float]) -> "FunctionsConstraint":
         """The same with every tolerance at least that of its row's unit."""

@@ -94,8 +94,8 @@ class PoseConstraint(Constraint):
         """For the kernels."""
         pose, rows = self.reference or Pose(np.zeros(3), np.eye(3)), self.rows
         data = [rows.held, rows.tolerance, pose.position, np.ravel(pose.rotation)]
-        addresses = (function.address for function in _compiled())
-        return ConstraintArrays(rows, np.concatenate(data), *addresses, _LINEAR + 15 * robot.dof)
+        write, bend = (function.address for function in _compiled())
+        return ConstraintArrays(rows, np.concatenate(data), write, bend, _LINEAR + 15 * robot.dof)
 
     @property
     def is_free(self) -> bool:

@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
 from constraint_geodesics.geometry.errors import GeometryError, NonFiniteError
@@ -52,15 +54,8 @@ def components(n: int, edges: Edges) -> Int[np.ndarray, "n"]:
     Raises GraphError with the first edge that names no node.
     """
     _check(n, edges)
-    # the least node that is reached, handed on along edges and to all that hang on the same one
-    least, before = np.arange(n), np.full(n, OUTSIDE)
-    while (least != before).any():
-        before = least.copy()
-        for i, k in (edges.T, edges.T[::-1]):
-            np.minimum.at(least, least[i], least[k])
-        while (least != least[least]).any():
-            least = least[least]
-    return _largest_first(least)
+    adjacency = sparse.coo_array((np.ones(len(edges)), edges.T), shape=(n, n))
+    return _largest_first(csgraph.connected_components(adjacency, directed=False)[1])
 
 
 def shortest_path(
@@ -77,10 +72,6 @@ def shortest_path(
     for name, node in (("source", source), ("target", target)):
         if not 0 <= node < n:
             raise GraphError(f"{name} = {node}: the nodes are 0 to {n - 1}")
-    # imported here: where a planner comes with its roadmaps, it starts without
-    from scipy import sparse
-    from scipy.sparse import csgraph
-
     _check(n, edges)
     adjacency = sparse.csr_array((weights, (edges[:, 0], edges[:, 1])), shape=(n, n))
     if adjacency.nnz != len(edges):

@@ -120,9 +120,9 @@ class _Single:
 
     def __init__(self, manifold: ConstraintManifold) -> None:
         count, dof = len(manifold.rows.held), manifold.robot.dof
-        self._manifold, self._rows, self._q = manifold.arrays, manifold.rows, np.empty((1, dof))
+        self._manifold, self._q = manifold.arrays, np.empty((1, dof))
         self._residual, self._jacobian = np.empty((1, count)), np.empty((1, count, dof))
-        self._excess, self._worst, self._all = np.empty((1, count)), np.empty(1), np.ones(1)
+        self._worst, self._all = np.empty(1), np.ones(1)
         self._settings = Retraction()
 
     def linearise(self, x: np.ndarray) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m D"]]:
@@ -133,8 +133,8 @@ class _Single:
 
     def violation(self, x: np.ndarray) -> float:
         """Excess over the tolerance [rad or m]."""
-        self.linearise(x)
-        kernels.excess_batch(self._rows, self._residual, self._excess, self._worst)
+        self._q[0] = x
+        kernels.violation_batch(self._manifold, self._q, self._worst)
         return float(self._worst[0])
 
     def retract(self, x: np.ndarray) -> Float[np.ndarray, "D"] | None:

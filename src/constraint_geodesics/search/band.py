@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints.projection import Retraction
-from constraint_geodesics.search import band_kernels
 from constraint_geodesics.search.space import Space, project_points
 
 ACCURACY = 1e-9
@@ -36,31 +35,10 @@ class BandSettings:
     clearance_m: float = 0.006
 
     def steps(self, guarded: bool) -> tuple[int, Retraction, float, float, bool]:
-        """As `relax_band` takes them."""
+        """As `relax_band` takes them.  guarded: no line between two nodes that touches nothing is
+        moved into something.
+        """
         return self.iterations, _AFTER_STEP, self.accuracy, self.largest_step_rad, guarded
-
-
-@dataclass(frozen=True)
-class Band:
-    """A relaxed band: nodes (n + 1, D) [rad], what is left of the violation, iterations, and
-    whether it converged.
-    """
-
-    nodes: Float[np.ndarray, "n D"]
-    violation: float
-    iterations: int
-    converged: bool
-
-
-def relax(
-    space: Space, nodes: Float[np.ndarray, "n D"], settings: BandSettings, guarded: bool = False
-) -> Band:
-    """The shortest band near the given one, its ends fixed.  guarded: no line between two nodes
-    that touches nothing is moved into something.
-    """
-    moved = np.array(nodes, np.float64)
-    left, iterations, converged = band_kernels.relax_band(space, moved, settings.steps(guarded))
-    return Band(moved, left, iterations, converged)
 
 
 def step_lengths(points: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T-1"]:

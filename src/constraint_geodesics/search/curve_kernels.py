@@ -37,7 +37,7 @@ class Spline(NamedTuple):
 
 
 @njit(**LEAF)
-def step_lengths(points, steps):
+def _write_steps(points, steps):
     """Distances between neighbouring points (T, D) into steps (T − 1,); returns their sum and the
     longest.
     """
@@ -117,7 +117,7 @@ def spline_through(nodes):
     """
     n = nodes.shape[0] - 1
     h, knots, moments = np.empty(n), np.zeros(n + 1), np.empty(nodes.shape)
-    step_lengths(nodes, h)
+    _write_steps(nodes, h)
     curve = Spline(knots, nodes, moments)
     for i in range(n):
         if not (np.isfinite(h[i]) and h[i] > _COINCIDENT):
@@ -163,7 +163,7 @@ def relaxed_curve(space, nodes, steps, settings):
     for k in range(count + 1):
         shares[k] = k / count
     points, left = curve_points(space, curve, shares, settings)
-    total, longest = step_lengths(points, np.empty(count))
+    total, longest = _write_steps(points, np.empty(count))
     sound = not (left > _LEFT or longest > JUMP * length / count)
     return sound, moved, points, total, used
 
@@ -202,7 +202,7 @@ def rows_along(space, points, allowed, settings):
     project_points(space, rows, new, settings)
     for _ in range(HALVINGS):
         steps, halfway = np.empty(rows.shape[0] - 1), _halfway(space, rows)
-        step_lengths(rows, steps)
+        _write_steps(rows, steps)
         off, extra = np.empty(steps.shape[0], np.bool_), 0
         for i in range(steps.shape[0]):
             off[i] = halfway[i] > allowed or steps[i] > 1.1 * LONGEST_ROW_STEP

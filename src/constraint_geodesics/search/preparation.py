@@ -1,6 +1,6 @@
 """What is prepared once for each constraint and kept for the next query: its space and roadmap."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Protocol
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from constraint_geodesics.certification.certifier import Certifier
+from constraint_geodesics.certification.collisions import CollisionCheck
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.geometry.graph import components
@@ -58,15 +59,14 @@ class Preparation:
     def __init__(
         self,
         scene: Scene,
-        freedom: Freedom,
+        checks: CollisionCheck,
         settings: PlannerParams,
         draw: Draw | None = None,
-        apart: Collection[tuple[int, int]] = (),
     ) -> None:
-        self.scene, self.freedom, self.settings = scene, freedom, settings
+        self.scene, self.checks, self.settings = scene, checks, settings
         self.draw = draw or scene.robot.sample
         self.band = band_settings(settings)
-        self._clearance = clearance_model(scene.robot, scene.workcell, apart)
+        self._clearance = clearance_model(scene.robot, scene.workcell, checks.apart)
         self._tasks: dict[tuple, Task] = {}
         self._roadmaps: dict[tuple, Roadmap | None] = {}
         self._named: frozenset[tuple] = frozenset()
@@ -99,7 +99,7 @@ class Preparation:
             settings = self.settings
             rng = np.random.default_rng(settings.seed)
             nodes = free_configurations(
-                manifold, self.freedom, self.draw, settings.roadmap_nodes, rng
+                manifold, self.checks, self.draw, settings.roadmap_nodes, rng
             )
             space = self._tasks[key].clear
             self._roadmaps[key] = (
@@ -116,8 +116,7 @@ def named_roadmaps(
     """
     found = {}
     with scene.world() as world, Certifier(scene) as certifier:
-        apart = certifier.collisions.apart
-        preparation = Preparation(scene, world, settings, apart=apart)
+        preparation = Preparation(scene, certifier.collisions, settings)
         for name, constraint in constraints.items():
             task, rng = preparation.task(constraint), np.random.default_rng(settings.seed)
             count, draw = settings.roadmap_nodes, scene.robot.sample

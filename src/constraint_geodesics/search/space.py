@@ -190,16 +190,6 @@ def project_node(space, q, settings, work):
     return worst
 
 
-@njit(**COMPILE)
-def project_each(space, points, settings):
-    """Project points (T, D) in place; returns what remains of the violation of the worst."""
-    work = workspace(space)
-    worst = 0.0
-    for i in range(points.shape[0]):
-        worst = max(worst, project_node(space, points[i], settings, work))
-    return worst
-
-
 @njit(**LEAF)
 def _is_within(space, q, work):
     """Whether a configuration keeps joint limits and clearance."""
