@@ -96,10 +96,8 @@ def problems(world: World, name: str, count: int) -> list[PlanningProblem]:
     planner = packaged_planner()
     clearance = clearance_model(planner.scene.robot, planner.scene.workcell)
     manifold = manifold_of(planner, name)
-    return [
-        PlanningProblem(a, b, manifold, world.is_free, clearance)
-        for a, b in pairs_of(name, count, 3)
-    ]
+    known = world.is_free, clearance, planner._certifier.collisions.is_clear
+    return [PlanningProblem(a, b, manifold, *known) for a, b in pairs_of(name, count, 3)]
 
 
 def assert_sound(path: Solution, asked: PlanningProblem, certifier: Certifier) -> None:

@@ -72,6 +72,7 @@ def test_kernels_that_count_no_references_lose_no_memory() -> None:
         planner.plan(start, goal, "level_cup")
         _nrt_python.memsys_enable_stats()
         try:
+            gc.collect()
             before = rtsys.get_allocation_stats()
             planner.plan(start, goal, "level_cup", budget_s=0.2)
             gc.collect()
@@ -79,4 +80,5 @@ def test_kernels_that_count_no_references_lose_no_memory() -> None:
         finally:
             _nrt_python.memsys_disable_stats()
     assert after.alloc - before.alloc > 100
-    assert after.alloc - before.alloc == after.free - before.free
+    # what was there before may be freed as well
+    assert after.alloc - before.alloc <= after.free - before.free

@@ -10,7 +10,7 @@ know configurations alone.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -21,6 +21,7 @@ from constraint_geodesics.problem import PlannerError
 ArrayLike = Float[np.ndarray, "D"] | Sequence[float]
 
 
+@runtime_checkable
 class Goal(Protocol):
     """A set of configurations, any of which may end the path."""
 
@@ -63,8 +64,7 @@ class ConfigurationGoal:
 def as_goal(goal: Goal | ArrayLike, dof: int) -> Goal:
     """A goal as it is; numbers are a configuration's.  Raises PlannerError if they are none."""
     if hasattr(goal, "configurations"):  # asking for the protocol takes longer than a certificate
-        found: Goal = goal
-        return found
+        return cast(Goal, goal)
     return ConfigurationGoal(checked_configuration(goal, dof, "goal"))
 
 

@@ -40,12 +40,12 @@ def kept(asked: Asked) -> Kept:
     kernels.keep(asked.chain, held, table, asked.rows, wanted, found)
     at_rows: list[Broken] = []
     between: list[Broken] = []
-    for channel, own in zip(channels, found.tolist(), strict=True):
-        if own[kernels.ROW] >= 0.0:
-            at_rows.append(channel.broken(own[kernels.ROW], own[kernels.AT_ROW]))
-        if own[kernels.SEGMENT] >= 0.0:
-            between.append(channel.broken(own[kernels.SEGMENT], own[kernels.ON_SEGMENT]))
-        for excesses, size in ((attained, own[kernels.ATTAINED]), (bound, own[kernels.BOUND])):
+    for channel, sizes in zip(channels, found.tolist(), strict=True):
+        if sizes[kernels.ROW] >= 0.0:
+            at_rows.append(channel.broken(sizes[kernels.ROW], sizes[kernels.AT_ROW]))
+        if sizes[kernels.SEGMENT] >= 0.0:
+            between.append(channel.broken(sizes[kernels.SEGMENT], sizes[kernels.ON_SEGMENT]))
+        for excesses, size in ((attained, sizes[kernels.ATTAINED]), (bound, sizes[kernels.BOUND])):
             excesses[channel.unit] = max(excesses[channel.unit], size - channel.tolerance)
     return summed_up(attained, bound, at_rows, between, asked.limits)
 

@@ -25,8 +25,9 @@ class Retraction(NamedTuple):
     """Settings of the projection: accuracy asked for [rad or m], steps at most, longest step
     [rad].
 
-    last_step: a step shorter than this [rad] is the last.  What Newton's method leaves after it is
-    of its square, which is returned in place of a measured excess; 0 to measure always.
+    last_step: a step shorter than this [rad] that corrects all rows is the last.  What Newton's
+    method leaves after it is of its square, which is returned in place of a measured excess; 0 to
+    measure always.
     """
 
     accuracy: float = 1e-9
@@ -149,7 +150,7 @@ def retract_one(manifold, bounds, q, settings, room):
     point far away walks to its own branch instead of jumping to another.
     """
     _, residual, excess, right, active, jacobian, rows, normal, step = room
-    dof, worst = q.shape[0], np.inf
+    dof, worst, count = q.shape[0], np.inf, np.sum(bounds.held)
     for iteration in range(settings.iterations + 1):
         linearise(manifold, q, room.own, residual, jacobian)
         worst = excess_of(bounds, residual, excess, active)
@@ -171,7 +172,7 @@ def retract_one(manifold, bounds, q, settings, room):
         scale = 1.0 if length <= settings.largest_step else settings.largest_step / length
         for d in range(dof):
             q[d] -= scale * step[d]
-        if length < settings.last_step:
+        if length < settings.last_step and size == count:
             return length * length
     return worst
 

@@ -102,7 +102,7 @@ def _limit(limit: np.ndarray, dim: int, what: str) -> np.ndarray:
         raise GeometryError(
             f"{what} has shape {values.shape}: must be ({dim},), one limit for each joint"
         )
-    if not min(values.tolist()) > 0.0:
+    if not all(value > 0.0 for value in values.tolist()):
         raise GeometryError(f"{what} = {values.tolist()}: must be positive")
     return values
 
