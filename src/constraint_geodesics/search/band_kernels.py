@@ -49,6 +49,8 @@ _SMALLEST_PIVOT = 1e-12
 _ON_BOUND = 1e-6  # an inequality so near is on its bound; one that is NEAR is taken into the step,
 # which then ends on it, not beyond
 _LEAST_CONE = 1e-3
+_DEPENDENT = 1e-7
+"""A row so short beside those before it adds nothing to them."""
 
 
 class _Active(NamedTuple):
@@ -266,55 +268,44 @@ def _let_go(active, size, gradient, normal, here, onto):
 
 
 @njit(**LEAF)
-def _null_space(rows, size, left, basis):
+def _null_space(rows, size, basis):
     """Orthonormal basis (D, k) of the null space of the leading rows, which are overwritten;
-    returns k.
+    returns k.  By Householder's reflections I − v vᵀ with |v|² = 2.
     """
-    dof = rows.shape[1]
-    # orthonormal rows first, then what is left of the unit vectors, the longest first
-    rank = 0
+    dof, rank = rows.shape[1], 0
     for i in range(size):
         for j in range(rank):
-            value = 0.0
-            for d in range(dof):
-                value += rows[i, d] * rows[j, d]
-            for d in range(dof):
-                rows[i, d] -= value * rows[j, d]
-        length = 0.0
+            _reflect(rows[j], j, rows[i])
+        square = 0.0
+        for d in range(rank, dof):
+            square += rows[i, d] * rows[i, d]
+        length = np.sqrt(square)
+        if length <= _DEPENDENT:
+            continue
+        head = abs(rows[i, rank]) + length
+        scale = 1.0 / np.sqrt(length * head)
+        first = scale * (head if rows[i, rank] > 0.0 else -head)
         for d in range(dof):
-            length += rows[i, d] ** 2
-        length = np.sqrt(length)
-        if length > 1e-7:
-            for d in range(dof):
-                rows[rank, d] = rows[i, d] / length
-            rank += 1
-    left[:, :] = 0.0
-    for a in range(dof):
-        left[a, a] = 1.0
-    for i in range(rank):
-        for a in range(dof):
-            value = rows[i, a]
-            for d in range(dof):
-                left[a, d] -= value * rows[i, d]
-    count = dof - rank
-    for k in range(count):
-        best, longest = 0, -1.0
-        for a in range(dof):
-            value = 0.0
-            for d in range(dof):
-                value += left[a, d] ** 2
-            if value > longest:
-                best, longest = a, value
-        scale = 1.0 / np.sqrt(longest)
+            rows[rank, d] = scale * rows[i, d] if d > rank else 0.0
+        rows[rank, rank] = first
+        rank += 1
+    for k in range(dof - rank):
+        column = basis[:, k]
         for d in range(dof):
-            basis[d, k] = left[best, d] * scale
-        for a in range(dof):
-            value = 0.0
-            for d in range(dof):
-                value += left[a, d] * basis[d, k]
-            for d in range(dof):
-                left[a, d] -= value * basis[d, k]
-    return count
+            column[d] = 1.0 if d == rank + k else 0.0
+        for j in range(rank - 1, -1, -1):
+            _reflect(rows[j], j, column)
+    return dof - rank
+
+
+@njit(**LEAF)
+def _reflect(v, first, x):
+    """(I − v vᵀ) x in place, for v whose entries before the first are zero."""
+    value = 0.0
+    for d in range(first, x.shape[0]):
+        value += v[d] * x[d]
+    for d in range(first, x.shape[0]):
+        x[d] -= value * v[d]
 
 
 @njit(**LEAF)
@@ -358,14 +349,16 @@ def _add_curvature(space, q, weighed, basis, count, hessian, work):
     ):
         for k in range(count):
             for i in range(dof):
-                value = 0.0
+                here[i] = 0.0
                 for d in range(dof):
-                    value += full[i, d] * basis[d, k]
-                for j in range(k + 1):
-                    add = value * basis[i, j]
-                    hessian[k, j] += add
-                    if j < k:
-                        hessian[j, k] += add
+                    here[i] += full[i, d] * basis[d, k]
+            for j in range(k + 1):
+                value = 0.0
+                for i in range(dof):
+                    value += here[i] * basis[i, j]
+                hessian[k, j] += value
+                if j < k:
+                    hessian[j, k] += value
         return
     _weighted_gradient(space, q, cone_weight, contacts, work, here)
     for k in range(count):
@@ -393,7 +386,7 @@ def reduced(space, q, gradient, basis, hessian, onto, work):
     node = work.node
     size = _gather(space, q, work)
     size = _let_go(work.active, size, gradient, node.normal, work.here, onto)
-    count = _null_space(work.active.rows, size, node.left, basis)
+    count = _null_space(work.active.rows, size, basis)
     cone_weight, contacts, curved = _weigh(work.active, size, work)
     for k in range(count):
         for j in range(count):

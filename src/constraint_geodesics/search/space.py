@@ -67,7 +67,7 @@ class Workspace(NamedTuple):
     """What the kernels write into, allocated once.
 
     constraint: what its kind needs; residual, excess, active, weights (m,) and jacobian (m, D) of
-    its rows; contacts; rows, normal, left (D, D); right, squares, before, point (D,).
+    its rows; contacts; rows, normal (D, D); right, squares, before, point (D,).
     """
 
     constraint: Any
@@ -79,7 +79,6 @@ class Workspace(NamedTuple):
     contacts: Contacts
     rows: np.ndarray
     normal: np.ndarray
-    left: np.ndarray
     right: np.ndarray
     squares: np.ndarray
     before: np.ndarray
@@ -98,7 +97,6 @@ def workspace(space):
         np.zeros(count),
         np.zeros((count, dof)),
         new_contacts(space.clearance, dof),
-        np.empty((dof, dof)),
         np.empty((dof, dof)),
         np.empty((dof, dof)),
         np.empty(dof),
