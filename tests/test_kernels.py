@@ -72,13 +72,14 @@ def test_kernels_that_count_no_references_lose_no_memory() -> None:
         planner.plan(start, goal, "level_cup")
         _nrt_python.memsys_enable_stats()
         try:
-            gc.collect()
-            before = rtsys.get_allocation_stats()
-            planner.plan(start, goal, "level_cup", budget_s=0.2)
-            gc.collect()
-            after = rtsys.get_allocation_stats()
+            # what is older than the counting is freed in the first round
+            for _ in range(2):
+                gc.collect()
+                before = rtsys.get_allocation_stats()
+                planner.plan(start, goal, "level_cup", budget_s=0.2)
+                gc.collect()
+                after = rtsys.get_allocation_stats()
         finally:
             _nrt_python.memsys_disable_stats()
     assert after.alloc - before.alloc > 100
-    # what was there before may be freed as well
-    assert after.alloc - before.alloc <= after.free - before.free
+    assert after.alloc - before.alloc == after.free - before.free
