@@ -828,6 +828,11 @@ def test_rows_are_so_close_that_lines_between_them_keep_the_constraint(planner) 
         rows = rows_of(candidate, allowed)
         assert rows[0].tobytes() == candidate.points[0].tobytes()
         assert rows[-1].tobytes() == candidate.points[-1].tobytes()
+        # they go along the curve, never back
+        steps = np.diff(rows, axis=0)
+        cosines = (steps[1:] * steps[:-1]).sum(axis=1)
+        cosines /= np.linalg.norm(steps[1:], axis=1) * np.linalg.norm(steps[:-1], axis=1)
+        assert cosines.min() > 0.9
         between = np.linspace(0.0, 1.0, 9)[:, None, None] * np.diff(rows, axis=0) + rows[:-1]
         assert task.manifold.violation(between).max() <= allowed
         counts.append(len(rows))
