@@ -43,6 +43,15 @@ def test_a_configuration_of_another_robot_is_refused() -> None:
             packaged_planner().plan(start, ConfigurationGoal(wrong), "level_cup")
 
 
+def test_what_merely_has_configurations_is_no_goal() -> None:
+    class Listed:
+        configurations = (np.zeros(6),)
+
+    start = pairs_of("level_cup", 1, seed=1)[0][0]
+    with pytest.raises(PlannerError, match="goal"):
+        packaged_planner().plan(start, Listed(), "level_cup")
+
+
 def test_another_kind_of_goal_is_planned_to_and_says_what_was_reached() -> None:
     start, goal = pairs_of("level_cup", 1, seed=1)[0]
     off = goal + 0.3

@@ -10,7 +10,7 @@ know configurations alone.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -63,8 +63,9 @@ class ConfigurationGoal:
 
 def as_goal(goal: Goal | ArrayLike, dof: int) -> Goal:
     """A goal as it is; numbers are a configuration's.  Raises PlannerError if they are none."""
-    if hasattr(goal, "configurations"):  # asking for the protocol takes longer than a certificate
-        return cast(Goal, goal)
+    # numbers first: asking for the protocol takes longer than looking at both ends
+    if not isinstance(goal, np.ndarray | list | tuple) and isinstance(goal, Goal):
+        return goal
     return ConfigurationGoal(checked_configuration(goal, dof, "goal"))
 
 

@@ -21,7 +21,7 @@ from constraint_geodesics.constraints.constraint import (
     constraint_from_json,
 )
 from constraint_geodesics.constraints.functions import FunctionsConstraint, RowBound, made_by
-from constraint_geodesics.constraints.kernels import curvature, linearise
+from constraint_geodesics.constraints.kernels import curvature, linearise, new_look
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.params import FunctionsConstraintParams
 from constraint_geodesics.scene.scene import Scene
@@ -199,23 +199,65 @@ def test_projection_ends_where_nothing_is_violated(manifold) -> None:
     np.testing.assert_array_equal(retract(manifold, on, Retraction(accuracy=1e-8)).joints, on)
 
 
+def test_many_configurations_are_projected_each_as_if_it_were_alone(manifold) -> None:
+    q = manifold.robot.sample(70, np.random.default_rng(6))
+    settings = Retraction(iterations=12, last_step=1e-5)
+    together, shares = retract(manifold, q, settings), np.linspace(0.2, 1.0, len(q))
+    narrow = retract(manifold, q, settings, shares)
+    residual, jacobian = manifold.linearise(q)
+    for n in range(len(q)):
+        alone = retract(manifold, q[n], settings)
+        np.testing.assert_array_equal(alone.joints, together.joints[n])
+        assert alone.violation == together.violation[n]
+        np.testing.assert_array_equal(
+            retract(manifold, q[n], settings, shares[n]).joints, narrow.joints[n]
+        )
+        np.testing.assert_array_equal(manifold.residual(q[n]), residual[n])
+        np.testing.assert_array_equal(manifold.jacobian(q[n]), jacobian[n])
+
+
+@pytest.mark.parametrize("size", [1e-7, 1e-5, 1e-3])
+def test_a_last_step_that_is_not_measured_leaves_no_more_than_it_says(manifold, size) -> None:
+    rng = np.random.default_rng(7)
+    on = retract(manifold, manifold.robot.sample(200, rng))
+    beside = on.joints[on.converged] + size * rng.normal(size=on.joints[on.converged].shape)
+    found = retract(manifold, beside, Retraction(last_step=1e-5))
+    assert found.converged.mean() > 0.98
+    # what is left is of the last step's square times half a second derivative: beside 10⁻⁵ rad
+    assert manifold.violation(found.joints[found.converged]).max() <= 5e-9
+
+
+def untouched(q, out) -> None:
+    out[0] = 1e-6
+
+
+def no_slope(q, out) -> None:
+    out[:] = 0.0
+
+
+def test_a_row_that_no_joint_moves_is_not_said_to_be_kept(xarm) -> None:
+    stuck = FunctionsConstraint(untouched, no_slope, (RowBound("stuck", "rad", 0.0),))
+    found = retract(ConstraintManifold(xarm, stuck), np.zeros((3, 6)), Retraction(last_step=1e-5))
+    np.testing.assert_allclose(found.violation, 1e-6)
+    assert not found.converged.any()
+
+
 @njit
-def closed_form(arrays, weights, q):
-    own = np.empty(arrays.constraint.room)
-    residual = np.zeros(weights.shape[0])
-    jacobian = np.zeros((weights.shape[0], q.shape[0]))
-    full = np.zeros((q.shape[0], q.shape[0]))
-    linearise(arrays, q, own, residual, jacobian)
-    return curvature(arrays, weights, own, full), full
+def closed_form(arrays, weights, q, which):
+    looked = new_look(arrays.constraint, q.shape[1])
+    full = np.zeros((q.shape[1], q.shape[1]))
+    linearise(arrays, q, looked)
+    return curvature(arrays, weights, looked, which, full), full
 
 
 def test_the_closed_curvature_is_that_of_finite_differences(manifold) -> None:
     """Where a kind knows Σ λ ∇²r in closed form: on the constraint, along its tangent space."""
     rng, step, rows = np.random.default_rng(5), 1e-5, manifold.constraint.rows
     result = retract(manifold, manifold.robot.sample(20, rng))
-    for q in result.joints[result.converged]:
+    on = result.joints[result.converged]
+    for which, q in enumerate(on):
         weights = rng.normal(size=len(rows.held)) * rows.held
-        known, full = closed_form(manifold.arrays, weights, q)
+        known, full = closed_form(manifold.arrays, weights, on, which)
         if not known:
             continue
         slopes = manifold.jacobian(q)

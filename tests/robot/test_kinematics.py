@@ -2,7 +2,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numba import njit
 
+from constraint_geodesics.robot.kernels import (
+    LANES,
+    Lanes,
+    new_posture,
+    pose_of,
+    poses_of,
+    sine_cosine,
+)
 from constraint_geodesics.robot.kinematics import RobotError, load_robot, rotation_from_rpy
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.urdf import data_path
@@ -39,6 +48,65 @@ def test_the_jacobian_is_the_poses_derivative(name: str, request: pytest.Fixture
         spin = (turned_ahead - turned_behind) / (2 * step) @ rotation.transpose(0, 2, 1)
         np.testing.assert_allclose(jacobian[:, 5, joint], spin[:, 1, 0], atol=1e-8)
         np.testing.assert_allclose(jacobian[:, 3, joint], spin[:, 2, 1], atol=1e-8)
+
+
+@pytest.mark.parametrize("turns", [1.0, 1e2, 1e4])
+def test_sines_and_cosines_are_those_of_the_library(turns: float) -> None:
+    angles = np.random.default_rng(0).uniform(-2.0 * np.pi * turns, 2.0 * np.pi * turns, 20_000)
+    special = 0.5 * np.pi * np.arange(-400, 401)
+    angles = np.concatenate([angles, special, np.nextafter(special, 1e3), [0.0, -0.0]])
+    found = both(angles, np.empty((2, len(angles))))
+    np.testing.assert_allclose(found, [np.sin(angles), np.cos(angles)], rtol=0.0, atol=4e-16)
+    assert np.isnan(both(np.array([np.nan, np.inf]), np.empty((2, 2)))).all()
+
+
+@njit
+def both(angles, out):
+    for n in range(angles.shape[0]):
+        out[0, n], out[1, n] = sine_cosine(angles[n])
+    return out
+
+
+SLIDER = """
+<robot name="slider">
+  <link name="stand"/>
+  <joint name="turn" type="revolute"><parent link="stand"/><child link="mast"/>
+    <origin xyz="0.1 0 0.3" rpy="0.2 0.1 0"/><axis xyz="0 0 1"/>
+    <limit lower="-2" upper="2" velocity="1" effort="1"/></joint>
+  <link name="mast"/>
+  <joint name="lift" type="prismatic"><parent link="mast"/><child link="arm"/>
+    <origin xyz="0 0.2 0.3" rpy="0 0.3 0"/><axis xyz="0.6 0 0.8"/>
+    <limit lower="-0.5" upper="0.5" velocity="1" effort="1"/></joint>
+  <link name="arm"/>
+  <joint name="swing" type="revolute"><parent link="arm"/><child link="tip"/>
+    <origin xyz="0.3 0 0"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" velocity="1" effort="1"/></joint>
+  <link name="tip"/>
+</robot>"""
+
+
+@pytest.mark.parametrize("name", [*ROBOTS, "slider"])
+def test_postures_side_by_side_are_those_of_one_after_another_to_the_bit(
+    name: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    if name == "slider":
+        urdf = tmp_path / "slider.urdf"
+        urdf.write_text(SLIDER)
+        robot = load_robot(urdf, "tip")
+    else:
+        robot = request.getfixturevalue(name).robot
+    dof, q = robot.dof, robot.sample(LANES, np.random.default_rng(2))
+    alone = new_posture(dof)
+    for count in (1, 2, 5, 6, 7, 8, 9, 15, 16, 31, LANES):
+        joints, turns = np.empty((2, dof, 3, LANES)), np.empty((2, dof, LANES))
+        lanes = Lanes(np.empty((3, 4, LANES)), *joints, *turns)
+        poses_of(robot.chain, q[:count], lanes)
+        for n in range(count):
+            pose_of(robot.chain, q[n], alone)
+            np.testing.assert_array_equal(lanes.frame[:, 0, n], alone.position)
+            np.testing.assert_array_equal(lanes.frame[:, 1:, n], alone.rotation)
+            np.testing.assert_array_equal(lanes.origins[:, :, n], alone.origins)
+            np.testing.assert_array_equal(lanes.axes[:, :, n], alone.axes)
 
 
 def test_any_batch_shape(xarm) -> None:

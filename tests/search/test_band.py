@@ -17,6 +17,7 @@ from constraint_geodesics.constraints.constraint import (
     Pose,
     constraint_manifold,
 )
+from constraint_geodesics.constraints.kernels import linearise
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.params import Params
 from constraint_geodesics.scene.box import Box
@@ -307,7 +308,8 @@ def test_the_reduced_hessian_is_that_of_the_lagrangian(spaces, name) -> None:
             np.zeros((robot.dof,) * 2),
             np.zeros(robot.dof),
         )
-        count = band_kernels.reduced(space, start, pull, basis, hessian, onto, work)
+        linearise(space, start[None], work.looked)
+        count = band_kernels.reduced(space, start, 0, pull, basis, hessian, onto, work)
         assert count == robot.dof - len(rows)
         basis, hessian = basis[:, :count], hessian[:count, :count]
         np.testing.assert_allclose(basis.T @ basis, np.eye(count), atol=1e-9)
@@ -347,6 +349,19 @@ def active_rows(manifold: ConstraintManifold, q: np.ndarray):
         return np.concatenate(rows)
 
     return rows_at, np.concatenate([tolerance[kept] > 0.0, np.ones(int(cone), bool)])
+
+
+def test_null_spaces_are_orthonormal_and_complete() -> None:
+    """Of rows in general position, of rows that depend on each other, and of none."""
+    rng = np.random.default_rng(8)
+    for size, rank in ((0, 0), (1, 1), (3, 3), (4, 2), (6, 5), (7, 7)):
+        rows = rng.normal(size=(size, rank)) @ rng.normal(size=(rank, 7))
+        basis, filled = np.empty((7, 7)), np.zeros((7, 7))
+        filled[:size] = rows
+        count = band_kernels.null_space(filled, size, basis)
+        assert count == 7 - rank
+        np.testing.assert_allclose(rows @ basis[:, :count], 0.0, atol=1e-12)
+        np.testing.assert_allclose(basis[:, :count].T @ basis[:, :count], np.eye(count), atol=1e-14)
 
 
 def test_without_a_constraint_a_bent_band_becomes_the_straight_line(spaces) -> None:
@@ -434,29 +449,27 @@ def test_a_curve_runs_through_its_ends_and_on_the_constraint(spaces, name) -> No
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_rows_lie_on_the_space_between_the_curves_points_and_keep_the_constraint_between_them(
-    spaces, name
-) -> None:
+def test_rows_lie_on_the_space_and_lines_between_them_keep_the_constraint(spaces, name) -> None:
     manifold, space = spaces.manifolds[name], spaces.clear(name)
-    tried = 0
+    used = []
     for nodes in spaces.lines(name, 16, 5, seed=11):
         sound, _, points, total, _ = relaxed_curve(
             space, nodes, BandSettings().steps(False), PROJECTION
         )
         if not sound:
             continue
-        tried += 1
         rows = rows_along(space, points, 1e-4, PROJECTION)
-        at = [np.flatnonzero((rows == point).all(axis=1)) for point in points]
-        assert (np.diff([k[0] for k in at]) > 0).all()
+        assert rows[[0, -1]].tobytes() == points[[0, -1]].tobytes()
         assert manifold.violation(rows).max() <= 1e-6
         assert manifold.robot.limit_distance(rows).min() >= -1e-6
         assert length(rows) == pytest.approx(total, rel=0.01)
         steps = np.linalg.norm(np.diff(rows, axis=0), axis=1)
         assert steps.max() <= 1.1 * LONGEST_ROW_STEP
         between = np.linspace(0.0, 1.0, 9)[:, None, None] * np.diff(rows, axis=0) + rows[:-1]
-        assert manifold.violation(between).max() <= 1.3e-4
-    assert tried > 0
+        off = manifold.violation(between).max(axis=0)
+        assert off.max() <= 1.3e-4
+        used.append(np.maximum(off / 1e-4, np.square(steps / LONGEST_ROW_STEP)))
+    assert np.median(np.concatenate(used)) > 0.7, "rows lie closer than they need to"
 
 
 def test_there_is_no_curve_through_nodes_that_coincide_or_are_no_numbers(spaces) -> None:

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.clearance import clearance_model
@@ -51,6 +52,22 @@ def test_contacts_that_no_joint_moves_leave_the_others_to_be_mended(turntable: S
     left = project_node(space, q, space.projection, workspace(space))
     assert post.clearance(turntable, q) == pytest.approx(MARGIN, abs=1e-6)
     assert left == pytest.approx(MARGIN - 0.001, abs=1e-9), "the blocks are as near as before"
+
+
+def test_a_short_step_onto_the_constraint_is_not_the_last_beside_a_broken_limit(xarm) -> None:
+    reference = Pose(*xarm.forward(np.array([0.3, -0.4, -0.6, 0.2, 0.5, 0.1])))
+    level = ConstraintManifold(xarm, Constraint((0, 0, 0, 1, 1, 0), reference=reference))
+    space, rng = space_of(level), np.random.default_rng(0)
+    settings = space.projection._replace(last_step=1e-3)
+    on = retract(level, xarm.sample(200, rng))
+    inside = on.joints[on.converged & (xarm.limit_distance(on.joints) > 0.01)]
+    assert len(inside) > 30
+    for q in inside:
+        q += 1e-7 * rng.normal(size=6)
+        q[0] = xarm.upper[0] + 1e-4  # turns the arm about the vertical, which nothing holds
+        left = project_node(space, q, settings, workspace(space))
+        assert left <= 1e-6
+        assert xarm.limit_distance(q) >= -1e-9
 
 
 def test_where_no_joint_moves_any_contact_nothing_is_moved(turntable: SerialRobot) -> None:

@@ -60,13 +60,13 @@ class _Axes(NamedTuple):
 @lru_cache(maxsize=256)
 def _demanded(
     own: _Axes, place: bytes, turn: bytes, allowed: float
-) -> tuple[kernels.Held, list[_Channel], np.ndarray]:
+) -> tuple[kernels.Held, tuple[_Channel, ...], np.ndarray]:
     """What is held, as numbers that have a tolerance, and their table for `kernels.keep`; of a
     reference's position and quaternion, as bytes.
     """
     angles = _angles_held(own, np.frombuffer(turn).copy())
     held = kernels.Held(*angles, any(own.axes[:3]), np.frombuffer(place).copy())
-    channels = list(_channels(own, held.kind, held.k))
+    channels = tuple(_channels(own, held.kind, held.k))
     table = np.array([(c.kind, c.entry, c.tolerance, c.tolerance + allowed) for c in channels])
     return held, channels, table
 

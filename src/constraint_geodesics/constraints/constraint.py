@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints import kernels
-from constraint_geodesics.constraints.kernels import ManifoldArrays, Rows
+from constraint_geodesics.constraints.kernels import ConstraintArrays, ManifoldArrays, Rows
 from constraint_geodesics.params import ConstraintParams
 from constraint_geodesics.robot.kinematics import SerialRobot, rotation_from_rpy
 
@@ -93,8 +93,8 @@ class Constraint:
         """Unit of each row: "m" or "rad"."""
         raise NotImplementedError
 
-    def arrays(self, robot: SerialRobot) -> Any:
-        """What the compiled search takes: a NamedTuple that is registered in kernels.py."""
+    def arrays(self, robot: SerialRobot) -> ConstraintArrays:
+        """What the compiled search takes: its `ConstraintArrays` for this robot."""
         raise NotImplementedError
 
     def compile(self) -> None:

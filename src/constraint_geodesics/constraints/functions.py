@@ -214,11 +214,13 @@ def _compiled(residual: Writes, jacobian: Writes, count: int) -> Any:
     options = {key: value for key, value in COMPILE.items() if key != "cache"}
     own_residual, own_jacobian = njit(**options)(residual), njit(**options)(jacobian)
 
-    def write(origins, axes, prismatic, base, tool, data, q, room, value, slope, dof, rows):
-        place = carray(floats(q), (dof,))
-        own_residual(place, carray(floats(value), (count,)))
-        if slope != 0:
-            own_jacobian(place, carray(floats(slope), (count, dof)))
+    def write(origins, axes, prismatic, base, tool, data, q, room, values, slopes, dof, rows, many):
+        for n in range(many):
+            place = carray(floats(q + 8 * dof * n), (dof,))
+            own_residual(place, carray(floats(values + 8 * count * n), (count,)))
+            if slopes != 0:
+                slope = carray(floats(slopes + 8 * count * dof * n), (count, dof))
+                own_jacobian(place, slope)
         return 0
 
     return c_function(write, LINEARISE_WORDS, cache=False)
@@ -227,9 +229,9 @@ def _compiled(residual: Writes, jacobian: Writes, count: int) -> Any:
 @njit(**LEAF)
 def values_batch(address, q, out):
     """Residuals (B, m) of q (B, D), by the C function at an address."""
-    for n in range(q.shape[0]):
-        place, value = q[n].ctypes.data, out[n].ctypes.data
-        call(address, (0, 0, 0, 0, 0, 0, place, 0, value, 0, q.shape[1], out.shape[1]))
+    places, values, (count, dof) = q.ctypes.data, out.ctypes.data, q.shape
+    if count:
+        call(address, (0, 0, 0, 0, 0, 0, places, 0, values, 0, dof, out.shape[1], count))
 
 
 @constraint_factory

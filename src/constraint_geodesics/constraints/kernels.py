@@ -1,4 +1,4 @@
-"""What the compiled search asks of a constraint, whatever its kind, one configuration at a time.
+"""What the compiled search asks of a constraint, whatever its kind.
 
 A kind brings C functions by their addresses, and numbers that they take (`ConstraintArrays`), so
 that the search is compiled once for all kinds.  Shapes: D joints, m rows of the residual.
@@ -15,6 +15,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from constraint_geodesics.compiled import COMPILE, LEAF
+from constraint_geodesics.robot.kernels import LANES
 from constraint_geodesics.robot.kinematics import ChainArrays
 
 
@@ -50,19 +51,21 @@ class ManifoldArrays(NamedTuple):
     constraint: Any
 
 
-LINEARISE_WORDS = 12
-"""Addresses of the chain's arrays, then of data, q, room, residual and Jacobian, the last 0 where
-it is not asked for; D and m.
+LINEARISE_WORDS = 13
+"""Addresses of the chain's arrays, then of data, q, room, residuals and Jacobians, the last 0 where
+they are not asked for; D, m and how many configurations, LANES at most.
 """
-CURVATURE_WORDS = 6
-"""Addresses of the chain's prismatic, data, room, weights and of the matrix to fill; D."""
+CURVATURE_WORDS = 7
+"""Addresses of the chain's prismatic, data, room, weights and of the matrix to fill; D; which of
+the configurations.
+"""
 
 
 class ConstraintArrays(NamedTuple):
     """A constraint of any kind, as the kernels take it.
 
     data (n,): the kind's own numbers.  linearise, curvature: addresses of what `c_function` made of
-    functions of LINEARISE_WORDS and CURVATURE_WORDS integers, which `linearise` and `curvature`
+    functions of LINEARISE_WORDS and CURVATURE_WORDS integers, which the functions of these names
     here call; the second 0 where there is no closed form, and its answer 0 where it finds none.
     room: how many numbers the two need to write into; what the first leaves there is the second's.
     """
@@ -72,6 +75,16 @@ class ConstraintArrays(NamedTuple):
     linearise: int
     curvature: int
     room: int
+
+
+class Looked(NamedTuple):
+    """What is known of up to LANES configurations: residuals (LANES, m), Jacobians (LANES, m, D),
+    and the room of the constraint's kind.
+    """
+
+    residuals: np.ndarray
+    jacobians: np.ndarray
+    room: np.ndarray
 
 
 def c_function(function: Callable[..., int], words: int, cache: bool = True) -> Any:
@@ -127,22 +140,24 @@ def chain_at(origins, axes, prismatic, base, tool, dof):
     )
 
 
+@njit(**COMPILE)
+def new_look(constraint, dof):
+    """What `linearise` writes into; rows that are not held are left zero."""
+    count = constraint.rows.held.shape[0]
+    residuals, jacobians = np.zeros((LANES, count)), np.zeros((LANES, count, dof))
+    return Looked(residuals, jacobians, np.empty(constraint.room))
+
+
 @njit(inline="always", **LEAF)
-def linearise(manifold, q, room, residual, jacobian):
-    """Residual (m,) and its Jacobian (m, D) of one configuration; rows that are not held are left
-    alone.  room: of `ConstraintArrays.room` numbers.
+def linearise(manifold, q, looked):
+    """Residuals and their Jacobians of at most LANES configurations (B, D) into the first of
+    `looked`; rows that are not held are left alone.
     """
-    _ask(manifold, q, room, residual, jacobian.ctypes.data)
+    _ask(manifold, q, looked.room, looked.residuals, looked.jacobians.ctypes.data)
 
 
 @njit(inline="always", **LEAF)
-def residual_of(manifold, q, room, residual):
-    """As `linearise`, without the Jacobian."""
-    _ask(manifold, q, room, residual, 0)
-
-
-@njit(inline="always", **LEAF)
-def _ask(manifold, q, room, residual, jacobian):
+def _ask(manifold, q, room, residuals, jacobians):
     chain, own = manifold.chain, manifold.constraint
     words = (
         chain.origins.ctypes.data,
@@ -153,27 +168,31 @@ def _ask(manifold, q, room, residual, jacobian):
         own.data.ctypes.data,
         q.ctypes.data,
         room.ctypes.data,
-        residual.ctypes.data,
-        jacobian,
+        residuals.ctypes.data,
+        jacobians,
+        q.shape[1],
+        residuals.shape[1],
         q.shape[0],
-        residual.shape[0],
     )
     call(own.linearise, words)
 
 
 @njit(inline="always", **LEAF)
-def curvature(manifold, weights, room, full):
-    """Σ λ_j ∇²r_j (D, D) where `linearise` was called last; False where there is no closed form."""
+def curvature(manifold, weights, looked, which, full):
+    """Σ λ_j ∇²r_j (D, D) of one of the configurations that `looked` is of; False where there is no
+    closed form.
+    """
     chain, own = manifold.chain, manifold.constraint
     if own.curvature == 0:
         return False
     words = (
         chain.prismatic.ctypes.data,
         own.data.ctypes.data,
-        room.ctypes.data,
+        looked.room.ctypes.data,
         weights.ctypes.data,
         full.ctypes.data,
         full.shape[0],
+        which,
     )
     return call(own.curvature, words) != 0
 
@@ -225,11 +244,12 @@ def residual_batch(manifold, q, residuals, jacobians):
     """Residuals (B, m) and their Jacobians (B, m, D) of q (B, D); rows that are not held are
     zero.
     """
-    own = np.empty(manifold.constraint.room)
+    room = np.empty(manifold.constraint.room)
     residuals[:] = 0.0
     jacobians[:] = 0.0
-    for b in range(q.shape[0]):
-        linearise(manifold, q[b], own, residuals[b], jacobians[b])
+    for b in range(0, q.shape[0], LANES):
+        slopes = jacobians[b : b + LANES].ctypes.data
+        _ask(manifold, q[b : b + LANES], room, residuals[b : b + LANES], slopes)
 
 
 @njit(**COMPILE)
@@ -237,11 +257,13 @@ def violation_batch(manifold, q, worst):
     """The largest excess of each of q (B, D) into worst (B,)."""
     rows = manifold.constraint.rows
     count = rows.held.shape[0]
-    own, residual, excess = np.empty(manifold.constraint.room), np.zeros(count), np.empty(count)
-    active = np.empty(count, dtype=np.bool_)
-    for b in range(q.shape[0]):
-        residual_of(manifold, q[b], own, residual)
-        worst[b] = excess_of(rows, residual, excess, active)
+    room, residuals = np.empty(manifold.constraint.room), np.zeros((LANES, count))
+    excess, active = np.empty(count), np.empty(count, dtype=np.bool_)
+    for b in range(0, q.shape[0], LANES):
+        part = q[b : b + LANES]
+        _ask(manifold, part, room, residuals, 0)
+        for n in range(part.shape[0]):
+            worst[b + n] = excess_of(rows, residuals[n], excess, active)
 
 
 @njit(**COMPILE)

@@ -30,7 +30,13 @@ from constraint_geodesics.constraints.kernels import (
     flags,
     floats,
 )
-from constraint_geodesics.robot.kernels import Posture, geometric_jacobian, pose_of
+from constraint_geodesics.robot.kernels import (
+    LANES,
+    Lanes,
+    geometric_jacobian,
+    poses_of,
+    posture_in,
+)
 from constraint_geodesics.robot.kinematics import SerialRobot
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -95,7 +101,7 @@ class PoseConstraint(Constraint):
         pose, rows = self.reference or Pose(np.zeros(3), np.eye(3)), self.rows
         data = [rows.held, rows.tolerance, pose.position, np.ravel(pose.rotation)]
         write, bend = (function.address for function in _compiled())
-        return ConstraintArrays(rows, np.concatenate(data), write, bend, _LINEAR + 15 * robot.dof)
+        return ConstraintArrays(rows, np.concatenate(data), write, bend, _room(robot.dof))
 
     @property
     def is_free(self) -> bool:
@@ -360,10 +366,6 @@ class _About(NamedTuple):
     rotation: np.ndarray
 
 
-_LINEAR = 21
-"""Numbers of the room that are not for the joints."""
-
-
 @njit(inline="always", **COMPILE)
 def _about_at(data):
     return _About(
@@ -374,51 +376,73 @@ def _about_at(data):
     )
 
 
+_WORDS = 12 * LANES
+"""Numbers of the room that are the tools' frames."""
+
+
 @njit(inline="always", **COMPILE)
-def _posture_at(room, dof):
-    """The arm's posture, in the room behind ω to orientation residual (3, 3)."""
-    joints = room + 8 * _LINEAR
-    return Posture(
-        carray(floats(room + 72), (3,)),
-        carray(floats(room + 96), (3, 3)),
-        carray(floats(joints), (dof, 3)),
-        carray(floats(joints + 24 * dof), (dof, 3)),
+def _lanes_at(room, dof):
+    """Where the arm is, at the head of the room."""
+    origins = room + 8 * _WORDS
+    axes, sines = origins + 24 * LANES * dof, origins + 48 * LANES * dof
+    return Lanes(
+        carray(floats(room), (3, 4, LANES)),
+        carray(floats(origins), (dof, 3, LANES)),
+        carray(floats(axes), (dof, 3, LANES)),
+        carray(floats(sines), (dof, LANES)),
+        carray(floats(sines + 8 * LANES * dof), (dof, LANES)),
     )
 
 
-def _write(origins, axes, prismatic, base, tool, data, q, room, residual, jacobian, dof, count):
+def _room(dof: int) -> int:
+    """Numbers for the lanes, for one orientation's derivative (3, 3) and a Jacobian (6, D)."""
+    return _WORDS + 8 * LANES * dof + 9 + 6 * dof
+
+
+def _write(
+    origins, axes, prismatic, base, tool, data, q, room, residuals, jacobians, dof, rows, count
+):
     chain, about = chain_at(origins, axes, prismatic, base, tool, dof), _about_at(data)
-    posture, linear = _posture_at(room, dof), carray(floats(room), (3, 3))
-    pose_of(chain, carray(floats(q), (dof,)), posture)
-    _residual(about, posture.position, posture.rotation, carray(floats(residual), (6,)), linear)
-    if jacobian == 0:
-        return 0
-    geometric = carray(floats(room + 8 * (_LINEAR + 6 * dof)), (6, dof))
-    out = carray(floats(jacobian), (6, dof))
-    geometric_jacobian(chain.prismatic, posture, geometric)
-    for i in range(6):
-        if not about.held[i]:
-            continue
-        for d in range(dof):
-            value = 0.0
-            if i < 3:
-                value = geometric[i, d]
-            else:
-                for a in range(3):
-                    value += linear[i - 3, a] * geometric[3 + a, d]
-            out[i, d] = value
+    lanes, rest = _lanes_at(room, dof), room + 8 * (_WORDS + 8 * LANES * dof)
+    linear, geometric = carray(floats(rest), (3, 3)), carray(floats(rest + 72), (6, dof))
+    values = carray(floats(residuals), (count, 6))
+    poses_of(chain, carray(floats(q), (count, dof)), lanes)
+    for n in range(count):
+        posture = posture_in(lanes, n)
+        _residual(about, posture.position, posture.rotation, values[n], linear)
+        if jacobians != 0:
+            geometric_jacobian(chain.prismatic, posture, geometric)
+            slopes = carray(floats(jacobians + 48 * dof * n), (6, dof))
+            _slopes(about.held, linear, geometric, slopes)
     return 0
 
 
-def _bend(prismatic, data, room, weights, full, dof):
+def _bend(prismatic, data, room, weights, full, dof, which):
     known = _curvature(
         carray(flags(prismatic), (dof,)),
         _about_at(data),
-        _posture_at(room, dof),
+        posture_in(_lanes_at(room, dof), which),
         carray(floats(weights), (6,)),
         carray(floats(full), (dof, dof)),
     )
     return 1 if known else 0
+
+
+@njit(**LEAF)
+def _slopes(held, linear, geometric, out):
+    """The Jacobian's rows (6, D) that are held: positions as they are, angles by what turns ω into
+    the residual.
+    """
+    for i in range(3):
+        if held[i]:
+            for d in range(out.shape[1]):
+                out[i, d] = geometric[i, d]
+        if held[3 + i]:
+            for d in range(out.shape[1]):
+                value = 0.0
+                for a in range(3):
+                    value += linear[i, a] * geometric[3 + a, d]
+                out[3 + i, d] = value
 
 
 @cache

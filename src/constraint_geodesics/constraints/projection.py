@@ -3,7 +3,7 @@ kinematics.
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,28 +12,34 @@ from numba import njit
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.kernels import (
+    Looked,
     Rows,
     backward,
     cholesky,
     excess_of,
     forward,
     linearise,
+    new_look,
 )
+from constraint_geodesics.robot.kernels import LANES
 
 
 class Retraction(NamedTuple):
     """Settings of the projection: accuracy asked for [rad or m], steps at most, longest step
     [rad].
 
-    last_step: a step shorter than this [rad] that corrects all rows is the last.  What Newton's
-    method leaves after it is of its square, which is returned in place of a measured excess; 0 to
-    measure always.
+    damping: what is added to J Jᵀ, as a share of its trace.  Beside a singular configuration a
+    small violation can take a long step to mend; with more damping the point stays near where it
+    was, and what is left of its violation changes as smoothly as where it began.
+    last_step: a step shorter than this [rad] that corrects all rows is the last, and what it leaves
+    is estimated (`left_by`) in place of measured; 0 to measure always.
     """
 
     accuracy: float = 1e-9
     iterations: int = 50
     largest_step: float = 0.6
     last_step: float = 0.0
+    damping: float = 1e-10
 
 
 @dataclass(frozen=True)
@@ -96,16 +102,17 @@ def solve_normal(normal, size, right, smallest_pivot):
 
 
 class RetractionRoom(NamedTuple):
-    """What the projection writes into: what the constraint's kind needs, residual, excess, right,
-    active (m,), jacobian, rows (m, D), normal (m, m), step (D,).
+    """What the projection writes into: LANES configurations and which they are; excess, right (m,),
+    active, tolerance (m,), rows (m, D), normal (m, m), step (D,).
     """
 
-    own: Any
-    residual: np.ndarray
+    looked: Looked
+    places: np.ndarray
+    order: np.ndarray
     excess: np.ndarray
     right: np.ndarray
     active: np.ndarray
-    jacobian: np.ndarray
+    tolerance: np.ndarray
     rows: np.ndarray
     normal: np.ndarray
     step: np.ndarray
@@ -116,12 +123,13 @@ def new_room(constraint, dof):
     """Room for the projections of one constraint."""
     count = constraint.rows.held.shape[0]
     return RetractionRoom(
-        np.empty(constraint.room),
-        np.zeros(count),
+        new_look(constraint, dof),
+        np.empty((LANES, dof)),
+        np.empty(LANES, dtype=np.int64),
         np.empty(count),
         np.empty(count),
         np.empty(count, dtype=np.bool_),
-        np.empty((count, dof)),
+        np.empty(count),
         np.empty((count, dof)),
         np.empty((count, count)),
         np.empty(dof),
@@ -142,50 +150,100 @@ def _gathered(active, excess, jacobian, right, rows):
 
 
 @njit(**LEAF)
-def retract_one(manifold, bounds, q, settings, room):
-    """Gauss-Newton onto the constraint, in place: q ← q − Jᵀ(JJᵀ)⁻¹ ι(q) until |ι| ≤ accuracy, for
-    q (D,); returns the remaining excess.
-
-    bounds: how the rows are bounded.  A step is never longer than `largest_step` [rad], so that a
-    point far away walks to its own branch instead of jumping to another.
+def left_by(square, ridge, weights, size):
+    """What a step of Newton's method leaves of the rows that it corrects, about: its length's
+    square, and what the ridge on J Jᵀ takes from it, where joints hardly move a row.
     """
-    _, residual, excess, right, active, jacobian, rows, normal, step = room
-    dof, worst, count = q.shape[0], np.inf, np.sum(bounds.held)
-    for iteration in range(settings.iterations + 1):
-        linearise(manifold, q, room.own, residual, jacobian)
-        worst = excess_of(bounds, residual, excess, active)
-        if not worst > settings.accuracy or iteration == settings.iterations:
-            break
-        size = _gathered(active, excess, jacobian, right, rows)
-        trace = normal_matrix(rows, size, normal)
+    largest = 0.0
+    for i in range(size):
+        largest = max(largest, abs(weights[i]))
+    return square + ridge * largest
+
+
+@njit(**LEAF)
+def _step(q, jacobian, held, settings, room):
+    """One step of Gauss-Newton, in place; returns what is left, inf where that is to be measured,
+    and −1 where there is no step.
+    """
+    excess, right, active = room.excess, room.right, room.active
+    rows, normal, step = room.rows, room.normal, room.step
+    size = _gathered(active, excess, jacobian, right, rows)
+    ridge = settings.damping * normal_matrix(rows, size, normal) + 1e-300
+    for i in range(size):
+        normal[i, i] += ridge
+    if not solve_normal(normal, size, right, 0.0):
+        return -1.0
+    square = 0.0
+    for d in range(q.shape[0]):
+        step[d] = 0.0
         for i in range(size):
-            normal[i, i] += 1e-10 * trace + 1e-300
-        if not solve_normal(normal, size, right, 0.0):
-            break
-        length = 0.0
-        for d in range(dof):
-            step[d] = 0.0
-            for i in range(size):
-                step[d] += rows[i, d] * right[i]
-            length += step[d] * step[d]
-        length = np.sqrt(length)
-        scale = 1.0 if length <= settings.largest_step else settings.largest_step / length
-        for d in range(dof):
-            q[d] -= scale * step[d]
-        if length < settings.last_step and size == count:
-            return length * length
-    return worst
+            step[d] += rows[i, d] * right[i]
+        square += step[d] * step[d]
+    length = np.sqrt(square)
+    scale = 1.0 if length <= settings.largest_step else settings.largest_step / length
+    for d in range(q.shape[0]):
+        q[d] -= scale * step[d]
+    if length < settings.last_step and size == held:
+        left = left_by(square, ridge, right, size)
+        if left <= settings.accuracy:
+            return left
+    return np.inf
 
 
 @njit(**COMPILE)
 def retract_batch(manifold, shares, q, settings, worst):
-    """`retract_one` for each of q (B, D), in place.  shares (B,): of the tolerance, that each may
-    use.  worst (B,) gets the remaining excesses.
+    """`retract_all` of q (B, D), in room of its own."""
+    retract_all(manifold, shares, q, settings, worst, new_room(manifold.constraint, q.shape[1]))
+
+
+@njit(**LEAF)
+def retract_all(manifold, shares, q, settings, worst, room):
+    """Gauss-Newton onto the constraint, in place: q ← q − Jᵀ(JJᵀ)⁻¹ ι(q) until |ι| ≤ accuracy, for
+    each of q (B, D).  shares (B,): of the tolerance, that each may use; those below 0 are left
+    alone.  worst (B,) gets the remaining excesses, 0 for these.
+
+    A step is never longer than `largest_step` [rad], so that a point far away walks to its own
+    branch instead of jumping to another.
     """
-    bounds = manifold.constraint.rows
-    room, tolerance = new_room(manifold.constraint, q.shape[1]), bounds.tolerance.copy()
-    narrow = Rows(bounds.held, tolerance, bounds.together)
-    for b in range(q.shape[0]):
+    bounds, order = manifold.constraint.rows, room.order
+    held, begin = np.sum(bounds.held), 0
+    while begin < q.shape[0]:
+        count = 0
+        while begin < q.shape[0] and count < LANES:
+            worst[begin] = 0.0
+            if shares[begin] >= 0.0:
+                order[count] = begin
+                count += 1
+            begin += 1
+        for iteration in range(settings.iterations + 1):
+            if count == 0:
+                break
+            may = iteration < settings.iterations
+            count = _stepped(manifold, shares, q, count, held, may, settings, worst, room)
+
+
+@njit(**LEAF)
+def _stepped(manifold, shares, q, count, held, may, settings, worst, room):
+    """Look at the first `count` of `room.order` and, if they may, take a step; those that go on
+    become the first, and their number is returned.
+    """
+    bounds, order, tolerance = manifold.constraint.rows, room.order, room.tolerance
+    narrow, left = Rows(bounds.held, tolerance, bounds.together), 0
+    for k in range(count):
+        for d in range(q.shape[1]):
+            room.places[k, d] = q[order[k], d]
+    linearise(manifold, room.places[:count], room.looked)
+    for k in range(count):
+        b = order[k]
         for i in range(tolerance.shape[0]):
             tolerance[i] = shares[b] * bounds.tolerance[i]
-        worst[b] = retract_one(manifold, narrow, q[b], settings, room)
+        worst[b] = excess_of(narrow, room.looked.residuals[k], room.excess, room.active)
+        if not (worst[b] > settings.accuracy and may):
+            continue
+        after = _step(q[b], room.looked.jacobians[k], held, settings, room)
+        if after == np.inf:
+            order[left] = b
+            left += 1
+        elif after >= 0.0:
+            worst[b] = after
+    return left

@@ -8,7 +8,13 @@ import numpy as np
 from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
-from constraint_geodesics.constraints.kernels import append_normal, linearise, shared_tolerance
+from constraint_geodesics.constraints.kernels import (
+    append_normal,
+    linearise,
+    new_look,
+    shared_tolerance,
+)
+from constraint_geodesics.robot.kernels import LANES
 
 
 class Bounds(NamedTuple):
@@ -77,8 +83,7 @@ def tangential_gradient(manifold, limits, times, joints, gradients):
     dof = joints.shape[2]
     last = joints.shape[1] - 1
     bounds, touching = manifold.constraint.rows, limits.touching
-    own = np.empty(manifold.constraint.room)
-    residual, jacobian = np.zeros(bounds.held.shape[0]), np.zeros((bounds.held.shape[0], dof))
+    looked = new_look(manifold.constraint, dof)
     rows, row = np.empty((dof, dof)), np.empty(dof)
     any_held = bounds.held.any()
     for b in range(joints.shape[0]):
@@ -91,9 +96,11 @@ def tangential_gradient(manifold, limits, times, joints, gradients):
             for d in range(dof):
                 ahead = (joints[b, s + 1, d] - q[d]) / (times[s + 1] - times[s])
                 gradient[d] = ahead - (q[d] - joints[b, s - 1, d]) / (times[s] - times[s - 1])
-            size = 0
+            size, n = 0, (s - 1) % LANES
             if any_held:
-                linearise(manifold, q, own, residual, jacobian)
+                if n == 0:
+                    linearise(manifold, joints[b, s : min(s + LANES, last)], looked)
+                residual, jacobian = looked.residuals[n], looked.jacobians[n]
                 size = _constraint_normals(
                     bounds, touching, residual, jacobian, gradient, row, rows
                 )

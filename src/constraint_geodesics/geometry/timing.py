@@ -84,7 +84,8 @@ def time_parametrisation(
     if not all(map(math.isfinite, limits[1].tolist())):
         raise GeometryError(f"acceleration = {limits[1].tolist()}: must be finite")
     times, spacing = np.empty(len(q)), np.empty(len(q) - 1)
-    if _spaced(q, spacing):
+    total, _, least = write_steps(q, spacing)
+    if math.isfinite(total) and least > COINCIDENT * total:
         _times(q, spacing, *limits, times)
         return times
     if not np.isfinite(q).all():
@@ -108,17 +109,19 @@ def _limit(limit: np.ndarray, dim: int, what: str) -> np.ndarray:
 
 
 @njit(**LEAF)
-def _spaced(q, spacing):
-    """Distances of neighbouring rows (T − 1,); whether all are finite and none coincide."""
-    total, least = 0.0, np.inf
-    for i in range(spacing.shape[0]):
+def write_steps(q, steps):
+    """Distances of neighbouring rows (T, D) into steps (T − 1,); their sum, the longest and the
+    least.
+    """
+    total, longest, least = 0.0, 0.0, np.inf
+    for i in range(steps.shape[0]):
         square = 0.0
         for d in range(q.shape[1]):
             square += (q[i + 1, d] - q[i, d]) ** 2
-        spacing[i] = np.sqrt(square)
-        total += spacing[i]
-        least = min(least, spacing[i])
-    return np.isfinite(total) and least > COINCIDENT * total
+        steps[i] = np.sqrt(square)
+        total += steps[i]
+        longest, least = max(longest, steps[i]), min(least, steps[i])
+    return total, longest, least
 
 
 @njit(**COMPILE)

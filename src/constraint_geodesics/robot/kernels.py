@@ -7,6 +7,8 @@ previous joint's frame to this joint's frame at zero, `axes` (D, 3) the joint ax
 `prismatic` (D,) bool, `tool` (4, 4) from the last joint's frame to the tool.
 """
 
+import math
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
@@ -14,84 +16,123 @@ from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
 
+EXACT = LEAF | {"fastmath": False}
+"""Those whose last bit does not hang on how a loop is compiled."""
 
-# A frame is a tuple of scalars, its position and its rotation by rows: an allocation costs more
-# than the arithmetic of a joint.  The three functions below are inlined, since passing a frame
-# through a call is slower.
-@njit(**COMPILE, inline="always")
-def frame_of(m):
-    """The frame that a transform (4, 4) leads to from the base."""
+
+def _split(exact: Fraction, bits: int) -> tuple[float, Fraction]:
+    """A number's leading bits, and the rest."""
+    unit = Fraction(2) ** (math.frexp(float(exact))[1] - bits)
+    leading = (exact // unit) * unit
+    return float(leading), exact - leading
+
+
+# π/2 in parts, of which so many quarter turns are exact products
+_FIRST, _rest = _split(Fraction(15707963267948966192313216916397514420986, 10**40), 33)
+_SECOND, _rest = _split(_rest, 33)
+_THIRD = float(_rest)
+_QUARTERS = 2.0 / math.pi
+_TO_INTEGER = 1.5 * 2.0**52  # added and taken off again, it rounds to the nearest integer
+_S1, _S2, _S3, _S4, _S5, _S6, _S7, _S8 = (
+    (-1) ** k / math.factorial(2 * k + 1) for k in range(1, 9)
+)
+_C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9 = (
+    (-1) ** k / math.factorial(2 * k) for k in range(1, 10)
+)
+
+
+# What is inlined here is the arithmetic of one configuration and of many side by side alike.  A
+# frame is three lines of scalars, each a coordinate of its origin and a row of its rotation: an
+# allocation costs more than the arithmetic of a joint, and so does passing a frame through a call.
+@njit(**EXACT, inline="always")
+def sine_cosine(angle):
+    """Sine and cosine of an angle [rad], to 1e-15 up to 10⁵ rad, by their Taylor series about the
+    nearest multiple of π/2: a compiler can work out many of them side by side.
+    """
+    turns = (angle * _QUARTERS + _TO_INTEGER) - _TO_INTEGER
+    x = ((angle - turns * _FIRST) - turns * _SECOND) - turns * _THIRD
+    y = x * x
+    s = _S1 + y * (_S2 + y * (_S3 + y * (_S4 + y * (_S5 + y * (_S6 + y * (_S7 + y * _S8))))))
+    c = _C5 + y * (_C6 + y * (_C7 + y * (_C8 + y * _C9)))
+    c = _C1 + y * (_C2 + y * (_C3 + y * (_C4 + y * c)))
+    s, c = x + x * y * s, 1.0 + y * c
+    quarter = turns - 4.0 * np.floor(0.25 * turns)
+    odd = (quarter == 1.0) | (quarter == 3.0)
+    sine = c if odd else s
+    cosine = s if odd else c
+    sine = -sine if quarter >= 2.0 else sine
+    cosine = -cosine if (quarter == 1.0) | (quarter == 2.0) else cosine
+    return sine, cosine
+
+
+@njit(**EXACT, inline="always")
+def line_of(m, i):
+    """Line i of the frame that a transform (4, 4) leads to from the base."""
+    return m[i, 3], m[i, 0], m[i, 1], m[i, 2]
+
+
+@njit(**EXACT, inline="always")
+def columns_of(m):
+    """A transform (4, 4) by its columns, the translation first, as `moved` takes it."""
     return (
-        m[0, 3],
-        m[1, 3],
-        m[2, 3],
-        m[0, 0],
-        m[0, 1],
-        m[0, 2],
-        m[1, 0],
-        m[1, 1],
-        m[1, 2],
-        m[2, 0],
-        m[2, 1],
-        m[2, 2],
+        (m[0, 3], m[1, 3], m[2, 3]),
+        (m[0, 0], m[1, 0], m[2, 0]),
+        (m[0, 1], m[1, 1], m[2, 1]),
+        (m[0, 2], m[1, 2], m[2, 2]),
     )
 
 
-@njit(**COMPILE, inline="always")
-def moved_frame(frame, m):
-    """The frame that a transform (4, 4) leads to from `frame`."""
-    p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = frame
+@njit(**EXACT, inline="always")
+def along(line, axis):
+    """The product of a line's row with a column: of a frame's axis, a coordinate in the base
+    frame.
+    """
+    return line[1] * axis[0] + line[2] * axis[1] + line[3] * axis[2]
+
+
+@njit(**EXACT, inline="always")
+def moved(line, columns):
+    """A line of the frame that a transform leads to from a frame."""
+    place, x, y, z = columns
+    return line[0] + along(line, place), along(line, x), along(line, y), along(line, z)
+
+
+@njit(**EXACT, inline="always")
+def turned(line, axis, own, sine, cosine):
+    """A line of a frame that was turned about its axis; own: what `along` says.  By Rodrigues'
+    formula.
+    """
+    p, u, v, w = line
+    x, y, z = axis
+    rest = own * (1.0 - cosine)
     return (
-        p0 + r00 * m[0, 3] + r01 * m[1, 3] + r02 * m[2, 3],
-        p1 + r10 * m[0, 3] + r11 * m[1, 3] + r12 * m[2, 3],
-        p2 + r20 * m[0, 3] + r21 * m[1, 3] + r22 * m[2, 3],
-        r00 * m[0, 0] + r01 * m[1, 0] + r02 * m[2, 0],
-        r00 * m[0, 1] + r01 * m[1, 1] + r02 * m[2, 1],
-        r00 * m[0, 2] + r01 * m[1, 2] + r02 * m[2, 2],
-        r10 * m[0, 0] + r11 * m[1, 0] + r12 * m[2, 0],
-        r10 * m[0, 1] + r11 * m[1, 1] + r12 * m[2, 1],
-        r10 * m[0, 2] + r11 * m[1, 2] + r12 * m[2, 2],
-        r20 * m[0, 0] + r21 * m[1, 0] + r22 * m[2, 0],
-        r20 * m[0, 1] + r21 * m[1, 1] + r22 * m[2, 1],
-        r20 * m[0, 2] + r21 * m[1, 2] + r22 * m[2, 2],
+        p,
+        u * cosine + (v * z - w * y) * sine + rest * x,
+        v * cosine + (w * x - u * z) * sine + rest * y,
+        w * cosine + (u * y - v * x) * sine + rest * z,
     )
 
 
-@njit(**COMPILE, inline="always")
+@njit(**EXACT, inline="always")
 def joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes):
     """The frame that joint j carries, from that of the joint before; writes the joint's origin and
     axis.
     """
-    p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = moved_frame(frame, origins[j])
-    x, y, z = axes[j, 0], axes[j, 1], axes[j, 2]
-    a0 = r00 * x + r01 * y + r02 * z
-    a1 = r10 * x + r11 * y + r12 * z
-    a2 = r20 * x + r21 * y + r22 * z
-    joint_origins[j, 0], joint_origins[j, 1], joint_origins[j, 2] = p0, p1, p2
+    m, axis = columns_of(origins[j]), (axes[j, 0], axes[j, 1], axes[j, 2])
+    one, two, three = moved(frame[0], m), moved(frame[1], m), moved(frame[2], m)
+    a0, a1, a2 = along(one, axis), along(two, axis), along(three, axis)
+    joint_origins[j, 0], joint_origins[j, 1], joint_origins[j, 2] = one[0], two[0], three[0]
     joint_axes[j, 0], joint_axes[j, 1], joint_axes[j, 2] = a0, a1, a2
     if prismatic[j]:
-        p0, p1, p2 = p0 + a0 * q[j], p1 + a1 * q[j], p2 + a2 * q[j]
+        one = one[0] + a0 * q[j], one[1], one[2], one[3]
+        two = two[0] + a1 * q[j], two[1], two[2], two[3]
+        three = three[0] + a2 * q[j], three[1], three[2], three[3]
     else:
-        # Rodrigues' rotation of each column c about the axis a: c cos + (a × c) sin + a (a·c)(1 −
-        # cos)
-        c, s = np.cos(q[j]), np.sin(q[j])
-        x, y, z = x * (1.0 - c), y * (1.0 - c), z * (1.0 - c)
-        r00, r10, r20 = (
-            r00 * c + (a1 * r20 - a2 * r10) * s + a0 * x,
-            r10 * c + (a2 * r00 - a0 * r20) * s + a1 * x,
-            r20 * c + (a0 * r10 - a1 * r00) * s + a2 * x,
-        )
-        r01, r11, r21 = (
-            r01 * c + (a1 * r21 - a2 * r11) * s + a0 * y,
-            r11 * c + (a2 * r01 - a0 * r21) * s + a1 * y,
-            r21 * c + (a0 * r11 - a1 * r01) * s + a2 * y,
-        )
-        r02, r12, r22 = (
-            r02 * c + (a1 * r22 - a2 * r12) * s + a0 * z,
-            r12 * c + (a2 * r02 - a0 * r22) * s + a1 * z,
-            r22 * c + (a0 * r12 - a1 * r02) * s + a2 * z,
-        )
-    return p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22
+        s, c = sine_cosine(q[j])
+        one = turned(one, axis, a0, s, c)
+        two = turned(two, axis, a1, s, c)
+        three = turned(three, axis, a2, s, c)
+    return one, two, three
 
 
 class Posture(NamedTuple):
@@ -111,20 +152,113 @@ def new_posture(dof):
     return Posture(np.empty(3), np.empty((3, 3)), np.empty((dof, 3)), np.empty((dof, 3)))
 
 
-@njit(**LEAF)
+@njit(**EXACT)
 def pose_of(chain, q, posture):
     """Write the posture of one configuration."""
     # taken apart once: a field that is read in a loop counts its array's references each time
     origins, axes, prismatic, base, tool = chain
     position, rotation, joint_origins, joint_axes = posture
-    frame = frame_of(base)
+    frame = line_of(base, 0), line_of(base, 1), line_of(base, 2)
     for j in range(q.shape[0]):
         frame = joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes)
-    p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = moved_frame(frame, tool)
-    position[0], position[1], position[2] = p0, p1, p2
-    rotation[0, 0], rotation[0, 1], rotation[0, 2] = r00, r01, r02
-    rotation[1, 0], rotation[1, 1], rotation[1, 2] = r10, r11, r12
-    rotation[2, 0], rotation[2, 1], rotation[2, 2] = r20, r21, r22
+    m = columns_of(tool)
+    one, two, three = moved(frame[0], m), moved(frame[1], m), moved(frame[2], m)
+    position[0], rotation[0, 0], rotation[0, 1], rotation[0, 2] = one
+    position[1], rotation[1, 0], rotation[1, 1], rotation[1, 2] = two
+    position[2], rotation[2, 0], rotation[2, 1], rotation[2, 2] = three
+
+
+LANES = 32
+"""Configurations that are worked out side by side."""
+_BLOCK = 8
+"""Lanes are filled up to a multiple of these: a loop's last few take as long."""
+_FEW = 6
+"""Configurations below which each is worked out by itself."""
+
+
+class Lanes(NamedTuple):
+    """Where an arm is in up to LANES configurations: frame (3, 4, LANES), the tool's position, then
+    its rotation; origins, axes (D, 3, LANES) of the joints; and their sines and cosines, or
+    positions in place of sines (D, LANES).
+    """
+
+    frame: np.ndarray
+    origins: np.ndarray
+    axes: np.ndarray
+    sines: np.ndarray
+    cosines: np.ndarray
+
+
+@njit(inline="always", **LEAF)
+def posture_in(lanes, n):
+    """The posture of configuration n."""
+    frame = lanes.frame
+    return Posture(frame[:, 0, n], frame[:, 1:, n], lanes.origins[:, :, n], lanes.axes[:, :, n])
+
+
+@njit(**EXACT)
+def _move_lanes(line, m, count):
+    """`moved` of a line (4, LANES), in place.  Here and below a loop that writes more is slower:
+    the compiler has to know that no output is another's input.
+    """
+    p, r0, r1, r2 = line[0], line[1], line[2], line[3]
+    columns = columns_of(m)
+    for n in range(count):
+        p[n] = p[n] + along((0.0, r0[n], r1[n], r2[n]), columns[0])
+    for n in range(count):
+        _, r0[n], r1[n], r2[n] = moved((0.0, r0[n], r1[n], r2[n]), columns)
+
+
+@njit(**EXACT)
+def _turn_lanes(line, axis, own, sines, cosines, count):
+    """`turned` of a line (4, LANES), in place."""
+    r0, r1, r2 = line[1], line[2], line[3]
+    for n in range(count):
+        row = 0.0, r0[n], r1[n], r2[n]
+        _, r0[n], r1[n], r2[n] = turned(row, axis, own[n], sines[n], cosines[n])
+
+
+@njit(**EXACT)
+def poses_of(chain, q, lanes):
+    """Write the postures of at most LANES configurations (B, D), each to the bit as `pose_of`
+    does.
+    """
+    origins, axes, prismatic, base, tool = chain
+    frame, joint_origins, joint_axes, sines, cosines = lanes
+    given, dof = q.shape
+    if given < _FEW:
+        for n in range(given):
+            pose_of(chain, q[n], posture_in(lanes, n))
+        return
+    count = -(-given // _BLOCK) * _BLOCK
+    for j in range(dof):
+        angles, other = sines[j], cosines[j]
+        for n in range(count):
+            angles[n] = q[min(n, given - 1), j]
+        if not prismatic[j]:
+            for n in range(count):
+                angles[n], other[n] = sine_cosine(angles[n])
+    for i in range(3):
+        for k in range(4):
+            frame[i, k, :count] = base[i, (k + 3) % 4]
+    for j in range(dof):
+        axis, s, c = (axes[j, 0], axes[j, 1], axes[j, 2]), sines[j], cosines[j]
+        for i in range(3):
+            line = frame[i]
+            _move_lanes(line, origins[j], count)
+            p, r0, r1, r2 = line[0], line[1], line[2], line[3]
+            o, a = joint_origins[j, i], joint_axes[j, i]
+            for n in range(count):
+                o[n] = p[n]
+            for n in range(count):
+                a[n] = along((p[n], r0[n], r1[n], r2[n]), axis)
+            if prismatic[j]:
+                for n in range(count):
+                    p[n] += a[n] * s[n]
+            else:
+                _turn_lanes(line, axis, a, s, c, count)
+    for i in range(3):
+        _move_lanes(frame[i], tool, count)
 
 
 @njit(**COMPILE)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
-from constraint_geodesics.robot.kernels import frame_of, joint_frame
+from constraint_geodesics.robot.kernels import joint_frame, line_of
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene import convex_kernels as convex
 from constraint_geodesics.scene.bodies import NodeTable, pairs_of, read_bodies
@@ -144,15 +144,13 @@ def _place_frames(chain, q, frames, joint_origins, joint_axes):
     # the base's frame is where its links are read
     frames[0] = 0.0
     frames[0, 3] = frames[0, 7] = frames[0, 11] = 1.0
-    frame = frame_of(base)
+    frame = line_of(base, 0), line_of(base, 1), line_of(base, 2)
     for j in range(q.shape[0]):
         frame = joint_frame(origins, axes, prismatic, q, j, frame, joint_origins, joint_axes)
-        p0, p1, p2, r00, r01, r02, r10, r11, r12, r20, r21, r22 = frame
         own = frames[j + 1]
-        own[0], own[1], own[2] = p0, p1, p2
-        own[3], own[4], own[5] = r00, r01, r02
-        own[6], own[7], own[8] = r10, r11, r12
-        own[9], own[10], own[11] = r20, r21, r22
+        own[0], own[3], own[4], own[5] = frame[0]
+        own[1], own[6], own[7], own[8] = frame[1]
+        own[2], own[9], own[10], own[11] = frame[2]
 
 
 @njit(**COMPILE)

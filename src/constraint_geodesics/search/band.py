@@ -1,9 +1,7 @@
-"""The elastic band: a chain of points on the constraint, shortened by Newton's method, and the
-curve through it.
+"""Settings of the elastic band: a chain of points on the constraint, shortened by Newton's method
+within the joint limits and clear of the workcell and of the arm itself.
 
-The short second-order refinement of a proposed curve.  It works in joint space on the exact
-constraint, within the joint limits and clear of the workcell and of the arm itself; the arithmetic
-is in band_kernels.py.
+The arithmetic is in band_kernels.py, the curve through the points in curve_kernels.py.
 """
 
 from dataclasses import dataclass
@@ -16,7 +14,7 @@ from constraint_geodesics.search.space import Space, project_points
 
 ACCURACY = 1e-9
 """Violation [rad or m] that is left on a point of a curve, at most."""
-PROJECTION = Retraction(ACCURACY, iterations=12, last_step=1e-5)
+PROJECTION = Retraction(ACCURACY, iterations=12, last_step=1e-5, damping=1e-6)
 _AFTER_STEP = PROJECTION._replace(iterations=6)
 """The projection of a node after a step of the band."""
 

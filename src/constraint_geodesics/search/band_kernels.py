@@ -19,14 +19,17 @@ from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.kernels import (
+    Looked,
     backward,
     cholesky,
     curvature,
     forward,
     linearise,
+    new_look,
     shared_tolerance,
 )
 from constraint_geodesics.constraints.projection import normal_matrix
+from constraint_geodesics.robot.kernels import LANES
 from constraint_geodesics.scene.clearance import (
     DISTANCE,
     PAIR,
@@ -40,6 +43,8 @@ from constraint_geodesics.search.space import (
     STILL,
     Workspace,
     is_free,
+    look_at,
+    project_all,
     project_node,
     workspace,
 )
@@ -70,11 +75,12 @@ class _Active(NamedTuple):
 
 
 class _BandWork(NamedTuple):
-    """What the kernels of a band write into: contact_weights, here, there, moved, row, gradient
-    (D,); the second derivatives full (D, D).
+    """What the kernels of a band write into: what is known of LANES nodes; contact_weights, here,
+    there, moved, row, gradient (D,); the second derivatives full (D, D).
     """
 
     node: Workspace
+    looked: Looked
     active: _Active
     contact_weights: np.ndarray
     here: np.ndarray
@@ -100,6 +106,7 @@ def new_work(space):
     )
     return _BandWork(
         node,
+        new_look(space.constraint, dof),
         active,
         np.empty(dof),
         np.empty(dof),
@@ -126,8 +133,8 @@ def _weighted_gradient(space, q, cone_weight, contacts, work, out):
     bounded together, and of so many contacts.
     """
     node, bounds = work.node, space.constraint.rows
-    residual, jacobian = node.residual, node.jacobian
-    linearise(space, q, node.constraint, residual, jacobian)
+    look_at(space, q, node)
+    residual, jacobian = node.looked.residuals[0], node.looked.jacobians[0]
     out[:] = 0.0
     size = _size_together(bounds, residual)
     for i in range(residual.shape[0]):
@@ -149,12 +156,13 @@ def _weighted_gradient(space, q, cone_weight, contacts, work, out):
 
 
 @njit(**LEAF)
-def _gather(space, q, work):
+def _gather(space, q, which, work):
     """The rows at q that count into `work.active`: exact ones, and inequalities that are near;
     returns how many.
     """
     dof, node, active, bounds = q.shape[0], work.node, work.active, space.constraint.rows
-    residual, jacobian, limits = node.residual, node.jacobian, space.limits
+    residual, jacobian = work.looked.residuals[which], work.looked.jacobians[which]
+    limits = space.limits
     rows, of, signs, loose, slack = (
         active.rows,
         active.of,
@@ -165,7 +173,6 @@ def _gather(space, q, work):
     count = residual.shape[0]
     common = shared_tolerance(bounds)
     cone = common > 0.0  # the size of the vector is bounded, not each entry
-    linearise(space, q, node.constraint, residual, jacobian)
     size = 0
     for i in range(count):
         if not bounds.held[i] or (cone and bounds.together[i]):
@@ -268,7 +275,7 @@ def _let_go(active, size, gradient, normal, here, onto):
 
 
 @njit(**LEAF)
-def _null_space(rows, size, basis):
+def null_space(rows, size, basis):
     """Orthonormal basis (D, k) of the null space of the leading rows, which are overwritten;
     returns k.  By Householder's reflections I − v vᵀ with |v|² = 2.
     """
@@ -335,7 +342,7 @@ def _weigh(active, size, work):
 
 
 @njit(**LEAF)
-def _add_curvature(space, q, weighed, basis, count, hessian, work):
+def _add_curvature(space, q, which, weighed, basis, count, hessian, work):
     """Add Nᵀ (Σ λ_j ∇²c_j) N to the leading (k, k) of `hessian`, N the leading k columns of
     `basis`: in closed form where the kind knows one, else by finite differences.  weighed: the
     weight of the rows bounded together, and how many contacts count.
@@ -345,7 +352,7 @@ def _add_curvature(space, q, weighed, basis, count, hessian, work):
     if (
         cone_weight == 0.0
         and contacts == 0
-        and curvature(space, node.weights, node.constraint, full)
+        and curvature(space, node.weights, work.looked, which, full)
     ):
         for k in range(count):
             for i in range(dof):
@@ -376,23 +383,23 @@ def _add_curvature(space, q, weighed, basis, count, hessian, work):
 
 
 @njit(**LEAF)
-def reduced(space, q, gradient, basis, hessian, onto, work):
+def reduced(space, q, which, gradient, basis, hessian, onto, work):
     """Null space `basis` (D, k) of the active rows at q and the reduced Hessian (k, k); returns k.
 
-    gradient: e = 2 q_i − q_{i−1} − q_{i+1} (D,).  An inequality whose multiplier would hold the
-    node back is let go.
+    which: of the configurations in `work.looked` q is.  gradient: e = 2 q_i − q_{i−1} − q_{i+1}
+    (D,).  An inequality whose multiplier would hold the node back is let go.
     onto (D,): the shortest step that ends on the inequalities that are kept.
     """
     node = work.node
-    size = _gather(space, q, work)
+    size = _gather(space, q, which, work)
     size = _let_go(work.active, size, gradient, node.normal, work.here, onto)
-    count = _null_space(work.active.rows, size, basis)
+    count = null_space(work.active.rows, size, basis)
     cone_weight, contacts, curved = _weigh(work.active, size, work)
     for k in range(count):
         for j in range(count):
             hessian[k, j] = 2.0 if k == j else 0.0
     if curved:
-        _add_curvature(space, q, (cone_weight, contacts), basis, count, hessian, work)
+        _add_curvature(space, q, which, (cone_weight, contacts), basis, count, hessian, work)
     return count
 
 
@@ -488,7 +495,8 @@ def _hold_back(space, nodes, trial, held, work):
 
 class _Band(NamedTuple):
     """What the m inner nodes of a band have: bases, hessians, factors, couplings (m, D, D), counts
-    (m,), gradients, right, steps, onto (m, D); trial (m + 2, D), held (m + 2,).
+    (m,), gradients, right, steps, onto (m, D); trial (m + 2, D), held (m + 2,); shares, left (m,)
+    of `project_all`.
     """
 
     bases: np.ndarray
@@ -502,6 +510,8 @@ class _Band(NamedTuple):
     onto: np.ndarray
     trial: np.ndarray
     held: np.ndarray
+    shares: np.ndarray
+    left: np.ndarray
 
 
 @njit(**COMPILE)
@@ -520,6 +530,8 @@ def _new_band(nodes):
         np.empty((m, dof)),
         nodes.copy(),
         np.zeros(m + 2, dtype=np.bool_),
+        np.ones(m),
+        np.empty(m),
     )
 
 
@@ -531,10 +543,13 @@ def _linearise_band(space, nodes, band, work):
     n, dof = nodes.shape[0] - 1, nodes.shape[1]
     onto, gradient = band.onto, work.gradient
     for i in range(n - 1):
+        which = i % LANES
+        if which == 0:
+            linearise(space, nodes[i + 1 : min(i + 1 + LANES, n)], work.looked)
         for d in range(dof):
             gradient[d] = gradient_of(nodes, i + 1, d)
         band.counts[i] = reduced(
-            space, nodes[i + 1], gradient, band.bases[i], band.hessians[i], onto[i], work
+            space, nodes[i + 1], which, gradient, band.bases[i], band.hessians[i], onto[i], work
         )
     for i in range(n - 1):
         for d in range(dof):
@@ -572,17 +587,31 @@ def _promise(nodes, band):
     return promised, longest
 
 
+@njit(**LEAF)
+def _project_nodes(space, nodes, settings, band, work):
+    """Project inner nodes (m, D) in place; returns what remains of the violation of the worst.
+
+    Side by side where nothing may meet; else onto all bounds at once, which leads to shorter bands
+    than the constraint first and what is near only then.
+    """
+    if space.clearance.top == 0:
+        return project_all(space, nodes, band.shares, settings, band.left, work)
+    worst = 0.0
+    for i in range(nodes.shape[0]):
+        worst = max(worst, project_node(space, nodes[i], settings, work))
+    return worst
+
+
 @njit(inline="always", **LEAF)
 def _moved(space, nodes, scale, projection, band, work):
     """The nodes after a share of the steps, projected, into `band.trial`; returns what remains of
     the violation.
     """
-    trial, worst = band.trial, 0.0
-    for i in range(1, nodes.shape[0] - 1):
+    trial, n = band.trial, nodes.shape[0] - 1
+    for i in range(1, n):
         for d in range(nodes.shape[1]):
             trial[i, d] = nodes[i, d] + scale * band.steps[i - 1, d]
-        worst = max(worst, project_node(space, trial[i], projection, work))
-    return worst
+    return _project_nodes(space, trial[1:n], projection, band, work)
 
 
 @njit(**COMPILE)
@@ -598,9 +627,8 @@ def relax_band(space, nodes, settings):
     n = nodes.shape[0] - 1
     work, band = new_work(space), _new_band(nodes)
     trial = band.trial
-    worst, used, converged = 0.0, 0, False
-    for i in range(1, n):
-        worst = max(worst, project_node(space, nodes[i], space.projection, work.node))
+    used, converged = 0, False
+    worst = _project_nodes(space, nodes[1:n], space.projection, band, work.node)
     energy = band_energy(nodes)
     for _ in range(most):
         used += 1

@@ -28,7 +28,7 @@ from constraint_geodesics.search.tree import tree_way
 
 Source = Literal["straight", "policy", "graph", "tree", "bend"]
 
-ROW_SAFETY = 0.8
+ROW_SAFETY = 0.95
 """Share of the allowed violation between two rows that their distance is chosen for."""
 PARTLY_RELAXED = (3, 1, 0)
 """Iterations of a band that must stay near the graph."""
@@ -297,8 +297,8 @@ def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
 
 
 def rows_of(candidate: Candidate, violation: float) -> Float[np.ndarray, "T D"]:
-    """Rows so close that straight joint lines between them leave the constraint by less than
-    `violation` [rad or m], the candidate's points among them.
+    """Rows along the candidate so close that straight joint lines between them leave the constraint
+    by less than `violation` [rad or m].
     """
     rows: np.ndarray = rows_along(
         candidate.space, candidate.points, ROW_SAFETY * violation, PROJECTION

@@ -9,11 +9,14 @@ from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.kernels import ManifoldArrays, violation_batch
+from constraint_geodesics.geometry.timing import write_steps
 from constraint_geodesics.search.band_kernels import relax_band
 from constraint_geodesics.search.space import project_points
 
 CHECK_STEP = 0.1
 """Distance of the points at which a relaxed curve is first looked at [rad]."""
+FEWEST = 3
+"""Steps between them at least: a spline through fewer is straight."""
 JUMP = 3.0
 """A step between two of these points longer than so many times CHECK_STEP is a jump to another
 branch.
@@ -22,6 +25,8 @@ HALVINGS = 8
 """Times that rows are drawn closer where the lines between them still leave the constraint."""
 LONGEST_ROW_STEP = 0.08
 """Distance of two rows at most [rad], however flat the path."""
+FILLED = 0.95
+"""Share of what is allowed that a line's length is to use: what it is off changes along the way."""
 _LEFT = 1e-6
 _COINCIDENT = 1e-12
 
@@ -34,22 +39,6 @@ class Spline(NamedTuple):
     knots: np.ndarray
     nodes: np.ndarray
     moments: np.ndarray
-
-
-@njit(**LEAF)
-def _write_steps(points, steps):
-    """Distances between neighbouring points (T, D) into steps (T − 1,); returns their sum and the
-    longest.
-    """
-    total, longest = 0.0, 0.0
-    for i in range(points.shape[0] - 1):
-        square = 0.0
-        for d in range(points.shape[1]):
-            square += (points[i + 1, d] - points[i, d]) ** 2
-        steps[i] = np.sqrt(square)
-        total += steps[i]
-        longest = max(longest, steps[i])
-    return total, longest
 
 
 @njit(**LEAF)
@@ -117,7 +106,7 @@ def spline_through(nodes):
     """
     n = nodes.shape[0] - 1
     h, knots, moments = np.empty(n), np.zeros(n + 1), np.empty(nodes.shape)
-    _write_steps(nodes, h)
+    write_steps(nodes, h)
     curve = Spline(knots, nodes, moments)
     for i in range(n):
         if not (np.isfinite(h[i]) and h[i] > _COINCIDENT):
@@ -158,12 +147,12 @@ def relaxed_curve(space, nodes, steps, settings):
     if not sound:
         return False, moved, moved, 0.0, used
     length = curve.knots[-1]
-    count = max(int(np.ceil(length / CHECK_STEP)), 2)
+    count = max(int(np.ceil(length / CHECK_STEP)), FEWEST)
     shares = np.empty(count + 1)
     for k in range(count + 1):
         shares[k] = k / count
     points, left = curve_points(space, curve, shares, settings)
-    total, longest = _write_steps(points, np.empty(count))
+    total, longest, _ = write_steps(points, np.empty(count))
     sound = not (left > _LEFT or longest > JUMP * length / count)
     return sound, moved, points, total, used
 
@@ -179,30 +168,23 @@ def _halfway(space, points):
 
 @njit(**COMPILE)
 def rows_along(space, points, allowed, settings):
-    """Rows (T, D) on the curve through points of the space, these among them, so close that
-    straight joint lines between them leave the constraint by at most `allowed` [rad or m]; the
-    points alone where two of them coincide.
+    """Rows (T, D) on the curve through points of the space, so close that straight joint lines
+    between them leave the constraint by at most `allowed` [rad or m]; the points alone where two of
+    them coincide.
 
     The curve is the spline through the points, projected: so close to the constraint that a step or
     two do.  Between two points h apart a straight line is off by r''h²/8; halfway it is measured,
-    and h chosen from it.  Near a singular configuration r'' changes faster than that: lines that
-    are still off are halved.
+    and the rows are spread by it.  Near a singular configuration r'' changes faster than that:
+    lines that are still off are halved.
     """
     curve, sound = spline_through(points)
     if not sound:
         return points.copy()
-    shares, new = _drawn_closer(curve, _halfway(space, points), allowed)
-    rows = np.empty((shares.shape[0], points.shape[1]))
-    _along(curve, shares, rows)
-    k = 0
-    for i in range(shares.shape[0]):
-        if not new[i]:
-            rows[i] = points[k]
-            k += 1
-    project_points(space, rows, new, settings)
+    shares = _spread(curve, _halfway(space, points), allowed)
+    rows, _ = curve_points(space, curve, shares, settings)
     for _ in range(HALVINGS):
         steps, halfway = np.empty(rows.shape[0] - 1), _halfway(space, rows)
-        _write_steps(rows, steps)
+        write_steps(rows, steps)
         off, extra = np.empty(steps.shape[0], np.bool_), 0
         for i in range(steps.shape[0]):
             off[i] = halfway[i] > allowed or steps[i] > 1.1 * LONGEST_ROW_STEP
@@ -220,25 +202,26 @@ def rows_along(space, points, allowed, settings):
 
 
 @njit(**COMPILE)
-def _drawn_closer(curve, halfway, allowed):
-    """Shares (T,) of the way whose lines are to be off by no more than is allowed, the curve's
-    knots among them, and which of them are new (T,).
+def _spread(curve, halfway, allowed):
+    """Shares (T,) of the way from 0 to 1 whose lines are as long as is allowed: by the constraint,
+    which those between the curve's knots leave by `halfway`, and by LONGEST_ROW_STEP.
     """
-    knots, count = curve.knots, halfway.shape[0]
-    pieces, total = np.empty(count, dtype=np.int64), 0
-    for i in range(count):
+    knots, last = curve.knots, halfway.shape[0]
+    wanted = np.zeros(last + 1)  # lines up to each of the knots
+    for i in range(last):
         step = knots[i + 1] - knots[i]
-        wanted = max(np.sqrt(halfway[i] / allowed), step / LONGEST_ROW_STEP)
-        pieces[i] = max(int(np.ceil(wanted)), 1)
-        total += pieces[i]
-    shares, new, k = np.empty(total + 1), np.ones(total + 1, np.bool_), 0
-    for i in range(count):
-        new[k] = False
-        for j in range(pieces[i]):
-            shares[k] = (knots[i] + j * (knots[i + 1] - knots[i]) / pieces[i]) / knots[-1]
-            k += 1
-    shares[total], new[total] = 1.0, False
-    return shares, new
+        lines = max(np.sqrt(halfway[i] / allowed), step / LONGEST_ROW_STEP)
+        wanted[i + 1] = wanted[i] + lines
+    count = int(np.ceil(wanted[last] / FILLED))
+    shares, i = np.empty(count + 1), 0
+    for k in range(count + 1):
+        at = k / count * wanted[last]
+        while i < last - 1 and at > wanted[i + 1]:
+            i += 1
+        within = (at - wanted[i]) / (wanted[i + 1] - wanted[i])
+        shares[k] = (knots[i] + within * (knots[i + 1] - knots[i])) / knots[last]
+    shares[0], shares[count] = 0.0, 1.0
+    return shares
 
 
 @njit(**COMPILE)

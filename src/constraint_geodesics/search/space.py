@@ -10,12 +10,14 @@ from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.constraints.kernels import ManifoldArrays, excess_of, linearise
+from constraint_geodesics.constraints.kernels import Looked, ManifoldArrays, excess_of, linearise
 from constraint_geodesics.constraints.projection import (
     Retraction,
+    RetractionRoom,
+    left_by,
     new_room,
     normal_matrix,
-    retract_one,
+    retract_all,
     solve_normal,
 )
 from constraint_geodesics.robot.kinematics import ChainArrays
@@ -66,16 +68,16 @@ def space_of(
 class Workspace(NamedTuple):
     """What the kernels write into, allocated once.
 
-    constraint: what its kind needs; residual, excess, active, weights (m,) and jacobian (m, D) of
-    its rows; contacts; rows, normal (D, D); right, squares, before, point (D,).
+    retraction: of the constraint alone; looked: its own, of one configuration, place (1, D);
+    excess, active, weights (m,); contacts; rows, normal (D, D); right, squares, before, point (D,).
     """
 
-    constraint: Any
-    residual: np.ndarray
+    retraction: RetractionRoom
+    looked: Looked
+    place: np.ndarray
     excess: np.ndarray
     active: np.ndarray
     weights: np.ndarray
-    jacobian: np.ndarray
     contacts: Contacts
     rows: np.ndarray
     normal: np.ndarray
@@ -89,13 +91,14 @@ class Workspace(NamedTuple):
 def workspace(space):
     """A workspace for the kernels of this space."""
     dof, count = space.limits.shape[1], space.constraint.rows.held.shape[0]
+    retraction = new_room(space.constraint, dof)
     return Workspace(
-        np.empty(space.constraint.room),
-        np.zeros(count),
+        retraction,
+        retraction.looked,
+        np.empty((1, dof)),
         np.zeros(count),
         np.zeros(count, dtype=np.bool_),
         np.zeros(count),
-        np.zeros((count, dof)),
         new_contacts(space.clearance, dof),
         np.empty((dof, dof)),
         np.empty((dof, dof)),
@@ -106,23 +109,32 @@ def workspace(space):
     )
 
 
+@njit(inline="always", **LEAF)
+def look_at(space, q, work):
+    """Residual and Jacobian of one configuration, the first of `work.looked`."""
+    for d in range(q.shape[0]):
+        work.place[0, d] = q[d]
+    linearise(space, work.place, work.looked)
+
+
 @njit(**LEAF)
 def _broken(space, q, work):
-    """What one configuration breaks, into `work.rows` and `work.right`: the number of rows, and the
-    worst [rad or m].
+    """What one configuration breaks, into `work.rows` and `work.right`: the number of rows, the
+    worst [rad or m], and how many of the rows are the constraint's.
     """
     dof, limits = q.shape[0], space.limits
     rows, right, contacts = work.rows, work.right, work.contacts
-    residual, jacobian, excess, active = work.residual, work.jacobian, work.excess, work.active
-    linearise(space, q, work.constraint, residual, jacobian)
-    worst = excess_of(space.constraint.rows, residual, excess, active)
+    jacobian, excess, active = work.looked.jacobians[0], work.excess, work.active
+    look_at(space, q, work)
+    worst = excess_of(space.constraint.rows, work.looked.residuals[0], excess, active)
     size = 0
-    for i in range(residual.shape[0]):
+    for i in range(active.shape[0]):
         if active[i] and size < dof:
             right[size] = excess[i]
             for d in range(dof):
                 rows[size, d] = jacobian[i, d]
             size += 1
+    own = size
     for d in range(dof):
         over = q[d] - limits[1, d] if q[d] > limits[1, d] else min(q[d] - limits[0, d], 0.0)
         if over != 0.0:
@@ -142,7 +154,7 @@ def _broken(space, q, work):
                     continue
                 right[size] = -short
                 size += 1
-    return size, worst
+    return size, worst, own
 
 
 @njit(inline="always", **COMPILE)
@@ -159,14 +171,14 @@ def project_node(space, q, settings, work):
     place; returns what remains [rad or m].  settings: a Retraction.
     """
     rows, right, normal, squares = work.rows, work.right, work.normal, work.squares
-    worst = np.inf
+    worst, held = np.inf, np.sum(space.constraint.rows.held)
     for iteration in range(settings.iterations + 1):
-        size, worst = _broken(space, q, work)
+        size, worst, own = _broken(space, q, work)
         if worst <= settings.accuracy or size == 0 or iteration == settings.iterations:
             break
-        trace = normal_matrix(rows, size, normal)
+        ridge = _RIDGE * normal_matrix(rows, size, normal)
         for i in range(size):
-            normal[i, i] += _RIDGE * trace
+            normal[i, i] += ridge
         if not solve_normal(normal, size, right, _SMALLEST_PIVOT):
             break
         # stored, so that the sum's last bit does not hang on how the loop is compiled
@@ -183,17 +195,27 @@ def project_node(space, q, settings, work):
         for d in range(q.shape[0]):
             for i in range(size):
                 q[d] -= scale * rows[i, d] * right[i]
-        if square < settings.last_step**2:
-            return square
+        # such a step brings nothing nearer by more than its length, which is far below the margin
+        if square < settings.last_step**2 and size == own == held and _keeps_limits(space, q):
+            left = left_by(square, ridge, right, size)
+            if left <= settings.accuracy:
+                return left
     return worst
+
+
+@njit(**LEAF)
+def _keeps_limits(space, q):
+    for d in range(q.shape[0]):
+        if q[d] < space.limits[0, d] or q[d] > space.limits[1, d]:
+            return False
+    return True
 
 
 @njit(**LEAF)
 def _is_within(space, q, work):
     """Whether a configuration keeps joint limits and clearance."""
-    for d in range(q.shape[0]):
-        if q[d] < space.limits[0, d] or q[d] > space.limits[1, d]:
-            return False
+    if not _keeps_limits(space, q):
+        return False
     if space.clearance.top == 0:
         return True
     contacts = work.contacts
@@ -201,20 +223,26 @@ def _is_within(space, q, work):
     return near == 0 or contacts.found[0, DISTANCE] >= space.margin
 
 
+@njit(**LEAF)
+def project_all(space, points, shares, settings, left, work):
+    """Project points (T, D) in place: onto the constraint alone, which is cheap, and onto limits
+    and clearance together with it only where one of them is broken then; returns what remains of
+    the violation of the worst [rad or m].
+
+    shares, left (T,): as `retract_all` takes them.
+    """
+    manifold = ManifoldArrays(space.chain, space.constraint)
+    retract_all(manifold, shares, points, settings, left, work.retraction)
+    worst = 0.0
+    for i in range(points.shape[0]):
+        if shares[i] >= 0.0 and not _is_within(space, points[i], work):
+            left[i] = project_node(space, points[i], space.projection, work)
+        worst = max(worst, left[i])
+    return worst
+
+
 @njit(**COMPILE)
 def project_points(space, points, open_ones, settings):
-    """Project those points (T, D) that are marked (T,), in place: onto the constraint alone, which
-    is cheap, and onto limits and clearance together with it only where one of them is broken then;
-    returns what remains of the violation of the worst [rad or m].
-    """
-    room, work = new_room(space.constraint, points.shape[1]), workspace(space)
-    manifold = ManifoldArrays(space.chain, space.constraint)
-    bounds, worst = space.constraint.rows, 0.0
-    for i in range(points.shape[0]):
-        if not open_ones[i]:
-            continue
-        left = retract_one(manifold, bounds, points[i], settings, room)
-        if not _is_within(space, points[i], work):
-            left = project_node(space, points[i], space.projection, work)
-        worst = max(worst, left)
-    return worst
+    """`project_all` of those points (T, D) that are marked (T,), in room of its own."""
+    shares = np.where(open_ones, 1.0, -1.0)
+    return project_all(space, points, shares, settings, np.empty(len(points)), workspace(space))
