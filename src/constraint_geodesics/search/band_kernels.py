@@ -588,8 +588,9 @@ def _promise(nodes, band):
 
 
 @njit(**LEAF)
-def _project_nodes(space, nodes, settings, band, work):
-    """Project inner nodes (m, D) in place; returns what remains of the violation of the worst.
+def _project_nodes(space, nodes, settings, enough, band, work):
+    """Project inner nodes (m, D) in place; returns what remains of the violation of the worst, or
+    of the first of which more than `enough` does: those behind it are then left alone.
 
     Side by side where nothing may meet; else onto all bounds at once, which leads to shorter bands
     than the constraint first and what is near only then.
@@ -599,11 +600,13 @@ def _project_nodes(space, nodes, settings, band, work):
     worst = 0.0
     for i in range(nodes.shape[0]):
         worst = max(worst, project_node(space, nodes[i], settings, work))
+        if worst > enough:
+            break
     return worst
 
 
 @njit(inline="always", **LEAF)
-def _moved(space, nodes, scale, projection, band, work):
+def _moved(space, nodes, scale, projection, enough, band, work):
     """The nodes after a share of the steps, projected, into `band.trial`; returns what remains of
     the violation.
     """
@@ -611,7 +614,7 @@ def _moved(space, nodes, scale, projection, band, work):
     for i in range(1, n):
         for d in range(nodes.shape[1]):
             trial[i, d] = nodes[i, d] + scale * band.steps[i - 1, d]
-    return _project_nodes(space, trial[1:n], projection, band, work)
+    return _project_nodes(space, trial[1:n], projection, enough, band, work)
 
 
 @njit(**COMPILE)
@@ -627,8 +630,8 @@ def relax_band(space, nodes, settings):
     n = nodes.shape[0] - 1
     work, band = new_work(space), _new_band(nodes)
     trial = band.trial
-    used, converged = 0, False
-    worst = _project_nodes(space, nodes[1:n], space.projection, band, work.node)
+    used, converged, reach = 0, False, largest
+    worst = _project_nodes(space, nodes[1:n], space.projection, np.inf, band, work.node)
     energy = band_energy(nodes)
     for _ in range(most):
         used += 1
@@ -643,18 +646,21 @@ def relax_band(space, nodes, settings):
             converged = True
             if longest > 0.05:
                 break
-        scale, improved = 1.0 if longest <= largest else largest / longest, False
-        for _ in range(6):
-            left = _moved(space, nodes, scale, projection, band, work.node)
-            if guarded:
+        scale, improved = min(1.0, reach / longest) if longest > 0.0 else 1.0, False
+        enough = max(worst, 1e-6)
+        for trials in range(6):
+            left = _moved(space, nodes, scale, projection, enough, band, work.node)
+            if guarded and left <= enough:
                 _hold_back(space, nodes, trial, band.held, work.node)
             after = band_energy(trial)
-            if after < energy and left <= max(worst, 1e-6):
+            if after < energy and left <= enough:
                 improved = True
                 break
             scale *= 0.4
         if not improved:
             break
+        # what was too far once is so again a little further on
+        reach = min(largest, 2.5 * reach) if trials == 0 else scale * longest
         nodes[:, :] = trial
         # between two kinks of a contact no step promises little, and none gains much
         converged = converged or energy - after <= accuracy * energy

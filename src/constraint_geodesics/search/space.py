@@ -37,6 +37,8 @@ NEAR = 0.05
 """Bounds so near [rad or m] are looked at."""
 CLOSE = 0.03
 """So are bodies that are so close beyond their margin [m]."""
+SHORT = 5e-7
+"""What may lack of a margin [m]: the last of it would take as many steps again."""
 STILL = 1e-9
 """A contact whose distance no joint changes by more [m/rad] is none to be kept."""
 _RIDGE = 1e-9
@@ -145,7 +147,8 @@ def _broken(space, q, work):
                 rows[size, d] = 1.0
                 size += 1
     if space.clearance.top > 0:
-        near = near_contacts(space.chain, space.clearance, q, space.margin, contacts)
+        far = space.margin - SHORT
+        near = near_contacts(space.chain, space.clearance, q, far, contacts)
         for c in range(near):
             short = space.margin - contacts.found[c, DISTANCE]
             worst = max(worst, short)
