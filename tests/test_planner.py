@@ -904,7 +904,8 @@ def test_a_budget_makes_paths_no_longer_and_is_kept_roughly(planner) -> None:
         better = planner.plan(start, goal, "tool_down", budget_s=0.2)
         assert first.status == better.status == "solved"
         assert better.length_rad <= first.length_rad
-        assert better.planning_time_s >= 0.2
+        # no curve is begun that may end too late, going by how long one took before
+        assert better.planning_time_s >= 0.1
         assert better.certificate is not None
         assert better.certificate.valid
 

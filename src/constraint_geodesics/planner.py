@@ -6,6 +6,7 @@ trajectory = planner.plan(start, goal, "level_cup")
 """
 
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -38,6 +39,8 @@ STANDING_S = 0.001
 _NO_MORE = "no more curves"
 _WORTHWHILE = 1e-4
 """Share by which a curve must be shorter than the path so far to be certified."""
+_LAST_ONES = 5
+"""Curves that tell how long the next may take: what is tried comes round again after so many."""
 _TIGHTENED = (1.0, 0.7, 0.4)
 """Shares of the allowed violation that a path's waypoints are drawn for, should the certificate ask
 for closer ones.
@@ -143,8 +146,8 @@ class Planner:
 
         parts: of the planner to use, for comparisons.  budget_s: by default the first path that is
         certified is the answer; with a budget shorter ones, round the other side of something, are
-        looked for until so many seconds have passed since the call; functions of a constraint's own
-        are compiled before.
+        looked for while there is time for one more before so many seconds have passed since the
+        call; functions of a constraint's own are compiled before.
         Raises PlannerError if an end has the wrong shape or is not finite, the name is unknown, or
         the budget is no positive number.
         """
@@ -228,11 +231,13 @@ class Planner:
         return self._nothing(query, end.status, line)
 
     def _improved(self, query: Query, path: Trajectory, budget_s: float) -> Trajectory:
-        """The shortest certified path that is found until the time is over; `path` if it remains
-        that.
+        """The shortest certified path that is found before the time is over; `path` if it remains
+        that.  No curve is begun that would end too late, going by the last ones.
         """
         curves = self.method.improvements(query.task, query.start, query.goal, query.parts)
-        while time.perf_counter() - query.began < budget_s:
+        spent = time.perf_counter() - query.began
+        lasted = deque([spent], maxlen=_LAST_ONES)
+        while spent + max(lasted) < budget_s:
             candidate = next(curves, _NO_MORE)
             if isinstance(candidate, str):
                 break
@@ -240,6 +245,8 @@ class Planner:
                 found = self._certified(query, candidate)
                 if isinstance(found, Trajectory) and found.length_rad < path.length_rad:
                     path = found
+            before, spent = spent, time.perf_counter() - query.began
+            lasted.append(spent - before)
         return replace(path, statistics=self._statistics(query, path.source))
 
     def _certified(self, query: Query, candidate: Candidate) -> Trajectory | str:

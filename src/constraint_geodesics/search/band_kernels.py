@@ -646,9 +646,9 @@ def relax_band(space, nodes, settings):
             converged = True
             if longest > 0.05:
                 break
-        scale, improved = min(1.0, reach / longest) if longest > 0.0 else 1.0, False
+        scale, improved, at_once = min(1.0, reach / longest) if longest > 0.0 else 1.0, False, True
         enough = max(worst, 1e-6)
-        for trials in range(6):
+        for _ in range(6):
             left = _moved(space, nodes, scale, projection, enough, band, work.node)
             if guarded and left <= enough:
                 _hold_back(space, nodes, trial, band.held, work.node)
@@ -656,11 +656,11 @@ def relax_band(space, nodes, settings):
             if after < energy and left <= enough:
                 improved = True
                 break
-            scale *= 0.4
+            scale, at_once = 0.4 * scale, False
         if not improved:
             break
         # what was too far once is so again a little further on
-        reach = min(largest, 2.5 * reach) if trials == 0 else scale * longest
+        reach = min(largest, 2.5 * reach) if at_once else scale * longest
         nodes[:, :] = trial
         # between two kinks of a contact no step promises little, and none gains much
         converged = converged or energy - after <= accuracy * energy
