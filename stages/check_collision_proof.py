@@ -1,5 +1,5 @@
 """Stage: the proof of freedom from collision against PyBullet at dense configurations, on 20,000
-paths of two robots; about a quarter of an hour on two cores.
+paths of two robots, and ways among thin shapes; about a quarter of an hour on two cores.
 """
 
 import json
@@ -25,11 +25,14 @@ from constraint_geodesics.studies.collision_proof import (
     summed,
     try_scene,
 )
+from constraint_geodesics.studies.thin_shapes import Thicket, try_thicket
 
 SEVEN_JOINTS = ("kuka_iiwa/model.urdf", "lbr_iiwa_link_7", "lbr_iiwa_link_0")
 """A robot of pybullet_data: its URDF, its tool's link and the one that stands on the table."""
 SCENES, LINES, GRAZED = 10, 230, 650
 """Scenes of each kind and robot, straight lines in each, and shapes that are tried for grazing."""
+AMONG_THIN, THICKETS, THIN_QUERIES = ("free", "level_cup"), 25, 5
+"""Constraints of the queries among thin shapes, scenes of these, and queries of each in a scene."""
 
 
 def main(params: Params, layout: Layout) -> None:
@@ -39,7 +42,8 @@ def main(params: Params, layout: Layout) -> None:
     table = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1), (base,))
     other = Scene(load_robot(find_urdf(urdf), tool), (table,))
     paths = []
-    with Planner(read_bundle(layout.planner), str(layout.planner)) as planner:
+    bundle = read_bundle(layout.planner)
+    with Planner(bundle, str(layout.planner)) as planner:
         for name in params.constraints:
             queries = read_queries(layout.benchmark_queries(name))
             alone = [query for query in queries if query.scene == TABLE]
@@ -55,11 +59,20 @@ def main(params: Params, layout: Layout) -> None:
     tasks = grazings(scene, paths, GRAZED, seed=0)
     found = parallel_map(graze, tasks, params.compute, description="grazed shapes")
     grazed = [each for each in found if each is not None]
+    thickets = [Thicket(bundle, AMONG_THIN, THIN_QUERIES, seed) for seed in range(THICKETS)]
+    among = parallel_map(
+        try_thicket, thickets, params.compute, description="ways among thin shapes"
+    )
     report = {
         "paths": [asdict(each) for each in summed([each for own in counts for each in own])],
         "grazed": len(grazed),
         "certified_beside_smaller": sum(each.beside_smaller for each in grazed),
         "certified_beside_larger": sum(each.beside_larger for each in grazed),
+        "among_thin_shapes": {
+            "asked": sum(each.asked for each in among),
+            "solved_by_birrt": sum(each.sampled for each in among),
+            "of_these_by_planner": sum(each.planned for each in among),
+        },
     }
     file = layout.root / "reports" / "collision_proof.json"
     file.write_text(json.dumps(report, indent=1) + "\n")
