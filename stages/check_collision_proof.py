@@ -71,7 +71,8 @@ def main(params: Params, layout: Layout) -> None:
         "among_thin_shapes": {
             "asked": sum(each.asked for each in among),
             "solved_by_birrt": sum(each.sampled for each in among),
-            "of_these_by_planner": sum(each.planned for each in among),
+            "of_these_by_planner": sum(each.both for each in among),
+            "by_planner": sum(each.planned for each in among),
         },
     }
     file = layout.root / "reports" / "collision_proof.json"

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -41,6 +42,26 @@ def test_a_configuration_of_another_robot_is_refused() -> None:
     for wrong in (np.zeros(5), np.full(6, np.nan)):
         with pytest.raises(PlannerError, match="goal"):
             packaged_planner().plan(start, ConfigurationGoal(wrong), "level_cup")
+
+
+class Either(NamedTuple):
+    """A goal that is a tuple as well."""
+
+    first: np.ndarray
+    second: np.ndarray
+
+    @property
+    def description(self) -> str:
+        return "one of two configurations"
+
+    def configurations(self, manifold: ConstraintManifold, start: np.ndarray) -> Iterator:
+        yield from self
+
+
+def test_a_goal_may_be_a_tuple() -> None:
+    start, goal = pairs_of("level_cup", 1, seed=1)[0]
+    path = packaged_planner().plan(start, Either(goal + 0.3, goal), "level_cup")
+    assert (path.status, path.goal.tobytes()) == ("solved", goal.tobytes())
 
 
 def test_what_merely_has_configurations_is_no_goal() -> None:

@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -19,6 +20,7 @@ from constraint_geodesics import Constraint, Planner, Pose, Trajectory, bundle
 from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.constraint import ConstraintError, ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
+from constraint_geodesics.methods import SearchMethod
 from constraint_geodesics.planner import PlannerError, check_trajectory
 from constraint_geodesics.recording.recording import read_recording
 from constraint_geodesics.scene.sphere import Sphere
@@ -908,6 +910,26 @@ def test_a_budget_makes_paths_no_longer_and_is_kept_roughly(planner) -> None:
         assert better.planning_time_s >= 0.1
         assert better.certificate is not None
         assert better.certificate.valid
+
+
+def test_no_curve_is_begun_that_would_end_after_the_budget() -> None:
+    """Curves that all take 0.1 s: two fit into 0.28 s."""
+    begun = []
+
+    class Slow(SearchMethod):
+        def improvements(self, *_: object) -> Iterator[None]:
+            while True:
+                begun.append(time.perf_counter())
+                time.sleep(0.1)
+                yield None
+
+    start, goal = pairs_of("free", 1, seed=1)[0]
+    with Planner(packaged_planner().bundle, "slow improvements", Slow()) as slow:
+        slow.plan(start, goal, "free")
+        path = slow.plan(start, goal, "free", budget_s=0.28)
+    assert path.status == "solved"
+    assert 1 <= len(begun) <= 2
+    assert path.planning_time_s >= 0.1
 
 
 def test_without_parts_that_propose_curves_a_budget_is_not_waited_for(planner) -> None:

@@ -173,9 +173,7 @@ def plan(
     ] = None,
     budget: Annotated[
         float | None,
-        typer.Option(
-            help="Look for shorter paths until so many seconds have passed; by default do not."
-        ),
+        typer.Option(help="Look for shorter paths for about so many seconds; by default do not."),
     ] = None,
     method: Annotated[
         str,

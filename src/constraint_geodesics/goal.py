@@ -64,7 +64,7 @@ class ConfigurationGoal:
 def as_goal(goal: Goal | ArrayLike, dof: int) -> Goal:
     """A goal as it is; numbers are a configuration's.  Raises PlannerError if they are none."""
     # numbers first: asking for the protocol takes longer than looking at both ends
-    if not isinstance(goal, np.ndarray | list | tuple) and isinstance(goal, Goal):
+    if type(goal) not in (np.ndarray, list, tuple) and isinstance(goal, Goal):
         return goal
     return ConfigurationGoal(checked_configuration(goal, dof, "goal"))
 

@@ -27,7 +27,14 @@ from constraint_geodesics.params import JudgeParams, PlannerParams
 from constraint_geodesics.problem import PlannerError as PlannerError
 from constraint_geodesics.problem import Status
 from constraint_geodesics.scene.scene import Scene, robot_from, workcell_from
-from constraint_geodesics.search.candidates import ALL_PARTS, Answer, Candidate, Parts, rows_of
+from constraint_geodesics.search.candidates import (
+    ALL_PARTS,
+    BENDS,
+    Answer,
+    Candidate,
+    Parts,
+    rows_of,
+)
 from constraint_geodesics.search.explanations import not_connected, refused_ends
 from constraint_geodesics.search.preparation import Preparation, Query
 from constraint_geodesics.trajectory import Asked, Statistics, Trajectory, read_trajectory
@@ -39,8 +46,8 @@ STANDING_S = 0.001
 _NO_MORE = "no more curves"
 _WORTHWHILE = 1e-4
 """Share by which a curve must be shorter than the path so far to be certified."""
-_LAST_ONES = 5
-"""Curves that tell how long the next may take: what is tried comes round again after so many."""
+_ROUND = BENDS + 1
+"""Curves after which the kinds that are tried come round again."""
 _TIGHTENED = (1.0, 0.7, 0.4)
 """Shares of the allowed violation that a path's waypoints are drawn for, should the certificate ask
 for closer ones.
@@ -146,8 +153,9 @@ class Planner:
 
         parts: of the planner to use, for comparisons.  budget_s: by default the first path that is
         certified is the answer; with a budget shorter ones, round the other side of something, are
-        looked for while there is time for one more before so many seconds have passed since the
-        call; functions of a constraint's own are compiled before.
+        looked for while there is time for one more, by how long such a one took before, until so
+        many seconds have passed since the call; functions of a constraint's own are compiled
+        before, a roadmap that is not made yet is made within.
         Raises PlannerError if an end has the wrong shape or is not finite, the name is unknown, or
         the budget is no positive number.
         """
@@ -232,12 +240,13 @@ class Planner:
 
     def _improved(self, query: Query, path: Trajectory, budget_s: float) -> Trajectory:
         """The shortest certified path that is found before the time is over; `path` if it remains
-        that.  No curve is begun that would end too late, going by the last ones.
+        that.  No curve is begun that would end too late, going by the last of its kind, and for the
+        first ones by the longest.
         """
         curves = self.method.improvements(query.task, query.start, query.goal, query.parts)
         spent = time.perf_counter() - query.began
-        lasted = deque([spent], maxlen=_LAST_ONES)
-        while spent + max(lasted) < budget_s:
+        lasted = deque[float](maxlen=_ROUND)
+        while spent + (lasted[0] if len(lasted) == _ROUND else max(lasted, default=0.0)) < budget_s:
             candidate = next(curves, _NO_MORE)
             if isinstance(candidate, str):
                 break

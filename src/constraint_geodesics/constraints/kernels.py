@@ -53,7 +53,7 @@ class ManifoldArrays(NamedTuple):
 
 LINEARISE_WORDS = 13
 """Addresses of the chain's arrays, then of data, q, room, residuals and Jacobians, the last 0 where
-they are not asked for; D, m and how many configurations, LANES at most.
+they are not asked for; D, m and how many configurations, LANES at most where room is asked for.
 """
 CURVATURE_WORDS = 7
 """Addresses of the chain's prismatic, data, room, weights and of the matrix to fill; D; which of
@@ -150,8 +150,8 @@ def new_look(constraint, dof):
 
 @njit(inline="always", **LEAF)
 def linearise(manifold, q, looked):
-    """Residuals and their Jacobians of at most LANES configurations (B, D) into the first of
-    `looked`; rows that are not held are left alone.
+    """Residuals and their Jacobians of at most LANES configurations (B, D), which lie one after
+    another in memory, into the first of `looked`; rows that are not held are left alone.
     """
     _ask(manifold, q, looked.room, looked.residuals, looked.jacobians.ctypes.data)
 

@@ -28,9 +28,9 @@ class Retraction(NamedTuple):
     """Settings of the projection: accuracy asked for [rad or m], steps at most, longest step
     [rad].
 
-    damping: what is added to J Jᵀ, as a share of its trace.  Beside a singular configuration a
-    small violation can take a long step to mend; with more damping the point stays near where it
-    was, and what is left of its violation changes as smoothly as where it began.
+    damping: what is added to the diagonal of J Jᵀ, as a share of its trace.  Beside a singular
+    configuration a small violation can take a long step to mend; with more damping the step is
+    shorter, and leaves more.
     last_step: a step shorter than this [rad] that corrects all rows is the last, and what it leaves
     is estimated (`left_by`) in place of measured; 0 to measure always.
     """
@@ -59,7 +59,8 @@ def retract(
     settings: Retraction | None = None,
     band: Float[np.ndarray, "*batch"] | None = None,
 ) -> Retracted:
-    """Nearest point (to first order) of the constraint manifold to each configuration.
+    """Nearest point (to first order) of the constraint manifold to each configuration; one that is
+    not finite does not converge.
 
     Points inside the tolerance stay where they are; joint limits are not considered.
     band: the share of the tolerance, 0 to 1, that each configuration may use; all of it by default.
@@ -69,6 +70,7 @@ def retract(
     shares = np.ones(len(joints)) if band is None else np.asarray(band, float).reshape(-1)
     worst = np.empty(len(joints))
     retract_batch(manifold.arrays, shares, joints, settings, worst)
+    worst[~np.isfinite(joints).all(axis=1)] = np.inf
     batch = q.shape[:-1]
     return Retracted(
         joints.reshape(q.shape), worst.reshape(batch), (worst <= settings.accuracy).reshape(batch)
@@ -151,8 +153,9 @@ def _gathered(active, excess, jacobian, right, rows):
 
 @njit(**LEAF)
 def left_by(square, ridge, weights, size):
-    """What a step of Newton's method leaves of the rows that it corrects, about: its length's
-    square, and what the ridge on J Jᵀ takes from it, where joints hardly move a row.
+    """What a step of Newton's method leaves of the rows that it corrects [rad or m], about: the
+    square of its length [rad], for second derivatives of order 1, and what the ridge on J Jᵀ takes
+    from it, by the rows' weights (m,).
     """
     largest = 0.0
     for i in range(size):
@@ -162,8 +165,9 @@ def left_by(square, ridge, weights, size):
 
 @njit(**LEAF)
 def _step(q, jacobian, held, settings, room):
-    """One step of Gauss-Newton, in place; returns what is left, inf where that is to be measured,
-    and −1 where there is no step.
+    """One step of Gauss-Newton of q (D,) in place, of the excesses in the room and their Jacobian
+    (m, D); held: how many rows there are.  Returns what is left [rad or m], inf where that is to be
+    measured, and −1 where there is no step.
     """
     excess, right, active = room.excess, room.right, room.active
     rows, normal, step = room.rows, room.normal, room.step

@@ -18,7 +18,7 @@ from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.problem import SATISFIED, PlanningProblem, Solution, Status, refusal
 from constraint_geodesics.scene.clearance import NO_CLEARANCE
 from constraint_geodesics.search.band import BandSettings, project, step_lengths
-from constraint_geodesics.search.candidates import ROW_SAFETY, Candidate, Task, rows_of
+from constraint_geodesics.search.candidates import Candidate, Task, rows_of
 from constraint_geodesics.search.curve_kernels import HALVINGS, LONGEST_ROW_STEP
 from constraint_geodesics.search.space import space_of
 
@@ -26,6 +26,8 @@ ROW_SPACING = 0.04
 """Distance of the rows [rad] that are drawn along a given path, before they are halved where that
 is not enough.
 """
+ROW_SAFETY = 0.8
+"""Share of the allowed violation between two rows that is used: nothing draws them closer later."""
 COINCIDENT = 1e-9
 """Ends that are no further apart [rad] are one configuration: a band between them has no direction.
 """

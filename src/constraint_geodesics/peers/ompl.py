@@ -22,7 +22,7 @@ from ompl import base, geometric, util
 
 from constraint_geodesics.constraints import kernels
 from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.constraints.projection import Retraction, retract, retract_batch
+from constraint_geodesics.constraints.projection import Retraction, new_room, retract, retract_all
 from constraint_geodesics.learning.lift import as_executed
 from constraint_geodesics.peers.elastic_band import answer, without_path
 from constraint_geodesics.peers.ompl_settings import OmplSettings, Search
@@ -124,6 +124,7 @@ class _Single:
         self._residual, self._jacobian = np.empty((1, count)), np.empty((1, count, dof))
         self._worst, self._all = np.empty(1), np.ones(1)
         self._settings = Retraction()
+        self._room = new_room(self._manifold.constraint, dof)
 
     def linearise(self, x: np.ndarray) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m D"]]:
         """Residual and Jacobian, until the next call."""
@@ -140,7 +141,7 @@ class _Single:
     def retract(self, x: np.ndarray) -> Float[np.ndarray, "D"] | None:
         """The configuration on the constraint, or None; as `projection.retract`."""
         joints = np.array(x, np.float64)[None]
-        retract_batch(self._manifold, self._all, joints, self._settings, self._worst)
+        retract_all(self._manifold, self._all, joints, self._settings, self._worst, self._room)
         return joints[0] if self._worst[0] <= self._settings.accuracy else None
 
 

@@ -1,8 +1,8 @@
 """Compiled kinematics of a serial chain: one implementation for the planner, the constraint and the
 training.
 
-All kernels work in float64 on one configuration and allocate nothing that grows with the batch, so
-that a retraction costs microseconds.  Shapes: D joints, `origins` (D, 4, 4) the transform from the
+All kernels work in float64, on one configuration or on LANES side by side, and allocate nothing
+that grows with the batch.  Shapes: D joints, `origins` (D, 4, 4) the transform from the
 previous joint's frame to this joint's frame at zero, `axes` (D, 3) the joint axis in that frame,
 `prismatic` (D,) bool, `tool` (4, 4) from the last joint's frame to the tool.
 """

@@ -1,4 +1,4 @@
-"""A body read from a URDF.  The planner's distances miss it; the certificate takes its pieces."""
+"""A body read from a URDF."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -15,7 +15,7 @@ from constraint_geodesics.search.space import Space, project_points
 ACCURACY = 1e-9
 """Violation [rad or m] that is left on a point of a curve, at most."""
 PROJECTION = Retraction(ACCURACY, iterations=12, last_step=1e-5, damping=1e-6)
-_AFTER_STEP = PROJECTION._replace(iterations=6)
+_AFTER_STEP = PROJECTION._replace(iterations=6, damping=1e-9)
 """The projection of a node after a step of the band."""
 
 

@@ -663,8 +663,8 @@ def relax_band(space, nodes, settings):
         reach = min(largest, 2.5 * reach) if at_once else scale * longest
         nodes[:, :] = trial
         # between two kinks of a contact no step promises little, and none gains much
-        converged = converged or energy - after <= accuracy * energy
-        energy, worst = after, left
+        converged = converged or energy - after <= scale * accuracy * energy
+        energy, worst = after, max(worst, left) if guarded else left
         if converged:
             break
     return worst, used, converged

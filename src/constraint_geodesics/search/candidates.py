@@ -24,7 +24,7 @@ from constraint_geodesics.search.band import PROJECTION, BandSettings
 from constraint_geodesics.search.curve_kernels import relaxed_curve, rows_along
 from constraint_geodesics.search.roadmap import Joined, Roadmap, join, resample, shortest_way
 from constraint_geodesics.search.space import Space, space_of
-from constraint_geodesics.search.tree import tree_way
+from constraint_geodesics.search.tree import TreeSettings, tree_way
 
 Source = Literal["straight", "policy", "graph", "tree", "bend"]
 
@@ -34,6 +34,8 @@ PARTLY_RELAXED = (3, 1, 0)
 """Iterations of a band that must stay near the graph."""
 TREES = 4
 """Pairs of trees that are grown where all else failed."""
+PATIENT = TreeSettings(iterations=4000, nodes=20_000)
+"""Of one more pair, the last."""
 BENDS = 4
 """Bent lines that are tried for each pair of trees, where a path is to be improved: they cost less.
 """
@@ -130,6 +132,7 @@ def candidates(
     if parts.tree and answer.status != "not_connected":
         for seed in range(TREES):
             yield from _over_tree(task, start, goal, parts.refinement, seed)
+        yield from _over_tree(task, start, goal, parts.refinement, TREES, PATIENT)
     yield answer
 
 
@@ -198,9 +201,14 @@ def connection(task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray
 
 
 def _over_tree(
-    task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], refine: bool, seed: int
+    task: Task,
+    start: Float[np.ndarray, "D"],
+    goal: Float[np.ndarray, "D"],
+    refine: bool,
+    seed: int,
+    settings: TreeSettings | None = None,
 ) -> Iterator[Candidate]:
-    corners = tree_way(task.clear, start, goal, seed)
+    corners = tree_way(task.clear, start, goal, seed, settings)
     if corners is not None:
         yield from _along(task, "tree", corners, refine, clear=True)
 
@@ -298,7 +306,7 @@ def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
 
 def rows_of(candidate: Candidate, violation: float) -> Float[np.ndarray, "T D"]:
     """Rows along the candidate so close that straight joint lines between them leave the constraint
-    by less than `violation` [rad or m].
+    by less than `violation` [rad or m] halfway.
     """
     rows: np.ndarray = rows_along(
         candidate.space, candidate.points, ROW_SAFETY * violation, PROJECTION

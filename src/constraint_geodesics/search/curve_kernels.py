@@ -21,6 +21,8 @@ JUMP = 3.0
 """A step between two of these points longer than so many times CHECK_STEP is a jump to another
 branch.
 """
+MOST_LINES = 1000.0
+"""Of the lines between two points, whatever the constraint is there."""
 HALVINGS = 8
 """Times that rows are drawn closer where the lines between them still leave the constraint."""
 LONGEST_ROW_STEP = 0.08
@@ -169,8 +171,8 @@ def _halfway(space, points):
 @njit(**COMPILE)
 def rows_along(space, points, allowed, settings):
     """Rows (T, D) on the curve through points of the space, so close that straight joint lines
-    between them leave the constraint by at most `allowed` [rad or m]; the points alone where two of
-    them coincide.
+    between them leave the constraint by at most `allowed` [rad or m] halfway; the points alone
+    where two of them coincide.
 
     The curve is the spline through the points, projected: so close to the constraint that a step or
     two do.  Between two points h apart a straight line is off by r''h²/8; halfway it is measured,
@@ -211,7 +213,7 @@ def _spread(curve, halfway, allowed):
     for i in range(last):
         step = knots[i + 1] - knots[i]
         lines = max(np.sqrt(halfway[i] / allowed), step / LONGEST_ROW_STEP)
-        wanted[i + 1] = wanted[i] + lines
+        wanted[i + 1] = wanted[i] + (lines if lines < MOST_LINES else MOST_LINES)
     count = int(np.ceil(wanted[last] / FILLED))
     shares, i = np.empty(count + 1), 0
     for k in range(count + 1):

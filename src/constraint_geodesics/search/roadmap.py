@@ -144,7 +144,7 @@ def resample(corners: Float[np.ndarray, "k D"], count: int) -> Float[np.ndarray,
 
 
 @njit(**LEAF)
-def _distance(first, second):
+def distance(first, second):
     """Of two configurations [rad]."""
     square = 0.0
     for d in range(first.shape[0]):
@@ -158,7 +158,7 @@ def edge_length(space, first, second, work):
     jumps or touches something.
     """
     dof = first.shape[0]
-    direct = _distance(first, second)
+    direct = distance(first, second)
     pieces = int(np.ceil(direct / EDGE_STEP)) + 1
     allowed = 0.05 + 3.0 * direct / pieces
     before, point, total = work.before, work.point, 0.0
@@ -169,7 +169,7 @@ def edge_length(space, first, second, work):
             point[d] = first[d] + k / pieces * (second[d] - first[d])
         if k < pieces and project_node(space, point, space.projection, work) > 1e-6:
             return np.inf
-        step = _distance(point, before)
+        step = distance(point, before)
         if not step <= allowed or not is_free(space, before, point, work):
             return np.inf
         total += step
@@ -219,7 +219,7 @@ def _holds(space, joints, begins, leads, lengths, looked_at, way):
             point = joints[there].copy()  # a node may lie in what the graph does not know
             holds = (
                 project_node(space, point, space.projection, work) <= 1e-6
-                and _distance(point, joints[there]) < EDGE_STEP
+                and distance(point, joints[there]) < EDGE_STEP
                 and edge_length(space, joints[here], joints[there], work) < np.inf
             )
             looked_at[e] = True
@@ -252,7 +252,7 @@ def _a_star(nodes, begins, leads, lengths, goal, sources, source_lengths, target
         node = sources[k]
         if source_lengths[k] < cost[node]:
             cost[node] = source_lengths[k]
-            heapq.heappush(heap, (cost[node] + _distance(nodes[node], goal), np.int64(node)))
+            heapq.heappush(heap, (cost[node] + distance(nodes[node], goal), np.int64(node)))
     while len(heap) > 0:
         node = heapq.heappop(heap)[1]
         if closed[node]:
@@ -270,7 +270,7 @@ def _a_star(nodes, begins, leads, lengths, goal, sources, source_lengths, target
             if through < cost[other]:
                 cost[other] = through
                 before[other] = node
-                heapq.heappush(heap, (through + _distance(nodes[other], goal), np.int64(other)))
+                heapq.heappush(heap, (through + distance(nodes[other], goal), np.int64(other)))
     if not np.isfinite(cost[n]):
         return np.empty(0, dtype=np.int64)
     count = 0

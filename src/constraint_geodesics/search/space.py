@@ -41,7 +41,6 @@ SHORT = 5e-7
 """What may lack of a margin [m]: the last of it would take as many steps again."""
 STILL = 1e-9
 """A contact whose distance no joint changes by more [m/rad] is none to be kept."""
-_RIDGE = 1e-9
 _SMALLEST_PIVOT = 1e-12
 
 
@@ -55,7 +54,7 @@ class Space(NamedTuple):
     limits: Float[np.ndarray, "2 D"]
     clearance: ClearanceArrays
     margin: float
-    projection: Retraction = Retraction(iterations=12)
+    projection: Retraction = Retraction(iterations=12, damping=1e-9)
 
 
 def space_of(
@@ -70,8 +69,9 @@ def space_of(
 class Workspace(NamedTuple):
     """What the kernels write into, allocated once.
 
-    retraction: of the constraint alone; looked: its own, of one configuration, place (1, D);
-    excess, active, weights (m,); contacts; rows, normal (D, D); right, squares, before, point (D,).
+    retraction: of the constraint alone; looked: the same as its own, of which `look_at` overwrites
+    the first configuration; place (1, D); excess, active, weights (m,); contacts; rows, normal
+    (D, D); right, squares, before, point (D,).
     """
 
     retraction: RetractionRoom
@@ -179,7 +179,7 @@ def project_node(space, q, settings, work):
         size, worst, own = _broken(space, q, work)
         if worst <= settings.accuracy or size == 0 or iteration == settings.iterations:
             break
-        ridge = _RIDGE * normal_matrix(rows, size, normal)
+        ridge = settings.damping * normal_matrix(rows, size, normal)
         for i in range(size):
             normal[i, i] += ridge
         if not solve_normal(normal, size, right, _SMALLEST_PIVOT):
@@ -198,7 +198,7 @@ def project_node(space, q, settings, work):
         for d in range(q.shape[0]):
             for i in range(size):
                 q[d] -= scale * rows[i, d] * right[i]
-        # such a step brings nothing nearer by more than its length, which is far below the margin
+        # what such a step moves bodies by, some 0.01 mm, is far below the margin and not looked at
         if square < settings.last_step**2 and size == own == held and _keeps_limits(space, q):
             left = left_by(square, ridge, right, size)
             if left <= settings.accuracy:
@@ -223,7 +223,7 @@ def _is_within(space, q, work):
         return True
     contacts = work.contacts
     near = near_contacts(space.chain, space.clearance, q, 2.0 * space.margin, contacts)
-    return near == 0 or contacts.found[0, DISTANCE] >= space.margin
+    return near == 0 or contacts.found[0, DISTANCE] >= space.margin - SHORT
 
 
 @njit(**LEAF)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
-from constraint_geodesics.search.roadmap import edge_length
+from constraint_geodesics.search.roadmap import distance, edge_length
 from constraint_geodesics.search.space import Space, is_free, project_node, workspace
 
 _LEFT = 1e-6
@@ -83,20 +83,13 @@ def _extended(space, nodes, parents, count, node, target, step, work, point):
     """
     dof = target.shape[0]
     while count < nodes.shape[0]:
-        before = 0.0
-        for d in range(dof):
-            before += (target[d] - nodes[node, d]) ** 2
-        before = np.sqrt(before)
+        before = distance(target, nodes[node])
         share = 1.0 if before <= step else step / before
         for d in range(dof):
             point[d] = nodes[node, d] + share * (target[d] - nodes[node, d])
         if project_node(space, point, space.projection, work) > _LEFT:
             return count, node, False
-        after, moved = 0.0, 0.0
-        for d in range(dof):
-            after += (target[d] - point[d]) ** 2
-            moved += (point[d] - nodes[node, d]) ** 2
-        after, moved = np.sqrt(after), np.sqrt(moved)
+        after, moved = distance(target, point), distance(point, nodes[node])
         reached = share == 1.0 and after < _LEFT
         if moved > 2.0 * step or (not reached and before - after < _PROGRESS * step):
             return count, node, False
@@ -168,13 +161,10 @@ def _grown(space, start, goal, seed, step, iterations, capacity, shortcuts):
 @njit(**COMPILE)
 def _shortened(space, way, shortcuts, work):
     """The way without the corners that random shortcuts leave out."""
-    dof, count = way.shape[1], len(way)
+    count = len(way)
     length = np.empty(max(count - 1, 1))
     for k in range(count - 1):
-        total = 0.0
-        for d in range(dof):
-            total += (way[k + 1, d] - way[k, d]) ** 2
-        length[k] = np.sqrt(total)
+        length[k] = distance(way[k + 1], way[k])
     for tried in range(shortcuts + 1):
         if count < 3:
             break
