@@ -41,10 +41,11 @@ _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9 = (
 )
 
 
-# What is inlined here is the arithmetic of one configuration and of many side by side alike.  A
-# frame is three lines of scalars, each a coordinate of its origin and a row of its rotation: an
-# allocation costs more than the arithmetic of a joint, and so does passing a frame through a call.
-@njit(**EXACT, inline="always")
+# One configuration and many side by side are worked out by the same arithmetic.  A frame is three
+# lines of scalars, each a coordinate of its origin and a row of its rotation: an allocation costs
+# more than the arithmetic of a joint.  LLVM inlines what is short; numba does it where a whole frame
+# would pass through a call, since it takes numba long.
+@njit(**EXACT)
 def sine_cosine(angle):
     """Sine and cosine of an angle [rad], to 1e-15 up to 10⁵ rad, by their Taylor series about the
     nearest multiple of π/2: a compiler can work out many of them side by side.
@@ -65,13 +66,13 @@ def sine_cosine(angle):
     return sine, cosine
 
 
-@njit(**EXACT, inline="always")
+@njit(**EXACT)
 def line_of(m, i):
     """Line i of the frame that a transform (4, 4) leads to from the base."""
     return m[i, 3], m[i, 0], m[i, 1], m[i, 2]
 
 
-@njit(**EXACT, inline="always")
+@njit(**EXACT)
 def columns_of(m):
     """A transform (4, 4) by its columns, the translation first, as `moved` takes it."""
     return (
@@ -82,7 +83,7 @@ def columns_of(m):
     )
 
 
-@njit(**EXACT, inline="always")
+@njit(**EXACT)
 def along(line, axis):
     """The product of a line's row with a column: of a frame's axis, a coordinate in the base
     frame.
@@ -90,14 +91,14 @@ def along(line, axis):
     return line[1] * axis[0] + line[2] * axis[1] + line[3] * axis[2]
 
 
-@njit(**EXACT, inline="always")
+@njit(**EXACT)
 def moved(line, columns):
     """A line of the frame that a transform leads to from a frame."""
     place, x, y, z = columns
     return line[0] + along(line, place), along(line, x), along(line, y), along(line, z)
 
 
-@njit(**EXACT, inline="always")
+@njit(**EXACT)
 def turned(line, axis, own, sine, cosine):
     """A line of a frame that was turned about its axis; own: what `along` says.  By Rodrigues'
     formula.
