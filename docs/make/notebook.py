@@ -42,7 +42,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         client = NotebookClient(
             notebook,
-            km=_Manager(transport="ipc"),  # a socket that is a file: nothing listens on the network
+            # a socket that is a file, where both sides find it: nothing listens on the network
+            km=_Manager(transport="ipc", ip=str(Path(folder) / "kernel")),
             timeout=300,
             record_timing=False,
             resources={"metadata": {"path": folder}},
