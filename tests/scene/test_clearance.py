@@ -153,7 +153,9 @@ def test_each_row_is_the_gradient_of_its_contacts_distance(
             seen += 1
             # where other corners come nearest there may be a kink, and two slopes
             if np.abs(slopes[0] - slopes[1]).max() < 1e-5:
-                np.testing.assert_allclose(row, slopes.mean(axis=0), atol=1e-6)
+                # a kink within the step leaves the gradient between the two slopes
+                off = np.abs(row - slopes.mean(axis=0))
+                assert (off <= 0.5 * np.abs(slopes[0] - slopes[1]) + 1e-6).all()
                 smooth += 1
     assert smooth > 0.9 * seen > 0
 
