@@ -2,6 +2,7 @@
 is an error.
 """
 
+import base64
 import json
 import re
 from html.parser import HTMLParser
@@ -31,9 +32,16 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Links to the notebook lead to its page."""
-    return markdown.replace(f"({NOTEBOOK})", f"({PAGE})")
+def on_page_markdown(markdown: str, config: Any, **_: Any) -> str:
+    """Links to the notebook lead to its page; pictures of reports are data inside the page."""
+    reports = Path(config["docs_dir"]).parent
+
+    def embedded(found: re.Match[str]) -> str:
+        picture = base64.b64encode((reports / found[1]).read_bytes()).decode()
+        return f"](data:image/png;base64,{picture})"
+
+    linked = re.sub(r"\]\(\.\./(reports/[^)]+\.png)\)", embedded, markdown)
+    return linked.replace(f"({NOTEBOOK})", f"({PAGE})")
 
 
 def on_post_build(config: Any) -> None:
