@@ -43,8 +43,8 @@ _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9 = (
 
 # One configuration and many side by side are worked out by the same arithmetic.  A frame is three
 # lines of scalars, each a coordinate of its origin and a row of its rotation: an allocation costs
-# more than the arithmetic of a joint.  LLVM inlines what is short; numba does it where a whole frame
-# would pass through a call, since it takes numba long.
+# more than the arithmetic of a joint.  LLVM inlines what is short; numba, which takes long for it,
+# does where a whole frame would pass through a call.
 @njit(**EXACT)
 def sine_cosine(angle):
     """Sine and cosine of an angle [rad], to 1e-15 up to 10⁵ rad, by their Taylor series about the
