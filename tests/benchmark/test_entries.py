@@ -9,6 +9,8 @@ import pytest
 from tests.planner_fixtures import manifold_of, packaged_planner, pairs_of
 
 from constraint_geodesics.benchmark.entries import (
+    Run,
+    batches_of,
     code_digest,
     committed_run,
     data_digest,
@@ -17,6 +19,7 @@ from constraint_geodesics.benchmark.entries import (
     spread,
     with_planners,
 )
+from constraint_geodesics.benchmark.queries import read_queries
 from constraint_geodesics.palette import FAMILIES
 from constraint_geodesics.params import BaselineParams, Params
 from constraint_geodesics.peers.baseline import BaselineError
@@ -176,6 +179,17 @@ def test_planners_that_a_clock_may_stop_are_not_asked_for_the_same_path_twice(pa
     clearance = {name for name, own in settings.items() if own.uses_clearance or own.band}
     assert {"straight + band", "BiRRT + band", "SLSQP"} <= clearance
     assert not clearance & {"planner", "BiRRT", "PRM", "BiRRT, decoded samples"}
+
+
+def test_nobody_is_asked_under_a_constraint_that_it_has_no_submanifold_of(params, tmp_path) -> None:
+    layout, asked = Layout(Path(__file__).parents[2]), {}
+    for constraint in ("level_cup", "shelf"):
+        queries = read_queries(layout.benchmark_queries(constraint))
+        batches = batches_of(Run(params, layout, queries, tmp_path, (), None))
+        asked[constraint] = {own.name for batch in batches for own in batch.baselines}
+    assert asked["level_cup"] == set(params.benchmark.planners)
+    grids = {"latent grid", "latent grid, constraint's nodes alone"}
+    assert asked["level_cup"] - asked["shelf"] == {"latent graph", *grids}
 
 
 def test_blocks_with_all_planners_stand_evenly_apart() -> None:

@@ -195,6 +195,14 @@ def test_planners_that_were_asked_less_are_compared_on_what_they_were_asked() ->
     assert (table.loc["peer", "queries"], table.loc["peer", "verdict"]) == (2, "behind")
 
 
+def test_a_budget_that_no_solvable_query_was_asked_with_counts_as_the_one_before() -> None:
+    rows = [row("ours", q, 0, 1.0 if q else np.nan, 0.01) for q in range(3)]
+    rows += [row("ours 1 s", 0, 0, np.nan, 1.1), row("peer", 1, 0, 1.5, 0.01)]
+    budgets = {"ours": 0.0, "ours 1 s": 1.0}
+    (line,) = ours_against_baselines(table_of(rows), budgets, [], [2.0]).to_dict("records")
+    assert (line["asked"], line["verdict"]) == ("ours", "behind")
+
+
 def test_training_pays_from_as_many_queries_as_what_is_saved_needs() -> None:
     rows = [row("ours", q, 0, 1.0, 0.01) for q in range(3)]
     rows += [row("slow", q, s, 1.0, 0.11) for q in range(2) for s in range(2)] + [

@@ -4,6 +4,7 @@ of their rows.
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -38,6 +39,10 @@ from constraint_geodesics.scene.urdf import find_urdf
 
 JUDGED_BY = "benchmark.runner"
 """The module that asks the planners and judges their answers: every row depends on what it imports.
+"""
+UNSEEN_SHARE = 0.1
+"""Of a planner's queries, asked under a constraint that is unseen: these rows show that planners
+work there, the others how well.
 """
 
 
@@ -112,7 +117,7 @@ def batches_of(run: Run) -> list[QueryBatch]:
         ends = [[q.number, *q.start.tolist(), *q.goal.tolist(), repr(q.obstacle)] for q in own]
         parts = [*shared, described.model_dump(), ends]
         for first in range(0, min(settings.queries, len(own)), settings.batch):
-            baselines = _baselines(run, first, parts)
+            baselines = _baselines(run, constraint, first, parts)
             if not baselines:
                 continue
             batch = QueryBatch(
@@ -137,12 +142,16 @@ def _by_case(queries: Sequence[Query]) -> dict[tuple[str, str], list[Query]]:
     return cases
 
 
-def _baselines(run: Run, first: int, parts: Sequence[Any]) -> tuple[Baseline, ...]:
-    """The planners that answer queries from the one at `first` on.  parts: of all fingerprints."""
+def _baselines(run: Run, constraint: str, first: int, parts: Sequence[Any]) -> tuple[Baseline, ...]:
+    """The planners that answer a constraint's queries from the one at `first` on.  parts: of all
+    fingerprints.
+    """
     bench, found = run.params.benchmark, []
     for name, own in run.settings.items():
         entry = bench.planners[name]
         count = entry.queries or bench.queries
+        if constraint in run.params.unseen:
+            count = 0 if _needs_submanifold(own) else math.ceil(UNSEEN_SHARE * count)
         if first >= count:
             continue
         about = [entry.kind, own.model_dump(mode="json")]
@@ -160,6 +169,14 @@ def _baselines(run: Run, first: int, parts: Sequence[Any]) -> tuple[Baseline, ..
             )
         )
     return tuple(found)
+
+
+def _needs_submanifold(settings: BaselineSettings) -> bool:
+    """Whether a planner searches a sub-manifold that was extracted for its constraint: none is for
+    those that are unseen.  The learned method makes a roadmap where it has none.
+    """
+    stages = {stage.split()[0] for stage in settings.trained}
+    return "extract_submanifold" in stages and "build_learned" not in stages
 
 
 def seeds_of(entry: BaselineParams, settings: BaselineSettings, seeds: int) -> int:

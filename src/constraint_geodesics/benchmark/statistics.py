@@ -170,8 +170,8 @@ def ours_against_baselines(
     budget, failures infinite.
 
     ours: the planner's names with the budget [s] that each is given, 0 for the first answer; within
-    a budget the one with the longest that is shorter counts.  own: names that are no baselines,
-    such as the planner without a part.
+    a budget the one with the longest that is shorter counts, of those that were asked a query which
+    somebody solves.  own: names that are no baselines, such as the planner without a part.
     One row a case, budget and baseline: success and p95 of both within the budget, over the queries
     that the baseline was asked, and `verdict`: of the baseline, "ahead" or "behind" if its p95 is
     shorter or longer by more than AHEAD, else "tied"; where both are infinite, success decides in
@@ -181,7 +181,8 @@ def ours_against_baselines(
     for case, found in _solvable(rows).groupby(CASE, sort=False):
         groups = dict(list(found.groupby("planner", sort=False)))
         for budget in budgets:
-            chosen = max((name for name in ours if ours[name] < budget), key=ours.__getitem__)
+            given = [name for name in ours if ours[name] < budget and name in groups]
+            chosen = max(given, key=ours.__getitem__)
             for name, theirs in groups.items():
                 if name in ours or name in own:
                     continue
