@@ -36,6 +36,7 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "geodesics check": HERE,
     "geodesics params": HERE,
     "geodesics doctor": HERE,
+    "geodesics robot": HERE,
     "geodesics package": ("tests/test_bundle.py", "package"),
     "geodesics results": HERE,
     "geodesics replay": HERE,
@@ -146,6 +147,7 @@ def test_a_command_of_ours_does_what_its_page_says(words, folder, monkeypatch, c
         "plan": "solved",
         "check": "valid",
         "params": "ok",
+        "robot": "carried by 7 joints",
         "results": "planner",
         "replay": "path.rrd",
     }

@@ -297,6 +297,56 @@ def _joints(text: str, option: str) -> list[float]:
         ) from None
 
 
+@app.command("robot")
+def show_robot(
+    urdf: Annotated[Path, typer.Argument(help="A URDF, here or in pybullet_data.")],
+    tool_link: Annotated[
+        str | None, typer.Option(help="Link that carries the tool; without it, those there are.")
+    ] = None,
+    hold: Annotated[
+        list[str] | None,
+        typer.Option(help='A joint that is not to move, as in "torso_lift_joint=0.2"; repeatable.'),
+    ] = None,
+    srdf: Annotated[
+        Path | None,
+        typer.Option(help="Which links may touch; without it that is found by sampling."),
+    ] = None,
+    as_json: bool = JSON,
+) -> None:
+    """Say what is understood of a robot: its chain, limits, the links that may touch and why, and
+    what is missing.  Exit code 0: understood; 2: wrong usage, or a URDF that can't be used.
+    """
+    from constraint_geodesics.robot.description import read_description
+    from constraint_geodesics.robot.kinematics import RobotError
+    from constraint_geodesics.scene.understood import understand
+    from constraint_geodesics.scene.urdf import find_urdf
+
+    try:
+        file = urdf if urdf.exists() else find_urdf(urdf)
+        if tool_link is None:
+            description = read_description(file)
+            ends = {link: len(description.moving(link)) for link in description.ends}
+            about: dict[str, Any] = {"robot": description.name, "tool_links": ends}
+            lines = [f"{link}: carried by {count} joints" for link, count in ends.items()]
+            lines += ["choose one of these links, or any other: --tool-link"]
+        else:
+            understood = understand(file, tool_link, dict(map(_held, hold or [])), srdf)
+            about, lines = understood.summary(), list(understood.lines())
+    except RobotError as error:
+        raise SystemExit(complain(error, WRONG_USAGE)) from None
+    print(json.dumps(about) if as_json else "\n".join(lines))
+
+
+def _held(text: str) -> tuple[str, float]:
+    from constraint_geodesics.robot.kinematics import RobotError
+
+    name, _, value = text.partition("=")
+    try:
+        return name.strip(), float(value)
+    except ValueError:
+        raise RobotError(f"--hold {text!r}: must be a joint and a number, joint=value") from None
+
+
 @app.command("bench")
 def bench(
     queries: int = typer.Option(1, help="Queries of each constraint and scene.", min=1),

@@ -1,0 +1,134 @@
+"""An arm as a URDF of its own: what all readers of a robot (PyBullet, the planner's kinematics, the
+certifier's) take for the same machine.
+
+Joints that are held become fixed where they are held, continuous ones revolute with two turns of
+room, and the tool's own frame a link; meshes are named by their whole paths.
+"""
+
+import copy
+import hashlib
+import math
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.robot.description import Arm, Joint, find_mesh
+from constraint_geodesics.robot.kinematics import origin_of
+
+TOOL = "tool"
+"""The link of a tool's own frame, with as many underscores as make it a new name."""
+_TURNS = 2.0 * math.pi
+"""Limits of a continuous joint, either way [rad]: any angle is reached the shorter way round."""
+
+
+def write_arm(
+    arm: Arm, folder: Path, tool: Float[np.ndarray, "4 4"] | None = None
+) -> tuple[Path, str]:
+    """Write the URDF into a folder, under a name that tells its content; returns the file and its
+    tool link.  tool: the tool's frame in the arm's tool link [m].
+    """
+    tree, link = _tree_of(arm, tool)
+    text = ElementTree.tostring(tree, encoding="unicode")
+    digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+    file = folder / f"{arm.description.file.stem}-{digest}.urdf"
+    if not file.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile("w", dir=folder, suffix=".part", delete=False) as part:
+            part.write(text)
+        Path(part.name).replace(file)  # at once, whoever else writes the same
+    return file, link
+
+
+def _tree_of(arm: Arm, tool: Float[np.ndarray, "4 4"] | None) -> tuple[ElementTree.Element, str]:
+    own = arm.description
+    tree = ElementTree.Element("robot", name=own.name)
+    for kind in ("material", "link", "joint"):
+        tree.extend(copy.deepcopy(element) for element in own.tree.findall(kind))
+    for mesh in tree.iter("mesh"):
+        found = find_mesh(mesh.get("filename", ""), own.file)
+        if found is not None:  # one that is only drawn may lack
+            mesh.set("filename", str(found.resolve()))
+    moved = {joint.name for joint in arm.moved}
+    for element in tree.findall("joint"):
+        joint = own.by_name[element.get("name", "")]
+        if joint.name not in moved:
+            _fix(element, joint, arm.held.get(joint.name, 0.0))
+        elif joint.kind == "continuous":
+            _bound(element)
+    if tool is None:
+        return tree, arm.tool_link
+    name = TOOL
+    while name in own.links or name in own.by_name:
+        name += "_"
+    ElementTree.SubElement(tree, "link", name=name)
+    joint_element = ElementTree.SubElement(tree, "joint", name=name, type="fixed")
+    ElementTree.SubElement(joint_element, "parent", link=arm.tool_link)
+    ElementTree.SubElement(joint_element, "child", link=name)
+    _place(joint_element, tool)
+    return tree, name
+
+
+def _fix(element: ElementTree.Element, joint: Joint, value: float) -> None:
+    """Make a joint fixed where its value puts it."""
+    pose = origin_of(element)
+    if joint.is_movable:
+        pose = pose @ _motion(element, joint.kind, value)
+    element.set("type", "fixed")
+    for name in (
+        "origin",
+        "axis",
+        "limit",
+        "mimic",
+        "dynamics",
+        "safety_controller",
+        "calibration",
+    ):
+        for child in element.findall(name):
+            element.remove(child)
+    _place(element, pose)
+
+
+def _bound(element: ElementTree.Element) -> None:
+    """Make a continuous joint revolute."""
+    element.set("type", "revolute")
+    limit = element.find("limit")
+    if limit is None:
+        limit = ElementTree.SubElement(element, "limit", effort="0")
+    limit.set("lower", repr(-_TURNS))
+    limit.set("upper", repr(_TURNS))
+
+
+def _motion(element: ElementTree.Element, kind: str, value: float) -> Float[np.ndarray, "4 4"]:
+    """What a joint's value moves its link by."""
+    entry = element.find("axis")
+    text = "1 0 0" if entry is None else entry.get("xyz", "1 0 0")
+    axis = np.array([float(word) for word in text.split()])
+    axis /= np.linalg.norm(axis)
+    pose = np.eye(4)
+    if kind == "prismatic":
+        pose[:3, 3] = value * axis
+        return pose
+    x, y, z = axis
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    pose[:3, :3] += math.sin(value) * across + (1.0 - math.cos(value)) * across @ across
+    return pose
+
+
+def _place(element: ElementTree.Element, pose: Float[np.ndarray, "4 4"]) -> None:
+    rotation = pose[:3, :3]
+    level = math.hypot(rotation[0, 0], rotation[1, 0])
+    pitch = math.atan2(-rotation[2, 0], level)
+    if level > 1e-9:
+        roll = math.atan2(rotation[2, 1], rotation[2, 2])
+        yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+    else:  # upright, where roll and yaw turn about one axis
+        roll, yaw = math.atan2(-rotation[1, 2], rotation[1, 1]), 0.0
+    ElementTree.SubElement(
+        element,
+        "origin",
+        xyz=" ".join(repr(float(x)) for x in pose[:3, 3]),
+        rpy=" ".join(map(repr, (roll, pitch, yaw))),
+    )
