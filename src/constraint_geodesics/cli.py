@@ -3,32 +3,28 @@
 import atexit
 import gc
 import json
-import math
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from constraint_geodesics import completion
+from constraint_geodesics import cli_planning, completion
 from constraint_geodesics.errors import ParamsError
 from constraint_geodesics.extras import MissingExtraError, require
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.progress import progress, waiting
+from constraint_geodesics.pipeline.progress import progress
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
 from constraint_geodesics.pipeline.threads import ONE_THREAD
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from constraint_geodesics.certification.certifier import Certificate
     from constraint_geodesics.recording.catalogue import Filter, Listed
 
-NO_PATH = 3
 JSON = typer.Option(False, "--json", help="Print the answer as one JSON object.")
 OF_CONSTRAINT: dict[str, Any] = {"shell_complete": completion.listed_constraints}
 
@@ -40,6 +36,12 @@ app = typer.Typer(
     rich_markup_mode=None,  # plain help starts in half the time, and keeps the units' brackets
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+app.command("plan", context_settings={"allow_extra_args": False})(cli_planning.plan)
+app.command("check")(cli_planning.check)
+app.command("robot")(cli_planning.show_robot)
+app.command("ik")(cli_planning.inverse_kinematics)
 
 
 def main() -> None:
@@ -147,204 +149,6 @@ def warm_up(
         print("all is compiled already")
     else:
         print(f"compiled in {seconds:.0f} s; the next plan starts at once")
-
-
-@app.command("plan", context_settings={"allow_extra_args": False})
-def plan(
-    start: Annotated[
-        str, typer.Option(help='Start configuration: the joints in rad, as in "0.1 -0.5 …".')
-    ],
-    goal: Annotated[str, typer.Option(help="Goal configuration: the joints in rad.")],
-    constraint: Annotated[
-        str,
-        typer.Option(
-            help="A name that `geodesics constraints` lists.",
-            shell_complete=completion.planned_constraints,
-        ),
-    ],
-    out: Annotated[Path | None, typer.Option(help="Write the path here, as CSV.")] = None,
-    record: Annotated[Path | None, typer.Option(help="Write a Rerun recording here.")] = None,
-    picture: Annotated[Path | None, typer.Option(help="Draw the path here, as PNG.")] = None,
-    planner: Annotated[
-        str | None,
-        typer.Option(
-            help="A planner's folder or MLflow address; else the pipeline's or the package's."
-        ),
-    ] = None,
-    budget: Annotated[
-        float | None,
-        typer.Option(help="Look for shorter paths for about so many seconds; by default do not."),
-    ] = None,
-    method: Annotated[
-        str,
-        typer.Option(
-            help="planner: straight line, roadmap and trees, refined; nothing in it is learned.  "
-            "learned: trained policies on the learned manifold alone, as in the paper.  "
-            "learned+band: the same, refined by the planner's elastic band.",
-            shell_complete=completion.methods,
-        ),
-    ] = "planner",
-    as_json: bool = JSON,
-) -> None:
-    """Plan one path.  Exit code 0: solved; 2: wrong usage; 3: there is no path, and the line says
-    why.
-    """
-    from constraint_geodesics.bundle import BundleError
-    from constraint_geodesics.planner import Planner, PlannerError
-
-    if record is not None:
-        require("record")
-    try:
-        first, last = _joints(start, "--start"), _joints(goal, "--goal")
-        with _loading(), Planner.load(planner, method) as loaded:
-            path = loaded.plan(first, last, constraint, budget_s=budget)
-            source = loaded.source
-    except (BundleError, PlannerError) as error:
-        raise SystemExit(complain(error, WRONG_USAGE)) from None
-    print(f"planner: {source}", file=sys.stderr)
-    if path.status == "solved":
-        if out is not None:
-            path.save(out)
-        if record is not None:
-            path.record(record)
-        if picture is not None:
-            path.draw(picture)
-    print(json.dumps(path.summary()) if as_json else f"{path.status}: {path.explanation}")
-    raise SystemExit(0 if path.status == "solved" else NO_PATH)
-
-
-@app.command("check")
-def check(
-    file: Annotated[
-        Path, typer.Argument(help="A path as CSV: a header, then one row of joints in rad a line.")
-    ],
-    constraint: Annotated[
-        str | None,
-        typer.Option(
-            help="A name that `geodesics constraints` lists; by default what the file says.",
-            shell_complete=completion.planned_constraints,
-        ),
-    ] = None,
-    planner: Annotated[
-        str | None, typer.Option(help="Where robot and workcell come from, as for `plan`.")
-    ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the certificate as one JSON object.")
-    ] = False,
-) -> None:
-    """Certify anybody's path, between whatever ends it has.  Exit code 0: valid; 2: wrong usage; 3:
-    what it breaks.
-    """
-    from constraint_geodesics.bundle import BundleError
-    from constraint_geodesics.planner import PlannerError, check_trajectory
-
-    try:
-        with _loading():
-            certificate = check_trajectory(file, constraint, planner)
-    except (BundleError, PlannerError) as error:
-        raise SystemExit(complain(error, WRONG_USAGE)) from None
-    broken = certificate.violation
-    untimed = (
-        " (no times: velocity and acceleration not looked at)"
-        if math.isnan(certificate.duration_s)
-        else ""
-    )
-    meant = constraint or f"the constraint that {file.name} names"
-    if as_json:
-        print(json.dumps(certificate.summary()))
-    elif broken is None:
-        print(
-            f"valid: {certificate.length_rad:.3f} rad, at most "
-            f"{certificate.violation_bound:.1e} (rad, m) off {meant} "
-            f"anywhere, {_clearance(certificate)}{untimed}"
-        )
-    else:
-        print(f"{broken.kind}: {broken.message}")
-    raise SystemExit(0 if broken is None else NO_PATH)
-
-
-def _clearance(certificate: "Certificate") -> str:
-    """What was proven of collisions, in words."""
-    if certificate.asked_pybullet:
-        return "free of collision, by PyBullet's distances where bodies all but touch"
-    if not math.isfinite(certificate.clearance_m):
-        return "with nothing that can touch"
-    return f"at least {1e3 * certificate.clearance_m:.1f} mm from any collision"
-
-
-@contextmanager
-def _loading() -> Iterator[None]:
-    """Say what a planner's user waits for: the compiler where it was not asked before."""
-    from constraint_geodesics import warmup
-
-    what = "loading the planner"
-    if not warmup.is_done():
-        what = "compiling the kernels, once for this environment: a minute or two"
-        if not sys.stderr.isatty():
-            print(what, file=sys.stderr, flush=True)
-    with waiting(what):
-        yield
-
-
-def _joints(text: str, option: str) -> list[float]:
-    from constraint_geodesics.planner import PlannerError
-
-    try:
-        return [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        raise PlannerError(
-            f"{option} {text!r}: must be numbers [rad], with spaces or commas between them"
-        ) from None
-
-
-@app.command("robot")
-def show_robot(
-    urdf: Annotated[Path, typer.Argument(help="A URDF, here or in pybullet_data.")],
-    tool_link: Annotated[
-        str | None, typer.Option(help="Link that carries the tool; without it, those there are.")
-    ] = None,
-    hold: Annotated[
-        list[str] | None,
-        typer.Option(help='A joint that is not to move, as in "torso_lift_joint=0.2"; repeatable.'),
-    ] = None,
-    srdf: Annotated[
-        Path | None,
-        typer.Option(help="Which links may touch; without it that is found by sampling."),
-    ] = None,
-    as_json: bool = JSON,
-) -> None:
-    """Say what is understood of a robot: its chain, limits, the links that may touch and why, and
-    what is missing.  Exit code 0: understood; 2: wrong usage, or a URDF that can't be used.
-    """
-    from constraint_geodesics.robot.description import read_description
-    from constraint_geodesics.robot.kinematics import RobotError
-    from constraint_geodesics.scene.understood import understand
-    from constraint_geodesics.scene.urdf import find_urdf
-
-    try:
-        file = urdf if urdf.exists() else find_urdf(urdf)
-        if tool_link is None:
-            description = read_description(file)
-            ends = {link: len(description.moving(link)) for link in description.ends}
-            about: dict[str, Any] = {"robot": description.name, "tool_links": ends}
-            lines = [f"{link}: carried by {count} joints" for link, count in ends.items()]
-            lines += ["choose one of these links, or any other: --tool-link"]
-        else:
-            understood = understand(file, tool_link, dict(map(_held, hold or [])), srdf)
-            about, lines = understood.summary(), list(understood.lines())
-    except RobotError as error:
-        raise SystemExit(complain(error, WRONG_USAGE)) from None
-    print(json.dumps(about) if as_json else "\n".join(lines))
-
-
-def _held(text: str) -> tuple[str, float]:
-    from constraint_geodesics.robot.kinematics import RobotError
-
-    name, _, value = text.partition("=")
-    try:
-        return name.strip(), float(value)
-    except ValueError:
-        raise RobotError(f"--hold {text!r}: must be a joint and a number, joint=value") from None
 
 
 @app.command("bench")

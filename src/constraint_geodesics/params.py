@@ -35,12 +35,28 @@ class _Record(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
+class PoseParams(_Record):
+    """A pose: of a tool in the base frame, of a tool's own frame in its link."""
+
+    position_m: Vector3
+    rpy_rad: Vector3
+
+
 class RobotParams(_Record):
-    """Which robot: a URDF, its tool link, and limits tighter than the URDF's."""
+    """Which robot: a URDF, its tool link, and limits tighter than the URDF's.
+
+    hold: values of joints that are not to move [rad or m]; those beside the chain rest.  tool: the
+    tool's own frame in its link.  may_touch: pairs of links that may, "adjacent": a link and the
+    one that it hangs on; "found": also those that nothing keeps apart, found by sampling; else the
+    SRDF that names them.
+    """
 
     urdf: str
     tool_link: str
     limits_rad: dict[str, tuple[Finite, Finite]] = {}
+    hold: dict[str, Finite] = {}
+    tool: PoseParams | None = None
+    may_touch: str = "adjacent"
 
 
 class WorkcellParams(_Record):
@@ -90,13 +106,6 @@ class LabelParams(_Record):
     seed: Seed
     queries: Count
     query_seed: Seed
-
-
-class PoseParams(_Record):
-    """A tool pose in the base frame."""
-
-    position_m: Vector3
-    rpy_rad: Vector3
 
 
 class PoseConstraintParams(_Record):
@@ -303,15 +312,15 @@ class GeometryParams(_Record):
 class PlannerParams(_Record):
     """The planner that users call."""
 
-    segments: Annotated[int, Field(ge=4)]
-    iterations: Count
-    accuracy: Positive
-    largest_step_rad: Positive
-    clearance_m: NonNegative
-    acceleration_rad_s2: Positive
-    roadmap_nodes: Annotated[int, Field(ge=10)]
-    roadmap_neighbours: Count
-    seed: Seed
+    segments: Annotated[int, Field(ge=4)] = 16
+    iterations: Count = 30
+    accuracy: Positive = 1e-5
+    largest_step_rad: Positive = 0.5
+    clearance_m: NonNegative = 0.006
+    acceleration_rad_s2: Positive = 10.0
+    roadmap_nodes: Annotated[int, Field(ge=10)] = 2000
+    roadmap_neighbours: Count = 12
+    seed: Seed = 0
 
 
 class BaselineParams(BaseModel):
@@ -394,11 +403,11 @@ class ExecutionParams(_Record):
 class JudgeParams(_Record):
     """What makes a path valid."""
 
-    end_tolerance_rad: Positive
-    max_step_rad: Positive
-    violation_tolerance: Positive
-    row_spacing_rad: Positive
-    spacing_rad: Positive
+    end_tolerance_rad: Positive = 1e-6
+    max_step_rad: Positive = 0.1
+    violation_tolerance: Positive = 1e-4
+    row_spacing_rad: Positive = 0.02
+    spacing_rad: Positive = 0.02
 
 
 class RecordingParams(_Record):

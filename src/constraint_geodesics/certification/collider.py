@@ -66,7 +66,7 @@ def collider(scene: Scene, chain: Chain, margin: float, beyond: float) -> Collid
     def arrays(wanted: Sequence[tuple[int, int]], top: int) -> kernels.Bodies:
         return kernels.Bodies(chain, table.hulls, nodes, table.pairs(wanted), top)
 
-    pairs = list(pairs_of(bodies))
+    pairs = list(pairs_of(bodies, robot.allowed))
     rigid = [pair for pair in pairs if bodies[pair[0]].frame == bodies[pair[1]].frame]
     moving = [pair for pair in pairs if pair not in rigid]
     all_arrays, apart = arrays(moving, len(moving)), []

@@ -10,13 +10,14 @@ import hashlib
 import math
 import tempfile
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.robot.description import Arm, Joint, find_mesh
-from constraint_geodesics.robot.kinematics import origin_of
+from constraint_geodesics.robot.kinematics import origin_of, rpy_of
 
 TOOL = "tool"
 """The link of a tool's own frame, with as many underscores as make it a new name."""
@@ -25,24 +26,39 @@ _TURNS = 2.0 * math.pi
 
 
 def write_arm(
-    arm: Arm, folder: Path, tool: Float[np.ndarray, "4 4"] | None = None
+    arm: Arm,
+    folder: Path,
+    tool: Float[np.ndarray, "4 4"] | None = None,
+    readable: Callable[[Path], Path] = Path,
 ) -> tuple[Path, str]:
     """Write the URDF into a folder, under a name that tells its content; returns the file and its
-    tool link.  tool: the tool's frame in the arm's tool link [m].
+    tool link.  tool: the tool's frame in the arm's tool link [m].  readable: the file to be named
+    in the place of a mesh that is collided.
     """
-    tree, link = _tree_of(arm, tool)
+    tree, link = _tree_of(arm, tool, readable)
     text = ElementTree.tostring(tree, encoding="unicode")
-    digest = hashlib.sha256(text.encode()).hexdigest()[:16]
-    file = folder / f"{arm.description.file.stem}-{digest}.urdf"
+    file = folder / f"{arm.description.file.stem}-{digest_of(text.encode())}.urdf"
     if not file.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=folder, suffix=".part", delete=False) as part:
-            part.write(text)
-        Path(part.name).replace(file)  # at once, whoever else writes the same
+        write_file(file, text)
     return file, link
 
 
-def _tree_of(arm: Arm, tool: Float[np.ndarray, "4 4"] | None) -> tuple[ElementTree.Element, str]:
+def digest_of(content: bytes) -> str:
+    """A few letters that tell a content."""
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def write_file(file: Path, text: str) -> None:
+    """Write a file at once, whoever else writes the same."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile("w", dir=file.parent, suffix=".part", delete=False) as part:
+        part.write(text)
+    Path(part.name).replace(file)
+
+
+def _tree_of(
+    arm: Arm, tool: Float[np.ndarray, "4 4"] | None, readable: Callable[[Path], Path]
+) -> tuple[ElementTree.Element, str]:
     own = arm.description
     tree = ElementTree.Element("robot", name=own.name)
     for kind in ("material", "link", "joint"):
@@ -51,6 +67,8 @@ def _tree_of(arm: Arm, tool: Float[np.ndarray, "4 4"] | None) -> tuple[ElementTr
         found = find_mesh(mesh.get("filename", ""), own.file)
         if found is not None:  # one that is only drawn may lack
             mesh.set("filename", str(found.resolve()))
+    for mesh in tree.iterfind("link/collision/geometry/mesh"):
+        mesh.set("filename", str(readable(Path(mesh.get("filename", "")))))
     moved = {joint.name for joint in arm.moved}
     for element in tree.findall("joint"):
         joint = own.by_name[element.get("name", "")]
@@ -118,17 +136,9 @@ def _motion(element: ElementTree.Element, kind: str, value: float) -> Float[np.n
 
 
 def _place(element: ElementTree.Element, pose: Float[np.ndarray, "4 4"]) -> None:
-    rotation = pose[:3, :3]
-    level = math.hypot(rotation[0, 0], rotation[1, 0])
-    pitch = math.atan2(-rotation[2, 0], level)
-    if level > 1e-9:
-        roll = math.atan2(rotation[2, 1], rotation[2, 2])
-        yaw = math.atan2(rotation[1, 0], rotation[0, 0])
-    else:  # upright, where roll and yaw turn about one axis
-        roll, yaw = math.atan2(-rotation[1, 2], rotation[1, 1]), 0.0
     ElementTree.SubElement(
         element,
         "origin",
         xyz=" ".join(repr(float(x)) for x in pose[:3, 3]),
-        rpy=" ".join(map(repr, (roll, pitch, yaw))),
+        rpy=" ".join(map(repr, rpy_of(pose[:3, :3]))),
     )

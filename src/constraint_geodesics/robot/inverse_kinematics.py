@@ -58,7 +58,7 @@ def solutions(
         robot.chain,
         np.ascontiguousarray(position, float),
         np.ascontiguousarray(rotation, float),
-        _seeds(robot.lower.tobytes(), robot.upper.tobytes(), settings.seeds),
+        seeds_of(robot, settings.seeds),
         settings,
         raw,
     )
@@ -79,9 +79,26 @@ def spread(q: Float[np.ndarray, "n D"], count: int) -> Float[np.ndarray, "m D"]:
     return q[chosen]
 
 
+def seeds_of(robot: SerialRobot, count: int) -> Float[np.ndarray, "n D"]:
+    """Configurations that fill the joint limits evenly, not to be written to; a turning joint
+    beyond a turn needs but one.
+    """
+    return _seeds(robot.lower.tobytes(), robot.upper.tobytes(), count)
+
+
+def turned_towards(
+    robot: SerialRobot, q: Float[np.ndarray, "n D"], other: Float[np.ndarray, "D"]
+) -> Float[np.ndarray, "n D"]:
+    """Configurations whose turning joints are moved by whole turns as near to another configuration
+    as the limits let them.
+    """
+    turns = np.where(robot.chain.prismatic, 0.0, np.round((other - q) / _TURN))
+    least, most = np.ceil((robot.lower - q) / _TURN), np.floor((robot.upper - q) / _TURN)
+    return q + _TURN * np.clip(turns, least, most)
+
+
 @lru_cache(maxsize=16)
 def _seeds(lower: bytes, upper: bytes, count: int) -> Float[np.ndarray, "n D"]:
-    """Configurations that fill the limits evenly; a turning joint beyond a turn needs but one."""
     low, high = np.frombuffer(lower), np.frombuffer(upper)
     middle, half = 0.5 * (low + high), np.minimum(0.5 * (high - low), np.pi)
     even = qmc.Halton(len(low), seed=0).random(count)

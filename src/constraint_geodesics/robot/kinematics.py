@@ -3,6 +3,7 @@
 Nothing here knows how many joints there are; adding a robot adds data only.
 """
 
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,7 +34,10 @@ class ChainArrays(NamedTuple):
 
 @dataclass(frozen=True)
 class SerialRobot:
-    """A serial arm: names, limits [rad or m, and per second] and its chain."""
+    """A serial arm: names, limits [rad or m, and per second] and its chain.
+
+    allowed: pairs of links that may touch, beside a link and the one that it hangs on.
+    """
 
     name: str
     urdf: Path
@@ -43,6 +47,7 @@ class SerialRobot:
     upper: Float[np.ndarray, "D"]
     velocity: Float[np.ndarray, "D"]
     chain: ChainArrays
+    allowed: frozenset[tuple[str, str]] = frozenset()
 
     @property
     def dof(self) -> int:
@@ -177,6 +182,16 @@ def rotation_from_rpy(rpy: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
             [-sp, cp * sr, cp * cr],
         ]
     )
+
+
+def rpy_of(rotation: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
+    """Roll, pitch, yaw [rad] that `rotation_from_rpy` makes a rotation from."""
+    level = math.hypot(rotation[0, 0], rotation[1, 0])
+    pitch = math.atan2(-rotation[2, 0], level)
+    if level < 1e-9:  # upright, where roll and yaw turn about one axis
+        return math.atan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0
+    roll = math.atan2(rotation[2, 1], rotation[2, 2])
+    return roll, pitch, math.atan2(rotation[1, 0], rotation[0, 0])
 
 
 def _attribute(joint: ElementTree.Element, child: str, name: str, urdf: Path) -> str:

@@ -4,6 +4,7 @@ apart whatever the arm does.
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -56,9 +57,10 @@ def allowed_by_sampling(
     """
     description = read_description(robot.urdf)
     found = {pair[:2]: pair for pair in _by_structure(description, set(robot.joint_names))}
-    for first, second, share in _touching(robot, samples, seed):
+    others = replace(robot, allowed=frozenset(found))
+    for first, second, share in _touching(others, samples, seed):
         first, second = sorted((first, second), key=description.links.index)
-        if share >= ALWAYS and (first, second) not in found:
+        if share >= ALWAYS:
             found[first, second] = AllowedPair(first, second, "always touch")
     return tuple(found.values())
 

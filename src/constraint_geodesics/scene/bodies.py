@@ -3,7 +3,7 @@ pairs of bodies that move relative to each other, as convex_kernels.py takes the
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -62,10 +62,12 @@ def read_bodies(
     return found + [Body(s.name, 0, pieces, shape=s) for s, pieces in shapes if pieces]
 
 
-def pairs_of(bodies: Sequence[Body]) -> Iterator[tuple[int, int]]:
+def pairs_of(
+    bodies: Sequence[Body], allowed: Collection[tuple[str, str]]
+) -> Iterator[tuple[int, int]]:
     """Bodies whose contact PyBullet reports, that of the lower frame first: not a link and the one
-    it hangs on, not a shape and a link that may touch it, or the one that carries the arm, not two
-    shapes.
+    it hangs on, not links that are allowed to touch, not a shape and a link that may touch it, or
+    the one that carries the arm, not two shapes.
     """
     order = sorted(range(len(bodies)), key=lambda i: (bodies[i].frame, bodies[i].shape is None, i))
     for place, a in enumerate(order):
@@ -81,7 +83,13 @@ def pairs_of(bodies: Sequence[Body]) -> Iterator[tuple[int, int]]:
                 continue
             if first.shape is None and second.name == first.parent:
                 continue
+            if first.shape is None and second.shape is None and _may_touch(first, second, allowed):
+                continue
             yield a, b
+
+
+def _may_touch(first: Body, second: Body, allowed: Collection[tuple[str, str]]) -> bool:
+    return (first.name, second.name) in allowed or (second.name, first.name) in allowed
 
 
 class NodeTable:
@@ -200,7 +208,5 @@ def _leads_furthest(
     rng = np.random.default_rng(0)
     near = normals + 1e-3 * rng.normal(size=normals.shape)
     directions = np.concatenate([normals, near, rng.normal(size=(_TRIED, 3))])
-    values = corners @ directions.T
-    highest = np.maximum.reduceat(values[beside], starts)
-    ends = values >= highest
-    return bool((values.max(axis=0) - np.where(ends, values, np.inf) <= _ROUNDING_M).all())
+    ends = np.append(starts, len(beside))
+    return bool(kernels.leads_furthest(corners, beside, ends, directions, _ROUNDING_M))

@@ -99,7 +99,8 @@ def clearance_model(
     """
     frames = _frames(robot.chain, np.zeros(robot.dof))
     bodies = read_bodies(robot, workcell, frames)
-    moving = ((a, b) for a, b in pairs_of(bodies) if bodies[a].frame != bodies[b].frame)
+    meeting = pairs_of(bodies, robot.allowed)
+    moving = ((a, b) for a, b in meeting if bodies[a].frame != bodies[b].frame)
     pairs = [pair for pair in moving if pair not in apart]
     if not pairs:
         return NO_CLEARANCE

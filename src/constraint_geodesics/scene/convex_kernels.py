@@ -275,3 +275,29 @@ def roughly_apart(nodes, a, b):
     u, v, w = u - nodes[a, BOX], v - nodes[a, BOX + 1], w - nodes[a, BOX + 2]
     u, v, w = max(u, 0.0), max(v, 0.0), max(w, 0.0)
     return np.sqrt(u * u + v * v + w * w) - nodes[a, ROUNDING] - nodes[b, BALL + 3]
+
+
+@njit(**COMPILE)
+def leads_furthest(corners, beside, ends, directions, tolerance):
+    """Whether no corner (m, 3) lies further out than all beside it, but for the tolerance [m] less
+    far than another, in any direction (n, 3).  beside: of corner k those from ends[k] on.
+    """
+    out = np.empty(corners.shape[0])
+    for d in range(directions.shape[0]):
+        most = -np.inf
+        for k in range(corners.shape[0]):
+            out[k] = 0.0
+            for i in range(3):
+                out[k] += corners[k, i] * directions[d, i]
+            most = max(most, out[k])
+        for k in range(corners.shape[0]):
+            if out[k] >= most - tolerance:
+                continue
+            is_end = True
+            for e in range(ends[k], ends[k + 1]):
+                if out[beside[e]] > out[k]:
+                    is_end = False
+                    break
+            if is_end:
+                return False
+    return True

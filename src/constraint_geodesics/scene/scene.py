@@ -2,8 +2,11 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from constraint_geodesics.params import Params, RobotParams, WorkcellParams
-from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
+from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, load_robot
+from constraint_geodesics.scene.arm import ADJACENT, load_arm
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.urdf import find_urdf, has_pybullet
 from constraint_geodesics.scene.world import World
@@ -31,8 +34,15 @@ class Scene:
 
 
 def robot_from(params: RobotParams) -> SerialRobot:
-    """The robot that params.yaml names."""
-    return load_robot(find_urdf(params.urdf), params.tool_link, params.limits_rad)
+    """The robot that parameters name: read from its own URDF where they name nothing beyond it."""
+    if params.hold or params.tool or params.may_touch != ADJACENT:
+        robot = load_arm(params).robot
+    else:
+        robot = load_robot(find_urdf(params.urdf), params.tool_link, params.limits_rad)
+    for name, velocity in zip(robot.joint_names, robot.velocity, strict=True):
+        if not np.isfinite(velocity):
+            raise RobotError(f"{params.urdf}: {name} has no <limit velocity=…>: give its limit")
+    return robot
 
 
 def workcell_from(params: WorkcellParams) -> tuple[Shape, ...]:

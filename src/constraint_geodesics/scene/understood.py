@@ -3,21 +3,18 @@ is missing for a certified plan, with the mend.
 """
 
 import math
-import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from constraint_geodesics.robot.arm_file import write_arm
+from constraint_geodesics.params import RobotParams
 from constraint_geodesics.robot.description import Arm, arm_to, read_description
-from constraint_geodesics.robot.kinematics import RobotError, load_robot
-from constraint_geodesics.scene.allowed_collisions import (
-    AllowedPair,
-    allowed_by_sampling,
-    allowed_by_srdf,
-)
+from constraint_geodesics.robot.kinematics import RobotError
+from constraint_geodesics.scene.allowed_collisions import AllowedPair, allowed_by_srdf
+from constraint_geodesics.scene.arm import ADJACENT, FOUND, load_arm
 from constraint_geodesics.scene.pieces import read_pieces
+from constraint_geodesics.scene.urdf import find_urdf
 
 
 @dataclass(frozen=True)
@@ -70,33 +67,24 @@ class Understood:
         }
 
 
-def understand(
-    urdf: Path,
-    tool_link: str,
-    held: Mapping[str, float] | None = None,
-    srdf: Path | None = None,
-) -> Understood:
-    """Read a URDF as far as it goes.  held: values of joints that are not to move [rad or m].
-
-    srdf: which links may touch; without one that is found by sampling.  Raises RobotError, one line
-    with the mend, where no arm can be made of it.
+def understand(params: RobotParams) -> Understood:
+    """Read a URDF as far as it goes.  Raises RobotError, one line with the mend, where no arm can
+    be made of it.
     """
-    arm = arm_to(read_description(urdf), tool_link, held)
+    arm = arm_to(read_description(find_urdf(params.urdf)), params.tool_link, params.hold)
     missing = list(_missing(arm))
     links = arm.description.tree.findall("link")
     shaped = sum(link.find("collision") is not None for link in links)
     count = shaped * (shaped - 1) // 2
+    if params.may_touch not in (ADJACENT, FOUND):
+        allowed_by_srdf(Path(params.may_touch), arm.description)
     try:
-        read_pieces(urdf)
+        loaded = load_arm(params)
+        read_pieces(loaded.robot.urdf)
     except RobotError as error:
         missing.append(str(error))
         return Understood(arm, (), count, tuple(missing))
-    if srdf is not None:
-        allowed = allowed_by_srdf(srdf, arm.description)
-    else:
-        with tempfile.TemporaryDirectory() as folder:
-            allowed = allowed_by_sampling(load_robot(*write_arm(arm, Path(folder))))
-    return Understood(arm, allowed, count - len(allowed), tuple(missing))
+    return Understood(arm, loaded.allowed, count - len(loaded.allowed), tuple(missing))
 
 
 def _missing(arm: Arm) -> Iterator[str]:

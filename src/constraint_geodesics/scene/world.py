@@ -98,7 +98,8 @@ _WITHOUT_CLIENT = [
 
 
 class World:
-    """One robot among fixed bodies.  Adjacent links and exempt links may touch; nothing else may.
+    """One robot among fixed bodies.  Adjacent links, pairs of links that the robot allows and
+    links exempt from a shape may touch; nothing else may.
 
     Raises RobotError if a URDF is missing and ValueError if an exempt link is not the robot's.
     """
@@ -107,6 +108,7 @@ class World:
         self._bullet = bullet = _Client()
         self.robot = robot
         flags = bullet.URDF_USE_SELF_COLLISION | bullet.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
+        flags |= bullet.URDF_IGNORE_VISUAL_SHAPES  # seconds for some robots
         bullet.setPhysicsEngineParameter(enableFileCaching=0)  # a file may be written anew
         with quiet():
             self._body = body = bullet.loadURDF(str(robot.urdf), useFixedBase=True, flags=flags)
@@ -116,6 +118,9 @@ class World:
         self._link_index[bullet.getBodyInfo(body)[0].decode()] = -1
         self._joints = [joint_index[name] for name in robot.joint_names]
         self._tool = self._link_index[robot.tool_link]
+        for pair in robot.allowed:
+            first, second = (self._link_index[name] for name in pair)
+            bullet.setCollisionFilterPair(body, body, first, second, 0)
         names = [shape.name for shape in fixed]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"two shapes of the workcell are called {twice[0]!r}")

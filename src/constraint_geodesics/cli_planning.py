@@ -1,0 +1,391 @@
+"""The commands of `geodesics` that plan: for the planner's own arm, or for that of any URDF."""
+
+import json
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+
+from constraint_geodesics import completion
+from constraint_geodesics.extras import require
+from constraint_geodesics.pipeline.progress import waiting
+from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
+
+if TYPE_CHECKING:
+    from constraint_geodesics.certification.certifier import Certificate
+    from constraint_geodesics.constraints.constraint import Pose
+    from constraint_geodesics.planner import Planner
+
+NO_PATH = 3
+POSE = '"x y z roll pitch yaw", in m and rad'
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print the answer as one JSON object.")]
+Source = Annotated[
+    str | None,
+    typer.Option(
+        "--planner",
+        help="A planner's folder or MLflow address; else the pipeline's or the package's.",
+    ),
+]
+Urdf = Annotated[
+    Path | None,
+    typer.Option(help="Another arm: a URDF, here or in pybullet_data; nothing is trained."),
+]
+ToolLink = Annotated[
+    str | None,
+    typer.Option("--tool-link", "--tool", help="Of that arm: the link that carries the tool."),
+]
+ToolPose = Annotated[
+    str | None, typer.Option(help=f"The pose of the tool's own frame in that link, as {POSE}.")
+]
+Hold = Annotated[
+    list[str] | None,
+    typer.Option(help='A joint that is not to move, as in "torso_lift_joint=0.2"; repeatable.'),
+]
+Srdf = Annotated[
+    Path | None, typer.Option(help="Which links may touch; without it that is found by sampling.")
+]
+Limit = Annotated[
+    str | None,
+    typer.Option(
+        help="A name that `geodesics constraints` lists; by default what the file says.",
+        shell_complete=completion.planned_constraints,
+    ),
+]
+
+
+class Arm(NamedTuple):
+    """Whom to ask, as options say it: a planner's files, or the arm of a URDF."""
+
+    planner: str | None
+    urdf: Path | None
+    tool_link: str | None
+    tool_pose: str | None
+    hold: list[str] | None
+    srdf: Path | None
+
+    def open(self, method: str = "planner") -> "Planner":
+        """Raises PlannerError, BundleError or RobotError for options that name none."""
+        from constraint_geodesics.planner import Planner, PlannerError
+
+        own = (self.tool_link, self.tool_pose, self.hold, self.srdf)
+        if self.urdf is None:
+            if any(own):
+                raise PlannerError("--tool-link, --tool-pose, --hold and --srdf need --urdf")
+            return Planner.load(self.planner, method)
+        if self.planner is not None or method != "planner":
+            raise PlannerError("--urdf goes without --planner and --method")
+        if self.tool_link is None:
+            raise PlannerError(f"which link carries the tool? `geodesics robot {self.urdf}`")
+        tool = None if self.tool_pose is None else _pose(self.tool_pose, "--tool-pose")
+        held = dict(map(_held, self.hold or []))
+        return Planner.from_urdf(self.urdf, self.tool_link, self.srdf, tool, hold=held)
+
+
+def plan(
+    start: Annotated[
+        str, typer.Option(help='Start configuration: the joints in rad, as in "0.1 -0.5 …".')
+    ],
+    constraint: Annotated[
+        str,
+        typer.Option(
+            help="A name that `geodesics constraints` lists; with --urdf free, or level: the tilt "
+            "that the tool has at the start.",
+            shell_complete=completion.planned_constraints,
+        ),
+    ],
+    goal: Annotated[str | None, typer.Option(help="Goal configuration: the joints in rad.")] = None,
+    goal_pose: Annotated[
+        str | None, typer.Option(help=f"Or a pose of the tool, as {POSE}, base frame.")
+    ] = None,
+    goal_free: Annotated[
+        str | None,
+        typer.Option(help='Axes of that pose which may have any value, as in "yaw" or "x y".'),
+    ] = None,
+    goal_tolerance: Annotated[
+        str | None, typer.Option(help="Half-widths of its other axes: six numbers, in m and rad.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the path here, as CSV.")] = None,
+    record: Annotated[Path | None, typer.Option(help="Write a Rerun recording here.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw the path here, as PNG.")] = None,
+    trajectory: Annotated[
+        bool,
+        typer.Option(
+            "--trajectory", help="Print JSON with the motion, as trajectory_msgs/JointTrajectory."
+        ),
+    ] = False,
+    planner: Source = None,
+    urdf: Urdf = None,
+    tool_link: ToolLink = None,
+    tool_pose: ToolPose = None,
+    hold: Hold = None,
+    srdf: Srdf = None,
+    budget: Annotated[
+        float | None,
+        typer.Option(help="Look for shorter paths for about so many seconds; by default do not."),
+    ] = None,
+    snap: Annotated[
+        bool,
+        typer.Option(
+            "--snap", help="Move a start that is off by at most 0.01 rad onto the constraint."
+        ),
+    ] = False,
+    velocity_scale: Annotated[
+        float, typer.Option(help="Share of the velocity limits that is used.")
+    ] = 1.0,
+    acceleration_scale: Annotated[
+        float, typer.Option(help="Share of the acceleration limits that is used.")
+    ] = 1.0,
+    method: Annotated[
+        str,
+        typer.Option(
+            help="planner: straight line, roadmap and trees, refined; nothing in it is learned.  "
+            "learned: trained policies on the learned manifold alone, as in the paper.  "
+            "learned+band: the same, refined by the planner's elastic band.",
+            shell_complete=completion.methods,
+        ),
+    ] = "planner",
+    as_json: AsJson = False,
+) -> None:
+    """Plan one path.  Exit code 0: solved; 2: wrong usage; 3: there is no path, and the line says
+    why.
+    """
+    from constraint_geodesics.bundle import BundleError
+    from constraint_geodesics.planner import PlannerError
+    from constraint_geodesics.robot.kinematics import RobotError
+
+    if record is not None:
+        require("record")
+    arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf)
+    try:
+        first = _joints(start, "--start")
+        wanted = _goal(goal, goal_pose, goal_free, goal_tolerance)
+        with _loading(), arm.open(method) as loaded:
+            path = loaded.plan(
+                first,
+                wanted,
+                constraint,
+                budget_s=budget,
+                snap=snap,
+                velocity_scale=velocity_scale,
+                acceleration_scale=acceleration_scale,
+            )
+            source = loaded.source
+    except (BundleError, PlannerError, RobotError) as error:
+        raise SystemExit(complain(error, WRONG_USAGE)) from None
+    print(f"planner: {source}", file=sys.stderr)
+    about: dict[str, Any] = path.summary()
+    if path.status == "solved":
+        if out is not None:
+            path.save(out)
+        if record is not None:
+            path.record(record)
+        if picture is not None:
+            path.draw(picture)
+        if trajectory:
+            about["trajectory"] = path.to_joint_trajectory()
+    told = json.dumps(about) if as_json or trajectory else f"{path.status}: {path.explanation}"
+    print(told)
+    raise SystemExit(0 if path.status == "solved" else NO_PATH)
+
+
+def inverse_kinematics(
+    pose: Annotated[str, typer.Option(help=f"Of the tool, as {POSE}, base frame.")],
+    planner: Source = None,
+    urdf: Urdf = None,
+    tool_link: ToolLink = None,
+    tool_pose: ToolPose = None,
+    hold: Hold = None,
+    srdf: Srdf = None,
+    as_json: AsJson = False,
+) -> None:
+    """Print the configurations that reach a tool pose, free of collision and within the limits, one
+    a line: of six joints all, of more some of each family.  Exit code 0: there are some; 2: wrong
+    usage; 3: there is none.
+    """
+    from constraint_geodesics.bundle import BundleError
+    from constraint_geodesics.planner import PlannerError
+    from constraint_geodesics.robot.kinematics import RobotError
+
+    arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf)
+    try:
+        wanted = _pose(pose, "--pose")
+        with _loading(), arm.open() as loaded:
+            found, names = loaded.ik(wanted), loaded.robot.joint_names
+    except (BundleError, PlannerError, RobotError) as error:
+        raise SystemExit(complain(error, WRONG_USAGE)) from None
+    if as_json:
+        print(json.dumps({"joint_names": list(names), "configurations": found.tolist()}))
+    else:
+        for q in found:
+            print(" ".join(f"{x:.9f}" for x in q))
+    if not len(found):
+        print("no configuration reaches this pose", file=sys.stderr)
+    raise SystemExit(0 if len(found) else NO_PATH)
+
+
+def check(
+    file: Annotated[
+        Path, typer.Argument(help="A path as CSV: a header, then one row of joints in rad a line.")
+    ],
+    constraint: Limit = None,
+    planner: Annotated[
+        str | None, typer.Option(help="Where robot and workcell come from, as for `plan`.")
+    ] = None,
+    urdf: Urdf = None,
+    tool_link: ToolLink = None,
+    tool_pose: ToolPose = None,
+    hold: Hold = None,
+    srdf: Srdf = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the certificate as one JSON object.")
+    ] = False,
+) -> None:
+    """Certify anybody's path, between whatever ends it has.  Exit code 0: valid; 2: wrong usage; 3:
+    what it breaks.
+    """
+    from constraint_geodesics.bundle import BundleError
+    from constraint_geodesics.planner import PlannerError
+    from constraint_geodesics.robot.kinematics import RobotError
+
+    arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf)
+    try:
+        with _loading(), arm.open() as loaded:
+            certificate = loaded.check(file, constraint)
+    except (BundleError, PlannerError, RobotError) as error:
+        raise SystemExit(complain(error, WRONG_USAGE)) from None
+    broken = certificate.violation
+    untimed = (
+        " (no times: velocity and acceleration not looked at)"
+        if math.isnan(certificate.duration_s)
+        else ""
+    )
+    meant = constraint or f"the constraint that {file.name} names"
+    if as_json:
+        print(json.dumps(certificate.summary()))
+    elif broken is None:
+        print(
+            f"valid: {certificate.length_rad:.3f} rad, at most "
+            f"{certificate.violation_bound:.1e} (rad, m) off {meant} "
+            f"anywhere, {_clearance(certificate)}{untimed}"
+        )
+    else:
+        print(f"{broken.kind}: {broken.message}")
+    raise SystemExit(0 if broken is None else NO_PATH)
+
+
+def _clearance(certificate: "Certificate") -> str:
+    """What was proven of collisions, in words."""
+    if certificate.asked_pybullet:
+        return "free of collision, by PyBullet's distances where bodies all but touch"
+    if not math.isfinite(certificate.clearance_m):
+        return "with nothing that can touch"
+    return f"at least {1e3 * certificate.clearance_m:.1f} mm from any collision"
+
+
+def show_robot(
+    urdf: Annotated[Path, typer.Argument(help="A URDF, here or in pybullet_data.")],
+    tool_link: Annotated[
+        str | None,
+        typer.Option(
+            "--tool-link", "--tool", help="Link that carries the tool; without it, those there are."
+        ),
+    ] = None,
+    hold: Hold = None,
+    srdf: Srdf = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say what is understood of a robot: its chain, limits, the links that may touch and why, and
+    what is missing.  Exit code 0: understood; 2: wrong usage, or a URDF that can't be used.
+    """
+    from constraint_geodesics.params import RobotParams
+    from constraint_geodesics.robot.description import read_description
+    from constraint_geodesics.robot.kinematics import RobotError
+    from constraint_geodesics.scene.arm import FOUND
+    from constraint_geodesics.scene.understood import understand
+    from constraint_geodesics.scene.urdf import find_urdf
+
+    try:
+        file = urdf if urdf.exists() else find_urdf(urdf)
+        if tool_link is None:
+            description = read_description(file)
+            ends = {link: len(description.moving(link)) for link in description.ends}
+            about: dict[str, Any] = {"robot": description.name, "tool_links": ends}
+            lines = [f"{link}: carried by {count} joints" for link, count in ends.items()]
+            lines += ["choose one of these links, or any other: --tool-link"]
+        else:
+            held = dict(map(_held, hold or []))
+            touching = FOUND if srdf is None else str(srdf)
+            params = RobotParams(urdf=str(file), tool_link=tool_link, hold=held, may_touch=touching)
+            understood = understand(params)
+            about, lines = understood.summary(), list(understood.lines())
+    except RobotError as error:
+        raise SystemExit(complain(error, WRONG_USAGE)) from None
+    print(json.dumps(about) if as_json else "\n".join(lines))
+
+
+@contextmanager
+def _loading() -> Iterator[None]:
+    """Say what a planner's user waits for: the compiler where it was not asked before."""
+    from constraint_geodesics import warmup
+
+    what = "loading the planner"
+    if not warmup.is_done():
+        what = "compiling the kernels, once for this environment: a minute or two"
+        if not sys.stderr.isatty():
+            print(what, file=sys.stderr, flush=True)
+    with waiting(what):
+        yield
+
+
+def _goal(joints: str | None, pose: str | None, free: str | None, tolerance: str | None) -> Any:
+    """A configuration, a pose or a region, as the options say."""
+    from constraint_geodesics.goals.region import GoalRegion
+    from constraint_geodesics.planner import PlannerError
+
+    if (joints is None) == (pose is None):
+        raise PlannerError("the goal is missing, or there are two: --goal or --goal-pose")
+    if pose is None:
+        if free or tolerance:
+            raise PlannerError("--goal-free and --goal-tolerance need --goal-pose")
+        return _joints(joints or "", "--goal")
+    wanted = _pose(pose, "--goal-pose")
+    if not free and not tolerance:
+        return wanted
+    widths = _joints(tolerance, "--goal-tolerance") if tolerance else (0.0,) * 6
+    return GoalRegion(wanted, (free or "").replace(",", " ").split(), widths)
+
+
+def _pose(text: str, option: str) -> "Pose":
+    from constraint_geodesics.constraints.constraint import Pose
+    from constraint_geodesics.planner import PlannerError
+
+    values = _joints(text, option)
+    if len(values) != 6 or not all(map(math.isfinite, values)):
+        raise PlannerError(f"{option} {text!r}: must be six numbers, {POSE}")
+    return Pose.from_rpy(values[:3], values[3:])
+
+
+def _joints(text: str, option: str) -> list[float]:
+    from constraint_geodesics.planner import PlannerError
+
+    try:
+        return [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        raise PlannerError(
+            f"{option} {text!r}: must be numbers, with spaces or commas between them"
+        ) from None
+
+
+def _held(text: str) -> tuple[str, float]:
+    from constraint_geodesics.robot.kinematics import RobotError
+
+    name, _, value = text.partition("=")
+    try:
+        return name.strip(), float(value)
+    except ValueError:
+        raise RobotError(f"--hold {text!r}: must be a joint and a number, joint=value") from None
