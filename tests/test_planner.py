@@ -21,7 +21,7 @@ from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.constraint import ConstraintError, ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.methods import SearchMethod
-from constraint_geodesics.planner import PlannerError, check_trajectory
+from constraint_geodesics.planner import PlannerError
 from constraint_geodesics.recording.recording import read_recording
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.candidates import Answer, Parts, Task, candidates, refined, rows_of
@@ -411,7 +411,7 @@ def test_an_alternative_goal_can_be_reached_as_it_is_printed(planner) -> None:
         ([0.0] * 5 + [np.inf], r"\[5\] is not finite"),
         ([0.0] * 5, r"\(5,\).*\(6,\)"),
         ([], r"\(0,\)"),
-        ([[0.0] * 6], r"\(1, 6\)"),
+        ([[0.0] * 5], r"\(5,\)|\(1, 5\)"),
         (0.5, r"\(\)"),
         (None, r"\(\)"),
         ("abc", "abc"),
@@ -454,7 +454,7 @@ def test_a_goal_that_is_the_start_is_a_path_that_stands(planner, tmp_path, name)
         assert (np.diff(path.times) > 0.0).all()
         assert path.violation_bound_rad <= 1e-4
         path.save(tmp_path / "path.csv")
-        assert check_trajectory(tmp_path / "path.csv", source=bundle.PACKAGED).valid
+        assert packaged_planner().check(tmp_path / "path.csv").valid
 
 
 @pytest.mark.parametrize("distance", [1e-9, 1e-6, 1e-3])
@@ -636,17 +636,17 @@ def test_a_saved_path_is_certified_by_itself(planner, tmp_path) -> None:
     for name in ("level_cup", "level_cup_relaxed", "slide"):
         path = solved(name)[0]
         path.save(tmp_path / "path.csv")
-        certificate = check_trajectory(tmp_path / "path.csv", source=bundle.PACKAGED)
+        certificate = packaged_planner().check(tmp_path / "path.csv")
         assert certificate.valid
         assert certificate.length_rad == path.length_rad
         assert certificate.violation_bound == path.violation_bound_rad
-    assert check_trajectory(tmp_path / "path.csv", "level_cup", bundle.PACKAGED).valid, (
+    assert packaged_planner().check(tmp_path / "path.csv", "level_cup").valid, (
         "what slides is level"
     )
-    other = check_trajectory(tmp_path / "path.csv", "tool_down", bundle.PACKAGED)
+    other = packaged_planner().check(tmp_path / "path.csv", "tool_down")
     assert other.violation.kind == "constraint"
     with pytest.raises(PlannerError, match="there is no constraint 'cup'"):
-        check_trajectory(tmp_path / "path.csv", "cup", bundle.PACKAGED)
+        packaged_planner().check(tmp_path / "path.csv", "cup")
 
 
 def lines_of(tmp_path: Path) -> list[str]:
@@ -663,8 +663,8 @@ def test_a_path_of_somebody_else_may_lack_times_and_constraint(tmp_path) -> None
     assert times is None
     assert constraint is None
     with pytest.raises(PlannerError, match=r"bare\.csv names no constraint.*--constraint"):
-        check_trajectory(bare, source=bundle.PACKAGED)
-    certificate = check_trajectory(bare, "level_cup", bundle.PACKAGED)
+        packaged_planner().check(bare)
+    certificate = packaged_planner().check(bare, "level_cup")
     assert certificate.valid
     assert np.isnan(certificate.duration_s)
 
@@ -691,7 +691,7 @@ def test_a_corrupted_line_is_named(tmp_path, line, text, said) -> None:
     lines[line - 1] = text
     (tmp_path / "path.csv").write_text("\n".join(lines))
     with pytest.raises(PlannerError, match=rf"path\.csv, {said}") as error:
-        check_trajectory(tmp_path / "path.csv", source=bundle.PACKAGED)
+        packaged_planner().check(tmp_path / "path.csv")
     assert one_line(str(error.value))
 
 
@@ -859,7 +859,8 @@ def test_curves_of_any_source_are_candidates_and_broken_ones_are_not(planner) ->
 def test_without_parts_that_propose_curves_none_is_found(planner) -> None:
     only = Parts(straight=False, graph=False, refinement=False, tree=False)
     ends = pairs_of("level_cup", 1, seed=1)[0]
-    (found,) = candidates(task_of(planner, "level_cup"), *ends, only)
+    proposed = candidates(task_of(planner, "level_cup"), *ends, only)
+    (found,) = (own for own in proposed if own is not None)
     assert isinstance(found, Answer)
     assert found.status == "not_found"
 

@@ -47,7 +47,7 @@ from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.functions import tip_on_sphere
 from constraint_geodesics.constraints.projection import retract
-from constraint_geodesics.planner import check_trajectory
+from constraint_geodesics.goals.region import GoalRegion
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.candidates import Parts
 
@@ -79,7 +79,13 @@ with Planner.load(PACKAGED) as planner:
         certifier.certify(rows, held_at_start)
     robot.forward(rows), robot.jacobian(rows), robot.skeleton(rows)
     planner.plan(start + 0.01, goal, "level_cup"), planner.plan(0.0 * start, goal, "free")
-check_trajectory("path.csv", source=PACKAGED)
+    planner.check("path.csv"), planner.project(start + 0.01, "level_cup")
+    pose = Pose(*robot.forward(goal))
+    anyhow = [pose, GoalRegion(pose, free=("yaw",), tolerance=(0.01, 0, 0, 0.1, 0.1, 0)), goal]
+    planner.ik(pose), planner.plan(start, anyhow, "level_cup", snap=True, velocity_scale=0.5)
+with Planner.from_urdf("franka_panda/panda.urdf", "panda_grasptarget") as other:
+    q = 0.5 * (other.robot.lower + other.robot.upper)
+    other.plan(q, Pose(*other.robot.forward(q + 0.1)), "level").to_joint_trajectory()
 bundle = read_bundle(PACKAGED)
 workcell = bundle.workcell.including(Sphere("ball", tuple(place), radius_m=0.08))
 with Planner(replace(bundle, workcell=workcell), "this test") as planner:

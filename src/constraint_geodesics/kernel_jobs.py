@@ -20,6 +20,7 @@ from constraint_geodesics.constraints.functions import values_batch
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.plugs import PULL, PULL_BOUNDS, plug
+from constraint_geodesics.robot.inverse_kinematics import solutions
 from constraint_geodesics.robot.kinematics import load_robot
 from constraint_geodesics.scene import convex_kernels as convex
 from constraint_geodesics.scene.clearance import clearance_model, path_stays_clear
@@ -27,6 +28,7 @@ from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.band import project
 from constraint_geodesics.search.candidates import Task, refined, rows_of
+from constraint_geodesics.search.nearest import nearest_on
 from constraint_geodesics.search.roadmap import build_roadmap, join, shortest_way
 from constraint_geodesics.search.space import Space, space_of
 from constraint_geodesics.search.tree import tree_way
@@ -114,6 +116,16 @@ def _trees() -> None:
     tree_way(_space(), _ROWS[0], _ROWS[-1], 0)
 
 
+def _inverse_kinematics() -> None:
+    robot = _scene().robot
+    position, rotation = robot.forward(_ROWS[0])
+    solutions(robot, position, rotation)
+
+
+def _nearest() -> None:
+    nearest_on(ConstraintManifold(_scene().robot, _level()), _ROWS[0], _ROWS)
+
+
 def _learned() -> None:
     robot, joints = _scene().robot, _ROWS[None].copy()
     bounds = plug(PULL_BOUNDS)(robot.lower, robot.upper, 1e-8)
@@ -137,6 +149,8 @@ JOBS = {
     "elastic band": Job(_band, ("space",)),
     "roadmap": Job(_roadmap, ("space",)),
     "trees": Job(_trees, ("roadmap",)),
+    "nearest configurations": Job(_nearest, ("roadmap",)),
+    "inverse kinematics": Job(_inverse_kinematics, ("kinematics",)),
     "learned method": Job(_learned, ("constraints and times",)),
 }
 """By their names, those that others wait for and the longest first."""

@@ -43,8 +43,10 @@ class Method(Protocol):
 
     def candidates(
         self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts
-    ) -> Iterator[Candidate | Answer]:
-        """Sound curves, the most promising first; an Answer ends them."""
+    ) -> Iterator[Candidate | Answer | None]:
+        """Sound curves, the most promising first; None where those begin that take longer, an
+        Answer at the end.
+        """
         ...
 
     def improvements(
@@ -68,7 +70,7 @@ class SearchMethod:
 
     def candidates(
         self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts
-    ) -> Iterator[Candidate | Answer]:
+    ) -> Iterator[Candidate | Answer | None]:
         """From the cheapest proposals to the most expensive."""
         return candidates(task, start, goal, parts)
 

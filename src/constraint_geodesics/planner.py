@@ -7,8 +7,8 @@ trajectory = planner.plan(start, goal, "level_cup")
 
 import time
 from collections import deque
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
@@ -18,15 +18,32 @@ from jaxtyping import Float
 from constraint_geodesics import warmup
 from constraint_geodesics.bundle import Bundle, open_bundle
 from constraint_geodesics.certification.certifier import Certificate, Certifier, Limits
-from constraint_geodesics.constraints.constraint import Constraint, Pose, constraint_from
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintManifold,
+    Pose,
+    constraint_from,
+)
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.timing import time_parametrisation
-from constraint_geodesics.goal import ArrayLike, Goal, as_goal, checked_configuration
+from constraint_geodesics.goals.goal import ArrayLike, Goal, Wanted, checked_configuration
+from constraint_geodesics.goals.pose import POSE_JOINTS
+from constraint_geodesics.goals.wanted import as_goals
 from constraint_geodesics.methods import Method, SearchMethod, open_method
-from constraint_geodesics.params import JudgeParams, PlannerParams
+from constraint_geodesics.params import (
+    JudgeParams,
+    PlannerParams,
+    PoseParams,
+    RobotParams,
+    WorkcellParams,
+)
 from constraint_geodesics.problem import PlannerError as PlannerError
 from constraint_geodesics.problem import Status
+from constraint_geodesics.robot.inverse_kinematics import Search, solutions, spread
+from constraint_geodesics.robot.kinematics import SerialRobot, rpy_of
+from constraint_geodesics.scene.arm import FOUND
 from constraint_geodesics.scene.scene import Scene, robot_from, workcell_from
+from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.search.candidates import (
     ALL_PARTS,
     BENDS,
@@ -35,8 +52,10 @@ from constraint_geodesics.search.candidates import (
     Parts,
     rows_of,
 )
-from constraint_geodesics.search.explanations import not_connected, refused_ends
+from constraint_geodesics.search.explanations import not_connected, refused_end
+from constraint_geodesics.search.nearest import nearest_on
 from constraint_geodesics.search.preparation import Preparation, Query
+from constraint_geodesics.search.pursuit import Pursued, shortest
 from constraint_geodesics.trajectory import Asked, Statistics, Trajectory, read_trajectory
 
 COINCIDENT_RAD = 1e-7
@@ -54,6 +73,25 @@ for closer ones.
 """
 _CLOSER = ("constraint_between_rows", "step")
 """What a certificate finds where waypoints lie too far apart."""
+SNAP_RAD = 0.01
+"""Distance by which a start is moved on request, at most."""
+REPRESENTATIVES, _MANY_SEEDS = 64, 1024
+"""Of the configurations that reach a pose, where there is no end of them; what they are found
+from.
+"""
+OWN_CONSTRAINTS = {"free": Constraint((0,) * 6), "level": Constraint((0, 0, 0, 1, 1, 0))}
+"""By name, of a planner that is made from a URDF: nothing held, and the tilt that the start has."""
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """The nearest configuration that keeps a constraint (D,) [rad], how far away it is [rad], and
+    by how much the one asked for violates it [rad or m].
+    """
+
+    configuration: Float[np.ndarray, "D"]
+    distance_rad: float
+    violation_before: float
 
 
 class Planner:
@@ -95,6 +133,46 @@ class Planner:
         """
         bundle, where = open_bundle(source)
         return cls(bundle, where, open_method(method, source, bundle))
+
+    @classmethod
+    def from_urdf(
+        cls,
+        urdf: str | Path,
+        tool_link: str,
+        srdf: str | Path | None = None,
+        tool: Pose | None = None,
+        *,
+        hold: Mapping[str, float] | None = None,
+        workcell: Sequence[Shape] = (),
+    ) -> Self:
+        """For the arm of any URDF, a path or a name in pybullet_data; nothing is trained.  The
+        names of its constraints are those of OWN_CONSTRAINTS.
+
+        srdf: which links may touch; without it adjacent and rigid pairs, and those that always
+        touch, found by sampling.  tool: the pose of the tool's own frame in its link.  hold: values
+        of joints that are not to move [rad or m].  workcell: shapes around the arm.
+        Raises RobotError, one line with the mend, where no arm can be made of the files.
+        """
+        own = None
+        if tool is not None:
+            rpy = rpy_of(tool.rotation)
+            own = PoseParams(position_m=tuple(tool.position.tolist()), rpy_rad=rpy)
+        robot = RobotParams(
+            urdf=str(urdf),
+            tool_link=tool_link,
+            hold=dict(hold or {}),
+            tool=own,
+            may_touch=FOUND if srdf is None else str(srdf),
+        )
+        around = WorkcellParams().including(*workcell)
+        made = cls(Bundle(robot, around, {}, PlannerParams(), JudgeParams(), {}), str(urdf))
+        made.constraints |= OWN_CONSTRAINTS
+        return made
+
+    @property
+    def robot(self) -> SerialRobot:
+        """Limits, velocities, names of the joints and forward kinematics."""
+        return self.scene.robot
 
     def __enter__(self) -> Self:
         self._require_open()
@@ -138,26 +216,68 @@ class Planner:
         nodes.flags.writeable = False
         return nodes
 
+    def ik(self, pose: Pose) -> Float[np.ndarray, "n D"]:
+        """Configurations [rad] free of collision and within the limits whose tool has a pose in the
+        base frame: of six joints every one, whole turns included; of more some that are spread over
+        all of them.
+        """
+        self._require_open()
+        robot, settings = self.robot, Search()
+        if robot.dof > POSE_JOINTS:
+            settings = settings._replace(seeds=_MANY_SEEDS)
+        found = solutions(robot, pose.position, pose.rotation, settings)
+        free = found[self._certifier.collisions.free(found)]
+        return spread(free, REPRESENTATIVES) if robot.dof > POSE_JOINTS else free
+
+    def project(self, q: ArrayLike, constraint: str | Constraint) -> Projection:
+        """The nearest configuration that keeps a constraint and the joint limits, as far as the
+        descent from q [rad] finds it; collisions are not looked at.
+
+        Raises PlannerError if the constraint holds an axis but has no reference, or nothing near
+        keeps it.
+        """
+        given, name = self._named(constraint)
+        if not given.is_placed:
+            raise PlannerError(f"{name} has no reference pose: use constraint.relative_to(pose)")
+        return self._projected(checked_configuration(q, self.robot.dof, "q"), given, name)
+
+    def _projected(
+        self, q: Float[np.ndarray, "D"], constraint: Constraint, name: str
+    ) -> Projection:
+        manifold = ConstraintManifold(self.robot, constraint)
+        found = nearest_on(manifold, q, q[None])
+        if not len(found):
+            raise PlannerError(f"no configuration was found near {q.tolist()} that keeps {name}")
+        away = float(np.linalg.norm(found[0] - q))
+        return Projection(found[0], away, float(manifold.violation(q)))
+
     def plan(
         self,
         start: ArrayLike,
-        goal: Goal | ArrayLike,
+        goal: Wanted | Sequence[Wanted],
         constraint: str | Constraint,
         *,
         parts: Parts = ALL_PARTS,
         budget_s: float | None = None,
+        snap: bool = False,
+        velocity_scale: float = 1.0,
+        acceleration_scale: float = 1.0,
     ) -> Trajectory:
-        """A short path from a start [rad] to a goal, a configuration [rad] or any other Goal, under
-        a constraint: a name from params.yaml, or a Constraint, which without a reference holds its
-        axes where the start has them.
+        """A short path from a start [rad] under a constraint: a name from params.yaml, or a
+        Constraint, which without a reference holds its axes where the start has them.
 
+        goal: a configuration [rad], a tool Pose, a GoalRegion or any other Goal, or a list of
+        them: the shortest path that is found to any is the answer.
         parts: of the planner to use, for comparisons.  budget_s: by default the first path that is
         certified is the answer; with a budget shorter ones, round the other side of something, are
         looked for while there is time for one more, by how long such a one took before, until so
         many seconds have passed since the call; functions of a constraint's own are compiled
-        before, a roadmap that is not made yet is made within.
+        before, a roadmap that is not made yet is made within.  snap: a start that violates the
+        constraint or a limit is moved to the nearest configuration that keeps them, where that is
+        at most SNAP_RAD away; else such a start is refused.  velocity_scale, acceleration_scale:
+        the shares of the limits that the motion uses, above 0 and at most 1.
         Raises PlannerError if an end has the wrong shape or is not finite, the name is unknown, or
-        the budget is no positive number.
+        the budget or a scale is none.
         """
         self._require_open()
         given, name = self._named(constraint)
@@ -165,19 +285,26 @@ class Planner:
         began = time.perf_counter()
         if budget_s is not None and not (np.isfinite(budget_s) and budget_s > 0.0):
             raise PlannerError(f"budget_s = {budget_s}: must be a positive number of seconds")
+        scales = velocity_scale, acceleration_scale
+        for scale, which in zip(scales, ("velocity", "acceleration"), strict=True):
+            if not 0.0 < scale <= 1.0:
+                raise PlannerError(f"{which}_scale = {scale}: must be above 0 and at most 1")
         dof = self.scene.robot.dof
-        q_start, wanted = checked_configuration(start, dof, "start"), as_goal(goal, dof)
-        task = self._preparation.task(self._held_at(given, q_start))
-        answers: list[Trajectory] = []
-        for q_goal in wanted.configurations(task.manifold, q_start):
-            query = Query(task, name, q_start, q_goal, began, parts)
-            answers.append(self._answer(query, budget_s))
-            if answers[-1].status == "solved":
-                return answers[-1]
-        if answers:
-            return answers[0]
-        query = Query(task, name, q_start, q_start, began, parts)
-        return self._nothing(query, "not_found", f"no configuration is {wanted.description}")
+        q_start, goals = checked_configuration(start, dof, "start"), as_goals(goal, dof)
+        held = self._held_at(given, q_start)
+        if snap:
+            q_start = self._snapped(q_start, held, name)
+        task = self._preparation.task(held)
+        query = Query(task, name, q_start, q_start, began, parts, scales)
+        refused = refused_end(query, "start", self._certifier.collisions)
+        if refused is not None:
+            return self._nothing(query, *refused)
+        pursued = list(self._pursued(query, goals))
+        if not pursued:
+            wanted = " or ".join(one.description for one in goals)
+            return self._nothing(query, "not_found", f"no configuration is {wanted}")
+        pursued.sort(key=lambda one: one.distance)
+        return self._answer(query, pursued, budget_s)
 
     def plan_batch(
         self,
@@ -201,6 +328,32 @@ class Planner:
                 progress(row + 1)
         return answers
 
+    def check(
+        self,
+        file: str | Path,
+        constraint: str | Constraint | None = None,
+        *,
+        start: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
+    ) -> Certificate:
+        """Certify a path from CSV (`read_trajectory`) under a constraint, by default the one its
+        file names; without a reference it is held where the path begins.  start, goal: the ends
+        [rad] that it must have, if any.
+
+        Raises PlannerError if the file can't be read, or neither names a constraint that exists.
+        """
+        self._require_open()
+        joints, times, own = read_trajectory(Path(file), self.robot.joint_names, self.robot)
+        if constraint is not None:
+            own, _ = self._named(constraint)
+        if own is None:
+            raise PlannerError(f"{file} names no constraint: say which with --constraint")
+        first, last = (
+            None if q is None else checked_configuration(q, self.robot.dof, name)
+            for q, name in ((start, "start"), (goal, "goal"))
+        )
+        return self._certifier.certify(joints, self._held_at(own, joints[0]), first, last, times)
+
     def _named(self, constraint: str | Constraint) -> tuple[Constraint, str]:
         if isinstance(constraint, Constraint):
             return constraint, constraint.label
@@ -214,28 +367,68 @@ class Planner:
             return constraint
         return constraint.relative_to(Pose(*self.scene.robot.forward(start)))
 
-    def _answer(self, query: Query, budget_s: float | None) -> Trajectory:
-        """The answer for one configuration as the goal."""
-        task, start, goal = query.task, query.start, query.goal
-        refused = refused_ends(query, self._certifier.collisions)
+    def _snapped(
+        self, start: Float[np.ndarray, "D"], constraint: Constraint, name: str
+    ) -> Float[np.ndarray, "D"]:
+        """The start, moved where it keeps the constraint; as it is where that is too far away."""
+        try:
+            found = self._projected(start, constraint, name)
+        except PlannerError:
+            return start
+        return found.configuration if found.distance_rad <= SNAP_RAD else start
+
+    def _pursued(self, query: Query, goals: Sequence[Goal]) -> Iterator[Pursued]:
+        """The goals' configurations."""
+        for goal in goals:
+            region = None
+            if goal.region is not None:
+                region = ConstraintManifold(self.scene.robot, goal.region)
+            for q in goal.configurations(query.task.manifold, query.start):
+                away = float(np.linalg.norm(q - query.start))
+                yield Pursued(q, away, self._curves(replace(query, goal=q)), region)
+
+    def _curves(self, query: Query) -> Iterator[Candidate | Answer | None]:
+        """The method's, unless the goal is refused."""
+        refused = refused_end(query, "goal", self._certifier.collisions)
         if refused is not None:
-            return self._nothing(query, *refused)
-        if np.abs(start - goal).max() <= COINCIDENT_RAD:
-            return self._standing(query)
-        problem, end = "", Answer("not_found")
-        for candidate in self.method.candidates(task, start, goal, query.parts):
-            if isinstance(candidate, Answer):
-                end = candidate
-                break
-            found = self._certified(query, candidate)
-            if isinstance(found, Trajectory):
-                return found if budget_s is None else self._improved(query, found, budget_s)
-            problem = f"; the {candidate.source} curve fails: {found}"
+            status, line = refused
+            yield Answer(status, explanation=line)
+            return
+        yield from self.method.candidates(query.task, query.start, query.goal, query.parts)
+
+    def _answer(
+        self, query: Query, pursued: Sequence[Pursued], budget_s: float | None
+    ) -> Trajectory:
+        """The answer for some configurations as the goal, the nearest first."""
+        if pursued[0].distance <= COINCIDENT_RAD:
+            return self._standing(replace(query, goal=pursued[0].goal))
+
+        def certify(candidate: Candidate) -> tuple[Trajectory, float] | str:
+            found = self._certified(replace(query, goal=candidate.points[-1]), candidate)
+            return found if isinstance(found, str) else (found, found.length_rad)
+
+        path, count = shortest(pursued, query.task, certify), len(pursued)
+        if path is None:
+            return self._failed(query, pursued)
+        if budget_s is not None:
+            path = self._improved(replace(query, goal=path.joints[-1]), path, budget_s)
+        if count == 1:
+            return path
+        line = f"{path.explanation}, the shortest to any of {count} configurations"
+        return replace(path, explanation=line, statistics=self._statistics(query, path.source))
+
+    def _failed(self, query: Query, pursued: Sequence[Pursued]) -> Trajectory:
+        """Why there is no path to any goal: what is said of the nearest one that could end one."""
+        answers = [(one, one.answer or Answer("not_found")) for one in pursued]
+        one, end = next((own for own in answers if not own[1].explanation), answers[0])
+        query = replace(query, goal=one.goal)
+        line = end.explanation
         if end.status == "not_connected":
-            return self._nothing(
-                query, end.status, not_connected(query, end, self._certifier.collisions)
-            )
-        line = f"no curve tried is a path under {query.name}{problem}"
+            line = not_connected(query, end, self._certifier.collisions)
+        elif not line:
+            line = f"no curve tried is a path under {query.name}{one.failed}"
+        if len(pursued) > 1:
+            line += f"; so it is with all {len(pursued)} configurations of the goal"
         return self._nothing(query, end.status, line)
 
     def _improved(self, query: Query, path: Trajectory, budget_s: float) -> Trajectory:
@@ -265,7 +458,8 @@ class Planner:
         for share in _TIGHTENED:
             joints = rows_of(candidate, share * allowed)
             try:
-                times = time_parametrisation(joints, robot.velocity, self._acceleration)
+                limits = robot.velocity * query.scales[0], self._acceleration * query.scales[1]
+                times = time_parametrisation(joints, *limits)
             except GeometryError as error:
                 return str(error)
             certificate = self._certifier.certify(
@@ -331,26 +525,3 @@ def limits_of(settings: PlannerParams, judge: JudgeParams, dof: int) -> Limits:
         violation_tolerance=judge.violation_tolerance,
         acceleration_rad_s2=(settings.acceleration_rad_s2,) * dof,
     )
-
-
-def check_trajectory(
-    file: str | Path, constraint: str | None = None, source: str | Path | None = None
-) -> Certificate:
-    """Certify a path from CSV (`read_trajectory`) under a named constraint, by default the one its
-    file names.
-
-    Raises PlannerError if the file can't be read, or neither names a constraint that exists.
-    """
-    bundle, _ = open_bundle(source)
-    warmup.ensure()
-    scene = Scene(robot_from(bundle.robot), workcell_from(bundle.workcell))
-    joints, times, own = read_trajectory(Path(file), scene.robot.joint_names, scene.robot)
-    if constraint is not None:
-        if constraint not in bundle.constraints:
-            known = ", ".join(bundle.constraints)
-            raise PlannerError(f"there is no constraint {constraint!r}: must be one of {known}")
-        own = constraint_from(bundle.constraints[constraint], scene.robot)
-    if own is None:
-        raise PlannerError(f"{file} names no constraint: say which with --constraint")
-    with Certifier(scene, limits_of(bundle.planner, bundle.judge, scene.robot.dof)) as certifier:
-        return certifier.certify(joints, own, times=times)

@@ -103,24 +103,21 @@ def refusal(problem: PlanningProblem) -> Status | None:
     """Why no planner needs to look at this problem, or None if both ends can be reached by a
     robot.
     """
-    violated = ends_refused(problem.manifold, problem.start, problem.goal)
-    if violated is not None:
-        return violated
+    for end in ("start", "goal"):
+        violated = end_refused(problem.manifold, getattr(problem, end), end)
+        if violated is not None:
+            return violated
     if not (problem.is_free(problem.start) and problem.is_free(problem.goal)):
         return "in_collision"
     return None
 
 
-def ends_refused(
-    manifold: ConstraintManifold, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]
+def end_refused(
+    manifold: ConstraintManifold, q: Float[np.ndarray, "D"], end: Literal["start", "goal"]
 ) -> Status | None:
-    """Why these can't be the ends of a path, collisions apart; None where they can."""
-    ends = np.stack([start, goal])
-    violation = manifold.violation(ends)
-    if violation[0] > SATISFIED:
-        return "start_violates"
-    if violation[1] > SATISFIED:
-        return "goal_violates"
-    if manifold.robot.limit_distance(ends).min() < -LIMIT_SLACK:
+    """Why a configuration can't be this end of a path, collisions apart; None where it can."""
+    if manifold.violation(q) > SATISFIED:
+        return "start_violates" if end == "start" else "goal_violates"
+    if manifold.robot.limit_distance(q) < -LIMIT_SLACK:
         return "out_of_limits"
     return None

@@ -167,6 +167,34 @@ class Trajectory:
         names = self.scene.robot.joint_names
         write_trajectory(Path(file), self.joints, self.times, self.constraint, names)
 
+    def to_joint_trajectory(self) -> dict[str, Any]:
+        """As ROS's trajectory_msgs/JointTrajectory: `joint_names`, and `points` with `positions`
+        [rad], `velocities` [rad/s], `accelerations` [rad/s²] and `time_from_start` [s].
+
+        Accelerations are the certified differences at the waypoints; a velocity lies between those
+        of the lines before and after; both ends are at rest.  Raises PlannerError without a path.
+        """
+        self._require_path("use")
+        steps, durations = np.diff(self.joints, axis=0), np.diff(self.times)[:, None]
+        speeds = np.pad(steps / durations, ((1, 1), (0, 0)))
+        lasting = np.pad(durations, ((1, 1), (0, 0)))
+        both = lasting[:-1] + lasting[1:]
+        accelerations = 2.0 * np.diff(speeds, axis=0) / both
+        velocities = (speeds[:-1] * lasting[1:] + speeds[1:] * lasting[:-1]) / both
+        rows = zip(self.joints, velocities, accelerations, self.times, strict=True)
+        return {
+            "joint_names": list(self.scene.robot.joint_names),
+            "points": [
+                {
+                    "positions": q.tolist(),
+                    "velocities": v.tolist(),
+                    "accelerations": a.tolist(),
+                    "time_from_start": float(t),
+                }
+                for q, v, a, t in rows
+            ],
+        }
+
     def record(self, file: str | Path, frames: int = 100) -> None:
         """Write a Rerun recording.  Raises PlannerError without a path, MissingExtraError without
         the extra `record`.

@@ -7,7 +7,6 @@ from tests.planner_fixtures import packaged_planner
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.functions import made_by
 from constraint_geodesics.constraints.projection import retract
-from constraint_geodesics.planner import check_trajectory
 from constraint_geodesics.trajectory import read_trajectory
 
 SPHERE = "constraint_geodesics.constraints.functions:tip_on_sphere"
@@ -52,7 +51,7 @@ def test_its_path_is_read_again(path, manifold, tmp_path) -> None:
     joints, _, constraint = read_trajectory(file, manifold.robot.joint_names, manifold.robot)
     np.testing.assert_array_equal(joints, path.joints)
     assert constraint.key == manifold.constraint.key
-    assert check_trajectory(file).valid
+    assert packaged_planner().check(file).valid
 
 
 def test_its_path_is_recorded(path, tmp_path) -> None:

@@ -20,6 +20,8 @@ from constraint_geodesics.constraints.kernels import ConstraintArrays, ManifoldA
 from constraint_geodesics.params import ConstraintParams
 from constraint_geodesics.robot.kinematics import SerialRobot, rotation_from_rpy
 
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Of a tool's pose, in the base frame."""
 CONTEXT = 12
 """Numbers that a policy sees of a constraint."""
 

@@ -19,7 +19,13 @@ from jaxtyping import Float
 from numba import carray, njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
-from constraint_geodesics.constraints.constraint import Constraint, ConstraintError, Pose, Series
+from constraint_geodesics.constraints.constraint import (
+    AXES,
+    Constraint,
+    ConstraintError,
+    Pose,
+    Series,
+)
 from constraint_geodesics.constraints.kernels import (
     CURVATURE_WORDS,
     LINEARISE_WORDS,
@@ -39,7 +45,6 @@ from constraint_geodesics.robot.kernels import (
 )
 from constraint_geodesics.robot.kinematics import SerialRobot
 
-AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 SEEN_TOLERANCE = 0.2
 """Tolerance [rad or m] that a policy sees as 1."""
 _SMALL = 1e-9

@@ -34,6 +34,8 @@ PARTLY_RELAXED = (3, 1, 0)
 """Iterations of a band that must stay near the graph."""
 TREES = 4
 """Pairs of trees that are grown where all else failed."""
+TREES_APART = 2
+"""Where the graph holds the ends to be unconnected, which it hardly ever errs in."""
 PATIENT = TreeSettings(iterations=4000, nodes=20_000)
 """Of one more pair, the last."""
 BENDS = 4
@@ -93,12 +95,13 @@ class Candidate:
 @dataclass(frozen=True)
 class Answer:
     """What `candidates` ended with where nothing was found, and how the ends are joined to the
-    graph.
+    graph.  explanation: where the status alone does not say it.
     """
 
     status: Status
     at_start: Joined | None = None
     at_goal: Joined | None = None
+    explanation: str = ""
 
 
 def candidates(
@@ -106,12 +109,12 @@ def candidates(
     start: Float[np.ndarray, "D"],
     goal: Float[np.ndarray, "D"],
     parts: Parts = ALL_PARTS,
-) -> Iterator[Candidate | Answer]:
-    """Sound curves from the cheapest proposals to the dearest, of one kind the shortest first; an
-    Answer ends them.
+) -> Iterator[Candidate | Answer | None]:
+    """Sound curves from the cheapest proposals to the dearest, of one kind the shortest first; None
+    where dearer ones begin, and an Answer at the end.
 
     A straight start that touches something is pushed out of it only after the graph was asked: that
-    takes longer.  Trees come last, and not where the graph holds the ends to be unconnected.
+    takes longer.  Trees come last.
     """
     blocked = None
     if parts.straight:
@@ -122,17 +125,23 @@ def candidates(
             yield found
         else:
             blocked = found
+    yield None
     answer = Answer("not_found")
     if parts.graph:
         answer = yield from _over_graph(task, start, goal, parts.refinement, blocked is not None)
+        yield None
     if blocked is not None and parts.refinement:
         pushed = _relaxed(task, "straight", blocked.nodes, task.settings, clear=True)
         if pushed is not None and _is_clear(task, pushed.points):
             yield pushed
-    if parts.tree and answer.status != "not_connected":
-        for seed in range(TREES):
+    if parts.tree:
+        apart = answer.status == "not_connected"
+        for seed in range(TREES_APART if apart else TREES):
+            yield None
             yield from _over_tree(task, start, goal, parts.refinement, seed)
-        yield from _over_tree(task, start, goal, parts.refinement, TREES, PATIENT)
+        if not apart:
+            yield None
+            yield from _over_tree(task, start, goal, parts.refinement, TREES, PATIENT)
     yield answer
 
 

@@ -1,13 +1,16 @@
 """Why a query has no path, as a status and one line for people."""
 
+from typing import Literal
+
 import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.certification.collisions import CollisionCheck
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.constraints.projection import retract
-from constraint_geodesics.problem import Status, ends_refused
+from constraint_geodesics.problem import Status, end_refused
 from constraint_geodesics.search.candidates import Answer
+from constraint_geodesics.search.nearest import nearest_on
 from constraint_geodesics.search.preparation import Query
 from constraint_geodesics.search.roadmap import Roadmap, join
 
@@ -15,19 +18,23 @@ ALTERNATIVES = 64
 """Configurations from which another goal with the same tool pose is looked for."""
 
 
-def refused_ends(query: Query, collisions: CollisionCheck) -> tuple[Status, str] | None:
-    """Why these ends can't be those of a path; None where they can."""
-    manifold = query.task.manifold
-    ends = {"start": query.start, "goal": query.goal}
-    status = ends_refused(manifold, query.start, query.goal)
-    if status in ("start_violates", "goal_violates"):
-        end = status.removesuffix("_violates")
-        return status, f"the {end} violates {query.name} by {manifold.amount(ends[end])}"
+def refused_end(
+    query: Query, end: Literal["start", "goal"], collisions: CollisionCheck
+) -> tuple[Status, str] | None:
+    """Why this end can't be that of a path; None where it can."""
+    manifold, q = query.task.manifold, getattr(query, end)
+    status = end_refused(manifold, q, end)
+    if status == "out_of_limits":
+        return status, _limit(manifold, end, q)
     if status is not None:
-        return status, next(line for end, q in ends.items() if (line := _limit(manifold, end, q)))
-    for end, q in ends.items():
-        if not collisions.is_free(q):
-            return "in_collision", f"the {end} touches {collisions.what_touches(q)}"
+        line = f"the {end} violates {query.name} by {manifold.amount(q)}"
+        nearest = nearest_on(manifold, q, q[None])
+        if len(nearest):
+            away = float(np.linalg.norm(nearest[0] - q))
+            line += f"; {_listed(nearest[0])} rad, {away:.2g} rad away, keeps it"
+        return status, line
+    if not collisions.is_free(q):
+        return "in_collision", f"the {end} touches {collisions.what_touches(q)}"
     return None
 
 

@@ -41,7 +41,9 @@ Draw = Callable[[int, np.random.Generator], Float[np.ndarray, "n D"]]
 
 @dataclass(frozen=True)
 class Query:
-    """One query while it is planned.  began: on `time.perf_counter`."""
+    """One query while it is planned.  goal: one configuration of it.  began: on
+    `time.perf_counter`.  scales: the shares of the velocity and acceleration limits that are used.
+    """
 
     task: Task
     name: str
@@ -49,6 +51,7 @@ class Query:
     goal: Float[np.ndarray, "D"]
     began: float
     parts: Parts = ALL_PARTS
+    scales: tuple[float, float] = (1.0, 1.0)
 
 
 class Preparation:

@@ -17,7 +17,14 @@ from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.geometry.graph import components, nearest_neighbour_edges
-from constraint_geodesics.search.space import Space, is_free, project_node, workspace
+from constraint_geodesics.search.space import (
+    Space,
+    is_free,
+    keep_slopes,
+    project_node,
+    turns_over,
+    workspace,
+)
 
 NEAREST = 32
 """Nodes that an end is tried to be joined to, the nearest first."""
@@ -162,6 +169,7 @@ def edge_length(space, first, second, work):
     pieces = int(np.ceil(direct / EDGE_STEP)) + 1
     allowed = 0.05 + 3.0 * direct / pieces
     before, point, total = work.before, work.point, 0.0
+    keep_slopes(space, first, work)
     for d in range(dof):
         before[d] = first[d]
     for k in range(1, pieces + 1):
@@ -170,7 +178,9 @@ def edge_length(space, first, second, work):
         if k < pieces and project_node(space, point, space.projection, work) > 1e-6:
             return np.inf
         step = distance(point, before)
-        if not step <= allowed or not is_free(space, before, point, work):
+        if not step <= allowed or turns_over(space, point, work):
+            return np.inf
+        if not is_free(space, before, point, work):
             return np.inf
         total += step
         for d in range(dof):

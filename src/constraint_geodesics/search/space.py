@@ -41,6 +41,10 @@ SHORT = 5e-7
 """What may lack of a margin [m]: the last of it would take as many steps again."""
 STILL = 1e-9
 """A contact whose distance no joint changes by more [m/rad] is none to be kept."""
+FLAT, TURNED = 0.5, 0.5
+"""A row that changes by less a radian or metre of the joints has no direction to speak of; the
+cosine of the angle by which that of others turns at most within an edge's step.
+"""
 _SMALLEST_PIVOT = 1e-12
 
 
@@ -70,8 +74,8 @@ class Workspace(NamedTuple):
     """What the kernels write into, allocated once.
 
     retraction: of the constraint alone; looked: the same as its own, of which `look_at` overwrites
-    the first configuration; place (1, D); excess, active, weights (m,); contacts; rows, normal
-    (D, D); right, squares, before, point (D,).
+    the first configuration; place (1, D); excess, active, weights (m,); slopes (m, D); contacts;
+    rows, normal (D, D); right, squares, before, point (D,).
     """
 
     retraction: RetractionRoom
@@ -80,6 +84,7 @@ class Workspace(NamedTuple):
     excess: np.ndarray
     active: np.ndarray
     weights: np.ndarray
+    slopes: np.ndarray
     contacts: Contacts
     rows: np.ndarray
     normal: np.ndarray
@@ -101,6 +106,7 @@ def workspace(space):
         np.zeros(count),
         np.zeros(count, dtype=np.bool_),
         np.zeros(count),
+        np.zeros((count, dof)),
         new_contacts(space.clearance, dof),
         np.empty((dof, dof)),
         np.empty((dof, dof)),
@@ -158,6 +164,38 @@ def _broken(space, q, work):
                 right[size] = -short
                 size += 1
     return size, worst, own
+
+
+@njit(**LEAF)
+def keep_slopes(space, q, work):
+    """Keep what the constraint's rows change by at a configuration, for `turns_over`."""
+    look_at(space, q, work)
+    jacobian = work.looked.jacobians[0]
+    for i in range(work.slopes.shape[0]):
+        for d in range(q.shape[0]):
+            work.slopes[i, d] = jacobian[i, d]
+
+
+@njit(**LEAF)
+def turns_over(space, q, work):
+    """Whether a row changes in quite another direction than where the slopes were kept, and keep
+    those of here.
+
+    Between near configurations none does but over a place where it is undefined, as the turn about
+    the vertical is for a tool that is upside down: no straight line keeps the constraint there.
+    """
+    look_at(space, q, work)
+    held, jacobian, over = space.constraint.rows.held, work.looked.jacobians[0], False
+    for i in range(work.slopes.shape[0]):
+        along, first, second = 0.0, 0.0, 0.0
+        for d in range(q.shape[0]):
+            along += jacobian[i, d] * work.slopes[i, d]
+            first += work.slopes[i, d] ** 2
+            second += jacobian[i, d] ** 2
+            work.slopes[i, d] = jacobian[i, d]
+        if held[i] and max(first, second) > FLAT**2:
+            over = over or along < TURNED * np.sqrt(first * second)
+    return over
 
 
 @njit(inline="always", **COMPILE)

@@ -15,7 +15,14 @@ from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.search.roadmap import distance, edge_length
-from constraint_geodesics.search.space import Space, is_free, project_node, workspace
+from constraint_geodesics.search.space import (
+    Space,
+    is_free,
+    keep_slopes,
+    project_node,
+    turns_over,
+    workspace,
+)
 
 _LEFT = 1e-6
 """Violation [rad or m] of a node, at most."""
@@ -82,6 +89,7 @@ def _extended(space, nodes, parents, count, node, target, step, work, point):
     Returns how many nodes it has then, the last of them, and whether that is the target to the bit.
     """
     dof = target.shape[0]
+    keep_slopes(space, nodes[node], work)
     while count < nodes.shape[0]:
         before = distance(target, nodes[node])
         share = 1.0 if before <= step else step / before
@@ -92,6 +100,8 @@ def _extended(space, nodes, parents, count, node, target, step, work, point):
         after, moved = distance(target, point), distance(point, nodes[node])
         reached = share == 1.0 and after < _LEFT
         if moved > 2.0 * step or (not reached and before - after < _PROGRESS * step):
+            return count, node, False
+        if turns_over(space, point, work):
             return count, node, False
         if not is_free(space, nodes[node], target if reached else point, work):
             return count, node, False

@@ -1,21 +1,20 @@
 """What a query asks to reach: a seam, with a configuration as its first kind.
 
-A further kind is one file with a class that has `description` and `configurations` (a tool pose
-would solve the inverse kinematics there).  `Planner.plan` takes it as it is, and `Trajectory.goal`
-says which configuration was reached.  Apart from that file it touches `cli.py`, if the command is
-to have an option for it, and its tests: planner, search, certification, recording and benchmark
-know configurations alone.
+A further kind is one file here with a class that has `description`, `configurations` and `region`.
+`Planner.plan` takes it as it is, and `Trajectory.goal` says which configuration was reached.  Apart
+from that file it touches `cli.py`, if the command is to have an option for it, and its tests:
+search, certification, recording and benchmark know configurations alone.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.constraints.constraint import ConstraintManifold
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.problem import PlannerError
 
 ArrayLike = Float[np.ndarray, "D"] | Sequence[float]
@@ -30,14 +29,26 @@ class Goal(Protocol):
         """In words, for explanations."""
         ...
 
+    @property
+    def region(self) -> Constraint | None:
+        """The set as a constraint, where it is more than single configurations: the end of a path
+        slides in it.
+        """
+        ...
+
     def configurations(
         self, manifold: ConstraintManifold, start: Float[np.ndarray, "D"]
-    ) -> Iterator[Float[np.ndarray, "D"]]:
-        """Configurations [rad] to be tried one after another, until a path to one is found.
+    ) -> Iterable[Float[np.ndarray, "D"]]:
+        """All configurations [rad] of the set, or where there is no end of them those worth a
+        look; the planner sees to limits, collisions and the constraint.
 
         Raises PlannerError if the goal makes no sense for this robot.
         """
         ...
+
+
+Wanted = Goal | Pose | ArrayLike
+"""What `Planner.plan` takes as a goal; a list of them means any."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +59,7 @@ class ConfigurationGoal:
     """
 
     joints: Float[np.ndarray, "D"]
+    region: Constraint | None = None
 
     @property
     def description(self) -> str:
@@ -56,17 +68,9 @@ class ConfigurationGoal:
 
     def configurations(
         self, manifold: ConstraintManifold, start: Float[np.ndarray, "D"]
-    ) -> Iterator[Float[np.ndarray, "D"]]:
+    ) -> Iterable[Float[np.ndarray, "D"]]:
         """It alone."""
-        yield checked_configuration(self.joints, manifold.robot.dof, "goal")
-
-
-def as_goal(goal: Goal | ArrayLike, dof: int) -> Goal:
-    """A goal as it is; numbers are a configuration's.  Raises PlannerError if they are none."""
-    # numbers first: asking for the protocol takes longer than looking at both ends
-    if type(goal) not in (np.ndarray, list, tuple) and isinstance(goal, Goal):
-        return goal
-    return ConfigurationGoal(checked_configuration(goal, dof, "goal"))
+        return [checked_configuration(self.joints, manifold.robot.dof, "goal")]
 
 
 def checked_configuration(q: Any, dof: int, name: str) -> Float[np.ndarray, "D"]:

@@ -1,0 +1,1 @@
+"""What a query asks to reach, a kind a file."""

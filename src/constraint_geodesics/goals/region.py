@@ -1,0 +1,60 @@
+"""A region of tool poses as the goal: some axes free, others within a box around a pose."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.constraints.constraint import AXES, Constraint, ConstraintManifold, Pose
+from constraint_geodesics.problem import PlannerError
+from constraint_geodesics.robot.inverse_kinematics import seeds_of, turned_towards
+from constraint_geodesics.search.nearest import nearest_on
+
+SEEDS = 128
+"""Configurations from which the nearest of the region are looked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class GoalRegion:
+    """Tool poses around one, in the base frame's axes.
+
+    free: names of axes that may have any value, of x, y, z, roll, pitch and yaw; two held angles
+    keep the direction of the third axis, which the tool may turn about.  tolerance: half-widths of
+    the others [m, m, m, rad, rad, rad], 0 by default.
+    Raises PlannerError for an axis that there is not, and for tolerances that are no six numbers of
+    at least 0, or of a free axis.
+    """
+
+    pose: Pose
+    free: Sequence[str] = ()
+    tolerance: Sequence[float] = (0.0,) * 6
+
+    def __post_init__(self) -> None:
+        names = [self.free] if isinstance(self.free, str) else list(self.free)
+        for name in names:
+            if name not in AXES:
+                raise PlannerError(f"free = {name!r}: must be of {', '.join(AXES)}")
+        held = tuple(int(axis not in names) for axis in AXES)
+        try:
+            region = Constraint(held, tuple(map(float, self.tolerance)), self.pose)
+        except (TypeError, ValueError) as error:
+            raise PlannerError(f"goal region: {error}") from None
+        object.__setattr__(self, "region", region)
+
+    region: Constraint = field(init=False, repr=False)
+
+    @property
+    def description(self) -> str:
+        """Where it is, and what is free."""
+        x, y, z = self.pose.position
+        return f"a configuration with the tool in the region around ({x:.4g}, {y:.4g}, {z:.4g}) m"
+
+    def configurations(
+        self, manifold: ConstraintManifold, start: Float[np.ndarray, "D"]
+    ) -> Iterable[Float[np.ndarray, "D"]]:
+        """Those nearest to the start, each nearer than all beside it."""
+        robot = manifold.robot
+        own = ConstraintManifold(robot, self.region)
+        seeds = turned_towards(robot, seeds_of(robot, SEEDS), start)
+        return nearest_on(own, start, np.concatenate([start[None], seeds]))

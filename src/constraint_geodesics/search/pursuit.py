@@ -1,0 +1,115 @@
+"""The shortest certified path from one configuration to any of several.
+
+The goals are looked at nearest first, kind of proposal by kind of proposal: the straight lines to
+all, the ways over the graph, the trees.  Of the curves that are found the shortest is certified
+first, and a goal whose straight distance is no less than the length of the path so far is left
+alone: no path to it is shorter.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.constraints.constraint import ConstraintManifold
+from constraint_geodesics.search.candidates import Answer, Candidate, Task, refined
+from constraint_geodesics.search.nearest import nearest_on
+
+Path = TypeVar("Path")
+
+_WORTHWHILE = 1e-4
+"""Share by which another path must be shorter to be looked for."""
+_CHEAP_ROUNDS, _PATIENTLY = 3, 4
+"""After so many rounds trees are grown, towards so many of the goals, the nearest."""
+_SLIDES = 6
+_MOVED_RAD = 1e-3
+"""An end that would move by less stays."""
+_ON = 1e-8
+"""Violation of an end that has moved, at most [rad or m]."""
+
+
+@dataclass(eq=False)
+class Pursued:
+    """A configuration that a path may end at, while paths to it are looked for.
+
+    distance: from the start, straight.  curves: those that are still to come.  region: the set that
+    the end may move in, None for the configuration alone.  answer: what the curves ended with.
+    failed: why the last curve is no path.
+    """
+
+    goal: Float[np.ndarray, "D"]
+    distance: float
+    curves: Iterator[Candidate | Answer | None] = field(repr=False)
+    region: ConstraintManifold | None = None
+    answer: Answer | None = None
+    failed: str = ""
+    is_over: bool = False
+
+
+def shortest(
+    pursued: Sequence[Pursued], task: Task, certify: Callable[[Candidate], tuple[Path, float] | str]
+) -> Path | None:
+    """The shortest path that is certified, None where there is none.
+
+    pursued: the nearest first.  certify: gives the path and its length, or why it is none.
+    """
+    path, least = None, np.inf
+    waiting, rounds = list(pursued), 0
+    while waiting:
+        found: list[tuple[float, Pursued, Candidate]] = []
+        nearest = least
+        for one in waiting:
+            if one.distance >= (1.0 - _WORTHWHILE) * nearest:
+                break
+            item = next(one.curves, Answer("not_found"))
+            if isinstance(item, Answer):
+                one.answer, one.is_over = item, True
+            elif item is not None:
+                if one.region is not None:
+                    item = slid(task, item, one.region)
+                found.append((item.length, one, item))
+                nearest = min(nearest, item.length)
+        for length, one, candidate in sorted(found, key=lambda entry: entry[0]):
+            if length >= (1.0 - _WORTHWHILE) * least:
+                one.is_over = True
+                continue
+            result = certify(candidate)
+            if isinstance(result, str):
+                one.failed = f"; the {candidate.source} curve fails: {result}"
+            else:
+                (path, least), one.is_over = result, True
+        worth = (1.0 - _WORTHWHILE) * least
+        waiting = [one for one in waiting if not one.is_over and one.distance < worth]
+        rounds += 1
+        if rounds >= _CHEAP_ROUNDS:
+            waiting = waiting[:_PATIENTLY]
+    return path
+
+
+def slid(task: Task, candidate: Candidate, region: ConstraintManifold) -> Candidate:
+    """The candidate with its end moved to where in the region the curve is shortest.
+
+    The end goes to the configuration of the region that is nearest to where the curve would begin
+    were it straight, going by its last direction, and the curve is relaxed anew.
+    """
+    share, tried = np.linspace(0.0, 1.0, len(candidate.nodes))[:, None], 1.0
+    for _ in range(_SLIDES):
+        end, before = candidate.points[-1], candidate.points[-2]
+        along = (end - before) / max(float(np.linalg.norm(end - before)), 1e-12)
+        found = nearest_on(region, end - tried * candidate.length * along, end[None])
+        if not len(found) or np.abs(found[0] - end).max() < _MOVED_RAD:
+            break
+        better = None
+        if task.manifold.violation(found) <= _ON:
+            nodes = candidate.nodes + share * (found[0] - end)
+            nodes[-1] = found[0]
+            clear = candidate.space is task.clear
+            better = refined(task, candidate.source, nodes, clear=clear)
+        if better is not None and better.length < (1.0 - _WORTHWHILE) * candidate.length:
+            candidate = better
+            share = np.linspace(0.0, 1.0, len(candidate.nodes))[:, None]
+        else:
+            tried *= 0.5
+    return candidate
