@@ -106,11 +106,18 @@ def test_the_first_path_is_what_its_page_says(monkeypatch, tmp_path) -> None:
     for answer in ("path", "mended", "longer", "round_it"):
         assert names[answer].status == "solved", answer
     assert names["certificate"].valid
-    assert names["found"].valid
     assert names["longer"].length_rad <= names["path"].length_rad
     assert sum(path.status == "solved" for path in names["paths"]) > 15
     for file in ("path.csv", "path.png", "path.rrd", "with_ball/planner.json"):
         assert (tmp_path / file).is_file(), file
+
+
+def test_any_arm_goes_to_any_goal_as_its_page_says(monkeypatch, tmp_path) -> None:
+    names = run("any_arm.md", monkeypatch, tmp_path)
+    assert names["trajectory"].status == names["path"].status == "solved"
+    assert names["level"].distance_rad > 0.01
+    assert names["path"].length_rad <= names["trajectory"].length_rad
+    assert len(names["message"]["points"]) == len(names["path"].times)
 
 
 def test_the_extensions_work(monkeypatch, tmp_path) -> None:
@@ -124,7 +131,8 @@ def test_the_extensions_work(monkeypatch, tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    "page", [page for page in having("python") if page not in ("first_path.md", "extend.md")]
+    "page",
+    [page for page in having("python") if page not in ("first_path.md", "extend.md", "any_arm.md")],
 )
 def test_the_other_code_runs(page, monkeypatch, tmp_path) -> None:
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)

@@ -37,6 +37,7 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "geodesics params": HERE,
     "geodesics doctor": HERE,
     "geodesics robot": HERE,
+    "geodesics ik": HERE,
     "geodesics package": ("tests/test_bundle.py", "package"),
     "geodesics results": HERE,
     "geodesics replay": HERE,
@@ -148,6 +149,7 @@ def test_a_command_of_ours_does_what_its_page_says(words, folder, monkeypatch, c
         "check": "valid",
         "params": "ok",
         "robot": "carried by 7 joints",
+        "ik": ".",
         "results": "planner",
         "replay": "path.rrd",
     }

@@ -1,0 +1,219 @@
+"""Planners of somebody's URDF, and what a user asks a planner besides a path: configurations of a
+pose, the nearest on a constraint, a start that is off, slower motions, ROS's messages.
+"""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.goals.region import GoalRegion
+from constraint_geodesics.planner import SNAP_RAD, Planner, PlannerError
+from constraint_geodesics.robot.inverse_kinematics import solutions
+from constraint_geodesics.robot.kinematics import RobotError
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.search.preparation import free_configurations
+from tests.planner_fixtures import packaged_planner, pairs_of
+
+IIWA = ("kuka_iiwa/model.urdf", "lbr_iiwa_link_7")
+
+
+@cache
+def panda() -> Planner:
+    return Planner.from_urdf("franka_panda/panda.urdf", "panda_grasptarget")
+
+
+def free_pairs(planner: Planner, count: int, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    drawn = planner.robot.sample(8 * count, np.random.default_rng(seed))
+    free = drawn[planner._certifier.collisions.free(drawn)][: 2 * count]
+    return list(zip(free[::2], free[1::2], strict=True))
+
+
+def test_paths_of_an_untrained_arm_are_certified_and_pybullet_agrees() -> None:
+    planner = panda()
+    with planner.scene.world() as world:
+        for start, goal in free_pairs(planner, 6, seed=1):
+            for wanted in (goal, Pose(*planner.robot.forward(goal))):
+                path = planner.plan(start, wanted, "free")
+                assert path.status == "solved", path.explanation
+                rows = np.linspace(path.joints[:-1], path.joints[1:], 8)
+                assert world.free(rows.reshape(-1, 7)).all()
+
+
+def test_a_level_tool_stays_as_it_starts() -> None:
+    planner = panda()
+    start, goal = free_pairs(planner, 1, seed=2)[0]
+    pose = Pose(*planner.robot.forward(start))
+    level = Constraint((0, 0, 0, 1, 1, 0), reference=pose)
+    level_goal = planner.project(goal, level).configuration
+    path = planner.plan(start, level_goal, "level")
+    assert path.constraint.key == level.key
+    if path.status == "solved":
+        tilts = planner.robot.forward(path.joints)[1][:, 2]
+        np.testing.assert_allclose(tilts, np.tile(pose.rotation[2], (len(tilts), 1)), atol=1e-4)
+    else:
+        assert path.status in ("in_collision", "not_connected"), path.explanation
+
+
+def test_the_end_of_seven_joints_slides_to_where_the_path_is_shortest() -> None:
+    """Against paths to each of many configurations that have the pose."""
+    planner = panda()
+    for start, goal in free_pairs(planner, 4, seed=3):
+        pose = Pose(*planner.robot.forward(goal))
+        path = planner.plan(start, pose, "free")
+        assert path.status == "solved", path.explanation
+        others = planner.ik(pose)
+        assert 16 <= len(others) <= 64
+        lengths = [planner.plan(start, q, "free").length_rad for q in others]
+        assert path.length_rad <= 1.02 * np.nanmin(lengths)
+
+
+def test_the_workcell_of_an_untrained_arm_is_kept_clear() -> None:
+    table = Box("table", (0.5, 0.0, 0.0), (0.6, 1.0, 0.2))
+    with Planner.from_urdf(*IIWA) as alone, Planner.from_urdf(*IIWA, workcell=[table]) as planner:
+        drawn = alone.robot.sample(200, np.random.default_rng(0))
+        drawn = drawn[alone._certifier.collisions.free(drawn)]
+        free = planner._certifier.collisions.free(drawn)
+        assert 0.3 < free.mean() < 1.0
+        (start, _), touching = drawn[free][:2], drawn[~free][0]
+        path = planner.plan(start, touching, "free")
+        assert path.status == "in_collision"
+        assert "the goal touches the workcell" in path.explanation
+        assert alone.plan(start, touching, "free").status == "solved"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("franka_panda/panda.urdf", "hand"), "there is no link 'hand'.*panda_grasptarget"),
+        (("no.urdf", "hand"), r"no\.urdf: no such URDF"),
+    ],
+)
+def test_what_is_no_arm_is_refused_in_one_line(words, said) -> None:
+    with pytest.raises(RobotError, match=said) as error:
+        Planner.from_urdf(*words)
+    assert "\n" not in str(error.value)
+
+
+# configurations of a pose
+
+
+def test_ik_gives_the_free_ones_of_all() -> None:
+    planner = packaged_planner()
+    for _, goal in pairs_of("free", 5, seed=40):
+        pose = Pose(*planner.robot.forward(goal))
+        found = planner.ik(pose)
+        assert np.abs(found - goal).max(axis=1).min() < 1e-6, "the one it was made of"
+        every = solutions(planner.robot, pose.position, pose.rotation)
+        free = planner._certifier.collisions.free(every)
+        np.testing.assert_array_equal(found, every[free])
+
+
+# projections
+
+
+def test_a_projection_says_what_it_changed() -> None:
+    planner, (start, _) = packaged_planner(), pairs_of("slide", 1, seed=41)[0]
+    off = start + np.array([0.01, -0.02, 0.01, 0.0, 0.02, 0.0])
+    found = planner.project(off, "slide")
+    manifold = ConstraintManifold(planner.robot, planner.constraints["slide"])
+    assert manifold.violation(found.configuration) < 1e-8
+    assert found.distance_rad == pytest.approx(np.linalg.norm(found.configuration - off))
+    assert found.distance_rad <= np.linalg.norm(start - off)
+    assert found.violation_before == manifold.violation(off) > 1e-3
+    with pytest.raises(PlannerError, match="no reference pose"):
+        planner.project(off, Constraint((0, 0, 0, 1, 1, 0)))
+
+
+def test_a_start_that_is_off_is_refused_with_the_nearest_or_moved_on_request() -> None:
+    planner, (start, goal) = packaged_planner(), pairs_of("level_cup", 1, seed=1)[0]
+    off = start + 0.002
+    refused = planner.plan(off, goal, "level_cup")
+    nearest = planner.project(off, "level_cup")
+    assert refused.status == "start_violates"
+    assert f"{nearest.distance_rad:.2g} rad away, keeps it" in refused.explanation
+    path = planner.plan(off, goal, "level_cup", snap=True)
+    assert path.status == "solved", path.explanation
+    np.testing.assert_array_equal(path.joints[0], nearest.configuration)
+    assert np.linalg.norm(path.joints[0] - off) <= SNAP_RAD
+    far = start + 0.05
+    assert planner.project(far, "level_cup").distance_rad > SNAP_RAD
+    assert planner.plan(far, goal, "level_cup", snap=True).status == "start_violates"
+
+
+# motions
+
+
+def test_slower_motions_use_a_share_of_the_limits() -> None:
+    planner, (start, goal) = packaged_planner(), pairs_of("level_cup", 1, seed=1)[0]
+    whole = planner.plan(start, goal, "level_cup")
+    slow = planner.plan(start, goal, "level_cup", velocity_scale=0.1, acceleration_scale=0.5)
+    np.testing.assert_array_equal(slow.joints, whole.joints)
+    speed = np.abs(np.diff(slow.joints, axis=0)) / np.diff(slow.times)[:, None]
+    share = (speed / planner.robot.velocity).max()
+    assert share == pytest.approx(0.1, rel=1e-3)
+    assert slow.times[-1] > 2.0 * whole.times[-1]
+    for name in ("velocity_scale", "acceleration_scale"):
+        for value in (0.0, -0.1, 1.1, np.nan):
+            with pytest.raises(PlannerError, match=f"{name} = .*above 0 and at most 1"):
+                planner.plan(start, goal, "level_cup", **{name: value})
+
+
+def test_a_joint_trajectory_is_what_a_controller_takes() -> None:
+    planner, (start, goal) = packaged_planner(), pairs_of("level_cup", 1, seed=1)[0]
+    path = planner.plan(start, goal, "level_cup")
+    message = path.to_joint_trajectory()
+    assert message["joint_names"] == list(planner.robot.joint_names)
+    points = message["points"]
+    rows = {name: np.array([point[name] for point in points]) for name in points[0]}
+    np.testing.assert_array_equal(rows["positions"], path.joints)
+    np.testing.assert_array_equal(rows["time_from_start"], path.times)
+    assert not rows["velocities"][[0, -1]].any(), "at rest at both ends"
+    assert (np.abs(rows["velocities"]) <= planner.robot.velocity * (1.0 + 1e-9)).all()
+    limit = planner.bundle.planner.acceleration_rad_s2
+    assert (np.abs(rows["accelerations"]) <= limit * (1.0 + 1e-9)).all()
+    assert np.abs(rows["accelerations"]).max() > 0.5 * limit
+    # the accelerations lead from line to line
+    middle = 0.5 * (path.times[1:] + path.times[:-1])
+    gained = rows["accelerations"][1:-1] * np.diff(middle)[:, None]
+    lines = np.diff(path.joints, axis=0) / np.diff(path.times)[:, None]
+    np.testing.assert_allclose(np.diff(lines, axis=0), gained, atol=1e-9)
+    with pytest.raises(PlannerError, match="no path"):
+        planner.plan(start + 0.3, goal, "level_cup").to_joint_trajectory()
+
+
+# single held angles
+
+
+@pytest.mark.parametrize("axis", [3, 4, 5])
+def test_a_single_held_angle_is_planned_for_on_its_sheet(axis) -> None:
+    """Where the tool is upside down to the reference the turn is undefined: configurations fall
+    into two parts there, and all queries within one are solved.
+    """
+    planner = packaged_planner()
+    axes = tuple(int(k == axis) for k in range(6))
+    held = Constraint(axes, reference=Pose(np.zeros(3), np.eye(3)))
+    task = planner._preparation.task(held)
+    rng = np.random.default_rng(1)
+    drawn = free_configurations(
+        task.manifold, planner._certifier.collisions, planner.robot.sample, 40, rng
+    )
+    sizes = np.sort(np.bincount(task.roadmap().labels))[::-1]
+    assert sizes[1] > 0.3 * sizes[0]
+    assert sizes[:2].sum() > 0.99 * sizes.sum()
+    statuses = [
+        planner.plan(start, goal, held).status
+        for start, goal in zip(drawn[::2], drawn[1::2], strict=True)
+    ]
+    assert set(statuses) == {"solved", "not_connected"}
+    assert 0.25 < np.mean(np.array(statuses) == "solved") < 0.75
+
+
+def test_a_region_leaves_an_end_free_under_a_constraint() -> None:
+    planner, (start, goal) = packaged_planner(), pairs_of("level_cup", 1, seed=5)[0]
+    pose = Pose(*planner.robot.forward(goal))
+    path = planner.plan(start, GoalRegion(pose, free=("x", "y", "yaw")), "level_cup")
+    assert path.status == "solved", path.explanation
+    assert planner.robot.forward(path.goal)[0][2] == pytest.approx(pose.position[2], abs=1e-7)
+    assert path.length_rad < planner.plan(start, pose, "level_cup").length_rad
