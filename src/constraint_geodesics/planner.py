@@ -167,6 +167,8 @@ class Planner:
         around = WorkcellParams().including(*workcell)
         made = cls(Bundle(robot, around, {}, PlannerParams(), JudgeParams(), {}), str(urdf))
         made.constraints |= OWN_CONSTRAINTS
+        made._preparation.keep_clear_as_it_can()
+        made.band = made._preparation.band
         return made
 
     @property

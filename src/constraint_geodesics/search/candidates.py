@@ -11,7 +11,7 @@ of their own (methods.py), through `refined` or not.
 
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Literal
 
 import numpy as np
@@ -38,6 +38,10 @@ TREES_APART = 2
 """Where the graph holds the ends to be unconnected, which it hardly ever errs in."""
 PATIENT = TreeSettings(iterations=4000, nodes=20_000)
 """Of one more pair, the last."""
+NARROW_M = 0.0005
+"""What is kept clear where no way with the settings' clearance was found [m]: a few times what the
+certificate asks for.
+"""
 BENDS = 4
 """Bent lines that are tried for each pair of trees, where a path is to be improved: they cost less.
 """
@@ -73,6 +77,12 @@ class Task:
         margin = self.settings.clearance_m
         object.__setattr__(self, "clear", space_of(self.manifold, self.clearance, margin))
         object.__setattr__(self, "open", space_of(self.manifold))
+
+    @cached_property
+    def narrow(self) -> "Task":
+        """The same with hardly any clearance, for passages that are narrower."""
+        least = min(NARROW_M, self.settings.clearance_m)
+        return replace(self, settings=replace(self.settings, clearance_m=least))
 
     clear: Space = field(init=False, repr=False)
     open: Space = field(init=False, repr=False)
@@ -139,9 +149,9 @@ def candidates(
         for seed in range(TREES_APART if apart else TREES):
             yield None
             yield from _over_tree(task, start, goal, parts.refinement, seed)
-        if not apart:
+        for seed, settings in ((0, None), (1, None), (TREES, None if apart else PATIENT)):
             yield None
-            yield from _over_tree(task, start, goal, parts.refinement, TREES, PATIENT)
+            yield from _over_tree(task.narrow, start, goal, parts.refinement, seed, settings)
     yield answer
 
 

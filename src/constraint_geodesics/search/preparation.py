@@ -18,13 +18,14 @@ from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
 from constraint_geodesics.search.band import BandSettings, project
-from constraint_geodesics.search.candidates import ALL_PARTS, Parts, Task
+from constraint_geodesics.search.candidates import ALL_PARTS, NARROW_M, Parts, Task
 from constraint_geodesics.search.roadmap import EDGE_STEP, Roadmap, build_roadmap
 from constraint_geodesics.search.space import Space
 
 KEPT_TASKS = 64
 """Constraints without a name that are remembered, with their roadmaps."""
 _ROUNDS = 20
+_DRAWN, _OF_TYPICAL = 400, 0.05
 
 
 class Freedom(Protocol):
@@ -73,6 +74,17 @@ class Preparation:
         self._tasks: dict[tuple, Task] = {}
         self._roadmaps: dict[tuple, Roadmap | None] = {}
         self._named: frozenset[tuple] = frozenset()
+
+    def keep_clear_as_it_can(self) -> None:
+        """Ask for less clearance than the settings do where the arm's links are so close to each
+        other that whole ways are narrower: for a share of what they typically have.
+        """
+        drawn = self.scene.robot.sample(_DRAWN, np.random.default_rng(self.settings.seed))
+        apart = self._clearance.clearance(self.scene.robot, drawn)
+        if (apart > 0.0).any():
+            typical = float(np.median(apart[apart > 0.0]))
+            least = max(_OF_TYPICAL * typical, NARROW_M)
+            self.band = replace(self.band, clearance_m=min(least, self.band.clearance_m))
 
     def supply(
         self, constraints: Mapping[str, Constraint], roadmaps: Mapping[str, Roadmap]
