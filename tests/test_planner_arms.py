@@ -42,18 +42,20 @@ def test_paths_of_an_untrained_arm_are_certified_and_pybullet_agrees() -> None:
 
 
 def test_a_level_tool_stays_as_it_starts() -> None:
-    planner = panda()
-    start, goal = free_pairs(planner, 1, seed=2)[0]
-    pose = Pose(*planner.robot.forward(start))
-    level = Constraint((0, 0, 0, 1, 1, 0), reference=pose)
-    level_goal = planner.project(goal, level).configuration
-    path = planner.plan(start, level_goal, "level")
-    assert path.constraint.key == level.key
-    if path.status == "solved":
+    planner, solved = panda(), 0
+    for start, goal in free_pairs(planner, 8, seed=2):
+        pose = Pose(*planner.robot.forward(start))
+        level = Constraint((0, 0, 0, 1, 1, 0), reference=pose)
+        end = planner.project(goal, level).configuration
+        if not planner._certifier.collisions.is_free(end):
+            continue
+        path = planner.plan(start, end, "level")
+        assert path.constraint.key == level.key
+        assert path.status == "solved", path.explanation
         tilts = planner.robot.forward(path.joints)[1][:, 2]
         np.testing.assert_allclose(tilts, np.tile(pose.rotation[2], (len(tilts), 1)), atol=1e-4)
-    else:
-        assert path.status in ("in_collision", "not_connected"), path.explanation
+        solved += 1
+    assert solved >= 3
 
 
 def test_the_end_of_seven_joints_slides_to_where_the_path_is_shortest() -> None:
@@ -99,15 +101,23 @@ def test_what_is_no_arm_is_refused_in_one_line(words, said) -> None:
 # configurations of a pose
 
 
-def test_ik_gives_the_free_ones_of_all() -> None:
+def test_ik_gives_free_configurations_of_the_pose_the_one_it_was_made_of_among_them() -> None:
+    """Freedom by PyBullet's word; what was left out touches something by it."""
     planner = packaged_planner()
-    for _, goal in pairs_of("free", 5, seed=40):
-        pose = Pose(*planner.robot.forward(goal))
-        found = planner.ik(pose)
-        assert np.abs(found - goal).max(axis=1).min() < 1e-6, "the one it was made of"
-        every = solutions(planner.robot, pose.position, pose.rotation)
-        free = planner._certifier.collisions.free(every)
-        np.testing.assert_array_equal(found, every[free])
+    with planner.scene.world() as world:
+        for _, goal in pairs_of("free", 8, seed=40):
+            pose = Pose(*planner.robot.forward(goal))
+            found = planner.ik(pose)
+            assert np.abs(found - goal).max(axis=1).min() < 1e-6
+            assert world.free(found).all()
+            assert (planner.robot.limit_distance(found) >= 0.0).all()
+            positions, rotations = planner.robot.forward(found)
+            np.testing.assert_allclose(
+                positions, np.tile(pose.position, (len(found), 1)), atol=1e-8
+            )
+            np.testing.assert_allclose(rotations - pose.rotation, 0.0, atol=1e-8)
+            every = solutions(planner.robot, pose.position, pose.rotation)
+            assert world.free(every).sum() == len(found)
 
 
 # projections

@@ -59,7 +59,8 @@ def test_from_far_away_most_end_where_nothing_beside_is_nearer(name) -> None:
         assert (np.diff(np.linalg.norm(found - q, axis=1)) >= 0.0).all()
         ends += [not beaten(manifold, own, q) for own in found]
     assert len(ends) >= 12
-    assert np.mean(ends) >= 0.6
+    # at the edge of a tolerance the descent still ends early now and then
+    assert np.mean(ends) >= (0.6 if manifold.rows.tolerance.any() else 0.95)
 
 
 def test_a_configuration_that_keeps_it_stays() -> None:
