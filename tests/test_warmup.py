@@ -85,7 +85,7 @@ with Planner.load(PACKAGED) as planner:
     planner.ik(pose), planner.plan(start, anyhow, "level_cup", snap=True, velocity_scale=0.5)
 with Planner.from_urdf("franka_panda/panda.urdf", "panda_grasptarget") as other:
     q = 0.5 * (other.robot.lower + other.robot.upper)
-    other.plan(q, Pose(*other.robot.forward(q + 0.1)), "level").to_joint_trajectory()
+    other.plan(q, Pose(*other.robot.forward(q + 0.1)), "free").to_joint_trajectory()
 bundle = read_bundle(PACKAGED)
 workcell = bundle.workcell.including(Sphere("ball", tuple(place), radius_m=0.08))
 with Planner(replace(bundle, workcell=workcell), "this test") as planner:

@@ -125,6 +125,6 @@ def test_what_the_proof_leaves_open_is_refused(monkeypatch) -> None:
 def test_the_arm_that_comes_with_pybullet_is_asked_for_in_one_line(tmp_path) -> None:
     ends = ("--start=0 0 -1 0 0 0", "--goal=0 0 -1 0 0 0", "--constraint=free")
     done = run(COMMAND.format(words=["geodesics", "plan", *ends]), tmp_path)
-    assert done.returncode == 1
+    assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert line.startswith("error: xarm/xarm6_robot.urdf: no such URDF here, and PyBullet")

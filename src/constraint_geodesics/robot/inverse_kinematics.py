@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from numba import njit
-from scipy.stats import qmc
 
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.robot.kernels import LANES, Lanes, poses_of
@@ -101,7 +100,12 @@ def turned_towards(
 def _seeds(lower: bytes, upper: bytes, count: int) -> Float[np.ndarray, "n D"]:
     low, high = np.frombuffer(lower), np.frombuffer(upper)
     middle, half = 0.5 * (low + high), np.minimum(0.5 * (high - low), np.pi)
-    even = qmc.Halton(len(low), seed=0).random(count)
+    # shares of the root of x^(D + 1) = x + 1 fill a box evenly [Roberts 2018]
+    root = 2.0
+    for _ in range(64):
+        root = (1.0 + root) ** (1.0 / (len(low) + 1))
+    shares = root ** -np.arange(1.0, len(low) + 1.0)
+    even = (0.5 + np.arange(1, count + 1)[:, None] * shares) % 1.0
     return np.ascontiguousarray(middle + half * (2.0 * even - 1.0))
 
 
