@@ -23,7 +23,9 @@ from constraint_geodesics.plugs import PULL, PULL_BOUNDS, plug
 from constraint_geodesics.robot.inverse_kinematics import solutions
 from constraint_geodesics.robot.kinematics import load_robot
 from constraint_geodesics.scene import convex_kernels as convex
+from constraint_geodesics.scene.bodies import Body, NodeTable
 from constraint_geodesics.scene.clearance import clearance_model, path_stays_clear
+from constraint_geodesics.scene.pieces import Piece, prism
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.band import project
@@ -62,6 +64,7 @@ def _distances() -> None:
     frames, simplex = np.zeros((_scene().robot.dof + 1, 12)), np.empty(convex.SIMPLEX)
     convex.place_balls(arrays.nodes, frames)
     convex.distance(arrays[:3], frames, 0, (0.0, 0.0), simplex)
+    NodeTable([Body("round", 0, (Piece(prism(8, 0.1, 0.0, 0.1)),))])
 
 
 def _kinematics() -> None:
