@@ -2,6 +2,7 @@
 pose was made of is among them, and a search from many times as many seeds finds no more.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -85,3 +86,38 @@ def test_representatives_are_far_apart() -> None:
         away > np.linalg.norm(found[:16, None] - found[:16], axis=2)[np.triu_indices(16, 1)].min()
     )
     np.testing.assert_array_equal(spread(found[:3], 16), found[:3])
+
+
+def test_a_pose_just_out_of_reach_has_no_solution() -> None:
+    """Of an arm of three joints any pose is, but those that it has."""
+    robot = robots()["xarm6"]
+    stretched = np.array([0.3, 1.2, -0.2, 0.0, 0.5, 0.0])
+    position, rotation = robot.forward(stretched)
+    assert len(solutions(robot, position, rotation))
+    reach = np.linalg.norm(
+        robot.forward(robot.sample(200_000, np.random.default_rng(0)))[0], axis=1
+    )
+    far = position * (reach.max() + 0.2) / np.linalg.norm(position)
+    assert not len(solutions(robot, far, rotation))
+
+
+def test_a_planar_arm_reaches_a_pose_or_not_by_a_thousandth_of_a_millimetre(tmp_path) -> None:
+    urdf = tmp_path / "planar.urdf"
+    urdf.write_text(PLANAR)
+    robot = load_robot(urdf, "tool")
+    position, rotation = robot.forward(np.array([0.4, 1.0, 0.1]))
+    assert len(solutions(robot, position, rotation))
+    # in its plane the tool's direction and distance hang together
+    for off in (1e-6, 5e-5):
+        assert not len(solutions(robot, position * (1.0 + off), rotation))
+
+
+def test_of_many_whole_turns_the_nearest_are_given() -> None:
+    robot = robots()["xarm6"]
+    wide = replace(robot, lower=np.full(6, -1e16), upper=np.full(6, 1e16))
+    q = robot.sample(1, np.random.default_rng(3))[0]
+    near = q + 100.0 * np.pi
+    found = solutions(wide, *robot.forward(q), near=near)
+    assert 0 < len(found) <= 16 * 3**6
+    assert np.abs(found - near).max() < 3.0 * np.pi + 1e-6
+    assert among(near, found)

@@ -13,7 +13,7 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
@@ -23,9 +23,15 @@ from constraint_geodesics.robot.kinematics import SerialRobot
 SAME = 1e-3
 """Solutions that differ by less in every joint [rad or m] are one."""
 _TURN = 2.0 * np.pi
+_TURNS = 3
+"""Whole turns of a joint that are looked at."""
 _AXES = 6
 _SMALL_STEP, _SMALL_ERROR = 1e-6, 1e-4
-"""A step so short [rad or m] from an error so small [rad or m] leaves about its square."""
+"""A step so short [rad or m] from an error so small [rad or m] leaves about its square, but where
+the pose is out of reach or the arm singular.
+"""
+_LEFT = 1e-9
+"""So the error is looked at, which may be so large at most [m, rad]."""
 
 
 class Search(NamedTuple):
@@ -46,12 +52,13 @@ def solutions(
     position: Float[np.ndarray, "3"],
     rotation: Float[np.ndarray, "3 3"],
     settings: Search | None = None,
+    near: Float[np.ndarray, "D"] | None = None,
 ) -> Float[np.ndarray, "n D"]:
     """Configurations within the joint limits whose tool is at this position [m] and rotation in the
-    base frame, to 1e-9, each once; of turning joints every value that differs by whole turns.
+    base frame, to 1e-9, each once; of turning joints the values that differ by whole turns, the
+    _TURNS nearest to `near` (D,) where the limits leave room for more.
     """
     settings = settings or Search()
-    turning = ~robot.chain.prismatic
     raw = np.empty((settings.seeds, robot.dof))
     count = _solve(
         robot.chain,
@@ -61,7 +68,7 @@ def solutions(
         settings,
         raw,
     )
-    return _within_limits(raw[:count], robot.lower, robot.upper, turning)
+    return whole_turns(robot, raw[:count], ~robot.chain.prismatic, near)
 
 
 def spread(q: Float[np.ndarray, "n D"], count: int) -> Float[np.ndarray, "m D"]:
@@ -109,22 +116,28 @@ def _seeds(lower: bytes, upper: bytes, count: int) -> Float[np.ndarray, "n D"]:
     return np.ascontiguousarray(middle + half * (2.0 * even - 1.0))
 
 
-def _within_limits(
+def whole_turns(
+    robot: SerialRobot,
     q: Float[np.ndarray, "n D"],
-    lower: Float[np.ndarray, "D"],
-    upper: Float[np.ndarray, "D"],
-    turning: np.ndarray,
+    turning: Bool[np.ndarray, "D"],
+    near: Float[np.ndarray, "D"] | None = None,
 ) -> Float[np.ndarray, "m D"]:
-    """Each with all whole turns of its turning joints that keep the limits."""
-    first = np.where(turning, np.ceil((lower - q) / _TURN), 0.0)
-    last = np.where(turning, np.floor((upper - q) / _TURN), 0.0)
-    inside = (turning | ((lower <= q) & (q <= upper))).all(axis=1)
+    """Configurations [rad or m] with all whole turns of some joints that keep the limits, or the
+    _TURNS nearest to `near`; none of one that breaks a limit otherwise.
+    """
+    first = np.where(turning, np.ceil((robot.lower - q) / _TURN), 0.0)
+    last = np.where(turning, np.floor((robot.upper - q) / _TURN), 0.0)
+    middle = np.zeros(robot.dof) if near is None else near
+    begin = np.clip(np.round((middle - q) / _TURN) - _TURNS // 2, first, last - _TURNS + 1.0)
+    first = np.where(last - first >= _TURNS, begin, first)
+    last = np.minimum(last, first + _TURNS - 1.0)
+    inside = (turning | ((robot.lower <= q) & (q <= robot.upper))).all(axis=1)
     ways = inside * np.maximum(last - first + 1.0, 0.0).prod(axis=1)
     found = [(q + _TURN * first)[ways == 1.0]]
     for own, low, high in zip(*(rows[ways > 1.0] for rows in (q, first, last)), strict=True):
         turns = product(*(np.arange(a, b + 1.0) for a, b in zip(low, high, strict=True)))
         found.append(own + _TURN * np.array(list(turns)))
-    return np.clip(np.concatenate(found), lower, upper)
+    return np.clip(np.concatenate(found), robot.lower, robot.upper)
 
 
 class _Room(NamedTuple):
@@ -304,13 +317,21 @@ def _is_new(q, found, count, prismatic):
     return True
 
 
+@njit(**LEAF)
+def _is_there(chain, position, rotation, q, room):
+    """Whether the tool of a configuration (1, D) has the pose, to _LEFT."""
+    poses_of(chain, q, room.lanes)
+    _errors(room.lanes.frame, position, rotation, room.errors, room.sizes)
+    return room.sizes[0] <= _LEFT**2
+
+
 @njit(**COMPILE)
 def _solve(chain, position, rotation, seeds, settings, found):
     """What the seeds (n, D) lead to, each once, into `found` (n, D), turning joints within half a
     turn of 0; returns how many that are.
     """
     dof = seeds.shape[1]
-    room = _new_room(dof)
+    room, last = _new_room(dof), _new_room(dof)
     q, age = np.empty((LANES, dof)), np.zeros(LANES, dtype=np.int64)
     begun, reached, count = 0, 0, 0
     while True:
@@ -327,10 +348,12 @@ def _solve(chain, position, rotation, seeds, settings, found):
         left = 0
         for n in range(count):
             length = _step(q[n], n, room.jacobians, room.errors, settings.longest)
-            if length < _SMALL_STEP and room.sizes[n] < _SMALL_ERROR**2:
-                if _is_new(q[n], found, reached, chain.prismatic):
-                    found[reached] = q[n]
-                    reached += 1
+            is_near = length < _SMALL_STEP and room.sizes[n] < _SMALL_ERROR**2
+            if is_near and not _is_new(q[n], found, reached, chain.prismatic):
+                continue
+            if is_near and _is_there(chain, position, rotation, q[n : n + 1], last):
+                found[reached] = q[n]
+                reached += 1
             elif age[n] + 1 < settings.iterations:  # what is no number ends there
                 q[left], age[left] = q[n], age[n] + 1
                 left += 1
