@@ -3,6 +3,7 @@ pose, the nearest on a constraint, a start that is off, slower motions, ROS's me
 """
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -146,6 +147,9 @@ def test_a_start_that_is_off_is_refused_with_the_nearest_or_moved_on_request() -
     path = planner.plan(off, goal, "level_cup", snap=True)
     assert path.status == "solved", path.explanation
     np.testing.assert_array_equal(path.joints[0], nearest.configuration)
+    assert path.explanation.endswith(f"from a start moved by {nearest.distance_rad:.2g} rad")
+    assert path.summary()["snapped_rad"] == nearest.distance_rad
+    assert planner.plan(start, goal, "level_cup", snap=True).summary()["snapped_rad"] == 0.0
     assert np.linalg.norm(path.joints[0] - off) <= SNAP_RAD
     far = start + 0.05
     assert planner.project(far, "level_cup").distance_rad > SNAP_RAD
@@ -178,7 +182,9 @@ def test_a_joint_trajectory_is_what_a_controller_takes() -> None:
     points = message["points"]
     rows = {name: np.array([point[name] for point in points]) for name in points[0]}
     np.testing.assert_array_equal(rows["positions"], path.joints)
-    np.testing.assert_array_equal(rows["time_from_start"], path.times)
+    times = [t["sec"] + 1e-9 * t["nanosec"] for t in rows["time_from_start"]]
+    np.testing.assert_allclose(times, path.times, atol=1e-9)
+    assert all(0 <= t["nanosec"] < 10**9 for t in rows["time_from_start"])
     assert not rows["velocities"][[0, -1]].any(), "at rest at both ends"
     assert (np.abs(rows["velocities"]) <= planner.robot.velocity * (1.0 + 1e-9)).all()
     limit = planner.bundle.planner.acceleration_rad_s2
@@ -191,6 +197,83 @@ def test_a_joint_trajectory_is_what_a_controller_takes() -> None:
     np.testing.assert_allclose(np.diff(lines, axis=0), gained, atol=1e-9)
     with pytest.raises(PlannerError, match="no path"):
         planner.plan(start + 0.3, goal, "level_cup").to_joint_trajectory()
+
+
+# prismatic and continuous joints
+
+
+@cache
+def gantry() -> Planner:
+    return Planner.from_urdf(Path(__file__).parent / "robots" / "gantry.urdf", "hand")
+
+
+def test_an_arm_with_prismatic_and_continuous_joints_keeps_a_level_tool() -> None:
+    planner, solved = gantry(), 0
+    robot = planner.robot
+    assert robot.continuous == {"turn", "spin"}
+    assert robot.chain.prismatic.tolist() == [True, True, True, False, False, False]
+    limit = np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])  # m/s² and rad/s²
+    with planner.scene.world() as world:
+        for start, goal in free_pairs(planner, 6, seed=4):
+            end = goal.copy()
+            end[4:] = start[4:]  # what tilts the hand, and where to
+            if not planner._certifier.collisions.is_free(end):
+                continue
+            pose = Pose(*robot.forward(end))
+            for wanted in (end, pose, GoalRegion(pose, free=("yaw",))):
+                path = planner.plan(start, wanted, "level")
+                assert path.status == "solved", path.explanation
+                assert path.certificate.goal_violation < 1e-6 or wanted is end
+                message = path.to_joint_trajectory()["points"]
+                assert (abs(np.array([p["accelerations"] for p in message])) <= limit + 1e-6).all()
+                rows = np.linspace(path.joints[:-1], path.joints[1:], 4).reshape(-1, 6)
+                assert world.free(rows).all()
+                solved += 1
+    assert solved >= 9
+
+
+def test_angles_of_continuous_joints_are_reached_the_shorter_way_round() -> None:
+    planner = gantry()
+    start = np.array([0.0, 0.0, 0.3, 3.0, 0.3, -3.0])
+    goal = np.array([0.1, 0.0, 0.3, -3.0, 0.3, 3.0])
+    path = planner.plan(start, goal, "free")
+    assert path.status == "solved", path.explanation
+    assert path.length_rad < 1.0
+    np.testing.assert_allclose(np.sin(path.goal - goal), 0.0, atol=1e-9)
+    beyond = start + np.array([0, 0, 0, 7.0, 0, 0])
+    refused = planner.plan(beyond, goal, "free")
+    assert refused.status == "out_of_limits"
+    assert "whole turns" in refused.explanation
+    assert planner.plan(start, beyond, "free").status == "solved"
+
+
+def test_the_certificate_names_the_pairs_that_are_not_looked_at() -> None:
+    planner = panda()
+    (start, goal), *_ = free_pairs(planner, 1, seed=1)
+    rests_on = planner.plan(start, goal, "free").certificate.rests_on
+    assert planner.robot.allowed
+    for first, second in planner.robot.allowed:
+        assert f"{first} with {second}" in rests_on
+
+
+def test_a_closed_planner_answers_nothing() -> None:
+    planner = Planner.from_urdf(*IIWA)
+    planner.close()
+    for ask in (
+        lambda: planner.project(np.zeros(7), "free"),
+        lambda: planner.ik(Pose(np.zeros(3), np.eye(3))),
+        lambda: planner.plan(np.zeros(7), np.ones(7), "free"),
+    ):
+        with pytest.raises(PlannerError, match="closed"):
+            ask()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_joint_is_held_at_a_number(value) -> None:
+    with pytest.raises(RobotError, match="panda_finger_joint1 = .*finite"):
+        Planner.from_urdf(
+            "franka_panda/panda.urdf", "panda_grasptarget", hold={"panda_finger_joint1": value}
+        )
 
 
 # single held angles

@@ -10,6 +10,7 @@ from constraint_geodesics.kernel_digest import LOCATORS
 if TYPE_CHECKING:
     from constraint_geodesics.constraints.constraint import Constraint as Constraint
     from constraint_geodesics.constraints.constraint import Pose as Pose
+    from constraint_geodesics.goals.region import GoalRegion as GoalRegion
     from constraint_geodesics.planner import Planner as Planner
     from constraint_geodesics.trajectory import Trajectory as Trajectory
 
@@ -17,9 +18,10 @@ os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", LOCATORS)
 if "numba" in sys.modules:  # it has read its settings already
     sys.modules["numba"].config.CACHE_LOCATOR_CLASSES = os.environ["NUMBA_CACHE_LOCATOR_CLASSES"]
 
-__all__ = ["Constraint", "Planner", "Pose", "Trajectory"]
+__all__ = ["Constraint", "GoalRegion", "Planner", "Pose", "Trajectory"]
 _MODULES = {
     "Constraint": "constraints.constraint",
+    "GoalRegion": "goals.region",
     "Planner": "planner",
     "Pose": "constraints.constraint",
     "Trajectory": "trajectory",

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from constraint_geodesics.certification.certifier import Certifier, Limits
+from constraint_geodesics.constraints.both import both
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.constraints.functions import values_batch
 from constraint_geodesics.constraints.projection import retract
@@ -126,7 +127,8 @@ def _inverse_kinematics() -> None:
 
 
 def _nearest() -> None:
-    nearest_on(ConstraintManifold(_scene().robot, _level()), _ROWS[0], _ROWS)
+    across = Constraint((1, 0, 0, 0, 0, 0), reference=Pose(np.zeros(3), np.eye(3)))
+    nearest_on(ConstraintManifold(_scene().robot, both(_level(), across)), _ROWS[0], _ROWS)
 
 
 def _learned() -> None:

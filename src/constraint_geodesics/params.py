@@ -310,14 +310,21 @@ class GeometryParams(_Record):
 
 
 class PlannerParams(_Record):
-    """The planner that users call."""
+    """The planner that users call.
+
+    clearance_m: that bodies keep in the search.  clearance_share: of what they typically have, and
+    no more is asked for: an arm whose links are close to each other could not move else; null for
+    no such bound.  acceleration: of turning joints and of prismatic ones.
+    """
 
     segments: Annotated[int, Field(ge=4)] = 16
     iterations: Count = 30
     accuracy: Positive = 1e-5
     largest_step_rad: Positive = 0.5
     clearance_m: NonNegative = 0.006
+    clearance_share: Annotated[float, Field(gt=0, le=1)] | None = None
     acceleration_rad_s2: Positive = 10.0
+    acceleration_m_s2: Positive = 1.0
     roadmap_nodes: Annotated[int, Field(ge=10)] = 2000
     roadmap_neighbours: Count = 12
     seed: Seed = 0

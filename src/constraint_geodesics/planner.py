@@ -6,9 +6,7 @@ trajectory = planner.plan(start, goal, "level_cup")
 """
 
 import time
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -16,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics import warmup
+from constraint_geodesics.answering import Answering
 from constraint_geodesics.bundle import Bundle, open_bundle
 from constraint_geodesics.certification.certifier import Certificate, Certifier, Limits
 from constraint_geodesics.constraints.constraint import (
@@ -24,9 +23,7 @@ from constraint_geodesics.constraints.constraint import (
     Pose,
     constraint_from,
 )
-from constraint_geodesics.geometry.errors import GeometryError
-from constraint_geodesics.geometry.timing import time_parametrisation
-from constraint_geodesics.goals.goal import ArrayLike, Goal, Wanted, checked_configuration
+from constraint_geodesics.goals.goal import ArrayLike, Wanted, checked_configuration
 from constraint_geodesics.goals.pose import POSE_JOINTS
 from constraint_geodesics.goals.wanted import as_goals
 from constraint_geodesics.methods import Method, SearchMethod, open_method
@@ -38,60 +35,29 @@ from constraint_geodesics.params import (
     WorkcellParams,
 )
 from constraint_geodesics.problem import PlannerError as PlannerError
-from constraint_geodesics.problem import Status
+from constraint_geodesics.problem import end_refused
 from constraint_geodesics.robot.inverse_kinematics import Search, solutions, spread
-from constraint_geodesics.robot.kinematics import SerialRobot, rpy_of
+from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, rpy_of
 from constraint_geodesics.scene.arm import FOUND
 from constraint_geodesics.scene.scene import Scene, robot_from, workcell_from
 from constraint_geodesics.scene.shape import Shape
-from constraint_geodesics.search.candidates import (
-    ALL_PARTS,
-    BENDS,
-    Answer,
-    Candidate,
-    Parts,
-    rows_of,
-)
-from constraint_geodesics.search.explanations import not_connected, refused_end
-from constraint_geodesics.search.nearest import nearest_on
+from constraint_geodesics.search.candidates import ALL_PARTS, Parts
+from constraint_geodesics.search.nearest import Projection, projection
 from constraint_geodesics.search.preparation import Preparation, Query
-from constraint_geodesics.search.pursuit import Pursued, shortest
-from constraint_geodesics.trajectory import Asked, Statistics, Trajectory, read_trajectory
+from constraint_geodesics.trajectory import Trajectory, read_trajectory
 
-COINCIDENT_RAD = 1e-7
-"""Ends that differ by less in every joint are one configuration."""
-STANDING_S = 0.001
-"""Duration of a path from a configuration to itself."""
-_NO_MORE = "no more curves"
-_WORTHWHILE = 1e-4
-"""Share by which a curve must be shorter than the path so far to be certified."""
-_ROUND = BENDS + 1
-"""Curves after which the kinds that are tried come round again."""
-_TIGHTENED = (1.0, 0.7, 0.4)
-"""Shares of the allowed violation that a path's waypoints are drawn for, should the certificate ask
-for closer ones.
+SNAP_RAD, SNAP_M = 0.01, 0.001
+"""Distances by which a start is moved on request, at most: of its turning joints, and of its
+prismatic ones.
 """
-_CLOSER = ("constraint_between_rows", "step")
-"""What a certificate finds where waypoints lie too far apart."""
-SNAP_RAD = 0.01
-"""Distance by which a start is moved on request, at most."""
+CLEARANCE_SHARE = 0.05
+"""Of what an arm typically keeps, asked for in the search by a planner that is made from a URDF."""
 REPRESENTATIVES, _MANY_SEEDS = 64, 1024
 """Of the configurations that reach a pose, where there is no end of them; what they are found
 from.
 """
 OWN_CONSTRAINTS = {"free": Constraint((0,) * 6), "level": Constraint((0, 0, 0, 1, 1, 0))}
 """By name, of a planner that is made from a URDF: nothing held, and the tilt that the start has."""
-
-
-@dataclass(frozen=True, eq=False)
-class Projection:
-    """The nearest configuration that keeps a constraint (D,) [rad], how far away it is [rad], and
-    by how much the one asked for violates it [rad or m].
-    """
-
-    configuration: Float[np.ndarray, "D"]
-    distance_rad: float
-    violation_before: float
 
 
 class Planner:
@@ -111,9 +77,10 @@ class Planner:
             name: constraint_from(c, self.scene.robot) for name, c in bundle.constraints.items()
         }
         self.method: Method = method or SearchMethod()
-        dof, settings = self.scene.robot.dof, bundle.planner
-        self._acceleration = np.full(dof, settings.acceleration_rad_s2)
-        self._certifier = Certifier(self.scene, limits_of(settings, bundle.judge, dof))
+        settings = bundle.planner
+        limits = limits_of(settings, bundle.judge, self.scene.robot)
+        self._certifier = Certifier(self.scene, limits)
+        self._answering = Answering(self.method, self._certifier)
         checks = self._certifier.collisions
         self._preparation = Preparation(self.scene, checks, settings, self.method.draw)
         roadmaps = bundle.roadmaps if self.method.roadmaps is None else self.method.roadmaps
@@ -144,15 +111,21 @@ class Planner:
         *,
         hold: Mapping[str, float] | None = None,
         workcell: Sequence[Shape] = (),
+        settings: PlannerParams | None = None,
     ) -> Self:
         """For the arm of any URDF, a path or a name in pybullet_data; nothing is trained.  The
         names of its constraints are those of OWN_CONSTRAINTS.
 
         srdf: which links may touch; without it adjacent and rigid pairs, and those that always
         touch, found by sampling.  tool: the pose of the tool's own frame in its link.  hold: values
-        of joints that are not to move [rad or m].  workcell: shapes around the arm.
+        of joints that are not to move [rad or m].  workcell: shapes around the arm.  settings:
+        accelerations, clearance, roadmaps; by default those of PlannerParams, with no more
+        clearance than CLEARANCE_SHARE of what the arm typically keeps.
         Raises RobotError, one line with the mend, where no arm can be made of the files.
         """
+        for name, value in (hold or {}).items():
+            if not np.isfinite(value):
+                raise RobotError(f"hold: {name} = {value}: must be a finite number [rad or m]")
         own = None
         if tool is not None:
             rpy = rpy_of(tool.rotation)
@@ -165,10 +138,9 @@ class Planner:
             may_touch=FOUND if srdf is None else str(srdf),
         )
         around = WorkcellParams().including(*workcell)
-        made = cls(Bundle(robot, around, {}, PlannerParams(), JudgeParams(), {}), str(urdf))
+        settings = settings or PlannerParams(clearance_share=CLEARANCE_SHARE)
+        made = cls(Bundle(robot, around, {}, settings, JudgeParams(), {}), str(urdf))
         made.constraints |= OWN_CONSTRAINTS
-        made._preparation.keep_clear_as_it_can()
-        made.band = made._preparation.band
         return made
 
     @property
@@ -220,7 +192,8 @@ class Planner:
 
     def ik(self, pose: Pose) -> Float[np.ndarray, "n D"]:
         """Configurations [rad] free of collision and within the limits whose tool has a pose in the
-        base frame: of six joints every one, whole turns included; of more some that are spread over
+        base frame: of six joints every branch that is found, whole turns included, of a joint with
+        room for more than three the three nearest to 0; of more joints some that are spread over
         all of them.
         """
         self._require_open()
@@ -238,20 +211,18 @@ class Planner:
         Raises PlannerError if the constraint holds an axis but has no reference, or nothing near
         keeps it.
         """
+        self._require_open()
         given, name = self._named(constraint)
         if not given.is_placed:
             raise PlannerError(f"{name} has no reference pose: use constraint.relative_to(pose)")
-        return self._projected(checked_configuration(q, self.robot.dof, "q"), given, name)
-
-    def _projected(
-        self, q: Float[np.ndarray, "D"], constraint: Constraint, name: str
-    ) -> Projection:
-        manifold = ConstraintManifold(self.robot, constraint)
-        found = nearest_on(manifold, q, q[None])
-        if not len(found):
-            raise PlannerError(f"no configuration was found near {q.tolist()} that keeps {name}")
-        away = float(np.linalg.norm(found[0] - q))
-        return Projection(found[0], away, float(manifold.violation(q)))
+        given.compile()
+        place = checked_configuration(q, self.robot.dof, "q")
+        found = projection(ConstraintManifold(self.robot, given), place)
+        if found is None:
+            raise PlannerError(
+                f"no configuration was found near {place.tolist()} that keeps {name}"
+            )
+        return found
 
     def plan(
         self,
@@ -276,8 +247,9 @@ class Planner:
         many seconds have passed since the call; functions of a constraint's own are compiled
         before, a roadmap that is not made yet is made within.  snap: a start that violates the
         constraint or a limit is moved to the nearest configuration that keeps them, where that is
-        at most SNAP_RAD away; else such a start is refused.  velocity_scale, acceleration_scale:
-        the shares of the limits that the motion uses, above 0 and at most 1.
+        at most SNAP_RAD away, and SNAP_M for prismatic joints, and nothing is touched on the way;
+        else such a start is refused.  velocity_scale, acceleration_scale: the shares of the limits
+        that the motion uses, above 0 and at most 1.
         Raises PlannerError if an end has the wrong shape or is not finite, the name is unknown, or
         the budget or a scale is none.
         """
@@ -293,20 +265,11 @@ class Planner:
                 raise PlannerError(f"{which}_scale = {scale}: must be above 0 and at most 1")
         dof = self.scene.robot.dof
         q_start, goals = checked_configuration(start, dof, "start"), as_goals(goal, dof)
-        held = self._held_at(given, q_start)
+        task, moved = self._preparation.task(self._held_at(given, q_start)), 0.0
         if snap:
-            q_start = self._snapped(q_start, held, name)
-        task = self._preparation.task(held)
-        query = Query(task, name, q_start, q_start, began, parts, scales)
-        refused = refused_end(query, "start", self._certifier.collisions)
-        if refused is not None:
-            return self._nothing(query, *refused)
-        pursued = list(self._pursued(query, goals))
-        if not pursued:
-            wanted = " or ".join(one.description for one in goals)
-            return self._nothing(query, "not_found", f"no configuration is {wanted}")
-        pursued.sort(key=lambda one: one.distance)
-        return self._answer(query, pursued, budget_s)
+            q_start, moved = self._snapped(q_start, task.manifold)
+        query = Query(task, name, q_start, q_start, began, parts, scales, moved)
+        return self._answering.answer(query, goals, budget_s)
 
     def plan_batch(
         self,
@@ -370,136 +333,24 @@ class Planner:
         return constraint.relative_to(Pose(*self.scene.robot.forward(start)))
 
     def _snapped(
-        self, start: Float[np.ndarray, "D"], constraint: Constraint, name: str
-    ) -> Float[np.ndarray, "D"]:
-        """The start, moved where it keeps the constraint; as it is where that is too far away."""
-        try:
-            found = self._projected(start, constraint, name)
-        except PlannerError:
-            return start
-        return found.configuration if found.distance_rad <= SNAP_RAD else start
-
-    def _pursued(self, query: Query, goals: Sequence[Goal]) -> Iterator[Pursued]:
-        """The goals' configurations."""
-        for goal in goals:
-            region = None
-            if goal.region is not None:
-                region = ConstraintManifold(self.scene.robot, goal.region)
-            for q in goal.configurations(query.task.manifold, query.start):
-                away = float(np.linalg.norm(q - query.start))
-                yield Pursued(q, away, self._curves(replace(query, goal=q)), region)
-
-    def _curves(self, query: Query) -> Iterator[Candidate | Answer | None]:
-        """The method's, unless the goal is refused."""
-        refused = refused_end(query, "goal", self._certifier.collisions)
-        if refused is not None:
-            status, line = refused
-            yield Answer(status, explanation=line)
-            return
-        yield from self.method.candidates(query.task, query.start, query.goal, query.parts)
-
-    def _answer(
-        self, query: Query, pursued: Sequence[Pursued], budget_s: float | None
-    ) -> Trajectory:
-        """The answer for some configurations as the goal, the nearest first."""
-        if pursued[0].distance <= COINCIDENT_RAD:
-            return self._standing(replace(query, goal=pursued[0].goal))
-
-        def certify(candidate: Candidate) -> tuple[Trajectory, float] | str:
-            found = self._certified(replace(query, goal=candidate.points[-1]), candidate)
-            return found if isinstance(found, str) else (found, found.length_rad)
-
-        path, count = shortest(pursued, query.task, certify), len(pursued)
-        if path is None:
-            return self._failed(query, pursued)
-        if budget_s is not None:
-            path = self._improved(replace(query, goal=path.joints[-1]), path, budget_s)
-        if count == 1:
-            return path
-        line = f"{path.explanation}, the shortest to any of {count} configurations"
-        return replace(path, explanation=line, statistics=self._statistics(query, path.source))
-
-    def _failed(self, query: Query, pursued: Sequence[Pursued]) -> Trajectory:
-        """Why there is no path to any goal: what is said of the nearest one that could end one."""
-        answers = [(one, one.answer or Answer("not_found")) for one in pursued]
-        one, end = next((own for own in answers if not own[1].explanation), answers[0])
-        query = replace(query, goal=one.goal)
-        line = end.explanation
-        if end.status == "not_connected":
-            line = not_connected(query, end, self._certifier.collisions)
-        elif not line:
-            line = f"no curve tried is a path under {query.name}{one.failed}"
-        if len(pursued) > 1:
-            line += f"; so it is with all {len(pursued)} configurations of the goal"
-        return self._nothing(query, end.status, line)
-
-    def _improved(self, query: Query, path: Trajectory, budget_s: float) -> Trajectory:
-        """The shortest certified path that is found before the time is over; `path` if it remains
-        that.  No curve is begun that would end too late, going by the last of its kind, and for the
-        first ones by the longest.
+        self, start: Float[np.ndarray, "D"], manifold: ConstraintManifold
+    ) -> tuple[Float[np.ndarray, "D"], float]:
+        """The start, moved where it keeps the constraint, and how far [rad]; as it is where that is
+        too far away or leads through something.
         """
-        curves = self.method.improvements(query.task, query.start, query.goal, query.parts)
-        spent = time.perf_counter() - query.began
-        lasted = deque[float](maxlen=_ROUND)
-        while spent + (lasted[0] if len(lasted) == _ROUND else max(lasted, default=0.0)) < budget_s:
-            candidate = next(curves, _NO_MORE)
-            if isinstance(candidate, str):
-                break
-            if candidate is not None and candidate.length < (1.0 - _WORTHWHILE) * path.length_rad:
-                found = self._certified(query, candidate)
-                if isinstance(found, Trajectory) and found.length_rad < path.length_rad:
-                    path = found
-            before, spent = spent, time.perf_counter() - query.began
-            lasted.append(spent - before)
-        return replace(path, statistics=self._statistics(query, path.source))
-
-    def _certified(self, query: Query, candidate: Candidate) -> Trajectory | str:
-        """The candidate as a trajectory if it is certified, otherwise why it is not."""
-        robot, constraint = self.scene.robot, query.task.manifold.constraint
-        allowed = self._certifier.limits.violation_tolerance
-        for share in _TIGHTENED:
-            joints = rows_of(candidate, share * allowed)
-            try:
-                limits = robot.velocity * query.scales[0], self._acceleration * query.scales[1]
-                times = time_parametrisation(joints, *limits)
-            except GeometryError as error:
-                return str(error)
-            certificate = self._certifier.certify(
-                joints, constraint, query.start, query.goal, times
-            )
-            if certificate.violation is None or certificate.violation.kind not in _CLOSER:
-                break
-        if certificate.violation is not None:
-            return certificate.violation.message
-        line = (
-            f"{certificate.length_rad:.3f} rad in {times[-1]:.2f} s from the {candidate.source} "
-            f"proposal, at most {certificate.violation_bound:.1e} off {query.name}"
+        broken = end_refused(manifold, start, "start")
+        found = None if broken is None else projection(manifold, start)
+        if found is None:
+            return start, 0.0
+        robot, away = self.robot, found.configuration - start
+        turned, slid = (
+            float(np.linalg.norm(away[own]))
+            for own in (~robot.chain.prismatic, robot.chain.prismatic)
         )
-        about = self._asked(query), self._statistics(query, candidate.source)
-        return Trajectory("solved", joints, times, line, *about, certificate)
-
-    def _standing(self, query: Query) -> Trajectory:
-        """The path between ends that only rounding tells apart."""
-        joints, times = np.stack([query.start, query.goal]), np.array([0.0, STANDING_S])
-        constraint = query.task.manifold.constraint
-        certificate = self._certifier.certify(joints, constraint, query.start, query.goal, times)
-        line = "the start is the goal"
-        if certificate.violation is not None:
-            line = f"{line}, and no path: {certificate.violation.message}"
-            return self._nothing(query, "not_found", line)
-        about = self._asked(query), self._statistics(query, "straight")
-        return Trajectory("solved", joints, times, line, *about, certificate)
-
-    def _nothing(self, query: Query, status: Status, explanation: str) -> Trajectory:
-        empty, about = np.empty((0, self.scene.robot.dof)), self._asked(query)
-        statistics = self._statistics(query, "")
-        return Trajectory(status, empty, np.empty(0), explanation, about, statistics)
-
-    def _asked(self, query: Query) -> Asked:
-        return Asked(query.task.manifold.constraint, query.name, self.scene)
-
-    def _statistics(self, query: Query, source: str) -> Statistics:
-        return Statistics(time.perf_counter() - query.began, self.method.name, source)
+        way = np.stack([np.clip(start, robot.lower, robot.upper), found.configuration])
+        if turned > SNAP_RAD or slid > SNAP_M or not self._certifier.collisions.is_clear(way):
+            return start, 0.0
+        return found.configuration, found.distance_rad
 
 
 def _batch(
@@ -519,11 +370,12 @@ def _batch(
     return first, last
 
 
-def limits_of(settings: PlannerParams, judge: JudgeParams, dof: int) -> Limits:
+def limits_of(settings: PlannerParams, judge: JudgeParams, robot: SerialRobot) -> Limits:
     """What a returned path is certified for."""
+    turning, sliding = settings.acceleration_rad_s2, settings.acceleration_m_s2
     return Limits(
         end_tolerance_rad=judge.end_tolerance_rad,
         max_step_rad=judge.max_step_rad,
         violation_tolerance=judge.violation_tolerance,
-        acceleration_rad_s2=(settings.acceleration_rad_s2,) * dof,
+        acceleration_rad_s2=tuple(sliding if own else turning for own in robot.chain.prismatic),
     )

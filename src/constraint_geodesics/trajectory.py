@@ -42,12 +42,16 @@ class Statistics:
     """How an answer came about.
 
     planning_time_s: everything, the certificate included.  method: of the planner.  source: the
-    proposal that the waypoints came from, "" without a path.
+    proposal that the waypoints came from, "" without a path.  snapped_rad: how far the start was
+    moved on request.  looked_at: the goal's configurations [rad], the nearest first; None where
+    the query was refused before.
     """
 
     planning_time_s: float
     method: str
     source: str = ""
+    snapped_rad: float = 0.0
+    looked_at: Float[np.ndarray, "n D"] | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +173,8 @@ class Trajectory:
 
     def to_joint_trajectory(self) -> dict[str, Any]:
         """As ROS's trajectory_msgs/JointTrajectory: `joint_names`, and `points` with `positions`
-        [rad], `velocities` [rad/s], `accelerations` [rad/s²] and `time_from_start` [s].
+        [rad or m], `velocities` [1/s], `accelerations` [1/s²] and `time_from_start`, in whole `sec`
+        and `nanosec`.
 
         Accelerations are the certified differences at the waypoints; a velocity lies between those
         of the lines before and after; both ends are at rest.  Raises PlannerError without a path.
@@ -189,7 +194,7 @@ class Trajectory:
                     "positions": q.tolist(),
                     "velocities": v.tolist(),
                     "accelerations": a.tolist(),
-                    "time_from_start": float(t),
+                    "time_from_start": _duration(float(t)),
                 }
                 for q, v, a, t in rows
             ],
@@ -227,6 +232,10 @@ class Trajectory:
             "max_violation_rad": self.max_violation_rad,
             "violation_bound_rad": self.violation_bound_rad,
             "clearance_m": self.clearance_m,
+            "goal_violation": np.nan
+            if self.certificate is None
+            else self.certificate.goal_violation,
+            "snapped_rad": self.statistics.snapped_rad,
             "planning_time_s": self.planning_time_s,
             "collision_time_s": self.collision_time_s,
         }
@@ -248,6 +257,12 @@ class Trajectory:
             f"**planned path**, constraint `{self.constraint_name}`\n\n- {self.explanation}\n"
             f"- duration {self.times[-1]:.2f} s\n- proposal: {self.source}"
         )
+
+
+def _duration(seconds: float) -> dict[str, int]:
+    """As ROS's builtin_interfaces/Duration, to the nearest nanosecond."""
+    whole, rest = divmod(round(1e9 * seconds), 1_000_000_000)
+    return {"sec": whole, "nanosec": rest}
 
 
 def _shares(s: Any) -> Float[np.ndarray, "n"]:

@@ -131,7 +131,9 @@ def test_a_refused_goal_of_several_is_passed_over_and_all_refused_are_told() -> 
     assert path.goal.tobytes() == goal.tobytes()
     none = packaged_planner().plan(start, [tilted, tilted - 0.01], "level_cup")
     assert none.status == "goal_violates"
-    assert "all 2 configurations of the goal" in none.explanation
+    assert "of 2 configurations of the goal: 2 goal_violates" in none.explanation
+    both = packaged_planner().plan(start, [tilted, beyond], "level_cup")
+    assert "1 goal_violates, 1 out_of_limits" in both.explanation
 
 
 @pytest.mark.parametrize("name", ["free", "level_cup", "slide", "tool_down"])
@@ -157,6 +159,31 @@ def test_a_pose_that_breaks_the_constraint_or_is_out_of_reach_is_told() -> None:
     far = planner.plan(start, Pose(np.array([3.0, 0.0, 0.0]), level.rotation), "level_cup")
     assert far.status == "not_found"
     assert "(3, 0, 0) m" in far.explanation
+
+
+def test_a_region_may_leave_free_what_the_constraint_holds() -> None:
+    """Place alone is asked for: the cup is level there all the same, and the certificate says how
+    well the place is kept.
+    """
+    planner = packaged_planner()
+    for start, goal in pairs_of("level_cup", 3, seed=34):
+        region = GoalRegion(pose_of(goal), free=("roll", "pitch", "yaw"))
+        path = planner.plan(start, region, "level_cup")
+        assert path.status == "solved", path.explanation
+        assert path.length_rad <= length_to(start, goal, "level_cup") * 1.001
+        position, rotation = planner.robot.forward(path.goal)
+        np.testing.assert_allclose(position, region.pose.position, atol=1e-7)
+        assert path.certificate.goal_violation < 1e-6
+        np.testing.assert_allclose(rotation[2], planner.robot.forward(start)[1][2], atol=2e-4)
+
+
+def test_a_budget_looks_for_shorter_paths_to_any_of_several() -> None:
+    planner = packaged_planner()
+    start, goal = pairs_of("tool_down", 1, seed=35)[0]
+    first = planner.plan(start, pose_of(goal), "tool_down")
+    longer = planner.plan(start, pose_of(goal), "tool_down", budget_s=0.3)
+    assert longer.length_rad <= first.length_rad
+    assert "configurations" in longer.explanation
 
 
 def test_the_end_lies_in_the_region_where_the_path_is_shortest() -> None:

@@ -76,12 +76,13 @@ class Certificate:
     max_violation: largest excess over the constraint's tolerance among the rows and the worst place
     between them; violation_bound: proven for the whole piecewise linear path; both the larger of
     the angles' [rad] and the positions' [m], which also stand separately.  limit_distance_rad: to
-    the nearest joint limit, negative outside.
+    the nearest joint limit, negative outside.  goal_violation: by how much the last row is beyond
+    the goal's region [rad or m]; nan where none was asked for.
     clearance_m: what bodies that can meet within the joint limits are proven to keep apart on the
     whole path, at least half of the least distance that they have; nan where it was not looked
-    at.  asked_pybullet: how
-    many parts of the path come so close to something that the proof rests on PyBullet's distances
-    there; clearance_m is 0 then.  rests_on: what was taken for the bodies.
+    at.  asked_pybullet: how many parts of the path come so close to something that the proof
+    rests on PyBullet's distances there; clearance_m is 0 then.  rests_on: what was taken for the
+    bodies, and which pairs of them were left out.
     largest_pose_difference: of all links from PyBullet's [rad or m]; nan without PyBullet.
     duration_s: nan without times.  time_s: what certification took, of which collision_time_s for
     collisions.
@@ -97,6 +98,7 @@ class Certificate:
     max_violation_m: float
     violation_bound_m: float
     limit_distance_rad: float
+    goal_violation: float
     clearance_m: float
     asked_pybullet: int
     rests_on: str
@@ -125,7 +127,7 @@ def _known(record: Violation | Certificate) -> dict[str, Any]:
 def blank(violation: Violation | None, began: float) -> Certificate:
     """The certificate of what is no path."""
     nan = float("nan")
-    measures = (nan,) * 10
+    measures = (nan,) * 11
     return Certificate(violation, *measures, 0, "", nan, nan, time.perf_counter() - began, 0.0)
 
 

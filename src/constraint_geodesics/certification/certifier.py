@@ -45,7 +45,8 @@ _POSES = 24
 
 class _Path(NamedTuple):
     """A path's rows (T, D), the lengths of its steps (T − 1,) [rad], each row's distance to the
-    nearest limit (T,), its length, longest step and least distance, and how the constraint is kept.
+    nearest limit (T,), its length, longest step and least distance, how far the last row is beyond
+    the goal's region, and how the constraint is kept.
     """
 
     rows: np.ndarray
@@ -54,6 +55,7 @@ class _Path(NamedTuple):
     length: float
     longest: float
     least: float
+    beyond: float
     kept: Kept
 
     def measures(self) -> dict[str, float]:
@@ -69,6 +71,7 @@ class _Path(NamedTuple):
             "max_violation_m": attained["m"],
             "violation_bound_m": bound["m"],
             "limit_distance_rad": self.least,
+            "goal_violation": self.beyond,
         }
 
 
@@ -131,15 +134,17 @@ class Certifier:
         goal: Float[np.ndarray, "D"] | None = None,
         times: Float[np.ndarray, "T"] | None = None,
         collisions: bool = True,
+        region: Constraint | None = None,
     ) -> Certificate:
         """Check a path [rad], with its times [s] if it has them, and report the first promise it
-        breaks.  collisions: whether they are looked at.
+        breaks.  collisions: whether they are looked at.  region: what the last row must keep, as a
+        constraint with a reference.
 
         A constraint without a reference is held relative to the tool's pose at `start`, or else at
         the first row.
-        The order: the array itself, ends, joint limits, steps, constraint at the rows and between
-        them, times, velocity and acceleration, pose, collisions.  Once one promise is broken no
-        later one is looked at; what is cheap to measure is measured all the same.
+        The order: the array itself, ends, the goal's region, joint limits, steps, constraint at the
+        rows and between them, times, velocity and acceleration, pose, collisions.  Once one promise
+        is broken no later one is looked at; what is cheap to measure is measured all the same.
         Raises CertificationError if `start` or `goal` has the wrong shape, or the reference is no
         pose.
         """
@@ -156,9 +161,10 @@ class Certifier:
         first = rows[0] if ends[0] is None else ends[0]
         with np.errstate(over="ignore", invalid="ignore"):
             kept = how_kept(Asked(self._chain, rows, constraint, first, self.limits))
+            beyond = np.nan if region is None else self._beyond(region, rows[-1])
         limits = MotionLimits(self._velocity, self.limits.acceleration_rad_s2)
         clock, duration = check_times(rows, times, limits)
-        path = _Path(rows, steps, margins, length, longest, least, kept)
+        path = _Path(rows, steps, margins, length, longest, least, beyond, kept)
         violation = next(chain(self._broken(path, *ends), clock), self._wrong_pose)
         asked, apart = time.perf_counter(), Separation(violation)
         if violation is None and collisions:
@@ -183,6 +189,7 @@ class Certifier:
         checks: tuple[Callable[[], Violation | None], ...] = (
             lambda: self._missed("start_missed", path.rows, 0, start),
             lambda: self._missed("goal_missed", path.rows, len(path.rows) - 1, goal),
+            lambda: self._beside(path),
             lambda: self._outside(path),
             lambda: self._jump(path),
             lambda: path.kept.at_rows,
@@ -226,6 +233,21 @@ class Certifier:
             f"{kind.split('_')[0]}"
         )
         return Violation(kind, row, value, allowed, f"{which}, {allowed:.3g} rad is allowed")
+
+    def _beyond(self, region: Constraint, end: np.ndarray) -> float:
+        """How far a configuration is beyond a region [rad or m]."""
+        rows = np.stack([end, end])
+        return max(how_kept(Asked(self._chain, rows, region, end, self.limits)).attained.values())
+
+    def _beside(self, path: _Path) -> Violation | None:
+        allowed, row = self.limits.violation_tolerance, len(path.rows) - 1
+        if not path.beyond > allowed:
+            return None
+        text = (
+            f"row {row}, the last, is {path.beyond:.3g} rad or m beyond the goal's region, "
+            f"{allowed:.3g} is allowed"
+        )
+        return Violation("goal_missed", row, path.beyond, allowed, text)
 
     def _outside(self, path: _Path) -> Violation | None:
         allowed = self.limits.limit_tolerance_rad

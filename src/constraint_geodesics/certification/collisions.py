@@ -48,6 +48,7 @@ class CollisionCheck:
     def __init__(self, scene: Scene, chain: Chain, world: World | None, beyond_rad: float) -> None:
         self._world = world
         self.collider = collider(scene, chain, MARGIN_M, beyond_rad)
+        self._allowed = sorted(scene.robot.allowed)
         self._standing = self._rigid_contact(scene.robot.dof)
 
     @cached_property
@@ -60,6 +61,9 @@ class CollisionCheck:
             line += f", hulls that cover more than the meshes of {', '.join(covered)}"
         if apart := len(self.collider.apart):
             line += f"; {apart} pairs that never meet within the joint limits"
+        if self._allowed:
+            pairs = ", ".join(f"{first} with {second}" for first, second in self._allowed)
+            line += f"; not looked at, since they may touch: {pairs}"
         if self._world is None:
             line += "; no PyBullet, with which nothing was compared"
         return line

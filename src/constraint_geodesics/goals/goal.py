@@ -2,8 +2,8 @@
 
 A further kind is one file here with a class that has `description`, `configurations` and `region`.
 `Planner.plan` takes it as it is, and `Trajectory.goal` says which configuration was reached.  Apart
-from that file it touches `cli.py`, if the command is to have an option for it, and its tests:
-search, certification, recording and benchmark know configurations alone.
+from that file it touches `cli_planning.py`, if the command is to have an option for it, and its
+tests: search, certification, recording and benchmark know configurations and constraints alone.
 """
 
 import math
@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.problem import PlannerError
+from constraint_geodesics.robot.inverse_kinematics import whole_turns
 
 ArrayLike = Float[np.ndarray, "D"] | Sequence[float]
 
@@ -31,8 +32,8 @@ class Goal(Protocol):
 
     @property
     def region(self) -> Constraint | None:
-        """The set as a constraint, where it is more than single configurations: the end of a path
-        slides in it.
+        """The set as a constraint with a reference, where it is one: the certificate says how well
+        the end keeps it, and where it leaves freedom the end slides in it.
         """
         ...
 
@@ -53,9 +54,11 @@ Wanted = Goal | Pose | ArrayLike
 
 @dataclass(frozen=True, eq=False)
 class ConfigurationGoal:
-    """One configuration (D,) [rad].
+    """One configuration (D,) [rad or m]; of continuous joints the angles, which whole turns do not
+    change.
 
-    Raises PlannerError if it has no joints, as many as another robot, or is not finite.
+    Raises PlannerError where it is asked for, if it has not as many joints as the robot, or is not
+    finite.
     """
 
     joints: Float[np.ndarray, "D"]
@@ -69,8 +72,14 @@ class ConfigurationGoal:
     def configurations(
         self, manifold: ConstraintManifold, start: Float[np.ndarray, "D"]
     ) -> Iterable[Float[np.ndarray, "D"]]:
-        """It alone."""
-        return [checked_configuration(self.joints, manifold.robot.dof, "goal")]
+        """It alone, or with the whole turns of continuous joints."""
+        robot = manifold.robot
+        q = checked_configuration(self.joints, robot.dof, "goal")
+        if not robot.continuous:
+            return [q]
+        turning = np.array([name in robot.continuous for name in robot.joint_names])
+        turned = whole_turns(robot, q[None], turning, start)
+        return turned if len(turned) else [q]  # whose limit it breaks is the planner's to say
 
 
 def checked_configuration(q: Any, dof: int, name: str) -> Float[np.ndarray, "D"]:

@@ -1,7 +1,7 @@
-"""A tool pose as the goal: every branch of the inverse kinematics, whole turns included."""
+"""A tool pose as the goal: the branches of the inverse kinematics, whole turns included."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -16,10 +16,13 @@ POSE_JOINTS = 6
 
 @dataclass(frozen=True, eq=False)
 class PoseGoal:
-    """A tool pose in the base frame.  joints: of the robot that is to reach it."""
+    """A tool pose in the base frame."""
 
     pose: Pose
-    joints: int
+    region: Constraint = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "region", Constraint((1,) * 6, reference=self.pose))
 
     @property
     def description(self) -> str:
@@ -27,15 +30,10 @@ class PoseGoal:
         x, y, z = self.pose.position
         return f"a configuration with the tool at ({x:.4g}, {y:.4g}, {z:.4g}) m, turned as asked"
 
-    @property
-    def region(self) -> Constraint | None:
-        """The pose, held by all of the families."""
-        return GoalRegion(self.pose).region if self.joints > POSE_JOINTS else None
-
     def configurations(
         self, manifold: ConstraintManifold, start: Float[np.ndarray, "D"]
     ) -> Iterable[Float[np.ndarray, "D"]]:
-        """All branches; of a family the configurations nearest to the start."""
-        if self.joints > POSE_JOINTS:
+        """The branches that are found; of families the configurations nearest to the start."""
+        if manifold.robot.dof > POSE_JOINTS:
             return GoalRegion(self.pose).configurations(manifold, start)
-        return solutions(manifold.robot, self.pose.position, self.pose.rotation)
+        return solutions(manifold.robot, self.pose.position, self.pose.rotation, near=start)

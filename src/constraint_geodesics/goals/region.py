@@ -6,12 +6,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from constraint_geodesics.constraints.both import both
 from constraint_geodesics.constraints.constraint import AXES, Constraint, ConstraintManifold, Pose
 from constraint_geodesics.problem import PlannerError
 from constraint_geodesics.robot.inverse_kinematics import seeds_of, turned_towards
 from constraint_geodesics.search.nearest import nearest_on
 
-SEEDS = 128
+SEEDS = 256
 """Configurations from which the nearest of the region are looked for."""
 
 
@@ -53,8 +54,16 @@ class GoalRegion:
     def configurations(
         self, manifold: ConstraintManifold, start: Float[np.ndarray, "D"]
     ) -> Iterable[Float[np.ndarray, "D"]]:
-        """Those nearest to the start, each nearer than all beside it."""
+        """Those nearest to the start that keep the path's constraint as well, each nearer than all
+        beside it; where none keeps both, those of the region.
+        """
         robot = manifold.robot
-        own = ConstraintManifold(robot, self.region)
+        together = ConstraintManifold(robot, both(self.region, manifold.constraint))
         seeds = turned_towards(robot, seeds_of(robot, SEEDS), start)
-        return nearest_on(own, start, np.concatenate([start[None], seeds]))
+        seeds = np.concatenate([start[None], seeds])
+        found = nearest_on(together, start, seeds)
+        return (
+            found
+            if len(found)
+            else nearest_on(ConstraintManifold(robot, self.region), start, seeds)
+        )

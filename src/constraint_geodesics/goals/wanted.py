@@ -20,7 +20,7 @@ def as_goals(goal: Any, dof: int) -> tuple[Goal, ...]:
         return tuple(own for one in goal for own in as_goals(one, dof))
     if type(goal) not in (np.ndarray, list, tuple):
         if isinstance(goal, Pose):
-            return (PoseGoal(goal, dof),)
+            return (PoseGoal(goal),)
         if isinstance(goal, Goal):
             return (goal,)
     return (ConfigurationGoal(checked_configuration(goal, dof, "goal")),)

@@ -36,7 +36,8 @@ class ChainArrays(NamedTuple):
 class SerialRobot:
     """A serial arm: names, limits [rad or m, and per second] and its chain.
 
-    allowed: pairs of links that may touch, beside a link and the one that it hangs on.
+    allowed: pairs of links that may touch, beside a link and the one that it hangs on.  continuous:
+    names of joints whose values a whole turn apart are one place.
     """
 
     name: str
@@ -48,6 +49,7 @@ class SerialRobot:
     velocity: Float[np.ndarray, "D"]
     chain: ChainArrays
     allowed: frozenset[tuple[str, str]] = frozenset()
+    continuous: frozenset[str] = frozenset()
 
     @property
     def dof(self) -> int:

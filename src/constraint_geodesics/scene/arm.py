@@ -54,7 +54,8 @@ def load_arm(params: RobotParams) -> LoadedArm:
     robot = load_robot(file, link, params.limits_rad)
     allowed = _allowed(params.may_touch, arm, robot)
     pairs = frozenset((first, second) for first, second, _ in allowed)
-    return LoadedArm(arm, replace(robot, allowed=pairs), allowed)
+    continuous = frozenset(joint.name for joint in arm.moved if joint.kind == "continuous")
+    return LoadedArm(arm, replace(robot, allowed=pairs, continuous=continuous), allowed)
 
 
 @cache

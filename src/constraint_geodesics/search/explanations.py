@@ -10,7 +10,7 @@ from constraint_geodesics.constraints.constraint import Constraint, ConstraintMa
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.problem import Status, end_refused
 from constraint_geodesics.search.candidates import Answer
-from constraint_geodesics.search.nearest import nearest_on
+from constraint_geodesics.search.nearest import projection
 from constraint_geodesics.search.preparation import Query
 from constraint_geodesics.search.roadmap import Roadmap, join
 
@@ -28,10 +28,10 @@ def refused_end(
         return status, _limit(manifold, end, q)
     if status is not None:
         line = f"the {end} violates {query.name} by {manifold.amount(q)}"
-        nearest = nearest_on(manifold, q, q[None])
-        if len(nearest):
-            away = float(np.linalg.norm(nearest[0] - q))
-            line += f"; {_listed(nearest[0])} rad, {away:.2g} rad away, keeps it"
+        nearest = projection(manifold, q)
+        if nearest is not None:
+            where, away = _listed(nearest.configuration), nearest.distance_rad
+            line += f"; {where} rad, {away:.2g} rad away, keeps it"
         return status, line
     if not collisions.is_free(q):
         return "in_collision", f"the {end} touches {collisions.what_touches(q)}"
@@ -41,8 +41,11 @@ def refused_end(
 def _limit(manifold: ConstraintManifold, end: str, q: Float[np.ndarray, "D"]) -> str:
     robot = manifold.robot
     for k in np.flatnonzero((q < robot.lower) | (q > robot.upper)):
-        limits = f"its limits are {robot.lower[k]:.4g} and {robot.upper[k]:.4g} rad"
-        return f"{robot.joint_names[k]} of the {end} is {q[k]:.4g} rad: {limits}"
+        unit = "m" if robot.chain.prismatic[k] else "rad"
+        limits = f"its limits are {robot.lower[k]:.4g} and {robot.upper[k]:.4g} {unit}"
+        if robot.joint_names[k] in robot.continuous:
+            limits += ", whole turns beyond them are for its controller to add"
+        return f"{robot.joint_names[k]} of the {end} is {q[k]:.4g} {unit}: {limits}"
     return ""
 
 

@@ -6,6 +6,8 @@ constraint to first order, and back onto it.  It ends where the distance is leas
 configurations beside, which from several seeds are several.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float
 from numba import njit
@@ -37,6 +39,28 @@ loosely until it is exact: a step that leads out of a bound nearby gains nothing
 _SLACK = 1e-9
 
 
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """The nearest configuration that keeps a constraint (D,) [rad], how far away it is [rad], and
+    by how much the one asked for violates it [rad or m].
+    """
+
+    configuration: Float[np.ndarray, "D"]
+    distance_rad: float
+    violation_before: float
+
+
+def projection(manifold: ConstraintManifold, q: Float[np.ndarray, "D"]) -> Projection | None:
+    """Of q [rad], as far as the descent from there finds it; None where nothing near keeps the
+    constraint.
+    """
+    found = nearest_on(manifold, q, q[None])
+    if not len(found):
+        return None
+    away = float(np.linalg.norm(found[0] - q))
+    return Projection(found[0], away, float(manifold.violation(q)))
+
+
 def nearest_on(
     manifold: ConstraintManifold, q: Float[np.ndarray, "D"], seeds: Float[np.ndarray, "n D"]
 ) -> Float[np.ndarray, "m D"]:
@@ -59,7 +83,7 @@ def _exact_rows(space, work):
     """Rows of the constraint that leave no freedom, into `work.rows`; returns how many."""
     own, jacobian, size = space.constraint.rows, work.looked.jacobians[0], 0
     for i in range(own.held.shape[0]):
-        if own.held[i] and own.tolerance[i] == 0.0:
+        if own.held[i] and own.tolerance[i] == 0.0 and size < jacobian.shape[1]:
             for d in range(jacobian.shape[1]):
                 work.rows[size, d] = jacobian[i, d]
             size += 1

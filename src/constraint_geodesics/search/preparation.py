@@ -25,7 +25,8 @@ from constraint_geodesics.search.space import Space
 KEPT_TASKS = 64
 """Constraints without a name that are remembered, with their roadmaps."""
 _ROUNDS = 20
-_DRAWN, _OF_TYPICAL = 400, 0.05
+_DRAWN = 400
+"""Configurations whose median clearance is the typical one."""
 
 
 class Freedom(Protocol):
@@ -44,6 +45,8 @@ Draw = Callable[[int, np.random.Generator], Float[np.ndarray, "n D"]]
 class Query:
     """One query while it is planned.  goal: one configuration of it.  began: on
     `time.perf_counter`.  scales: the shares of the velocity and acceleration limits that are used.
+    snapped_rad: how far the start was moved.  looked_at: the goal's configurations, the nearest
+    first.
     """
 
     task: Task
@@ -53,6 +56,8 @@ class Query:
     began: float
     parts: Parts = ALL_PARTS
     scales: tuple[float, float] = (1.0, 1.0)
+    snapped_rad: float = 0.0
+    looked_at: Float[np.ndarray, "n D"] | None = None
 
 
 class Preparation:
@@ -69,22 +74,23 @@ class Preparation:
     ) -> None:
         self.scene, self.checks, self.settings = scene, checks, settings
         self.draw = draw or scene.robot.sample
-        self.band = band_settings(settings)
         self._clearance = clearance_model(scene.robot, scene.workcell, checks.apart)
+        self.band = self._band()
         self._tasks: dict[tuple, Task] = {}
         self._roadmaps: dict[tuple, Roadmap | None] = {}
         self._named: frozenset[tuple] = frozenset()
 
-    def keep_clear_as_it_can(self) -> None:
-        """Ask for less clearance than the settings do where the arm's links are so close to each
-        other that whole ways are narrower: for a share of what they typically have.
-        """
+    def _band(self) -> BandSettings:
+        """With the clearance that this arm can keep."""
+        band, share = band_settings(self.settings), self.settings.clearance_share
+        if share is None:
+            return band
         drawn = self.scene.robot.sample(_DRAWN, np.random.default_rng(self.settings.seed))
         apart = self._clearance.clearance(self.scene.robot, drawn)
-        if (apart > 0.0).any():
-            typical = float(np.median(apart[apart > 0.0]))
-            least = max(_OF_TYPICAL * typical, NARROW_M)
-            self.band = replace(self.band, clearance_m=min(least, self.band.clearance_m))
+        if not (apart > 0.0).any():
+            return band
+        least = max(share * float(np.median(apart[apart > 0.0])), NARROW_M)
+        return replace(band, clearance_m=min(least, band.clearance_m))
 
     def supply(
         self, constraints: Mapping[str, Constraint], roadmaps: Mapping[str, Roadmap]

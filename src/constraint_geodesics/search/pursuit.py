@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.constraints.constraint import ConstraintManifold
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.search.candidates import Answer, Candidate, Task, refined
 from constraint_geodesics.search.nearest import nearest_on
 
@@ -34,28 +34,31 @@ _ON = 1e-8
 class Pursued:
     """A configuration that a path may end at, while paths to it are looked for.
 
-    distance: from the start, straight.  curves: those that are still to come.  region: the set that
-    the end may move in, None for the configuration alone.  answer: what the curves ended with.
-    failed: why the last curve is no path.
+    distance: from the start, straight.  curves: those that are still to come.  region: what the end
+    must keep, where it is more than the configuration; room: the set that it may move in.  answer:
+    what the curves ended with.  failed: why the last curve is no path.
     """
 
     goal: Float[np.ndarray, "D"]
     distance: float
     curves: Iterator[Candidate | Answer | None] = field(repr=False)
-    region: ConstraintManifold | None = None
+    region: Constraint | None = None
+    room: ConstraintManifold | None = None
     answer: Answer | None = None
     failed: str = ""
     is_over: bool = False
 
 
 def shortest(
-    pursued: Sequence[Pursued], task: Task, certify: Callable[[Candidate], tuple[Path, float] | str]
-) -> Path | None:
-    """The shortest path that is certified, None where there is none.
+    pursued: Sequence[Pursued],
+    task: Task,
+    certify: Callable[[Pursued, Candidate], tuple[Path, float] | str],
+) -> tuple[Path, Pursued] | None:
+    """The shortest path that is certified, and whose it is; None where there is none.
 
     pursued: the nearest first.  certify: gives the path and its length, or why it is none.
     """
-    path, least = None, np.inf
+    best, least = None, np.inf
     waiting, rounds = list(pursued), 0
     while waiting:
         found: list[tuple[float, Pursued, Candidate]] = []
@@ -67,38 +70,38 @@ def shortest(
             if isinstance(item, Answer):
                 one.answer, one.is_over = item, True
             elif item is not None:
-                if one.region is not None:
-                    item = slid(task, item, one.region)
+                if one.room is not None:
+                    item = slid(task, item, one.room)
                 found.append((item.length, one, item))
                 nearest = min(nearest, item.length)
         for length, one, candidate in sorted(found, key=lambda entry: entry[0]):
             if length >= (1.0 - _WORTHWHILE) * least:
                 one.is_over = True
                 continue
-            result = certify(candidate)
+            result = certify(one, candidate)
             if isinstance(result, str):
                 one.failed = f"; the {candidate.source} curve fails: {result}"
             else:
-                (path, least), one.is_over = result, True
+                best, least, one.is_over = (result[0], one), result[1], True
         worth = (1.0 - _WORTHWHILE) * least
         waiting = [one for one in waiting if not one.is_over and one.distance < worth]
         rounds += 1
         if rounds >= _CHEAP_ROUNDS:
             waiting = waiting[:_PATIENTLY]
-    return path
+    return best
 
 
-def slid(task: Task, candidate: Candidate, region: ConstraintManifold) -> Candidate:
-    """The candidate with its end moved to where in the region the curve is shortest.
+def slid(task: Task, candidate: Candidate, room: ConstraintManifold) -> Candidate:
+    """The candidate with its end moved to where in its room the curve is shortest.
 
-    The end goes to the configuration of the region that is nearest to where the curve would begin
+    The end goes to the configuration of the room that is nearest to where the curve would begin
     were it straight, going by its last direction, and the curve is relaxed anew.
     """
     share, tried = np.linspace(0.0, 1.0, len(candidate.nodes))[:, None], 1.0
     for _ in range(_SLIDES):
         end, before = candidate.points[-1], candidate.points[-2]
         along = (end - before) / max(float(np.linalg.norm(end - before)), 1e-12)
-        found = nearest_on(region, end - tried * candidate.length * along, end[None])
+        found = nearest_on(room, end - tried * candidate.length * along, end[None])
         if not len(found) or np.abs(found[0] - end).max() < _MOVED_RAD:
             break
         better = None

@@ -78,7 +78,7 @@ def try_thicket(task: Thicket) -> Solved:
     sampling = SamplingPlanner("birrt", settings, judge.row_spacing_rad)
     solved: list[tuple[bool, bool]] = []
     bundle = replace(task.bundle, workcell=workcell)
-    limits = limits_of(bundle.planner, judge, robot_from(bundle.robot).dof)
+    limits = limits_of(bundle.planner, judge, robot_from(bundle.robot))
     with Planner(bundle, "thin shapes") as planner, Certifier(planner.scene, limits) as certifier:
         checks = certifier.collisions
         for name in task.constraints:

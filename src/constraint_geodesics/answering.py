@@ -1,0 +1,234 @@
+"""How a query is answered once its ends are known: curves to every configuration of the goal, the
+shortest of which is timed and certified, or why there is none.
+"""
+
+import time
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.certification.certifier import Certifier
+from constraint_geodesics.constraints.both import both
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
+from constraint_geodesics.geometry.errors import GeometryError
+from constraint_geodesics.geometry.timing import time_parametrisation
+from constraint_geodesics.goals.goal import Goal
+from constraint_geodesics.methods import Method
+from constraint_geodesics.problem import Status
+from constraint_geodesics.search.candidates import BENDS, Answer, Candidate, rows_of
+from constraint_geodesics.search.explanations import not_connected, refused_end
+from constraint_geodesics.search.preparation import Query
+from constraint_geodesics.search.pursuit import Pursued, shortest, slid
+from constraint_geodesics.trajectory import Asked, Statistics, Trajectory
+
+COINCIDENT_RAD = 1e-7
+"""Ends that differ by less in every joint are one configuration."""
+STANDING_S = 0.001
+"""Duration of a path from a configuration to itself."""
+_NO_MORE = "no more curves"
+_WORTHWHILE = 1e-4
+"""Share by which a curve must be shorter than the path so far to be certified."""
+_ROUND = BENDS + 1
+"""Curves after which the kinds that are tried come round again."""
+_TIGHTENED = (1.0, 0.7, 0.4)
+"""Shares of the allowed violation that a path's waypoints are drawn for, should the certificate ask
+for closer ones.
+"""
+_CLOSER = ("constraint_between_rows", "step")
+"""What a certificate finds where waypoints lie too far apart."""
+_IMPROVED = 3
+"""Configurations of a goal beside the one that was reached, the nearest, to which shorter paths are
+looked for.
+"""
+
+
+@dataclass(frozen=True)
+class Answering:
+    """Whom the curves come from, and who certifies them."""
+
+    method: Method
+    certifier: Certifier
+
+    def answer(self, query: Query, goals: Sequence[Goal], budget_s: float | None) -> Trajectory:
+        """The path of a query to the nearest of some goals, or why there is none."""
+        refused = refused_end(query, "start", self.certifier.collisions)
+        if refused is not None:
+            return self._nothing(query, *refused)
+        pursued = sorted(self._pursued(query, goals), key=lambda one: one.distance)
+        if not pursued:
+            wanted = " or ".join(one.description for one in goals)
+            return self._nothing(query, "not_found", f"no configuration is {wanted}")
+        query = replace(query, looked_at=np.array([one.goal for one in pursued]))
+        if pursued[0].distance <= COINCIDENT_RAD:
+            return self._standing(replace(query, goal=pursued[0].goal), pursued[0].region)
+
+        def certify(one: Pursued, candidate: Candidate) -> tuple[Trajectory, float] | str:
+            found = self._certified(query, candidate, one.region)
+            return found if isinstance(found, str) else (found, found.length_rad)
+
+        found = shortest(pursued, query.task, certify)
+        if found is None:
+            return self._failed(query, pursued)
+        path, reached = found
+        if budget_s is not None:
+            others = [one for one in pursued if one is not reached and one.answer is None]
+            path = self._improved(query, path, [reached, *others[:_IMPROVED]], budget_s)
+        line = path.explanation
+        if len(pursued) > 1:
+            line += f", the shortest found to any of {len(pursued)} configurations"
+        if query.snapped_rad:
+            line += f", from a start moved by {query.snapped_rad:.2g} rad"
+        return replace(path, explanation=line, statistics=self._statistics(query, path.source))
+
+    def _pursued(self, query: Query, goals: Iterable[Goal]) -> Iterator[Pursued]:
+        """The goals' configurations."""
+        manifold = query.task.manifold
+        for goal in goals:
+            room = None
+            if goal.region is not None:
+                room = ConstraintManifold(manifold.robot, both(goal.region, manifold.constraint))
+                if room.codim >= manifold.robot.dof:
+                    room = None
+            for q in goal.configurations(manifold, query.start):
+                away = float(np.linalg.norm(q - query.start))
+                yield Pursued(q, away, self._curves(query, q), goal.region, room)
+
+    def _curves(
+        self, query: Query, goal: Float[np.ndarray, "D"]
+    ) -> Iterator[Candidate | Answer | None]:
+        """The method's, unless the goal is refused."""
+        query = replace(query, goal=goal)
+        refused = refused_end(query, "goal", self.certifier.collisions)
+        if refused is not None:
+            status, line = refused
+            yield Answer(status, explanation=line)
+            return
+        yield from self.method.candidates(query.task, query.start, goal, query.parts)
+
+    def _failed(self, query: Query, pursued: Sequence[Pursued]) -> Trajectory:
+        """Why there is no path to any goal: what is said of the nearest one that could end one, and
+        how many of the others ended how.
+        """
+        answers = [(one, one.answer or Answer("not_found")) for one in pursued]
+        one, end = next((own for own in answers if not own[1].explanation), answers[0])
+        query = replace(query, goal=one.goal)
+        line = end.explanation
+        if end.status == "not_connected":
+            line = not_connected(query, end, self.certifier.collisions)
+        elif not line:
+            line = f"no curve tried is a path under {query.name}{one.failed}"
+        if len(pursued) > 1:
+            ends = Counter(
+                "too far for trees" if one.answer is None else one.answer.status for one in pursued
+            )
+            told = ", ".join(f"{count} {status}" for status, count in ends.most_common())
+            line += f"; of {len(pursued)} configurations of the goal: {told}"
+        return self._nothing(query, end.status, line)
+
+    def _improved(
+        self, query: Query, path: Trajectory, pursued: Sequence[Pursued], budget_s: float
+    ) -> Trajectory:
+        """The shortest certified path that is found before the time is over; `path` if it remains
+        that.  No curve is begun that would end too late, going by the last of its kind, and for the
+        first ones by the longest.
+        """
+        worth = [one for one in pursued if one.distance < path.length_rad]
+        curves = _by_turns([self._improvements(query, one) for one in worth or pursued[:1]])
+        spent = time.perf_counter() - query.began
+        lasted = deque[float](maxlen=_ROUND * max(len(worth), 1))
+        while (
+            spent + (lasted[0] if len(lasted) == lasted.maxlen else max(lasted, default=0.0))
+            < budget_s
+        ):
+            item = next(curves, _NO_MORE)
+            if isinstance(item, str):
+                break
+            one, candidate = item
+            if candidate is not None and candidate.length < (1.0 - _WORTHWHILE) * path.length_rad:
+                found = self._certified(query, candidate, one.region)
+                if isinstance(found, Trajectory) and found.length_rad < path.length_rad:
+                    path = found
+            before, spent = spent, time.perf_counter() - query.began
+            lasted.append(spent - before)
+        return path
+
+    def _improvements(
+        self, query: Query, one: Pursued
+    ) -> Iterator[tuple[Pursued, Candidate | None]]:
+        if refused_end(replace(query, goal=one.goal), "goal", self.certifier.collisions):
+            return
+        for found in self.method.improvements(query.task, query.start, one.goal, query.parts):
+            if found is not None and one.room is not None:
+                found = slid(query.task, found, one.room)
+            yield one, found
+
+    def _certified(
+        self, query: Query, candidate: Candidate, region: Constraint | None
+    ) -> Trajectory | str:
+        """The candidate as a trajectory if it is certified, otherwise why it is not."""
+        robot, constraint = self.certifier.scene.robot, query.task.manifold.constraint
+        limits = self.certifier.limits
+        assert limits.acceleration_rad_s2 is not None
+        velocity = robot.velocity * query.scales[0]
+        acceleration = np.array(limits.acceleration_rad_s2) * query.scales[1]
+        for share in _TIGHTENED:
+            joints = rows_of(candidate, share * limits.violation_tolerance)
+            try:
+                times = time_parametrisation(joints, velocity, acceleration)
+            except GeometryError as error:
+                return str(error)
+            certificate = self.certifier.certify(
+                joints, constraint, query.start, candidate.points[-1], times, region=region
+            )
+            if certificate.violation is None or certificate.violation.kind not in _CLOSER:
+                break
+        if certificate.violation is not None:
+            return certificate.violation.message
+        line = (
+            f"{certificate.length_rad:.3f} rad in {times[-1]:.2f} s from the {candidate.source} "
+            f"proposal, at most {certificate.violation_bound:.1e} off {query.name}"
+        )
+        about = self._asked(query), self._statistics(query, candidate.source)
+        return Trajectory("solved", joints, times, line, *about, certificate)
+
+    def _standing(self, query: Query, region: Constraint | None) -> Trajectory:
+        """The path between ends that only rounding tells apart."""
+        joints, times = np.stack([query.start, query.goal]), np.array([0.0, STANDING_S])
+        constraint = query.task.manifold.constraint
+        certificate = self.certifier.certify(
+            joints, constraint, query.start, query.goal, times, region=region
+        )
+        line = "the start is the goal"
+        if certificate.violation is not None:
+            line = f"{line}, and no path: {certificate.violation.message}"
+            return self._nothing(query, "not_found", line)
+        about = self._asked(query), self._statistics(query, "straight")
+        return Trajectory("solved", joints, times, line, *about, certificate)
+
+    def _nothing(self, query: Query, status: Status, explanation: str) -> Trajectory:
+        empty, about = np.empty((0, len(query.start))), self._asked(query)
+        statistics = self._statistics(query, "")
+        return Trajectory(status, empty, np.empty(0), explanation, about, statistics)
+
+    def _asked(self, query: Query) -> Asked:
+        return Asked(query.task.manifold.constraint, query.name, self.certifier.scene)
+
+    def _statistics(self, query: Query, source: str) -> Statistics:
+        spent = time.perf_counter() - query.began
+        return Statistics(spent, self.method.name, source, query.snapped_rad, query.looked_at)
+
+
+def _by_turns(
+    several: Sequence[Iterator[tuple[Pursued, Candidate | None]]],
+) -> Iterator[tuple[Pursued, Candidate | None]]:
+    """One of each, again and again, until all are at their end."""
+    waiting = deque(several)
+    while waiting:
+        own = waiting.popleft()
+        for item in own:
+            yield item
+            waiting.append(own)
+            break
