@@ -61,7 +61,9 @@ class Answering:
         if not pursued:
             wanted = " or ".join(one.description for one in goals)
             return self._nothing(query, "not_found", f"no configuration is {wanted}")
-        query = replace(query, looked_at=np.array([one.goal for one in pursued]))
+        regions = tuple(goal.region for goal in goals if goal.region is not None)
+        looked_at = np.array([one.goal for one in pursued])
+        query = replace(query, looked_at=looked_at, regions=regions)
         if pursued[0].distance <= COINCIDENT_RAD:
             return self._standing(replace(query, goal=pursued[0].goal), pursued[0].region)
 
@@ -214,7 +216,8 @@ class Answering:
         return Trajectory(status, empty, np.empty(0), explanation, about, statistics)
 
     def _asked(self, query: Query) -> Asked:
-        return Asked(query.task.manifold.constraint, query.name, self.certifier.scene)
+        constraint, scene = query.task.manifold.constraint, self.certifier.scene
+        return Asked(constraint, query.name, scene, query.regions)
 
     def _statistics(self, query: Query, source: str) -> Statistics:
         spent = time.perf_counter() - query.began

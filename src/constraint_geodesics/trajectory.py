@@ -30,11 +30,14 @@ CONSTRAINT_LINE = "# constraint: "
 
 @dataclass(frozen=True)
 class Asked:
-    """What a query was asked under: the constraint with its reference, its name, and the scene."""
+    """What a query was asked under: the constraint with its reference, its name, and the scene;
+    regions: those of its goals that are more than single configurations.
+    """
 
     constraint: Constraint
     name: str
     scene: Scene = field(repr=False)
+    regions: tuple[Constraint, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -201,14 +204,21 @@ class Trajectory:
         }
 
     def record(self, file: str | Path, frames: int = 100) -> None:
-        """Write a Rerun recording.  Raises PlannerError without a path, MissingExtraError without
+        """Write a Rerun recording: the motion, and what of a goal's region and configurations was
+        looked at.  Raises PlannerError without a path, MissingExtraError without
         the extra `record`.
         """
         require("record")
+        from constraint_geodesics.recording.goal import GoalView
         from constraint_geodesics.recording.recording import PathRecord, record_path
 
         self._require_path("record")
-        record = PathRecord("planner", self.constraint_name, 0, 0, self.joints, self._markdown())
+        looked_at, regions = self.statistics.looked_at, self.asked.regions
+        goal = None
+        if looked_at is not None and (regions or len(looked_at) > 1):
+            goal = GoalView(looked_at, regions)
+        name, text = self.constraint_name, self._markdown()
+        record = PathRecord("planner", name, 0, 0, self.joints, text, goal=goal)
         manifold = ConstraintManifold(self.scene.robot, self.constraint)
         record_path(Path(file), record, manifold, self.scene.workcell, frames=frames)
 

@@ -27,8 +27,9 @@ from tests.recording.files import (
     timelines,
 )
 
-from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.constraints.projection import retract
+from constraint_geodesics.recording.goal import GoalView
 from constraint_geodesics.recording.recorder import status_text
 from constraint_geodesics.recording.recording import (
     About,
@@ -463,3 +464,35 @@ def listening(ports):
     ]
     addresses = [row[1].split(":") for row in rows if row[3] == "0A"]
     return {(address, int(port, 16)) for address, port in addresses if int(port, 16) in ports}
+
+
+def test_what_a_query_asked_to_reach_is_drawn(xarm, tmp_path):
+    """The arm at every configuration that was looked at, the region's pose, box and free angle."""
+    manifold, joints = xarm
+    robot = manifold.robot
+    pose = Pose(*robot.forward(joints[-1]))
+    region = Constraint((1, 1, 1, 1, 1, 0), (0.02, 0.03, 0.0, 0.0, 0.0, 0.0), pose)
+    looked_at = np.stack([joints[-1], joints[-2]])
+    path = path_of(joints, goal=GoalView(looked_at, (region,)), meshes=False)
+    read = batches(recorded(tmp_path, manifold, path))
+    found = {chunk.entity_path: batch for chunk, batch in read if "/goal/" in chunk.entity_path}
+    assert set(found) == {
+        "/goal/looked_at",
+        *(f"/goal/region_0/{name}" for name in ("pose", "places", "free_yaw")),
+    }
+    lines = found["/goal/looked_at"].column("LineStrips3D:strips")[0].as_py()
+    np.testing.assert_allclose(lines, robot.skeleton(looked_at), atol=1e-6)
+    box = found["/goal/region_0/places"].column("Boxes3D:half_sizes")[0].as_py()
+    np.testing.assert_allclose(box, [[0.02, 0.03, 0.0]], atol=1e-8)
+    circle = np.array(found["/goal/region_0/free_yaw"].column("LineStrips3D:strips")[0].as_py()[0])
+    np.testing.assert_allclose(circle[:, 2], pose.position[2], atol=1e-6)
+    reach = np.linalg.norm(circle - pose.position, axis=1)
+    np.testing.assert_allclose(reach, reach[0], atol=1e-6)
+
+
+def test_a_single_configuration_has_no_goal_to_draw(xarm, tmp_path):
+    manifold, joints = xarm
+    file = recorded(tmp_path, manifold, path_of(joints, meshes=False))
+    assert not any(
+        "goal/" in entity for entity in read_recording(file).entity_paths if "tool" not in entity
+    )

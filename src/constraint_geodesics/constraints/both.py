@@ -6,7 +6,7 @@ certified by itself.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -22,24 +22,21 @@ from constraint_geodesics.constraints.kernels import (
     call,
     floats,
 )
-from constraint_geodesics.constraints.pose import PoseConstraint
 from constraint_geodesics.robot.kernels import LANES
 from constraint_geodesics.robot.kinematics import SerialRobot
 
 _HEAD = 6
 """Numbers before the data of the two: addresses, rows, how long the first's data and room are."""
-_ANGLES = slice(3, 6)
 
 
 def both(first: Constraint, second: Constraint) -> Constraint:
     """What holds both; one of them where the other holds nothing.
 
-    Of poses, what one holds exactly is left out of the other: it would be the same rows again, or
-    rows that nothing keeps.
+    What one holds exactly is left out of the other, where a kind can tell: it would be the same
+    rows again, or rows that nothing keeps.
     """
-    held = not (first.is_free or second.is_free)
-    if held and isinstance(first, PoseConstraint) and isinstance(second, PoseConstraint):
-        first, second = _once(first, second)
+    if not (first.is_free or second.is_free):
+        first, second = first.apart_from(second)
     if first.is_free or second.is_free:
         return second if first.is_free else first
     return Both(first, second)
@@ -107,26 +104,6 @@ class Both(Constraint):
     def key(self) -> tuple:
         """Those of both."""
         return ("both", self.first.key, self.second.key)
-
-
-def _once(first: PoseConstraint, second: PoseConstraint) -> tuple[PoseConstraint, PoseConstraint]:
-    one, other = np.array(first.axes, bool), np.array(second.axes, bool)
-    exact = [
-        axes & (np.array(own.tolerance) == 0.0) for axes, own in ((one, first), (other, second))
-    ]
-    other[:3] &= ~(exact[0] & exact[1])[:3]
-    if not (exact[1] != other)[_ANGLES].any() and not (other & ~exact[0])[_ANGLES].any():
-        other[_ANGLES] = False
-    elif not (exact[0] != one)[_ANGLES].any() and not (one & ~exact[1])[_ANGLES].any():
-        one[_ANGLES] = False
-    return _holding(first, one), _holding(second, other)
-
-
-def _holding(constraint: PoseConstraint, held: np.ndarray) -> PoseConstraint:
-    tolerance = np.where(held, constraint.tolerance, 0.0)
-    return replace(
-        constraint, axes=tuple(held.astype(int).tolist()), tolerance=tuple(tolerance.tolist())
-    )
 
 
 def _write(

@@ -121,6 +121,15 @@ class Constraint:
         """The same constraint held at `pose`, for the kinds that have a reference."""
         return self
 
+    @property
+    def reference(self) -> Pose | None:
+        """The pose that it is held at, for the kinds that have one."""
+        return None
+
+    def apart_from(self, other: "Constraint") -> "tuple[Constraint, Constraint]":
+        """It and another without rows that both would hold, for the kinds that can tell."""
+        return self, other
+
     def loosened(self, least: Mapping[str, float]) -> "Constraint":
         """The same with every tolerance at least that of its row's unit: {"m": …, "rad": …}."""
         raise NotImplementedError

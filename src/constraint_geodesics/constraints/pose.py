@@ -122,6 +122,26 @@ class PoseConstraint(Constraint):
         """The same constraint held at `pose`."""
         return replace(self, reference=pose)
 
+    def apart_from(self, other: Constraint) -> tuple[Constraint, Constraint]:
+        """Positions that both hold exactly are the first's; so are angles, if either one's are all
+        exact and among the other's exact ones, the other's.
+        """
+        if not isinstance(other, PoseConstraint):
+            return self, other
+        first, second = np.array(self.axes, bool), np.array(other.axes, bool)
+        exact = first & (np.array(self.tolerance) == 0.0)
+        exact_too = second & (np.array(other.tolerance) == 0.0)
+        second[:3] &= ~(exact & exact_too)[:3]
+        if not (second & ~(exact & exact_too))[3:].any():
+            second[3:] = False
+        elif not (first & ~(exact & exact_too))[3:].any():
+            first[3:] = False
+        return self._holding(first), other._holding(second)
+
+    def _holding(self, held: np.ndarray) -> "PoseConstraint":
+        tolerance = np.where(held, self.tolerance, 0.0).tolist()
+        return replace(self, axes=tuple(held.astype(int).tolist()), tolerance=tuple(tolerance))
+
     def loosened(self, least: Mapping[str, float]) -> "PoseConstraint":
         """The same with every held axis loosened to the least of its unit."""
         wider = zip(self.axes, self.tolerance, self.units, strict=True)

@@ -28,6 +28,7 @@ from rerun.urdf import UrdfTree
 from constraint_geodesics import palette
 from constraint_geodesics.certification.certifier import Limits
 from constraint_geodesics.constraints.constraint import ConstraintManifold, Series
+from constraint_geodesics.recording.goal import GoalView, goal_drawings
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.urdf import urdf_name
@@ -99,6 +100,8 @@ class PathRecord:
     """What stands round the robot besides its workcell, where that has a name."""
     tolerance: float = Limits.violation_tolerance
     """What the judge grants a violation [rad or m]."""
+    goal: GoalView | None = None
+    """What was asked to reach, where it is more than the last configuration."""
     meshes: bool = True
     """Whether the file holds the meshes of robot and bodies, to be opened anywhere; without them it
     is a tenth as large and names the URDFs that `geodesics replay` adds them from.
@@ -175,6 +178,7 @@ def record_path(
     chunks = [
         *scene_chunks(robot, workcell, sampled, meshes=path.meshes),
         *tool_chunks(sampled, rgb(palette.planner_colour(path.planner))),
+        *(static(*drawing) for drawing in goal_drawings(robot, path.goal)),
         *_series_chunks(series, sampled),
         *joint_chunks(robot, sampled),
         *_latent_chunks(path.latent, sampled),
@@ -511,7 +515,10 @@ def _blueprint(path: PathRecord, sampled: Frames, series: Sequence[Series]) -> A
     shares = [2.5 if isinstance(panel, rrb.Spatial2DView) else 1.0 for panel in right]
     right.append(joint_panel())
     shares.append(1.8)  # its legend names every joint
-    return arranged(scene_panel(sampled), rrb.Vertical(*right, row_shares=shares), path_time())
+    more = () if path.goal is None else ("goal",)
+    return arranged(
+        scene_panel(sampled, *more), rrb.Vertical(*right, row_shares=shares), path_time()
+    )
 
 
 def path_time() -> Any:

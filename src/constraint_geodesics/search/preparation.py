@@ -46,7 +46,7 @@ class Query:
     """One query while it is planned.  goal: one configuration of it.  began: on
     `time.perf_counter`.  scales: the shares of the velocity and acceleration limits that are used.
     snapped_rad: how far the start was moved.  looked_at: the goal's configurations, the nearest
-    first.
+    first.  regions: of the goals that have one.
     """
 
     task: Task
@@ -58,6 +58,7 @@ class Query:
     scales: tuple[float, float] = (1.0, 1.0)
     snapped_rad: float = 0.0
     looked_at: Float[np.ndarray, "n D"] | None = None
+    regions: tuple[Constraint, ...] = ()
 
 
 class Preparation:
