@@ -55,7 +55,7 @@ dag: env  ## the pipeline as a graph, a node a stage
 smoke: env  ## the same pipeline on small parameters, in a copy of this checkout
 	python tests/pipeline/smoke.py .geodesics/smoke
 
-bench: env  ## all planners on all queries, and the studies (two hours; go on after an interruption by calling it again)
+bench: env  ## all planners on all queries, and the studies (three hours; go on after an interruption by calling it again)
 	geodesics params
 	python stages/draw_benchmark_queries.py
 	dvc repro stages/dvc.yaml

@@ -83,6 +83,11 @@ class Layout:
         return self.root / "data" / "benchmark_rows"
 
     @property
+    def arm_rows(self) -> Path:
+        """Folder of the rows of the study of arms and goals, a file a part (JSON)."""
+        return self.root / "data" / "arm_rows"
+
+    @property
     def benchmark_table(self) -> Path:
         """The benchmark's rows, all together (CSV)."""
         return self.root / "reports" / "benchmark.csv"

@@ -37,7 +37,7 @@ def run_stage(stage: Callable[..., None], arguments: Sequence[str]) -> None:
         with one_thread(), waiting(" ".join([name, *arguments])):
             stage(params, Layout(), *arguments)
         note_stage_time(Layout().stage_times, name, arguments, time.perf_counter() - began)
-    except (ValueError, OSError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError, MissingExtraError) as error:
         if os.environ.get("GEODESICS_TRACEBACK"):
             raise
         raise SystemExit(complain(error)) from None

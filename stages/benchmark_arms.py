@@ -1,0 +1,69 @@
+"""Stage: eight arms from their URDFs, tool poses as goals and single held angles; goes on where an
+earlier run of it stopped.
+"""
+
+import json
+import sys
+from dataclasses import replace
+
+from constraint_geodesics.benchmark.entries import code_digest, data_digest
+from constraint_geodesics.benchmark.queries import TABLE, read_queries
+from constraint_geodesics.benchmark.row import write_table
+from constraint_geodesics.benchmark.runner import fingerprint
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import machine, run_header
+from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.studies.arm_parts import (
+    SEED,
+    Part,
+    figures,
+    kept,
+    measure,
+    parts_of,
+    table_of,
+)
+from constraint_geodesics.studies.arms import robots_folder
+
+MEASURED_BY = "studies.arm_parts"
+"""The module that measures: every row depends on what it imports."""
+
+
+def main(params: Params, layout: Layout) -> None:
+    """Write data/arm_rows/ as the parts finish, then reports/arms.csv and arms.json."""
+    robots_folder()  # what is missing is said before anything is measured
+    parts = fingerprinted(params, layout)
+    left = [part for part in parts if kept(part) is None]
+    parallel_map(measure, left, params.compute, description="arms and goals")
+    rows = table_of([row for part in parts for row in kept(part) or ()])
+    reports = layout.root / "reports"
+    write_table(rows, reports / "arms.csv", run_header(layout.root))
+    (reports / "arms.json").write_text(json.dumps(figures(rows), indent=1) + "\n")
+
+
+def fingerprinted(params: Params, layout: Layout) -> list[Part]:
+    """All parts, each with a digest of what its rows depend on."""
+    queries = {
+        name: [q for q in read_queries(layout.benchmark_queries(name)) if q.scene == TABLE]
+        for name in params.constraints
+    }
+    shared = [
+        (layout.root / "requirements.lock").read_bytes(),
+        code_digest(MEASURED_BY),
+        data_digest(layout.planner),
+        machine(),
+        SEED,
+    ]
+    found = []
+    for part in parts_of(queries, layout.planner, layout.arm_rows):
+        asked = part.queries
+        if not isinstance(asked, int):
+            ends = [[q.number, *q.start.tolist(), *q.goal.tolist()] for q in asked]
+        own = [part.table, part.arm, part.constraint, asked if isinstance(asked, int) else ends]
+        found.append(replace(part, fingerprint=fingerprint(*shared, *own)))
+    return found
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])
