@@ -9,6 +9,8 @@ import pandas as pd
 
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.report.arms_page import TABLES
+from constraint_geodesics.studies.arm_parts import figures, table_of
 from constraint_geodesics.studies.execution import PLANNED, STRAIGHT
 from constraint_geodesics.studies.proposals import policy_figures, policy_table
 
@@ -62,6 +64,29 @@ def execution_figures() -> dict:
         PLANNED: figures,
         STRAIGHT: spilled,
     }
+
+
+def arm_rows() -> list[dict]:
+    """Two queries of each table of the study of arms; BiRRT is asked a third one, and one of a held
+    angle has no path.
+    """
+    named = {"arm": "UR5", "constraint": "level", "status": "solved", "length_rad": 2.0}
+    found = {"time_ms": 3.0, "best_known_rad": 1.6, "birrt_status": "", "given_status": ""}
+    rows = [
+        named | found | {"table": table, "query": query} for table in TABLES for query in range(3)
+    ]
+    of = {(own["table"], own["query"]): own for own in rows}
+    of["configurations", 2] |= {"birrt_status": "solved", "birrt_time_ms": 80.0}
+    nothing = {"length_rad": np.nan, "best_known_rad": np.nan, "time_ms": 900.0}
+    of["held_angle", 2] |= {"status": "not_connected"} | nothing
+    return rows
+
+
+def write_arm_report(layout: Layout) -> None:
+    """reports/arms.json of this layout."""
+    file = layout.root / "reports" / "arms.json"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(figures(table_of(arm_rows()))))
 
 
 def write_study_reports(params: Params, layout: Layout) -> None:

@@ -14,7 +14,7 @@ import pytest
 import torch
 from mlflow.utils.search_utils import SearchUtils
 from tests.report.pages import DASHBOARD, check_page
-from tests.report.study_fixtures import write_study_reports
+from tests.report.study_fixtures import write_arm_report, write_study_reports
 
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import (
@@ -37,6 +37,7 @@ from constraint_geodesics.learning.vae import JointVae
 from constraint_geodesics.palette import planner_colour
 from constraint_geodesics.params import load_params
 from constraint_geodesics.pipeline.layout import Layout, in_checkout
+from constraint_geodesics.report.arms_page import arm_tables
 from constraint_geodesics.report.cells import plus_minus, short
 from constraint_geodesics.report.figures import PLANNERS
 from constraint_geodesics.report.page import Recorded
@@ -296,6 +297,7 @@ def run(tmp_path_factory):
     write_csv(layout.report("benchmark_geometry", "quadrature", "csv"), QUADRATURE)
     write_csv(layout.report("benchmark_planners", "removed", "csv"), sampled_rows())
     write_study_reports(params, layout)
+    write_arm_report(layout)
     return params, layout
 
 
@@ -654,6 +656,13 @@ def test_the_geometry_table_says_what_its_metrics_say(run, written):
     assert rows[2] == ["curve lengths, batches of 4096", "50,000", "200", "250"]
     assert rows[5][0] == "environment steps, PPO included, retracted onto level_cup"
     assert rows[-1][:4] == ["plane", "1.250", "1.0030", "1.00000"]
+
+
+def test_the_page_has_the_tables_of_arms_and_goals(run, page):
+    text = (run[1].root / "reports" / "arms.md").read_text()
+    for own in arm_tables(run[1]):
+        assert f"<h3>{own.title}</h3>" in page
+        assert f"## {own.title}\n" in text
 
 
 def test_only_what_params_ask_for_was_searched():

@@ -11,6 +11,7 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.recording.png import save_png
 from constraint_geodesics.report import pipeline_tables, study_report
+from constraint_geodesics.report.arms_page import arm_tables, arms_markdown
 from constraint_geodesics.report.figures import PLANNERS
 from constraint_geodesics.report.page import Picture, write_page
 from constraint_geodesics.report.pipeline_figures import Drawn, draw_data_cards, draw_figures
@@ -51,6 +52,8 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
     (reports / "execution.md").write_text(executed)
     if "policies" in studies:
         (reports / "policies.md").write_text(study_report.policies_markdown(params, layout))
+    if "arms" in studies:
+        (reports / "arms.md").write_text(arms_markdown(layout))
     pictures, described = ([save_figure(layout, one) for one in own] for own in (drawn, cards))
     ablated = [picture for picture in pictures if picture.name == ABLATION]
     others = [picture for picture in pictures if picture.name != ABLATION]
@@ -79,6 +82,7 @@ def page_content(params: Params, layout: Layout, table: pd.DataFrame) -> dict[st
         ],
         "executed": [study_report.execution_block(params, layout)],
         "proposals": study_report.policy_blocks(params, layout) if "policies" in studies else [],
+        "arms": arm_tables(layout) if "arms" in studies else [],
         "results": pipeline_tables.result_tables(params, layout, table),
         "ablations": (
             pipeline_tables.ablation_tables(params, layout) if "ablations" in studies else []

@@ -156,6 +156,7 @@ def studies_at_hand(params: Params, layout: Layout) -> frozenset[str]:
             *(layout.report("ablate_manifold", name) for name in params.manifolds),
         ],
         "policies": [layout.report("benchmark_policies", manifold)],
+        "arms": [layout.root / "reports" / "arms.json"],
     }
     return frozenset(n for n, own in files.items() if all(file.is_file() for file in own))
 
