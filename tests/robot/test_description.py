@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from constraint_geodesics.robot.arm_file import write_arm
-from constraint_geodesics.robot.description import arm_to, read_description
+from constraint_geodesics.robot.description import arm_to, find_mesh, read_description
 from constraint_geodesics.robot.kinematics import RobotError, load_robot, rotation_from_rpy
 from constraint_geodesics.scene.urdf import data_path
 from constraint_geodesics.scene.world import World
@@ -47,6 +47,8 @@ ARM = """<robot name="arm">
 </robot>
 """
 TURN_LIMIT = '<limit lower="-2" upper="2" velocity="1" effort="1"/>'
+LIFT_LIMIT = '<limit lower="0.1" upper="0.5" velocity="1" effort="1"/>'
+FOLLOW = '<mimic joint="grip" multiplier="0.5" offset="0.01"/>'
 EXTRA = '<joint name="{}" type="fixed"><parent link="{}"/><child link="{}"/></joint></robot>'
 
 
@@ -93,14 +95,8 @@ FAULTS = {
     "axis not finite": ('<axis xyz="0 0 1"/>', '<axis xyz="0 nan 1"/>', "nan", "three numbers"),
     "origin of words": ('xyz="0 0 0.2"', 'xyz="here"', "'here'", "three numbers"),
     "origin infinite": ('rpy="0.3 0 0"', 'rpy="inf 0 0"', "inf", "three numbers"),
-    "no limits": (TURN_LIMIT, "", "'turn' has no lower", "continuous"),
-    "no upper": (TURN_LIMIT, '<limit lower="-2" velocity="1"/>', "upper", "continuous"),
-    "crossed limits": (TURN_LIMIT, '<limit lower="2" upper="-2"/>', "2 and -2", "swap"),
-    "equal limits": (TURN_LIMIT, '<limit lower="0" upper="0"/>', "0 and 0", "fixed"),
     "limits of words": (TURN_LIMIT, '<limit lower="low" upper="2"/>', "'low'", "number"),
     "limits not finite": (TURN_LIMIT, '<limit lower="-inf" upper="2"/>', "'-inf'", "number"),
-    "velocity 0": (TURN_LIMIT, TURN_LIMIT.replace('ty="1"', 'ty="0"'), "velocity 0", "top speed"),
-    "velocity below 0": (TURN_LIMIT, TURN_LIMIT.replace('ty="1"', 'ty="-1"'), "-1", "top speed"),
     "velocity NaN": (TURN_LIMIT, TURN_LIMIT.replace('ty="1"', 'ty="nan"'), "nan", "number"),
     "follows nobody": ('<mimic joint="grip"', '<mimic joint="grap"', "'grap'", "remove"),
     "follows itself": ('<mimic joint="grip"', '<mimic joint="follow"', "'follow'", "remove"),
@@ -122,15 +118,60 @@ FAULTS = {
 }
 
 
+UNFIT = {
+    "no limits": (TURN_LIMIT, "", "'turn' has no lower", "continuous"),
+    "no upper": (TURN_LIMIT, '<limit lower="-2" velocity="1"/>', "upper", "continuous"),
+    "crossed limits": (TURN_LIMIT, '<limit lower="2" upper="-2"/>', "2 and -2", "swap"),
+    "equal limits": (TURN_LIMIT, '<limit lower="0" upper="0"/>', "0 and 0", "fixed"),
+    "velocity 0": (TURN_LIMIT, TURN_LIMIT.replace('ty="1"', 'ty="0"'), "velocity 0", "top speed"),
+    "velocity below 0": (TURN_LIMIT, TURN_LIMIT.replace('ty="1"', 'ty="-1"'), "-1", "top speed"),
+    "lift without limits": (LIFT_LIMIT, "", "'lift' has no lower", "or hold it"),
+    "lift without bounds": (LIFT_LIMIT, '<limit lower="-1e16" upper="1e16"/>', "1e+16", "true"),
+    "floating": ('type="revolute"', 'type="floating"', "'turn'", "make it fixed"),
+    "planar": ('type="revolute"', 'type="planar"', "'turn'", "make it fixed"),
+    "follows the arm": (
+        FOLLOW,
+        '<mimic joint="turn" offset="0.5"/>',
+        "'follow' follows 'turn'",
+        "--hold follow=0.5",
+    ),
+    "follows the arm in the end": (
+        '<axis xyz="0 1 0"/>\n    <limit lower="0" upper',
+        '<axis xyz="0 1 0"/><mimic joint="roll"/><limit lower="0" upper',
+        "'grip' follows 'roll'",
+        "--hold grip=0",
+    ),
+}
+"""Faults of joints on the chain to the hand, or of those that follow them."""
+
+
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_is_one_line_with_file_element_and_mend(name: str, tmp_path: Path) -> None:
-    before, after, element, mend = FAULTS[name]
-    assert before in ARM
-    file = tmp_path / "arm.urdf"
-    file.write_text(ARM.replace(before, after))
+    file, element, mend = broken(FAULTS[name], tmp_path)
     with pytest.raises(RobotError) as caught:
         read_description(file)
-    line = str(caught.value)
+    check_line(str(caught.value), file, element, mend)
+
+
+@pytest.mark.parametrize("name", UNFIT)
+def test_a_joint_that_can_not_move_is_one_line_where_it_is_to(name: str, tmp_path: Path) -> None:
+    file, element, mend = broken(UNFIT[name], tmp_path)
+    description = read_description(file)
+    with pytest.raises(RobotError) as caught:
+        arm_to(description, "hand")
+    check_line(str(caught.value), file, element, mend)
+
+
+def broken(fault: tuple[str, str, str, str], folder: Path) -> tuple[Path, str, str]:
+    """A file with a fault, and what is to be said of it."""
+    before, after, element, mend = fault
+    assert before in ARM
+    file = folder / "arm.urdf"
+    file.write_text(ARM.replace(before, after))
+    return file, element, mend
+
+
+def check_line(line: str, file: Path, element: str, mend: str) -> None:
     assert "\n" not in line
     assert line.startswith(f"{file}: ")
     assert element in line
@@ -163,7 +204,8 @@ def arm_file(tmp_path: Path) -> Path:
         ("right", {}, "follows 'grip'"),
         ("hand", {"nose": 0.0}, "turn, lift, roll, grip, follow"),
         ("hand", {"lift": 0.0}, "0.1 to 0.5 m"),
-        ("hand", {"turn": float("nan")}, "nan"),
+        ("hand", {"turn": float("nan")}, "nan: give a finite number"),
+        ("hand", {"roll": float("inf")}, "inf: give a finite number"),
         ("hand", {"turn": 0.0, "lift": 0.2, "roll": 0.0}, "no joint that moves"),
     ],
 )
@@ -181,6 +223,75 @@ def test_joints_beside_the_chain_rest_or_follow(arm_file: Path) -> None:
     assert [joint.name for joint in arm.moved] == ["lift", "roll"]
     assert arm.held == pytest.approx({"turn": 0.5, "grip": 0.03, "follow": 0.025})
     assert arm_to(description, "upper").held["lift"] == 0.1  # 0 is beyond its limits
+
+
+GRIP_LIMIT = '<limit lower="0" upper="0.04" velocity="1" effort="1"/>'
+
+
+@pytest.mark.parametrize(
+    "limit",
+    ["", '<limit velocity="0"/>', '<limit lower="0" upper="0"/>', '<limit lower="1" upper="-1"/>'],
+)
+def test_limits_of_joints_that_stand_still_are_not_asked_for(limit: str, tmp_path: Path) -> None:
+    file = tmp_path / "arm.urdf"
+    still = ARM.replace(GRIP_LIMIT, limit).replace(TURN_LIMIT, limit)
+    assert still.count(limit) >= 3
+    file.write_text(still)
+    description = read_description(file)
+    arm = arm_to(description, "hand", {"turn": 0.0})
+    assert arm.held == {"turn": 0.0, "grip": 0.0, "follow": 0.01}
+    assert load_robot(*write_arm(arm, tmp_path)).joint_names == ("lift", "roll")
+    with pytest.raises(RobotError, match="'turn'"):
+        arm_to(description, "hand")
+
+
+def test_what_follows_a_joint_of_the_arm_may_be_held_on_purpose(tmp_path: Path) -> None:
+    file = tmp_path / "arm.urdf"
+    file.write_text(ARM.replace('<mimic joint="grip"', '<mimic joint="turn"'))
+    description = read_description(file)
+    assert arm_to(description, "hand", {"follow": 0.02}).held["follow"] == 0.02
+    assert arm_to(description, "hand", {"turn": 0.04}).held["follow"] == pytest.approx(0.03)
+
+
+def test_limits_that_are_none_mean_once_either_way(tmp_path: Path) -> None:
+    file = tmp_path / "arm.urdf"
+    wide = '<limit lower="-1e16" upper="1e16" velocity="1"/>'
+    file.write_text(ARM.replace(TURN_LIMIT, wide))
+    arm = arm_to(read_description(file), "hand")
+    robot = load_robot(*write_arm(arm, tmp_path))
+    np.testing.assert_allclose([robot.lower[0], robot.upper[0]], [-2.0 * np.pi, 2.0 * np.pi])
+
+
+def test_meshes_are_beside_the_urdf_above_it_or_where_ros_keeps_them(tmp_path, monkeypatch) -> None:
+    urdf, current = tmp_path / "robots" / "arm" / "arm.urdf", tmp_path / "current"
+    places = {
+        "beside": urdf.parent / "pack" / "a.stl",
+        "above": tmp_path / "robots" / "pack" / "a.stl",
+        "ros": tmp_path / "ros" / "pack" / "a.stl",
+        "itself": tmp_path / "own" / "pack" / "a.stl",
+        "ament": tmp_path / "ament" / "share" / "pack" / "a.stl",
+        "current": current / "pack" / "a.stl",
+    }
+    for place in places.values():
+        place.parent.mkdir(parents=True)
+        place.touch()
+    monkeypatch.chdir(current)
+    for name, folders in (
+        ("ROS_PACKAGE_PATH", [".", "", tmp_path / "ros", tmp_path / "own" / "pack"]),
+        ("AMENT_PREFIX_PATH", [tmp_path / "ament"]),
+    ):
+        monkeypatch.setenv(name, ":".join(map(str, folders)))
+    for name in ("beside", "above"):
+        for address in ("pack/a.stl", "package://pack/a.stl"):
+            assert find_mesh(address, urdf) == places[name]
+        places[name].unlink()
+    assert find_mesh("pack/a.stl", urdf) is None
+    for name in ("ros", "itself", "ament"):
+        assert find_mesh("package://pack/a.stl", urdf) == places[name]
+        places[name].unlink()
+    assert find_mesh("package://pack/a.stl", urdf) is None
+    assert find_mesh(f"file://{places['current']}", urdf) == places["current"]
+    assert find_mesh(str(places["current"]), urdf) == places["current"]
 
 
 def test_an_arm_written_alone_is_the_same_arm(arm_file: Path, tmp_path: Path) -> None:

@@ -12,11 +12,23 @@ from constraint_geodesics.robot.kernels import (
     poses_of,
     sine_cosine,
 )
-from constraint_geodesics.robot.kinematics import RobotError, load_robot, rotation_from_rpy
+from constraint_geodesics.robot.kinematics import (
+    RobotError,
+    load_robot,
+    rotation_about,
+    rotation_from_rpy,
+)
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.urdf import data_path
 
 ROBOTS = ["scene", "kuka_scene"]
+
+
+@pytest.mark.parametrize("place", range(3))
+def test_a_rotation_about_an_axis_is_that_of_its_angle(place: int) -> None:
+    rpy = 0.7 * np.eye(3)[place]
+    wanted = rotation_from_rpy(rpy)
+    np.testing.assert_allclose(rotation_about(3.0 * rpy, 0.7), wanted, atol=1e-15)
 
 
 @pytest.mark.parametrize("name", ROBOTS)

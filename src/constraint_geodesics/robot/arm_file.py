@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.robot.description import Arm, Joint, find_mesh
-from constraint_geodesics.robot.kinematics import origin_of, rpy_of
+from constraint_geodesics.robot.kinematics import origin_of, rotation_about, rpy_of
 
 TOOL = "tool"
 """The link of a tool's own frame, with as many underscores as make it a new name."""
@@ -51,7 +51,9 @@ def digest_of(content: bytes) -> str:
 def write_file(file: Path, text: str) -> None:
     """Write a file at once, whoever else writes the same."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", dir=file.parent, suffix=".part", delete=False) as part:
+    with tempfile.NamedTemporaryFile(
+        "w", encoding="utf-8", dir=file.parent, suffix=".part", delete=False
+    ) as part:
         part.write(text)
     Path(part.name).replace(file)
 
@@ -124,14 +126,11 @@ def _motion(element: ElementTree.Element, kind: str, value: float) -> Float[np.n
     entry = element.find("axis")
     text = "1 0 0" if entry is None else entry.get("xyz", "1 0 0")
     axis = np.array([float(word) for word in text.split()])
-    axis /= np.linalg.norm(axis)
     pose = np.eye(4)
     if kind == "prismatic":
-        pose[:3, 3] = value * axis
-        return pose
-    x, y, z = axis
-    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    pose[:3, :3] += math.sin(value) * across + (1.0 - math.cos(value)) * across @ across
+        pose[:3, 3] = value * axis / np.linalg.norm(axis)
+    else:
+        pose[:3, :3] = rotation_about(axis, value)
     return pose
 
 

@@ -6,6 +6,7 @@ names the file, the element and the mend.
 """
 
 import math
+import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -18,7 +19,10 @@ from constraint_geodesics.robot.kinematics import RobotError
 MOVABLE = ("revolute", "continuous", "prismatic")
 _KINDS = (*MOVABLE, "fixed", "floating", "planar")
 _XACRO = "xacro"
+_PACKAGE = "package://"
 _SHORTEST_AXIS = 1e-9
+_WIDEST = 1000.0
+"""Limits further apart [rad or m] stand for none."""
 
 
 class Mimic(NamedTuple):
@@ -35,8 +39,9 @@ class Mimic(NamedTuple):
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint of a URDF.  lower, upper [rad or m], infinite for a continuous one; velocity [1/s],
-    infinite where none is given.
+    """A joint of a URDF.  lower, upper [rad or m], infinite for a continuous one and where there
+    are none; velocity [1/s], infinite where none is given.  fault: the line that says why it can't
+    move, which is none where it is not to; "" for one that can.
     """
 
     name: str
@@ -47,6 +52,7 @@ class Joint:
     upper: float = math.inf
     velocity: float = math.inf
     mimic: Mimic | None = None
+    fault: str = ""
 
     @property
     def is_movable(self) -> bool:
@@ -185,9 +191,21 @@ class _Reader:
         if kind not in MOVABLE:
             return Joint(name, kind, parent, child)
         self._check_axis(element.find("axis"), where)
-        limits = self._limits(element.find("limit"), where, kind)
-        mimic = self._mimic(element.find("mimic"), where)
-        return Joint(name, kind, parent, child, *limits, mimic)
+        limit, mimic = element.find("limit"), self._mimic(element.find("mimic"), where)
+        given = {} if limit is None else dict(limit.attrib)
+        lower, upper, speed = (
+            self._number(given, name, where) for name in ("lower", "upper", "velocity")
+        )
+        fault = self._unfit(kind, lower, upper, speed)
+        line = str(self.fault(where, *fault)) if fault else ""
+        lower = -math.inf if lower is None else lower
+        upper = math.inf if upper is None else upper
+        if kind == "revolute" and upper - lower > _WIDEST and not fault:
+            kind = "continuous"
+        if kind == "continuous" or lower > upper:
+            lower, upper = -math.inf, math.inf
+        speed = math.inf if speed is None else speed
+        return Joint(name, kind, parent, child, lower, upper, speed, mimic, line)
 
     def _end(self, joint: ElementTree.Element, end: str) -> str:
         element = joint.find(end)
@@ -202,29 +220,31 @@ class _Reader:
         if numbers and math.hypot(*numbers[0]) < _SHORTEST_AXIS:
             raise self.fault(where, "has an axis of length 0", 'give a direction, as xyz="0 0 1"')
 
-    def _limits(
-        self, limit: ElementTree.Element | None, where: str, kind: str
-    ) -> tuple[float, float, float]:
-        given = {} if limit is None else dict(limit.attrib)
-        values = {name: self._number(given, name, where) for name in ("lower", "upper", "velocity")}
-        speed = values["velocity"]
+    def _unfit(
+        self, kind: str, lower: float | None, upper: float | None, speed: float | None
+    ) -> tuple[str, str] | None:
+        """What keeps a joint from moving, and the mend."""
         if speed is not None and speed <= 0.0:
-            mend = "give the joint's top speed, or leave it out"
-            raise self.fault(where, f"has velocity {given['velocity']}", mend)
-        fastest = math.inf if speed is None else speed
+            return (
+                f"has velocity {speed:g}",
+                'give its top speed, as <limit velocity="1">, or hold it',
+            )
         if kind == "continuous":
-            return -math.inf, math.inf, fastest
-        lower, upper = values["lower"], values["upper"]
+            return None
         for name, value in (("lower", lower), ("upper", upper)):
             if value is None:
-                mend = f'give <limit {name}="…">, or make the joint continuous'
-                raise self.fault(where, f"has no {name} limit", mend)
+                other = ", or make the joint continuous" if kind == "revolute" else ", or hold it"
+                return f"has no {name} limit", f'give <limit {name}="…">{other}'
         assert lower is not None
         assert upper is not None
-        if not lower < upper:
-            mend = "swap them, or make the joint fixed"
-            raise self.fault(where, f"has limits {lower:g} and {upper:g}", mend)
-        return lower, upper, fastest
+        what = f"has limits {lower:g} and {upper:g}"
+        if lower == upper:
+            return what, "make the joint fixed, or hold it"
+        if lower > upper:
+            return what, "swap them, or hold it"
+        if kind == "prismatic" and upper - lower > _WIDEST:
+            return what, "give its true limits, or hold it"
+        return None
 
     def _mimic(self, mimic: ElementTree.Element | None, where: str) -> Mimic | None:
         if mimic is None:
@@ -290,7 +310,9 @@ class _Reader:
                 raise self.fault(where, "has a mesh with scale 0", "give its true scale")
             name = shape.get("filename", "")
             if find_mesh(name, self.urdf) is None:
-                mend = "put it beside the URDF, or for package:// in a folder above it"
+                mend = "put it beside the URDF or in a folder above it"
+                if name.startswith(_PACKAGE):
+                    mend += ", or name the folder that holds the package in ROS_PACKAGE_PATH"
                 raise self.fault(where, f"names the mesh {name!r}, which is not there", mend)
 
     def _numbers(
@@ -324,14 +346,31 @@ class _Reader:
 
 
 def find_mesh(name: str, urdf: Path) -> Path | None:
-    """The file of a mesh as a URDF names it: beside it, or in a folder above it, where package://
-    addresses are looked for; None where there is none.
+    """The file of a mesh as a URDF names it: in the URDF's folder, or in one above it, where
+    PyBullet looks as well; then of package:// addresses where ROS keeps packages.  None where there
+    is none.
     """
-    plain = name.removeprefix("package://").removeprefix("file://")
+    plain = name.removeprefix(_PACKAGE).removeprefix("file://")
     if not plain:
         return None
-    places = (folder / plain for folder in (Path(), *urdf.resolve().parents))
-    return next((place for place in places if place.is_file()), None)
+    folders = [urdf.absolute().parent, *urdf.resolve().parents]
+    if name.startswith(_PACKAGE):
+        folders += _package_folders(plain.split("/")[0])
+    return next((folder / plain for folder in folders if (folder / plain).is_file()), None)
+
+
+def _package_folders(package: str) -> Iterator[Path]:
+    """Folders that may hold a package of ROS: those of ROS_PACKAGE_PATH, which may also name the
+    package itself, then those that ROS 2 installs to.
+    """
+    for name, below in (("ROS_PACKAGE_PATH", ""), ("AMENT_PREFIX_PATH", "share")):
+        for entry in os.environ.get(name, "").split(os.pathsep):
+            folder = Path(entry)
+            if not folder.is_absolute():  # the current folder is none of them
+                continue
+            yield folder / below
+            if folder.name == package:
+                yield folder.parent
 
 
 @dataclass(frozen=True)
@@ -366,8 +405,9 @@ def arm_to(
     """The arm from the root to a link.  held: values of joints that are not to move [rad or m]; all
     others beside the chain rest at 0, or where their limits are nearest to it, or follow.
 
-    Raises RobotError for a link or joint that is not there, a value beyond its limits, and a chain
-    without a joint, or with one that follows another.
+    Raises RobotError for a link or joint that is not there, a value beyond its limits, a chain
+    without a joint, or with one that can't move or follows another, and for a joint that follows
+    one of the chain.
     """
     file, wanted = description.file, dict(held or {})
     if tool_link not in description.links:
@@ -378,21 +418,46 @@ def arm_to(
         if joint is None or not joint.is_movable:
             movable = ", ".join(joint.name for joint in description.joints if joint.is_movable)
             raise RobotError(f"{file}: {name!r} can't be held: the joints that move are {movable}")
+        if not math.isfinite(value):
+            raise RobotError(f"{file}: {name} can't be held at {value}: give a finite number")
         if not joint.lower <= value <= joint.upper:
             raise RobotError(f"{file}: {name} can't be held at {value:g}: {joint.range}")
     chain = [joint for joint in description.moving(tool_link) if joint.name not in wanted]
     values = _resting(description, wanted)
+    for joint in description.path(tool_link):
+        if not joint.is_movable and joint.kind != "fixed":
+            raise RobotError(
+                f"{file}: joint {joint.name!r} leads to {tool_link!r} and is {joint.kind}: make it "
+                "fixed in the URDF"
+            )
     for joint in chain:
         if joint.mimic is not None:
             raise RobotError(
                 f"{file}: joint {joint.name!r} leads to {tool_link!r} and follows "
                 f"{joint.mimic.joint!r}: hold it, or choose a tool link before it"
             )
+        if joint.fault:
+            raise RobotError(joint.fault)
     if not chain:
         raise RobotError(f"{file}: no joint that moves leads to {tool_link!r}: choose another link")
     names = {joint.name for joint in chain}
+    for joint in description.joints:
+        leader = _leader(description, joint, wanted)
+        if leader.name in names and joint is not leader:
+            raise RobotError(
+                f"{file}: joint {joint.name!r} follows {leader.name!r}, which moves on the way to "
+                f"{tool_link!r}: if it may stand still, hold it, as --hold "
+                f"{joint.name}={values[joint.name]:g}"
+            )
     still = {name: value for name, value in values.items() if name not in names}
     return Arm(description, tool_link, tuple(chain), still)
+
+
+def _leader(description: Description, joint: Joint, wanted: Mapping[str, float]) -> Joint:
+    """The joint that one follows in the end; itself where it follows none, or is held."""
+    while joint.mimic is not None and joint.name not in wanted:
+        joint = description.by_name[joint.mimic.joint]
+    return joint
 
 
 def _resting(description: Description, wanted: Mapping[str, float]) -> dict[str, float]:

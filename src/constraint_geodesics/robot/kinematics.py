@@ -186,6 +186,13 @@ def rotation_from_rpy(rpy: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     )
 
 
+def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation about an axis of any length but 0, by an angle [rad]."""
+    x, y, z = axis / np.linalg.norm(axis)
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * across + (1.0 - math.cos(angle)) * across @ across
+
+
 def rpy_of(rotation: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
     """Roll, pitch, yaw [rad] that `rotation_from_rpy` makes a rotation from."""
     level = math.hypot(rotation[0, 0], rotation[1, 0])
