@@ -48,10 +48,15 @@ def test_chain_held_joints_and_pairs_are_told(robot) -> None:
     assert reasons["panda_link7", "panda_hand"] == "rigid"
     assert ("panda_link5", "panda_hand") not in reasons
     assert about["missing"] == []
+    assert about["pairs_looked_at"] == 55 - len(about["may_touch"])
+    assert 0.7 < about["free_share"] < 0.9
+    assert about["touch_often"] == []
     code, out, _ = robot(*words)
     assert code == 0
     assert "panda_joint7: revolute" in out
     assert "may touch, rigid: panda_link7 with panda_hand" in out
+    share = f"{100.0 * about['free_share']:.3g}"
+    assert f"free of self-collision: {share} % of 2,000 sampled configurations" in out
 
 
 def test_an_srdf_says_which_links_may_touch(robot, tmp_path: Path) -> None:
@@ -64,7 +69,14 @@ def test_an_srdf_says_which_links_may_touch(robot, tmp_path: Path) -> None:
     code, out, _ = robot(*words, "--json")
     assert code == 0
     pairs = [{"links": ["panda_link0", "panda_link2"], "reason": "Never"}]
-    assert strict(out)["may_touch"] == pairs
+    about = strict(out)
+    assert about["may_touch"] == pairs
+    # of 55 pairs 10 hang on each other, but for the fingers beside the hand; the SRDF has one more
+    assert about["pairs_looked_at"] == 55 - 9 - 1
+    # the last link and the hand behind it, which no SRDF allows here, are within each other
+    assert about["free_share"] == 0.0
+    assert {"links": ["panda_link7", "panda_hand"], "share": 1.0} in about["touch_often"]
+    assert "look at: panda_link7 with panda_hand touch at 100 %" in robot(*words)[1]
     srdf.write_text(srdf.read_text().replace("panda_link2", "link2"))
     code, out, err = robot(*words)
     assert (code, out) == (2, "")
@@ -86,6 +98,7 @@ def test_what_is_missing_comes_with_its_mend(robot, tmp_path: Path) -> None:
     file.write_text(ARM.replace('<box size="0.1 0.1 1"/>', '<box size="0 1 1"/>'))
     (line,) = strict(robot(str(file), "--tool-link", "hand", "--json")[1])["missing"]
     assert "box" in line
+    assert str(file) in line
 
 
 @pytest.mark.parametrize(
@@ -96,6 +109,8 @@ def test_what_is_missing_comes_with_its_mend(robot, tmp_path: Path) -> None:
         ((str(PANDA), "--tool-link", "hand"), "there is no link 'hand'"),
         ((str(PANDA), "--tool-link", "panda_hand", "--hold", "x"), "--hold 'x'"),
         ((str(PANDA), "--tool-link", "panda_hand", "--hold", "x=1"), "'x' can't be held"),
+        ((str(PANDA), "--tool-link", "panda_hand", "--hold", "panda_joint1=nan"), "a number"),
+        ((str(PANDA), "--tool-link", "panda_hand", "--hold", "panda_joint1=inf"), "a number"),
     ],
 )
 def test_wrong_usage_is_one_line(robot, words: tuple[str, ...], said: str) -> None:

@@ -122,6 +122,22 @@ def test_what_the_proof_leaves_open_is_refused(monkeypatch) -> None:
         assert certifier.certify(upright, free).valid
 
 
+def test_pairs_that_may_touch_are_asked_for_in_one_line(tmp_path) -> None:
+    words = ["geodesics", "robot", str(ROBOT), "--tool-link", "tool"]
+    program = COMMAND.replace("sys.argv", 'import os; os.environ["XDG_CACHE_HOME"] = "."; sys.argv')
+    done = run(program.format(words=words), tmp_path)
+    assert done.returncode == 0, done.stderr
+    (line,) = [own for own in done.stdout.splitlines() if "PyBullet" in own]
+    assert line.startswith(f"missing: {ROBOT}: ")
+    assert line.endswith("name an SRDF (--srdf), or use Python 3.11")
+    srdf = tmp_path / "arm.srdf"
+    srdf.write_text("<robot/>")
+    done = run(program.format(words=[*words, "--srdf", str(srdf)]), tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "missing" not in done.stdout
+    assert "looked at for collisions" in done.stdout
+
+
 def test_the_arm_that_comes_with_pybullet_is_asked_for_in_one_line(tmp_path) -> None:
     ends = ("--start=0 0 -1 0 0 0", "--goal=0 0 -1 0 0 0", "--constraint=free")
     done = run(COMMAND.format(words=["geodesics", "plan", *ends]), tmp_path)

@@ -384,8 +384,11 @@ def _joints(text: str, option: str) -> list[float]:
 def _held(text: str) -> tuple[str, float]:
     from constraint_geodesics.robot.kinematics import RobotError
 
-    name, _, value = text.partition("=")
+    name, _, text_of = text.partition("=")
     try:
-        return name.strip(), float(value)
+        value = float(text_of)
     except ValueError:
-        raise RobotError(f"--hold {text!r}: must be a joint and a number, joint=value") from None
+        value = math.nan
+    if not math.isfinite(value):
+        raise RobotError(f"--hold {text!r}: must be a joint and a number, joint=value")
+    return name.strip(), value

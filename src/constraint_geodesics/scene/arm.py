@@ -7,6 +7,8 @@ cache under a name that tells its content.
 
 import json
 import tempfile
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -17,29 +19,41 @@ from platformdirs import user_cache_path
 from constraint_geodesics.params import RobotParams
 from constraint_geodesics.robot.arm_file import digest_of, write_arm, write_file
 from constraint_geodesics.robot.description import Arm, arm_to, read_description
-from constraint_geodesics.robot.kinematics import SerialRobot, load_robot, rotation_from_rpy
+from constraint_geodesics.robot.kinematics import (
+    RobotError,
+    SerialRobot,
+    load_robot,
+    rotation_from_rpy,
+)
+from constraint_geodesics.scene import allowed_collisions
 from constraint_geodesics.scene.allowed_collisions import (
-    SAMPLES,
     AllowedPair,
+    OftenTouching,
+    Sampled,
     allowed_by_sampling,
     allowed_by_srdf,
 )
 from constraint_geodesics.scene.collada import as_obj
-from constraint_geodesics.scene.urdf import find_urdf
+from constraint_geodesics.scene.pieces import is_binary_stl, read_pieces, stl_as_obj
+from constraint_geodesics.scene.urdf import find_urdf, has_pybullet
 
 ADJACENT, FOUND = "adjacent", "found"
 """What `RobotParams.may_touch` says where it names no SRDF."""
+_AS_OBJ: Mapping[str, Callable[[Path], str]] = {".dae": as_obj, ".stl": stl_as_obj}
+_FORMAT = "2"
+"""Of the files in the cache; another one where they are made in another way."""
 
 
 @dataclass(frozen=True)
 class LoadedArm:
-    """What was understood of a URDF, the robot that it became, and pairs of its links that may
-    touch.
+    """What was understood of a URDF, the robot that it became, pairs of its links that may touch,
+    and what sampling showed of the others, where that found them.
     """
 
     arm: Arm
     robot: SerialRobot
     allowed: tuple[AllowedPair, ...]
+    sampled: Sampled | None
 
 
 def load_arm(params: RobotParams) -> LoadedArm:
@@ -52,10 +66,14 @@ def load_arm(params: RobotParams) -> LoadedArm:
         tool[:3, 3] = params.tool.position_m
     file, link = write_arm(arm, folder, tool, _readable)
     robot = load_robot(file, link, params.limits_rad)
-    allowed = _allowed(params.may_touch, arm, robot)
+    try:
+        read_pieces(file)  # before PyBullet, which has no word for some faults of meshes
+        allowed, sampled = _allowed(params.may_touch, arm, robot)
+    except RobotError as error:  # the user knows the file that the arm was made of
+        raise RobotError(str(error).replace(str(file), str(arm.description.file))) from None
     pairs = frozenset((first, second) for first, second, _ in allowed)
     continuous = frozenset(joint.name for joint in arm.moved if joint.kind == "continuous")
-    return LoadedArm(arm, replace(robot, allowed=pairs, continuous=continuous), allowed)
+    return LoadedArm(arm, replace(robot, allowed=pairs, continuous=continuous), allowed, sampled)
 
 
 @cache
@@ -63,7 +81,7 @@ def arms_folder() -> Path:
     """Where arms' files are kept: the user's cache, or where that can't be written a folder of this
     process's.
     """
-    folder = user_cache_path("constraint_geodesics") / "arms"
+    folder = user_cache_path("constraint_geodesics") / "arms" / _FORMAT
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -72,25 +90,44 @@ def arms_folder() -> Path:
         return Path(tempfile.mkdtemp(prefix="arms-"))
 
 
-def _allowed(may_touch: str, arm: Arm, robot: SerialRobot) -> tuple[AllowedPair, ...]:
+def _allowed(
+    may_touch: str, arm: Arm, robot: SerialRobot
+) -> tuple[tuple[AllowedPair, ...], Sampled | None]:
     if may_touch == ADJACENT:
-        return ()
+        return (), None
     if may_touch != FOUND:
-        return allowed_by_srdf(Path(may_touch), arm.description)
-    limits = digest_of(np.stack([robot.lower, robot.upper]).tobytes())
-    known = robot.urdf.with_name(f"{robot.urdf.stem}-{limits}-{SAMPLES}.json")
-    if known.is_file():
-        return tuple(AllowedPair(*pair) for pair in json.loads(known.read_text()))
-    found = allowed_by_sampling(robot)
-    write_file(known, json.dumps(found))
-    return found
+        return allowed_by_srdf(Path(may_touch), arm.description), None
+    kept = robot.urdf.with_name(f"{robot.urdf.stem}-{_sampled_digest(robot)}.json")
+    if kept.is_file():
+        pairs, often, free = json.loads(kept.read_text(encoding="utf-8"))
+        found = tuple(AllowedPair(*pair) for pair in pairs)
+        return found, Sampled(tuple(OftenTouching(*own) for own in often), free)
+    if not has_pybullet():
+        raise RobotError(
+            f"{robot.urdf}: the links that may touch are found with PyBullet, which is not "
+            "installed: name an SRDF (--srdf), or use Python 3.11"
+        )
+    found, sampled = allowed_by_sampling(robot)
+    write_file(kept, json.dumps([found, *sampled]))
+    return found, sampled
+
+
+def _sampled_digest(robot: SerialRobot) -> str:
+    """Of all that sampling depends on, beside the URDF."""
+    own = allowed_collisions
+    meshes = ElementTree.parse(robot.urdf).iterfind("link/collision/geometry/mesh")
+    files = dict.fromkeys(mesh.get("filename", "") for mesh in meshes)
+    settings = (own.SAMPLES, own.ALWAYS, own.NEAR_M, own.OFTEN)
+    parts = [np.stack([robot.lower, robot.upper]).tobytes().hex(), repr(settings)]
+    return digest_of(" ".join([*parts, *(digest_of(Path(f).read_bytes()) for f in files)]).encode())
 
 
 def _readable(mesh: Path) -> Path:
-    """A mesh as OBJ or STL, which all readers take alike."""
-    if mesh.suffix.lower() != ".dae":
+    """A mesh as OBJ or binary STL, which all readers take alike."""
+    kind = mesh.suffix.lower()
+    if kind not in _AS_OBJ or (kind == ".stl" and is_binary_stl(mesh)):
         return mesh
     written = arms_folder() / f"{mesh.stem}-{digest_of(mesh.read_bytes())}.obj"
     if not written.is_file():
-        write_file(written, as_obj(mesh))
+        write_file(written, _AS_OBJ[kind](mesh))
     return written

@@ -1,27 +1,27 @@
 """Collision meshes in Collada's format, written as OBJ: PyBullet reads Collada, but a file that is
 none ends the process.
 
-Positions alone are read, of triangles, polygons and their lists, where the scene places them, in
-metres and with z up, as PyBullet takes them.
+Positions alone are read, of triangles, strips and fans of them, polygons and their lists, where the
+scene places them, in metres and with z up, as PyBullet takes them.  Lines have no faces; what else
+might have some and can't be read is a fault.
 """
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.robot.kinematics import RobotError
+from constraint_geodesics.robot.kinematics import RobotError, rotation_about
 
 _UPRIGHT = {
     "Z_UP": np.eye(3),
     "Y_UP": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
     "X_UP": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
 }
+_LINES = ("lines", "linestrips")
 Element = ElementTree.Element
-Parts = list[tuple[Float[np.ndarray, "n 3"], list[list[int]]]]
-"""Corners and faces of each geometry."""
 
 
 def as_obj(mesh: Path) -> str:
@@ -30,7 +30,7 @@ def as_obj(mesh: Path) -> str:
     """
     try:
         parts = list(_parts(mesh))
-    except (OSError, ValueError, KeyError, IndexError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, IndexError, AttributeError, RecursionError) as error:
         reason = str(error).splitlines()[0] if str(error) else "broken"
         raise RobotError(f"{mesh}: no Collada mesh: {reason}: write it as OBJ or STL") from None
     if not any(faces for _, faces in parts):
@@ -60,27 +60,41 @@ def _parts(mesh: Path) -> Iterator[tuple[Float[np.ndarray, "n 3"], list[list[int
         raise ValueError("no scene")
     for geometry, pose in _placed(_of(scene.get("url"), named), frame, named):
         corners, faces = _faces(geometry, named)
-        yield corners @ pose[:3, :3].T + pose[:3, 3], faces
+        placed = corners @ pose[:3, :3].T + pose[:3, 3]
+        if not np.isfinite(placed).all():
+            raise ValueError("corners that are no finite numbers")
+        yield placed, faces
 
 
 def _of(address: str | None, named: dict[str | None, Element]) -> Element:
-    return named[(address or "").removeprefix("#")]
+    name = (address or "").removeprefix("#")
+    if name not in named:
+        raise ValueError(f"it names {name!r}, which is not there")
+    return named[name]
 
 
 def _placed(
-    node: Element, pose: Float[np.ndarray, "4 4"], named: dict[str | None, Element]
+    node: Element,
+    pose: Float[np.ndarray, "4 4"],
+    named: dict[str | None, Element],
+    above: tuple[Element, ...] = (),
 ) -> Iterator[tuple[Element, Float[np.ndarray, "4 4"]]]:
     """The geometries below a node, with what places each."""
+    if node in above:
+        raise ValueError(f"the node {node.get('id')!r} is below itself")
+    above = (*above, node)
     for child in node:
+        if child.tag in _NOT_READ:
+            raise ValueError(f"<{child.tag}> is not read")
         values = np.array((child.text or "").split(), float) if child.tag in _MOVES else None
         if values is not None:
             pose = pose @ _MOVES[child.tag](values)
         elif child.tag == "instance_geometry":
             yield _of(child.get("url"), named), pose
         elif child.tag == "instance_node":
-            yield from _placed(_of(child.get("url"), named), pose, named)
+            yield from _placed(_of(child.get("url"), named), pose, named, above)
         elif child.tag == "node":
-            yield from _placed(child, pose, named)
+            yield from _placed(child, pose, named, above)
 
 
 def _translation(by: np.ndarray) -> np.ndarray:
@@ -91,9 +105,10 @@ def _translation(by: np.ndarray) -> np.ndarray:
 
 def _rotation(turn: np.ndarray) -> np.ndarray:
     """About an axis, by an angle in degrees."""
-    move, (x, y, z) = np.eye(4), turn[:3] / np.linalg.norm(turn[:3])
-    angle, across = np.radians(turn[3]), np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    move[:3, :3] += np.sin(angle) * across + (1.0 - np.cos(angle)) * across @ across
+    if not turn[:3].any():
+        raise ValueError("an axis of length 0")
+    move = np.eye(4)
+    move[:3, :3] = rotation_about(turn[:3], np.radians(turn[3]))
     return move
 
 
@@ -103,6 +118,8 @@ _MOVES = {
     "rotate": _rotation,
     "scale": lambda values: np.diag([*values, 1.0]),
 }
+_NOT_READ = ("instance_controller", "lookat", "skew")
+"""Skinned meshes, and moves that no exporter of robots writes."""
 
 
 def _faces(
@@ -110,33 +127,71 @@ def _faces(
 ) -> tuple[Float[np.ndarray, "n 3"], list[list[int]]]:
     """Corners and faces of one geometry in its own frame."""
     corners, faces = [np.empty((0, 3))], list[list[int]]()
-    mesh = geometry.find("mesh")
-    for primitives in mesh if mesh is not None else ():
-        if primitives.tag not in ("triangles", "polylist", "polygons"):
+    for kind in ("convex_mesh", "brep"):
+        if geometry.find(kind) is not None:
+            raise ValueError(f"<{kind}> is not read")
+    for primitives in geometry.iterfind("mesh/*"):
+        if primitives.tag in ("source", "vertices", "extra", *_LINES):
             continue
-        inputs = primitives.findall("input")
-        vertex = next(own for own in inputs if own.get("semantic") == "VERTEX")
-        stride = 1 + max(int(own.get("offset", "0")) for own in inputs)
+        if primitives.tag not in _FACES:
+            raise ValueError(f"<{primitives.tag}> is not read")
+        if primitives.find("ph") is not None:
+            raise ValueError("<ph>, a polygon with holes, is not read")
+        vertex = _input(primitives, "VERTEX")
+        offsets = [int(own.get("offset", "0")) for own in primitives.findall("input")]
         first = sum(map(len, corners))
         corners.append(_positions(_of(vertex.get("source"), named), named))
         counts = [int(word) for word in (primitives.findtext("vcount") or "").split()]
         for text in primitives.findall("p"):
-            numbers = np.array((text.text or "").split(), int).reshape(-1, stride)
-            own = numbers[:, int(vertex.get("offset", "0"))] + first
-            if primitives.tag == "triangles":
-                faces += own.reshape(-1, 3).tolist()
-            else:
-                ends = np.cumsum(counts or [len(own)])
-                faces += [face.tolist() for face in np.split(own, ends[:-1])]
-    points = np.concatenate(corners)
-    if faces and max(map(max, faces)) >= len(points):
-        raise ValueError("a face with a corner that is not there")
-    return points, faces
+            numbers = np.array((text.text or "").split(), int).reshape(-1, 1 + max(offsets))
+            own = numbers[:, int(vertex.get("offset", "0"))]
+            if len(own) and not 0 <= own.min() <= own.max() < len(corners[-1]):
+                raise ValueError("a face with a corner that is not there")
+            faces += _FACES[primitives.tag](own + first, counts)
+    return np.concatenate(corners), [face for face in faces if len(face) > 2]
+
+
+def _listed(own: np.ndarray, counts: list[int]) -> list[list[int]]:
+    """Polygons of so many corners; without counts a single one."""
+    ends = np.cumsum(counts or [len(own)])
+    if ends[-1] != len(own):
+        raise ValueError(f"polygons of {ends[-1]} corners, where {len(own)} are given")
+    return [face.tolist() for face in np.split(own, ends[:-1])]
+
+
+def _strip(own: np.ndarray, _: list[int]) -> list[list[int]]:
+    """Each corner after the second makes a triangle with the two before it, turned every other
+    time.
+    """
+    faces = np.stack([own[:-2], own[1:-1], own[2:]], axis=1)
+    faces[1::2] = faces[1::2, ::-1]
+    return faces.tolist()
+
+
+def _fan(own: np.ndarray, _: list[int]) -> list[list[int]]:
+    """Each corner after the second makes a triangle with the one before it and the first."""
+    return [[int(own[0]), *pair] for pair in np.stack([own[1:-1], own[2:]], axis=1).tolist()]
+
+
+_FACES: Mapping[str, Callable[[np.ndarray, list[int]], list[list[int]]]] = {
+    "triangles": lambda own, _: own.reshape(-1, 3).tolist(),
+    "tristrips": _strip,
+    "trifans": _fan,
+    "polylist": _listed,
+    "polygons": lambda own, _: [own.tolist()],
+}
+"""Faces of what a <p> lists, by its element."""
+
+
+def _input(element: Element, semantic: str) -> Element:
+    for own in element.iterfind("input"):
+        if own.get("semantic") == semantic:
+            return own
+    raise ValueError(f"<{element.tag}> without {semantic}")
 
 
 def _positions(vertices: Element, named: dict[str | None, Element]) -> Float[np.ndarray, "n 3"]:
-    position = next(own for own in vertices if own.get("semantic") == "POSITION")
-    source = _of(position.get("source"), named)
+    source = _of(_input(vertices, "POSITION").get("source"), named)
     accessor = source.find("technique_common/accessor")
     if accessor is None:
         raise ValueError("positions without an accessor")

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
+from constraint_geodesics.robot.description import find_mesh
 from constraint_geodesics.robot.kinematics import RobotError, origin_of
 
 HULL_MARGIN = 0.001
@@ -26,6 +27,8 @@ _BLOCK = 4096
 NOT_CONVEX = 0.001
 """A mesh with corners so deep inside its hull [m] is not convex."""
 _SIDES = 64
+_STL_HEAD = 84
+"""Bytes of a binary STL file before its triangles; the last four count them."""
 _SIGNS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
@@ -115,7 +118,11 @@ def _pieces_of(collision: ElementTree.Element, urdf: Path, link: str) -> Iterato
             f"{urdf}: the collision shape {shape.tag!r} of link {link!r} can't be bounded: must be "
             f"one of {', '.join(_KINDS)}"
         ) from None
-    except (ValueError, QhullError, OSError) as error:
+    except QhullError:
+        raise RobotError(
+            f"{urdf}: collision shape of link {link!r}: has no volume: take a box in its place"
+        ) from None
+    except (ValueError, OSError) as error:
         reason = str(error).splitlines()[0]
         raise RobotError(f"{urdf}: collision shape of link {link!r}: {reason}") from None
 
@@ -155,7 +162,10 @@ def _cylinder(shape: ElementTree.Element, _: Path) -> Iterator[Piece]:
 
 
 def _mesh(shape: ElementTree.Element, urdf: Path) -> Iterator[Piece]:
-    file = _mesh_file(shape.get("filename", ""), urdf)
+    name = shape.get("filename", "")
+    file = find_mesh(name, urdf)
+    if file is None:
+        raise ValueError(f"there is no mesh {name!r}")
     scale = _numbers(shape, "scale", "1 1 1")
     yield from _mesh_pieces(file, file.stat().st_mtime_ns, tuple(scale))
 
@@ -177,15 +187,6 @@ def mesh_piece(points: Float[np.ndarray, "n 3"]) -> Piece:
     blocks = np.array_split(corners, range(_BLOCK, len(corners), _BLOCK))
     hollow = max(float(-(normals @ own.T + offsets).max(axis=0).min()) for own in blocks)
     return Piece(corners[hull.vertices], HULL_MARGIN + 10.0**-_SAME, hollow)
-
-
-def _mesh_file(name: str, urdf: Path) -> Path:
-    """Beside the URDF, or in a folder above it, as PyBullet looks for package:// addresses."""
-    plain = name.removeprefix("package://").removeprefix("file://")
-    for folder in (Path(), *urdf.resolve().parents):
-        if (folder / plain).is_file():
-            return folder / plain
-    raise ValueError(f"there is no mesh {name!r}")
 
 
 def read_mesh(file: Path) -> list[Float[np.ndarray, "n 3"]]:
@@ -216,17 +217,43 @@ def _read_obj(file: Path) -> list[Float[np.ndarray, "n 3"]]:
             numbers = [int(word.split("/")[0]) for word in words]
             objects[-1].update(n - 1 if n > 0 else len(corners) + n for n in numbers)
     points = np.array(corners, float).reshape(-1, 3)
+    if not all(0 <= number < len(points) for used in objects for number in used):
+        raise ValueError(f"{file.name} has a face with a corner that is not there")
     return [points[sorted(used)] for used in objects if used]
 
 
 def _read_stl(file: Path) -> list[Float[np.ndarray, "n 3"]]:
-    data = file.read_bytes()
-    count = int.from_bytes(data[80:84], "little")
-    if len(data) == 84 + 50 * count:
+    if is_binary_stl(file):
         face = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-        points = np.frombuffer(data[84:], face)["corners"].reshape(-1, 3).astype(float)
+        faces = np.fromfile(file, face, offset=_STL_HEAD)
+        points = faces["corners"].reshape(-1, 3).astype(float)
     else:
-        lines = data.decode(errors="replace").splitlines()
-        rows = [line.split()[1:4] for line in lines if line.split()[:1] == ["vertex"]]
-        points = np.array(rows, float).reshape(-1, 3)
+        points = _stl_corners(file)
     return [np.unique(points, axis=0)] if len(points) else []
+
+
+def is_binary_stl(file: Path) -> bool:
+    """Whether an STL file is binary, as PyBullet reads it, rather than a text."""
+    with file.open("rb") as data:
+        count = int.from_bytes(data.read(_STL_HEAD)[80:], "little")
+    return file.stat().st_size == _STL_HEAD + 50 * count
+
+
+def stl_as_obj(file: Path) -> str:
+    """An STL file that is a text as OBJ.  Raises RobotError where it is none."""
+    try:
+        corners = _stl_corners(file)
+    except ValueError as error:
+        raise RobotError(f"{file}: no STL mesh: {error}: write it as OBJ or binary STL") from None
+    if not len(corners) or len(corners) % 3 or not np.isfinite(corners).all():
+        raise RobotError(f"{file}: no STL mesh: has no triangles: write it as OBJ or binary STL")
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in corners.tolist()]
+    lines += [f"f {k} {k + 1} {k + 2}" for k in range(1, len(corners), 3)]
+    return "\n".join(lines) + "\n"
+
+
+def _stl_corners(file: Path) -> Float[np.ndarray, "n 3"]:
+    """Of all triangles of an STL file that is a text."""
+    words = (line.split() for line in file.read_text(errors="replace").splitlines())
+    rows = [row[1:4] for row in words if row[:1] == ["vertex"]]
+    return np.array(rows, float).reshape(-1, 3)

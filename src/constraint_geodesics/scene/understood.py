@@ -11,21 +11,30 @@ from typing import Any
 from constraint_geodesics.params import RobotParams
 from constraint_geodesics.robot.description import Arm, arm_to, read_description
 from constraint_geodesics.robot.kinematics import RobotError
-from constraint_geodesics.scene.allowed_collisions import AllowedPair, allowed_by_srdf
-from constraint_geodesics.scene.arm import ADJACENT, FOUND, load_arm
+from constraint_geodesics.scene.allowed_collisions import (
+    SAMPLES,
+    AllowedPair,
+    Sampled,
+    allowed_by_srdf,
+    sampled,
+)
+from constraint_geodesics.scene.arm import ADJACENT, FOUND, LoadedArm, load_arm
+from constraint_geodesics.scene.bodies import Body, pairs_of
 from constraint_geodesics.scene.pieces import read_pieces
-from constraint_geodesics.scene.urdf import find_urdf
+from constraint_geodesics.scene.urdf import find_urdf, has_pybullet
 
 
 @dataclass(frozen=True)
 class Understood:
-    """An arm, the pairs of its links that may touch, how many pairs are looked at, and what is
-    missing, a line each.
+    """An arm, the pairs of its links that may touch, how many pairs are looked at, what sampled
+    configurations show of them, and what is missing, a line each.  Without PyBullet there are no
+    samples, and of an arm that can't be loaded no pairs.
     """
 
     arm: Arm
     allowed: tuple[AllowedPair, ...]
-    looked_at: int
+    looked_at: int | None
+    sampled: Sampled | None
     missing: tuple[str, ...]
 
     def lines(self) -> Iterator[str]:
@@ -36,7 +45,16 @@ class Understood:
             by_reason.setdefault(reason, []).append(f"{first} with {second}")
         for reason, pairs in by_reason.items():
             yield f"may touch, {reason}: {', '.join(pairs)}"
-        yield f"looked at for collisions: {self.looked_at} pairs of links"
+        if self.looked_at is not None:
+            yield f"looked at for collisions: {self.looked_at} pairs of links"
+        if self.sampled is not None:
+            of = f"of {SAMPLES:,} sampled configurations"
+            yield f"free of self-collision: {_percent(self.sampled.free)} {of}"
+            for first, second, share in self.sampled.often:
+                yield (
+                    f"look at: {first} with {second} touch at {_percent(share)} {of}: where they "
+                    "do not in truth, an SRDF may allow them"
+                )
         for line in self.missing:
             yield f"missing: {line}"
 
@@ -63,6 +81,11 @@ class Understood:
                 for first, second, reason in self.allowed
             ],
             "pairs_looked_at": self.looked_at,
+            "free_share": None if self.sampled is None else self.sampled.free,
+            "touch_often": [
+                {"links": [first, second], "share": share}
+                for first, second, share in (self.sampled.often if self.sampled else ())
+            ],
             "missing": list(self.missing),
         }
 
@@ -73,18 +96,24 @@ def understand(params: RobotParams) -> Understood:
     """
     arm = arm_to(read_description(find_urdf(params.urdf)), params.tool_link, params.hold)
     missing = list(_missing(arm))
-    links = arm.description.tree.findall("link")
-    shaped = sum(link.find("collision") is not None for link in links)
-    count = shaped * (shaped - 1) // 2
     if params.may_touch not in (ADJACENT, FOUND):
         allowed_by_srdf(Path(params.may_touch), arm.description)
     try:
         loaded = load_arm(params)
-        read_pieces(loaded.robot.urdf)
+        shown = loaded.sampled
+        if shown is None and has_pybullet():
+            shown = sampled(loaded.robot)
     except RobotError as error:
         missing.append(str(error))
-        return Understood(arm, (), count, tuple(missing))
-    return Understood(arm, loaded.allowed, count - len(loaded.allowed), tuple(missing))
+        return Understood(arm, (), None, None, tuple(missing))
+    return Understood(arm, loaded.allowed, _looked_at(loaded), shown, tuple(missing))
+
+
+def _looked_at(loaded: LoadedArm) -> int:
+    """How many pairs of links are looked at for collisions."""
+    links = read_pieces(loaded.robot.urdf)
+    bodies = [Body(own.name, 0, own.pieces, own.parent) for own in links if own.pieces]
+    return sum(1 for _ in pairs_of(bodies, loaded.robot.allowed))
 
 
 def _missing(arm: Arm) -> Iterator[str]:
@@ -97,6 +126,11 @@ def _missing(arm: Arm) -> Iterator[str]:
         seen, felt = link.find("visual") is not None, link.find("collision") is not None
         if link.get("name") in carried and seen and not felt:
             yield f"{link.get('name')} is drawn but has no <collision>: nothing keeps it clear"
+
+
+def _percent(share: float) -> str:
+    """Whole percents, or what is left of them near none and all."""
+    return f"{100.0 * share:.3g} %"
 
 
 def _finite(value: float) -> float | None:

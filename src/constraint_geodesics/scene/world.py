@@ -3,6 +3,7 @@
 The only importer of pybullet.  Every world is a client of its own; nothing is simulated here.
 """
 
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,7 +12,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from jaxtyping import Bool, Float
 
-from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.urdf import quiet
 
@@ -101,7 +102,8 @@ class World:
     """One robot among fixed bodies.  Adjacent links, pairs of links that the robot allows and
     links exempt from a shape may touch; nothing else may.
 
-    Raises RobotError if a URDF is missing and ValueError if an exempt link is not the robot's.
+    Raises RobotError if PyBullet has not all of the robot's collision shapes, and ValueError if an
+    exempt link is not the robot's.
     """
 
     def __init__(self, robot: SerialRobot, fixed: Sequence[Shape] = ()) -> None:
@@ -116,6 +118,7 @@ class World:
         joint_index = {row[1].decode(): row[0] for row in info}
         self._link_index = {row[12].decode(): row[0] for row in info}
         self._link_index[bullet.getBodyInfo(body)[0].decode()] = -1
+        self._check_shapes()
         self._joints = [joint_index[name] for name in robot.joint_names]
         self._tool = self._link_index[robot.tool_link]
         for pair in robot.allowed:
@@ -224,6 +227,18 @@ class World:
             link = info[16]
         position, quaternion = bullet.getBasePositionAndOrientation(body)
         return LoadedChain(position, quaternion, tuple(reversed(links)))
+
+    def _check_shapes(self) -> None:
+        """PyBullet goes on without a shape that it can't read, and nothing would touch it."""
+        for link in ElementTree.parse(self.robot.urdf).getroot().iterfind("link"):
+            name = link.get("name", "")
+            shapes = self._bullet.getCollisionShapeData(self._body, self._link_index[name])
+            if len(shapes) < len(link.findall("collision")):
+                self.close()
+                raise RobotError(
+                    f"{self.robot.urdf}: a collision shape of link {name!r} is none to PyBullet: "
+                    "write its mesh as OBJ or binary STL, in the URDF's folder or one above it"
+                )
 
     def _place(self, q: np.ndarray) -> None:
         values = np.asarray(q, float)[:, None].tolist()
