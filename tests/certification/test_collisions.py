@@ -380,7 +380,7 @@ def solid(corners: np.ndarray) -> str:
     ("geometry", "message"),
     [
         ('<plane normal="0 0 1"/>', "'plane' of link 'wall' can't be bounded"),
-        ('<box size="1 0 1"/>', "link 'wall': a box with size 1 0 1, which must be positive"),
+        ('<box size="1 0 1"/>', "link 'wall': a box with size 1 0 1, which must be 3 positive"),
         ('<mesh filename="wall.dae"/>', "wall.dae is no mesh that can be read: must be OBJ or STL"),
         ('<mesh filename="none.obj"/>', "there is no mesh 'none.obj'"),
         ('<mesh filename="flat.stl"/>', "link 'wall'"),

@@ -94,6 +94,8 @@ FAULTS = {
     "axis of two": ('<axis xyz="0 0 1"/>', '<axis xyz="0 1"/>', "'0 1'", "three numbers"),
     "axis not finite": ('<axis xyz="0 0 1"/>', '<axis xyz="0 nan 1"/>', "nan", "three numbers"),
     "origin of words": ('xyz="0 0 0.2"', 'xyz="here"', "'here'", "three numbers"),
+    "axis too long": ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 1e200"/>', "1e200", "three numbers"),
+    "endless name": ('name="left"', f'name="{"x" * 3000}"', "more than 250", "shorten"),
     "origin infinite": ('rpy="0.3 0 0"', 'rpy="inf 0 0"', "inf", "three numbers"),
     "limits of words": (TURN_LIMIT, '<limit lower="low" upper="2"/>', "'low'", "number"),
     "limits not finite": (TURN_LIMIT, '<limit lower="-inf" upper="2"/>', "'-inf'", "number"),

@@ -88,6 +88,37 @@ def test_what_was_found_by_sampling_is_kept(own_folder, monkeypatch) -> None:
         load_arm(PANDA)
 
 
+def test_a_visual_that_is_not_there_is_left_out(tmp_path) -> None:
+    file = tmp_path / "arm.urdf"
+    drawn = '<visual><geometry><mesh filename="{}"/></geometry></visual><visual/>'
+    text = ARM.replace('<link name="hand"/>', f'<link name="hand">{drawn.format("no.stl")}</link>')
+    text = text.replace('<link name="left"/>', f'<link name="left">{drawn.format("l.stl")}</link>')
+    (tmp_path / "l.stl").write_text(stl(CORNERS))
+    file.write_text(text)
+    robot = robot_from(RobotParams(urdf=str(file), tool_link="hand", may_touch=FOUND))
+    assert "no.stl" not in robot.urdf.read_text()
+    assert robot.urdf.read_text().count("<visual>") == 1
+    with Scene(robot).world() as world:
+        assert world.is_free(np.array([0.0, 0.2, 0.0]))
+
+
+@pytest.mark.parametrize("size", ["1", "1 1", "1 1 0", "1 1 nan", "1 1 inf"])
+def test_a_box_has_three_edges(tmp_path, size) -> None:
+    file = tmp_path / "arm.urdf"
+    file.write_text(ARM.replace('size="0.1 0.1 1"', f'size="{size}"'))
+    said = rf"arm\.urdf: .*'upper': a box with size {size}, which must be 3 positive numbers"
+    with pytest.raises(RobotError, match=said):
+        robot_from(RobotParams(urdf=str(file), tool_link="hand", may_touch=FOUND))
+
+
+def test_what_pybullet_does_not_load_is_one_line(tmp_path) -> None:
+    file = tmp_path / "arm.urdf"
+    broken = '<link name="hand"><inertial><mass value="x"/></inertial></link>'
+    file.write_text(ARM.replace('<link name="hand"/>', broken))
+    with pytest.raises(RobotError, match=r"arm\.urdf: PyBullet can't load it: look at <inertial>"):
+        robot_from(RobotParams(urdf=str(file), tool_link="hand", may_touch=FOUND))
+
+
 def test_an_edited_mesh_is_sampled_anew(tmp_path) -> None:
     """The hand becomes so large that it is always in the base."""
     mesh = tmp_path / "hand.stl"

@@ -67,8 +67,12 @@ def _tree_of(
         tree.extend(copy.deepcopy(element) for element in own.tree.findall(kind))
     for mesh in tree.iter("mesh"):
         found = find_mesh(mesh.get("filename", ""), own.file)
-        if found is not None:  # one that is only drawn may lack
+        if found is not None:
             mesh.set("filename", str(found.resolve()))
+    for link in tree.findall("link"):
+        for visual in link.findall("visual"):
+            if not _is_drawn(visual, own.file):  # PyBullet would refuse the whole robot
+                link.remove(visual)
     for mesh in tree.iterfind("link/collision/geometry/mesh"):
         mesh.set("filename", str(readable(Path(mesh.get("filename", "")))))
     moved = {joint.name for joint in arm.moved}
@@ -89,6 +93,13 @@ def _tree_of(
     ElementTree.SubElement(joint_element, "child", link=name)
     _place(joint_element, tool)
     return tree, name
+
+
+def _is_drawn(visual: ElementTree.Element, urdf: Path) -> bool:
+    shape, mesh = visual.find("geometry/*"), visual.find("geometry/mesh")
+    if mesh is not None:
+        return find_mesh(mesh.get("filename", ""), urdf) is not None
+    return shape is not None
 
 
 def _fix(element: ElementTree.Element, joint: Joint, value: float) -> None:

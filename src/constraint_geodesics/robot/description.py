@@ -20,7 +20,9 @@ MOVABLE = ("revolute", "continuous", "prismatic")
 _KINDS = (*MOVABLE, "fixed", "floating", "planar")
 _XACRO = "xacro"
 _PACKAGE = "package://"
-_SHORTEST_AXIS = 1e-9
+_SHORTEST_AXIS, _LARGEST = 1e-9, 1e6
+_LONGEST = 250
+"""Names that are longer end PyBullet's process at some length."""
 _WIDEST = 1000.0
 """Limits further apart [rad or m] stand for none."""
 
@@ -175,6 +177,9 @@ class _Reader:
             name = element.get("name")
             if not name:
                 raise self.fault(f"{kind} number {number}", "has no name", "give it one")
+            if len(name.encode()) > _LONGEST:
+                what = f"has a name of more than {_LONGEST} letters"
+                raise self.fault(f"{kind} {name[:20]!r}…", what, "shorten it")
             if name in found:
                 raise self.fault(f"{kind} {name!r}", "is there twice", "rename one of the two")
             found.append(name)
@@ -328,8 +333,9 @@ class _Reader:
                 values = tuple(float(word) for word in text.split())
             except ValueError:
                 values = ()
-            if len(values) != 3 or not all(map(math.isfinite, values)):
-                raise self.fault(where, f"has {name}={text!r}", "it must be three numbers")
+            if len(values) != 3 or not all(abs(value) <= _LARGEST for value in values):
+                mend = f"it must be three numbers, none beyond {_LARGEST:g}"
+                raise self.fault(where, f"has {name}={text!r}", mend)
             found.append(values)
         return found
 

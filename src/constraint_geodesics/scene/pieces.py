@@ -23,7 +23,7 @@ HULL_MARGIN = 0.001
 """What PyBullet keeps around a hull [m]."""
 _SAME = 7
 """Corners of a mesh that agree to so many decimals [m] are one."""
-_BLOCK = 4096
+_BLOCK, _FEW = 256, 64
 NOT_CONVEX = 0.001
 """A mesh with corners so deep inside its hull [m] is not convex."""
 _SIDES = 64
@@ -134,16 +134,17 @@ def _numbers(shape: ElementTree.Element, name: str, default: str | None = None) 
     return np.array(text.split(), float)
 
 
-def _size(shape: ElementTree.Element, name: str) -> np.ndarray:
-    """Sizes [m], which must be positive."""
+def _size(shape: ElementTree.Element, name: str, count: int = 1) -> np.ndarray:
+    """Sizes [m], so many, which must be positive."""
     sizes = _numbers(shape, name)
-    if not (sizes > 0.0).all():
-        raise ValueError(f"a {shape.tag} with {name} {shape.get(name)}, which must be positive")
+    if not ((sizes > 0.0) & np.isfinite(sizes)).all() or len(sizes) != count:
+        what = "a positive number" if count == 1 else f"{count} positive numbers"
+        raise ValueError(f"a {shape.tag} with {name} {shape.get(name)}, which must be {what}")
     return sizes
 
 
 def _box(shape: ElementTree.Element, _: Path) -> Iterator[Piece]:
-    yield Piece(box_corners(0.5 * _size(shape, "size")))
+    yield Piece(box_corners(0.5 * _size(shape, "size", 3)))
 
 
 def _sphere(shape: ElementTree.Element, _: Path) -> Iterator[Piece]:
@@ -183,10 +184,25 @@ def mesh_piece(points: Float[np.ndarray, "n 3"]) -> Piece:
     """The hull of a mesh's corners.  Raises QhullError where it has no volume."""
     corners = np.unique(points.round(_SAME), axis=0)
     hull = ConvexHull(corners)
-    normals, offsets = hull.equations[:, :3], hull.equations[:, 3:]
-    blocks = np.array_split(corners, range(_BLOCK, len(corners), _BLOCK))
-    hollow = max(float(-(normals @ own.T + offsets).max(axis=0).min()) for own in blocks)
+    hollow = _deepest(corners, hull.equations)
     return Piece(corners[hull.vertices], HULL_MARGIN + 10.0**-_SAME, hollow)
+
+
+def _deepest(corners: Float[np.ndarray, "n 3"], faces: Float[np.ndarray, "f 4"]) -> float:
+    """How far the corner that lies deepest in a hull does [m].  A few faces bound how deep each one
+    can lie; those that may lie deepest are measured to all faces first, and most never are.
+    """
+
+    def depths(own: Float[np.ndarray, "k 3"], of: Float[np.ndarray, "m 4"]) -> np.ndarray:
+        return -(own @ of[:, :3].T + of[:, 3]).max(axis=1)
+
+    bounds = depths(corners, faces[:: len(faces) // _FEW + 1])
+    order, found = np.argsort(-bounds), -np.inf
+    for own in np.array_split(order, range(_BLOCK, len(order), _BLOCK)):
+        if bounds[own[0]] <= found:
+            break
+        found = max(found, float(depths(corners[own], faces).max()))
+    return found
 
 
 def read_mesh(file: Path) -> list[Float[np.ndarray, "n 3"]]:

@@ -90,6 +90,7 @@ class _Client:
 
 
 _WITHOUT_CLIENT = [
+    "error",
     "getEulerFromQuaternion",
     "getMatrixFromQuaternion",
     "getQuaternionFromEuler",
@@ -112,8 +113,14 @@ class World:
         flags = bullet.URDF_USE_SELF_COLLISION | bullet.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
         flags |= bullet.URDF_IGNORE_VISUAL_SHAPES  # seconds for some robots
         bullet.setPhysicsEngineParameter(enableFileCaching=0)  # a file may be written anew
-        with quiet():
-            self._body = body = bullet.loadURDF(str(robot.urdf), useFixedBase=True, flags=flags)
+        try:
+            with quiet():
+                self._body = body = bullet.loadURDF(str(robot.urdf), useFixedBase=True, flags=flags)
+        except bullet.error:
+            self.close()
+            raise RobotError(
+                f"{robot.urdf}: PyBullet can't load it: look at <inertial>, <visual>, <material>"
+            ) from None
         info = [bullet.getJointInfo(body, i) for i in range(bullet.getNumJoints(body))]
         joint_index = {row[1].decode(): row[0] for row in info}
         self._link_index = {row[12].decode(): row[0] for row in info}
