@@ -14,6 +14,7 @@ from constraint_geodesics.planner import SNAP_RAD, Planner, PlannerError
 from constraint_geodesics.robot.inverse_kinematics import solutions
 from constraint_geodesics.robot.kinematics import RobotError
 from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.preparation import free_configurations
 from tests.planner_fixtures import packaged_planner, pairs_of
 
@@ -70,6 +71,25 @@ def test_the_end_of_seven_joints_slides_to_where_the_path_is_shortest() -> None:
         assert 16 <= len(others) <= 64
         lengths = [planner.plan(start, q, "free").length_rad for q in others]
         assert path.length_rad <= 1.02 * np.nanmin(lengths)
+
+
+def test_a_pose_is_reached_where_all_the_nearest_configurations_touch_something() -> None:
+    """A ball stands where the elbow would be: others of the family go round it."""
+    solved = 0
+    with Planner.from_urdf(*IIWA) as alone:
+        for start, goal in free_pairs(alone, 6, seed=9):
+            pose = Pose(*alone.robot.forward(goal))
+            nearest = alone.plan(start, pose, "free")
+            elbow = alone.robot.skeleton(nearest.goal)[4]
+            ball = Sphere("ball", tuple(elbow.tolist()), 0.1)
+            with Planner.from_urdf(*IIWA, workcell=[ball]) as planner:
+                if not planner._certifier.collisions.is_free(start) or not len(planner.ik(pose)):
+                    continue
+                path = planner.plan(start, pose, "free")
+                assert path.status == "solved", path.explanation
+                assert np.abs(path.goal - nearest.goal).max() > 0.05
+                solved += 1
+    assert solved >= 3
 
 
 def test_the_workcell_of_an_untrained_arm_is_kept_clear() -> None:
@@ -270,7 +290,7 @@ def test_a_closed_planner_answers_nothing() -> None:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_joint_is_held_at_a_number(value) -> None:
-    with pytest.raises(RobotError, match="panda_finger_joint1 = .*finite"):
+    with pytest.raises(RobotError, match="panda.urdf: hold.panda_finger_joint1=.*finite number"):
         Planner.from_urdf(
             "franka_panda/panda.urdf", "panda_grasptarget", hold={"panda_finger_joint1": value}
         )

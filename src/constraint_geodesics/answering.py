@@ -6,6 +6,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +19,7 @@ from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.goals.goal import Goal
 from constraint_geodesics.methods import Method
 from constraint_geodesics.problem import Status
+from constraint_geodesics.robot.inverse_kinematics import spread
 from constraint_geodesics.search.candidates import BENDS, Answer, Candidate, rows_of
 from constraint_geodesics.search.explanations import not_connected, refused_end
 from constraint_geodesics.search.preparation import Query
@@ -39,10 +41,22 @@ for closer ones.
 """
 _CLOSER = ("constraint_between_rows", "step")
 """What a certificate finds where waypoints lie too far apart."""
+_MEMBERS, _NEAREST, _SPREAD = 512, 8, 24
+"""Of further configurations of a goal, the nearest: how many are looked at for collisions, of the
+free ones how many have curves led to them as the nearest, and how many of the others.
+"""
 _IMPROVED = 3
 """Configurations of a goal beside the one that was reached, the nearest, to which shorter paths are
 looked for.
 """
+
+
+class _Rest(NamedTuple):
+    """What more configurations a goal has, its region and the room that an end has in it."""
+
+    configurations: Iterator[Float[np.ndarray, "D"] | None]
+    region: Constraint | None
+    room: ConstraintManifold | None
 
 
 @dataclass(frozen=True)
@@ -57,13 +71,12 @@ class Answering:
         refused = refused_end(query, "start", self.certifier.collisions)
         if refused is not None:
             return self._nothing(query, *refused)
-        pursued = sorted(self._pursued(query, goals), key=lambda one: one.distance)
+        pursued, rest = self._pursued(query, goals)
         if not pursued:
             wanted = " or ".join(one.description for one in goals)
             return self._nothing(query, "not_found", f"no configuration is {wanted}")
         regions = tuple(goal.region for goal in goals if goal.region is not None)
-        looked_at = np.array([one.goal for one in pursued])
-        query = replace(query, looked_at=looked_at, regions=regions)
+        query = replace(query, regions=regions)
         if pursued[0].distance <= COINCIDENT_RAD:
             return self._standing(replace(query, goal=pursued[0].goal), pursued[0].region)
 
@@ -71,7 +84,13 @@ class Answering:
             found = self._certified(query, candidate, one.region)
             return found if isinstance(found, str) else (found, found.length_rad)
 
-        found = shortest(pursued, query.task, certify)
+        def more() -> list[Pursued]:
+            further = self._more(query, rest)
+            pursued.extend(further)
+            return further
+
+        found = shortest(pursued, query.task, certify, more)
+        query = replace(query, looked_at=np.array([one.goal for one in pursued]))
         if found is None:
             return self._failed(query, pursued)
         path, reached = found
@@ -85,18 +104,48 @@ class Answering:
             line += f", from a start moved by {query.snapped_rad:.2g} rad"
         return replace(path, explanation=line, statistics=self._statistics(query, path.source))
 
-    def _pursued(self, query: Query, goals: Iterable[Goal]) -> Iterator[Pursued]:
-        """The goals' configurations."""
+    def _pursued(self, query: Query, goals: Iterable[Goal]) -> tuple[list[Pursued], list[_Rest]]:
+        """The goals' configurations, the nearest first, and what more there are."""
         manifold = query.task.manifold
+        found, rest = list[Pursued](), list[_Rest]()
         for goal in goals:
             room = None
             if goal.region is not None:
                 room = ConstraintManifold(manifold.robot, both(goal.region, manifold.constraint))
                 if room.codim >= manifold.robot.dof:
                     room = None
-            for q in goal.configurations(manifold, query.start):
-                away = float(np.linalg.norm(q - query.start))
-                yield Pursued(q, away, self._curves(query, q), goal.region, room)
+            configurations = iter(goal.configurations(manifold, query.start))
+            for q in configurations:
+                if q is None:
+                    rest.append(_Rest(configurations, goal.region, room))
+                    break
+                found.append(self._one(query, q, goal.region, room))
+        return sorted(found, key=lambda one: one.distance), rest
+
+    def _one(
+        self,
+        query: Query,
+        q: Float[np.ndarray, "D"],
+        region: Constraint | None,
+        room: ConstraintManifold | None,
+    ) -> Pursued:
+        away = float(np.linalg.norm(q - query.start))
+        return Pursued(q, away, self._curves(query, q), region, room)
+
+    def _more(self, query: Query, rest: Sequence[_Rest]) -> list[Pursued]:
+        """Of what more configurations there are the nearest free ones, and some that are spread
+        over all.
+        """
+        found = list[Pursued]()
+        for configurations, region, room in rest:
+            members = np.array([q for q in configurations if q is not None])
+            members = members.reshape(-1, len(query.start))
+            members = members[np.argsort(np.linalg.norm(members - query.start, axis=1))][:_MEMBERS]
+            free = members[self.certifier.collisions.free(members)]
+            others = spread(free[_NEAREST:], _SPREAD)
+            for q in (*free[:_NEAREST], *others):
+                found.append(self._one(query, q, region, room))
+        return sorted(found, key=lambda one: one.distance)
 
     def _curves(
         self, query: Query, goal: Float[np.ndarray, "D"]

@@ -12,6 +12,7 @@ from typing import Self
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import ValidationError
 
 from constraint_geodesics import warmup
 from constraint_geodesics.answering import Answering
@@ -24,7 +25,7 @@ from constraint_geodesics.constraints.constraint import (
     constraint_from,
 )
 from constraint_geodesics.goals.goal import ArrayLike, Wanted, checked_configuration
-from constraint_geodesics.goals.pose import POSE_JOINTS
+from constraint_geodesics.goals.pose import MANY_SEEDS, POSE_JOINTS
 from constraint_geodesics.goals.wanted import as_goals
 from constraint_geodesics.methods import Method, SearchMethod, open_method
 from constraint_geodesics.params import (
@@ -33,6 +34,7 @@ from constraint_geodesics.params import (
     PoseParams,
     RobotParams,
     WorkcellParams,
+    one_line,
 )
 from constraint_geodesics.problem import PlannerError as PlannerError
 from constraint_geodesics.problem import end_refused
@@ -52,10 +54,8 @@ prismatic ones.
 """
 CLEARANCE_SHARE = 0.05
 """Of what an arm typically keeps, asked for in the search by a planner that is made from a URDF."""
-REPRESENTATIVES, _MANY_SEEDS = 64, 1024
-"""Of the configurations that reach a pose, where there is no end of them; what they are found
-from.
-"""
+REPRESENTATIVES = 64
+"""Of the configurations that reach a pose, where there is no end of them."""
 OWN_CONSTRAINTS = {"free": Constraint((0,) * 6), "level": Constraint((0, 0, 0, 1, 1, 0))}
 """By name, of a planner that is made from a URDF: nothing held, and the tilt that the start has."""
 
@@ -123,20 +123,20 @@ class Planner:
         clearance than CLEARANCE_SHARE of what the arm typically keeps.
         Raises RobotError, one line with the mend, where no arm can be made of the files.
         """
-        for name, value in (hold or {}).items():
-            if not np.isfinite(value):
-                raise RobotError(f"hold: {name} = {value}: must be a finite number [rad or m]")
         own = None
         if tool is not None:
             rpy = rpy_of(tool.rotation)
             own = PoseParams(position_m=tuple(tool.position.tolist()), rpy_rad=rpy)
-        robot = RobotParams(
-            urdf=str(urdf),
-            tool_link=tool_link,
-            hold=dict(hold or {}),
-            tool=own,
-            may_touch=FOUND if srdf is None else str(srdf),
-        )
+        try:
+            robot = RobotParams(
+                urdf=str(urdf),
+                tool_link=tool_link,
+                hold=dict(hold or {}),
+                tool=own,
+                may_touch=FOUND if srdf is None else str(srdf),
+            )
+        except ValidationError as error:
+            raise RobotError(f"{urdf}: {one_line(error)}") from None
         around = WorkcellParams().including(*workcell)
         settings = settings or PlannerParams(clearance_share=CLEARANCE_SHARE)
         made = cls(Bundle(robot, around, {}, settings, JudgeParams(), {}), str(urdf))
@@ -199,7 +199,7 @@ class Planner:
         self._require_open()
         robot, settings = self.robot, Search()
         if robot.dof > POSE_JOINTS:
-            settings = settings._replace(seeds=_MANY_SEEDS)
+            settings = settings._replace(seeds=MANY_SEEDS)
         found = solutions(robot, pose.position, pose.rotation, settings)
         free = found[self._certifier.collisions.free(found)]
         return spread(free, REPRESENTATIVES) if robot.dof > POSE_JOINTS else free

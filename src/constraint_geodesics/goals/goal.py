@@ -39,9 +39,10 @@ class Goal(Protocol):
 
     def configurations(
         self, manifold: ConstraintManifold, start: Float[np.ndarray, "D"]
-    ) -> Iterable[Float[np.ndarray, "D"]]:
+    ) -> Iterable[Float[np.ndarray, "D"] | None]:
         """All configurations [rad] of the set, or where there is no end of them those worth a
-        look; the planner sees to limits, collisions and the constraint.
+        look; the planner sees to limits, collisions and the constraint.  After None come more, to
+        be worked out only if they are asked for: of these the planner looks at some free ones.
 
         Raises PlannerError if the goal makes no sense for this robot.
         """

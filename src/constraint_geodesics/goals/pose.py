@@ -1,17 +1,26 @@
 """A tool pose as the goal: the branches of the inverse kinematics, whole turns included."""
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
-from constraint_geodesics.goals.region import GoalRegion
-from constraint_geodesics.robot.inverse_kinematics import solutions
+from constraint_geodesics.robot.inverse_kinematics import (
+    Search,
+    seeds_of,
+    solutions,
+    turned_towards,
+)
+from constraint_geodesics.search.nearest import nearest_on
 
 POSE_JOINTS = 6
 """An arm with more joints reaches a pose by families of configurations."""
+MANY_SEEDS = 1024
+"""Of the inverse kinematics, for members of all families."""
+_NEAREST, _SEEDS = 64, 128
+"""Members of families, and other configurations, from which the nearest ones are looked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +41,18 @@ class PoseGoal:
 
     def configurations(
         self, manifold: ConstraintManifold, start: Float[np.ndarray, "D"]
-    ) -> Iterable[Float[np.ndarray, "D"]]:
-        """The branches that are found; of families the configurations nearest to the start."""
-        if manifold.robot.dof > POSE_JOINTS:
-            return GoalRegion(self.pose).configurations(manifold, start)
-        return solutions(manifold.robot, self.pose.position, self.pose.rotation, near=start)
+    ) -> Iterator[Float[np.ndarray, "D"] | None]:
+        """The branches that are found; of families the configurations nearest to the start, then
+        members.
+        """
+        robot, (place, turn) = manifold.robot, (self.pose.position, self.pose.rotation)
+        found = solutions(robot, place, turn, near=start)
+        if robot.dof <= POSE_JOINTS:
+            yield from found
+            return
+        own = ConstraintManifold(robot, self.region)
+        found = found[np.argsort(np.linalg.norm(found - start, axis=1))][:_NEAREST]
+        seeds = turned_towards(robot, seeds_of(robot, _SEEDS), start)
+        yield from nearest_on(own, start, np.concatenate([start[None], found, seeds]))
+        yield None
+        yield from solutions(robot, place, turn, Search(seeds=MANY_SEEDS), start)

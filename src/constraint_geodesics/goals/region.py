@@ -1,6 +1,6 @@
 """A region of tool poses as the goal: some axes free, others within a box around a pose."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,10 +10,12 @@ from constraint_geodesics.constraints.both import both
 from constraint_geodesics.constraints.constraint import AXES, Constraint, ConstraintManifold, Pose
 from constraint_geodesics.problem import PlannerError
 from constraint_geodesics.robot.inverse_kinematics import seeds_of, turned_towards
-from constraint_geodesics.search.nearest import nearest_on
+from constraint_geodesics.search.nearest import members_of, nearest_on
 
 SEEDS = 256
 """Configurations from which the nearest of the region are looked for."""
+MANY_SEEDS = 512
+"""Those from which others are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,17 +55,20 @@ class GoalRegion:
 
     def configurations(
         self, manifold: ConstraintManifold, start: Float[np.ndarray, "D"]
-    ) -> Iterable[Float[np.ndarray, "D"]]:
+    ) -> Iterator[Float[np.ndarray, "D"] | None]:
         """Those nearest to the start that keep the path's constraint as well, each nearer than all
-        beside it; where none keeps both, those of the region.
+        beside it, then others; where none keeps both, those of the region.
         """
         robot = manifold.robot
         together = ConstraintManifold(robot, both(self.region, manifold.constraint))
-        seeds = turned_towards(robot, seeds_of(robot, SEEDS), start)
-        seeds = np.concatenate([start[None], seeds])
-        found = nearest_on(together, start, seeds)
-        return (
-            found
-            if len(found)
-            else nearest_on(ConstraintManifold(robot, self.region), start, seeds)
+        near, many = (
+            turned_towards(robot, seeds_of(robot, count), start) for count in (SEEDS, MANY_SEEDS)
         )
+        seeds = np.concatenate([start[None], near])
+        found = nearest_on(together, start, seeds)
+        if not len(found):
+            yield from nearest_on(ConstraintManifold(robot, self.region), start, seeds)
+            return
+        yield from found
+        yield None
+        yield from members_of(together, many)

@@ -14,7 +14,7 @@ from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.constraints.projection import normal_matrix, solve_normal
+from constraint_geodesics.constraints.projection import normal_matrix, retract, solve_normal
 from constraint_geodesics.search.roadmap import distance
 from constraint_geodesics.search.space import look_at, project_node, space_of, workspace
 
@@ -76,6 +76,16 @@ def nearest_on(
         if all(np.abs(own - other).max() > SAME_RAD for other in kept):
             kept.append(own)
     return np.array(kept).reshape(-1, robot.dof)
+
+
+def members_of(
+    manifold: ConstraintManifold, seeds: Float[np.ndarray, "n D"]
+) -> Float[np.ndarray, "m D"]:
+    """Configurations within the joint limits that keep the constraint, near these seeds."""
+    robot = manifold.robot
+    result = retract(manifold, seeds)
+    good = result.converged & (robot.limit_distance(result.joints) >= 0.0)
+    return result.joints[good]
 
 
 @njit(**LEAF)

@@ -8,7 +8,7 @@ alone: no path to it is shorter.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -23,6 +23,8 @@ _WORTHWHILE = 1e-4
 """Share by which another path must be shorter to be looked for."""
 _CHEAP_ROUNDS, _PATIENTLY = 3, 4
 """After so many rounds trees are grown, towards so many of the goals, the nearest."""
+_ALMOST = 1.1
+"""A path that is no longer than so many times the straight distance is short enough."""
 _SLIDES = 6
 _MOVED_RAD = 1e-3
 """An end that would move by less stays."""
@@ -53,16 +55,59 @@ def shortest(
     pursued: Sequence[Pursued],
     task: Task,
     certify: Callable[[Pursued, Candidate], tuple[Path, float] | str],
+    more: Callable[[], Sequence[Pursued]],
 ) -> tuple[Path, Pursued] | None:
     """The shortest path that is certified, and whose it is; None where there is none.
 
-    pursued: the nearest first.  certify: gives the path and its length, or why it is none.
+    pursued: the nearest first.  certify: gives the path and its length, or why it is none.  more:
+    further ones, the nearest first, where the path is not almost as short as can be.
     """
-    best, least = None, np.inf
-    waiting, rounds = list(pursued), 0
-    while waiting:
-        found: list[tuple[float, Pursued, Candidate]] = []
-        nearest = least
+    pursuit = _Pursuit(task, certify)
+    left = pursuit.go_on(pursued, _CHEAP_ROUNDS)
+    if pursuit.least > _ALMOST * pursued[0].distance:
+        left += pursuit.go_on(more(), _CHEAP_ROUNDS)
+    left.sort(key=lambda one: one.distance)
+    pursuit.go_on(left[:_PATIENTLY])
+    return pursuit.best
+
+
+class _Pursuit(Generic[Path]):
+    """The best path so far, and its length."""
+
+    def __init__(
+        self, task: Task, certify: Callable[[Pursued, Candidate], tuple[Path, float] | str]
+    ) -> None:
+        self.task, self.certify = task, certify
+        self.best: tuple[Path, Pursued] | None = None
+        self.least = np.inf
+
+    @property
+    def worth(self) -> float:
+        """A path must be shorter."""
+        return (1.0 - _WORTHWHILE) * self.least
+
+    def go_on(self, pursued: Sequence[Pursued], rounds: int | None = None) -> list[Pursued]:
+        """Ask for so many curves to each, or for all there are; returns those that may have more
+        that are worth it.
+        """
+        waiting, done = [one for one in pursued if one.distance < self.worth], 0
+        while waiting and done != rounds:
+            for length, one, candidate in sorted(self._found(waiting), key=lambda own: own[0]):
+                if length >= self.worth:
+                    one.is_over = True
+                    continue
+                result = self.certify(one, candidate)
+                if isinstance(result, str):
+                    one.failed = f"; the {candidate.source} curve fails: {result}"
+                else:
+                    self.best, self.least, one.is_over = (result[0], one), result[1], True
+            waiting = [one for one in waiting if not one.is_over and one.distance < self.worth]
+            done += 1
+        return waiting
+
+    def _found(self, waiting: Sequence[Pursued]) -> Iterator[tuple[float, Pursued, Candidate]]:
+        """The next curve to each that is near enough."""
+        nearest = self.least
         for one in waiting:
             if one.distance >= (1.0 - _WORTHWHILE) * nearest:
                 break
@@ -71,24 +116,9 @@ def shortest(
                 one.answer, one.is_over = item, True
             elif item is not None:
                 if one.room is not None:
-                    item = slid(task, item, one.room)
-                found.append((item.length, one, item))
+                    item = slid(self.task, item, one.room)
                 nearest = min(nearest, item.length)
-        for length, one, candidate in sorted(found, key=lambda entry: entry[0]):
-            if length >= (1.0 - _WORTHWHILE) * least:
-                one.is_over = True
-                continue
-            result = certify(one, candidate)
-            if isinstance(result, str):
-                one.failed = f"; the {candidate.source} curve fails: {result}"
-            else:
-                best, least, one.is_over = (result[0], one), result[1], True
-        worth = (1.0 - _WORTHWHILE) * least
-        waiting = [one for one in waiting if not one.is_over and one.distance < worth]
-        rounds += 1
-        if rounds >= _CHEAP_ROUNDS:
-            waiting = waiting[:_PATIENTLY]
-    return best
+                yield item.length, one, item
 
 
 def slid(task: Task, candidate: Candidate, room: ConstraintManifold) -> Candidate:

@@ -127,7 +127,7 @@ class BiRRT:
 def birrt_beside(planner: Planner, constraint: Constraint) -> Iterator[BiRRT]:
     """BiRRT in the planner's scene, with a certifier of its own for the planner's promises."""
     scene, bundle = planner.scene, planner.bundle
-    limits = limits_of(bundle.planner, bundle.judge, scene.robot.dof)
+    limits = limits_of(bundle.planner, bundle.judge, scene.robot)
     with Certifier(scene, limits) as certifier:
         clearance = clearance_model(scene.robot, scene.workcell, certifier.collisions.apart)
         manifold = ConstraintManifold(scene.robot, constraint)
