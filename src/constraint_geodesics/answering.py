@@ -20,7 +20,7 @@ from constraint_geodesics.goals.goal import Goal
 from constraint_geodesics.methods import Method
 from constraint_geodesics.problem import Status
 from constraint_geodesics.robot.inverse_kinematics import spread
-from constraint_geodesics.search.candidates import BENDS, Answer, Candidate, rows_of
+from constraint_geodesics.search.candidates import BENDS, Answer, Candidate, connection, rows_of
 from constraint_geodesics.search.explanations import not_connected, refused_end
 from constraint_geodesics.search.preparation import Query
 from constraint_geodesics.search.pursuit import Pursued, shortest, slid
@@ -89,7 +89,10 @@ class Answering:
             pursued.extend(further)
             return further
 
-        found = shortest(pursued, query.task, certify, more)
+        def is_connected(one: Pursued) -> bool:
+            return connection(query.task, query.start, one.goal).status != "not_connected"
+
+        found = shortest(pursued, query.task, certify, more, is_connected)
         query = replace(query, looked_at=np.array([one.goal for one in pursued]))
         if found is None:
             return self._failed(query, pursued)

@@ -56,18 +56,24 @@ def shortest(
     task: Task,
     certify: Callable[[Pursued, Candidate], tuple[Path, float] | str],
     more: Callable[[], Sequence[Pursued]],
+    is_connected: Callable[[Pursued], bool],
 ) -> tuple[Path, Pursued] | None:
     """The shortest path that is certified, and whose it is; None where there is none.
 
     pursued: the nearest first.  certify: gives the path and its length, or why it is none.  more:
-    further ones, the nearest first, where the path is not almost as short as can be.
+    further ones, the nearest first, where the path is not almost as short as can be.  is_connected:
+    whether the graph does not keep one apart from the start.
     """
     pursuit = _Pursuit(task, certify)
     left = pursuit.go_on(pursued, _CHEAP_ROUNDS)
     if pursuit.least > _ALMOST * pursued[0].distance:
         left += pursuit.go_on(more(), _CHEAP_ROUNDS)
-    left.sort(key=lambda one: one.distance)
-    pursuit.go_on(left[:_PATIENTLY])
+    left = sorted(left, key=lambda one: one.distance)[:_PATIENTLY]
+    if (
+        pursuit.best is not None
+    ):  # the graph hardly ever errs: no trees to where it says there is no way
+        left = [one for one in left if is_connected(one)]
+    pursuit.go_on(left)
     return pursuit.best
 
 
