@@ -28,7 +28,7 @@ def kernels_digest(package: Path = PACKAGE) -> bytes:
     digest = hashlib.sha256()
     for file in sorted(package.rglob("*.py")):
         content = file.read_bytes()
-        if b"njit" in content:
+        if b"njit" in content or b"c_function" in content:
             digest.update(file.relative_to(package).as_posix().encode() + content)
     return digest.digest()
 

@@ -149,7 +149,9 @@ def candidates(
         for seed in range(TREES_APART if apart else TREES):
             yield None
             yield from _over_tree(task, start, goal, parts.refinement, seed)
-        for seed, settings in ((0, None), (1, None), (TREES, None if apart else PATIENT)):
+        narrower = task.settings.clearance_m > 2.0 * NARROW_M  # else the same passages are as wide
+        last = ((0, None), (1, None), (TREES, None if apart else PATIENT))
+        for seed, settings in last if narrower else last[2:]:
             yield None
             yield from _over_tree(task.narrow, start, goal, parts.refinement, seed, settings)
     yield answer
