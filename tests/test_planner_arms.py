@@ -10,6 +10,7 @@ import pytest
 
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.goals.region import GoalRegion
+from constraint_geodesics.methods import SearchMethod
 from constraint_geodesics.planner import SNAP_RAD, Planner, PlannerError
 from constraint_geodesics.robot.inverse_kinematics import solutions
 from constraint_geodesics.robot.kinematics import RobotError
@@ -117,6 +118,23 @@ def test_what_is_no_arm_is_refused_in_one_line(words, said) -> None:
     with pytest.raises(RobotError, match=said) as error:
         Planner.from_urdf(*words)
     assert "\n" not in str(error.value)
+
+
+class Elsewhere(SearchMethod):
+    """Curves to a configuration beside the goal."""
+
+    def candidates(self, task, start, goal, parts):
+        yield from super().candidates(task, start, goal + 0.1, parts)
+
+
+def test_a_path_to_another_configuration_than_was_asked_is_no_answer() -> None:
+    planner = packaged_planner()
+    start, goal = pairs_of("free", 1, seed=3)[0]
+    with Planner(planner.bundle, "packaged", Elsewhere()) as wrong:
+        for wanted in (goal, Pose(*planner.robot.forward(goal))):
+            path = wrong.plan(start, wanted, "free")
+            assert path.status == "not_found"
+            assert "away from the goal" in path.explanation
 
 
 # configurations of a pose
@@ -330,3 +348,28 @@ def test_a_region_leaves_an_end_free_under_a_constraint() -> None:
     assert path.status == "solved", path.explanation
     assert planner.robot.forward(path.goal)[0][2] == pytest.approx(pose.position[2], abs=1e-7)
     assert path.length_rad < planner.plan(start, pose, "level_cup").length_rad
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        (lambda p: p.ik([0.4, 0.0, 0.4]), r"pose = .*: must be a Pose"),
+        (lambda p: p.plan(np.zeros(7), [], "free"), "there is no goal"),
+        (lambda p: p.plan(np.zeros(7), None, "free"), "there is no goal"),
+        (lambda p: p.plan(np.zeros(7), np.ones(7), "free", budget_s="1"), "budget_s = '1'"),
+        (lambda p: p.plan(np.zeros(7), np.ones(7), "free", velocity_scale="1"), "velocity_scale"),
+        (lambda p: GoalRegion([0.0] * 7, free="yaw"), "pose = .*: must be a Pose"),
+        (lambda p: GoalRegion(Pose(np.zeros(3), np.eye(3)), tolerance=0.1), "must be six numbers"),
+    ],
+)
+def test_what_is_of_another_type_is_refused_by_its_name(asked, said) -> None:
+    with pytest.raises(PlannerError, match=said):
+        asked(panda())
+
+
+def test_a_region_is_no_further_than_its_own_pose() -> None:
+    planner = panda()
+    for start, goal in free_pairs(planner, 6, seed=12):
+        pose = Pose(*planner.robot.forward(goal))
+        own = planner.plan(start, pose, "free").length_rad
+        assert planner.plan(start, GoalRegion(pose, free="yaw"), "free").length_rad <= 1.01 * own

@@ -18,7 +18,7 @@ from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.goals.goal import Goal
 from constraint_geodesics.methods import Method
-from constraint_geodesics.problem import Status
+from constraint_geodesics.problem import PlannerError, Status
 from constraint_geodesics.robot.inverse_kinematics import spread
 from constraint_geodesics.search.candidates import BENDS, Answer, Candidate, connection, rows_of
 from constraint_geodesics.search.explanations import not_connected, refused_end
@@ -74,14 +74,14 @@ class Answering:
         pursued, rest = self._pursued(query, goals)
         if not pursued:
             wanted = " or ".join(one.description for one in goals)
-            return self._nothing(query, "not_found", f"no configuration is {wanted}")
+            return self._nothing(query, "not_found", f"no configuration was found for {wanted}")
         regions = tuple(goal.region for goal in goals if goal.region is not None)
         query = replace(query, regions=regions)
         if pursued[0].distance <= COINCIDENT_RAD:
             return self._standing(replace(query, goal=pursued[0].goal), pursued[0].region)
 
         def certify(one: Pursued, candidate: Candidate) -> tuple[Trajectory, float] | str:
-            found = self._certified(query, candidate, one.region)
+            found = self._certified(query, candidate, one)
             return found if isinstance(found, str) else (found, found.length_rad)
 
         def more() -> list[Pursued]:
@@ -114,6 +114,8 @@ class Answering:
         for goal in goals:
             room = None
             if goal.region is not None:
+                if not goal.region.is_placed:
+                    raise PlannerError(f"goal: the region of {goal.description} has no reference")
                 room = ConstraintManifold(manifold.robot, both(goal.region, manifold.constraint))
                 if room.codim >= manifold.robot.dof:
                     room = None
@@ -202,7 +204,7 @@ class Answering:
                 break
             one, candidate = item
             if candidate is not None and candidate.length < (1.0 - _WORTHWHILE) * path.length_rad:
-                found = self._certified(query, candidate, one.region)
+                found = self._certified(query, candidate, one)
                 if isinstance(found, Trajectory) and found.length_rad < path.length_rad:
                     path = found
             before, spent = spent, time.perf_counter() - query.began
@@ -219,10 +221,11 @@ class Answering:
                 found = slid(query.task, found, one.room)
             yield one, found
 
-    def _certified(
-        self, query: Query, candidate: Candidate, region: Constraint | None
-    ) -> Trajectory | str:
-        """The candidate as a trajectory if it is certified, otherwise why it is not."""
+    def _certified(self, query: Query, candidate: Candidate, one: Pursued) -> Trajectory | str:
+        """The candidate as a trajectory if it is certified, otherwise why it is not: its end is the
+        configuration that was asked for, or any in the region.
+        """
+        goal = one.goal if one.room is None else None
         robot, constraint = self.certifier.scene.robot, query.task.manifold.constraint
         limits = self.certifier.limits
         assert limits.acceleration_rad_s2 is not None
@@ -235,7 +238,7 @@ class Answering:
             except GeometryError as error:
                 return str(error)
             certificate = self.certifier.certify(
-                joints, constraint, query.start, candidate.points[-1], times, region=region
+                joints, constraint, query.start, goal, times, region=one.region
             )
             if certificate.violation is None or certificate.violation.kind not in _CLOSER:
                 break

@@ -224,7 +224,8 @@ def inverse_kinematics(
         for q in found:
             print(" ".join(f"{x:.9f}" for x in q))
     if not len(found):
-        print("no configuration reaches this pose", file=sys.stderr)
+        line = "no configuration was found that reaches this pose and touches nothing"
+        print(line, file=sys.stderr)
     raise SystemExit(0 if len(found) else NO_PATH)
 
 
@@ -312,6 +313,8 @@ def show_robot(
     try:
         file = urdf if urdf.exists() else find_urdf(urdf)
         if tool_link is None:
+            if hold or srdf:
+                raise RobotError("--hold and --srdf need --tool-link")
             description = read_description(file)
             ends = {link: len(description.moving(link)) for link in description.ends}
             about: dict[str, Any] = {"robot": description.name, "tool_links": ends}
@@ -366,7 +369,7 @@ def _pose(text: str, option: str) -> "Pose":
 
     values = _joints(text, option)
     if len(values) != 6 or not all(map(math.isfinite, values)):
-        raise PlannerError(f"{option} {text!r}: must be six numbers, {POSE}")
+        raise PlannerError(f"{option} {text!r}: must be six finite numbers, {POSE}")
     return Pose.from_rpy(values[:3], values[3:])
 
 

@@ -54,7 +54,7 @@ prismatic ones.
 """
 CLEARANCE_SHARE = 0.05
 """Of what an arm typically keeps, asked for in the search by a planner that is made from a URDF."""
-REPRESENTATIVES = 64
+SPREAD = 64
 """Of the configurations that reach a pose, where there is no end of them."""
 OWN_CONSTRAINTS = {"free": Constraint((0,) * 6), "level": Constraint((0, 0, 0, 1, 1, 0))}
 """By name, of a planner that is made from a URDF: nothing held, and the tilt that the start has."""
@@ -125,6 +125,7 @@ class Planner:
         """
         own = None
         if tool is not None:
+            _require_pose(tool, "tool")
             rpy = rpy_of(tool.rotation)
             own = PoseParams(position_m=tuple(tool.position.tolist()), rpy_rad=rpy)
         try:
@@ -159,6 +160,9 @@ class Planner:
         """Free the physics world; a closed planner answers no more."""
         self._closed = True
         self._certifier.close()
+
+    def __getstate__(self) -> None:
+        raise TypeError("a planner holds a physics world: make one in each process")
 
     def _require_open(self) -> None:
         if self._closed:
@@ -197,12 +201,13 @@ class Planner:
         all of them.
         """
         self._require_open()
+        _require_pose(pose, "pose")
         robot, settings = self.robot, Search()
         if robot.dof > POSE_JOINTS:
             settings = settings._replace(seeds=MANY_SEEDS)
         found = solutions(robot, pose.position, pose.rotation, settings)
         free = found[self._certifier.collisions.free(found)]
-        return spread(free, REPRESENTATIVES) if robot.dof > POSE_JOINTS else free
+        return spread(free, SPREAD) if robot.dof > POSE_JOINTS else free
 
     def project(self, q: ArrayLike, constraint: str | Constraint) -> Projection:
         """The nearest configuration that keeps a constraint and the joint limits, as far as the
@@ -257,12 +262,12 @@ class Planner:
         given, name = self._named(constraint)
         given.compile()
         began = time.perf_counter()
-        if budget_s is not None and not (np.isfinite(budget_s) and budget_s > 0.0):
-            raise PlannerError(f"budget_s = {budget_s}: must be a positive number of seconds")
+        if budget_s is not None and not (_is_number(budget_s) and 0.0 < budget_s < np.inf):
+            raise PlannerError(f"budget_s = {budget_s!r}: must be a positive number of seconds")
         scales = velocity_scale, acceleration_scale
         for scale, which in zip(scales, ("velocity", "acceleration"), strict=True):
-            if not 0.0 < scale <= 1.0:
-                raise PlannerError(f"{which}_scale = {scale}: must be above 0 and at most 1")
+            if not (_is_number(scale) and 0.0 < scale <= 1.0):
+                raise PlannerError(f"{which}_scale = {scale!r}: must be above 0 and at most 1")
         dof = self.scene.robot.dof
         q_start, goals = checked_configuration(start, dof, "start"), as_goals(goal, dof)
         task, moved = self._preparation.task(self._held_at(given, q_start)), 0.0
@@ -353,13 +358,23 @@ class Planner:
         return found.configuration, found.distance_rad
 
 
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float | np.number)
+
+
+def _require_pose(value: object, name: str) -> None:
+    if not isinstance(value, Pose):
+        raise PlannerError(f"{name} = {value!r}: must be a Pose")
+
+
 def _batch(
     starts: Float[np.ndarray, "B D"], goals: Float[np.ndarray, "B D"], dof: int
 ) -> tuple[Float[np.ndarray, "B D"], Float[np.ndarray, "B D"]]:
     try:
         first, last = np.asarray(starts, float), np.asarray(goals, float)
     except (TypeError, ValueError):
-        raise PlannerError(f"starts and goals must be (B, {dof}) numbers [rad]") from None
+        line = f"starts and goals must be (B, {dof}) numbers [rad]; other goals are `plan`'s"
+        raise PlannerError(line) from None
     if first.ndim != 2 or first.shape != last.shape or first.shape[1] != dof:
         shapes = f"starts and goals have shapes {first.shape} and {last.shape}"
         raise PlannerError(f"{shapes}: both must be (B, {dof})")

@@ -30,7 +30,6 @@ from constraint_geodesics.studies.arm_parts import (
 )
 from constraint_geodesics.studies.arm_queries import (
     between_configurations,
-    held_angle,
     to_free_yaw,
     to_redundant_poses,
 )
@@ -83,7 +82,7 @@ def test_a_free_yaw_is_no_worse_than_the_best_of_a_grid() -> None:
 
 
 def test_birrt_is_asked_every_pair_between_configurations() -> None:
-    with arms.arm_planner("iiwa") as planner:
+    with arms.ARMS["iiwa"].planner() as planner:
         rows = between_configurations(planner, "free", 2, seed=0)
         poses = to_redundant_poses(planner, 1, seed=0)
     assert [own.query for own in rows] == [0, 1]
@@ -97,7 +96,7 @@ def test_birrt_is_asked_every_pair_between_configurations() -> None:
 
 def test_birrt_is_asked_what_the_planner_does_not_solve(monkeypatch) -> None:
     monkeypatch.setattr("constraint_geodesics.studies.arm_queries.BIRRT_S", 0.1)
-    rows = held_angle(packaged_planner(), "roll", 3, seed=0)
+    rows = between_configurations(packaged_planner(), "roll", 3, seed=0, ask_all=False)
     assert len(rows) == 3
     assert all((own.status == "solved") == (own.birrt_status == "") for own in rows)
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.goals.region import NEAREST
 from constraint_geodesics.robot.inverse_kinematics import (
     Search,
     seeds_of,
@@ -16,11 +17,11 @@ from constraint_geodesics.robot.inverse_kinematics import (
 from constraint_geodesics.search.nearest import nearest_on
 
 POSE_JOINTS = 6
-"""An arm with more joints reaches a pose by families of configurations."""
+"""Joints up to which a pose is reached by single configurations, and not by families of them."""
 MANY_SEEDS = 1024
 """Of the inverse kinematics, for members of all families."""
-_NEAREST, _SEEDS = 64, 128
-"""Members of families, and other configurations, from which the nearest ones are looked for."""
+_SEEDS = 128
+"""Configurations, beside NEAREST members of families, from which the nearest are looked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class PoseGoal:
     def description(self) -> str:
         """The pose."""
         x, y, z = self.pose.position
-        return f"a configuration with the tool at ({x:.4g}, {y:.4g}, {z:.4g}) m, turned as asked"
+        return f"the tool at ({x:.4g}, {y:.4g}, {z:.4g}) m, turned as asked"
 
     def configurations(
         self, manifold: ConstraintManifold, start: Float[np.ndarray, "D"]
@@ -51,7 +52,7 @@ class PoseGoal:
             yield from found
             return
         own = ConstraintManifold(robot, self.region)
-        found = found[np.argsort(np.linalg.norm(found - start, axis=1))][:_NEAREST]
+        found = found[np.argsort(np.linalg.norm(found - start, axis=1))][:NEAREST]
         seeds = turned_towards(robot, seeds_of(robot, _SEEDS), start)
         yield from nearest_on(own, start, np.concatenate([start[None], found, seeds]))
         yield None

@@ -9,11 +9,13 @@ from jaxtyping import Float
 from constraint_geodesics.constraints.both import both
 from constraint_geodesics.constraints.constraint import AXES, Constraint, ConstraintManifold, Pose
 from constraint_geodesics.problem import PlannerError
-from constraint_geodesics.robot.inverse_kinematics import seeds_of, turned_towards
+from constraint_geodesics.robot.inverse_kinematics import seeds_of, solutions, turned_towards
 from constraint_geodesics.search.nearest import members_of, nearest_on
 
 SEEDS = 256
-"""Configurations from which the nearest of the region are looked for."""
+"""Configurations from which the nearest of the region are looked for,"""
+NEAREST = 64
+"""and those of them, at most, that have the region's own pose."""
 MANY_SEEDS = 512
 """Those from which others are."""
 
@@ -34,14 +36,21 @@ class GoalRegion:
     tolerance: Sequence[float] = (0.0,) * 6
 
     def __post_init__(self) -> None:
+        if not isinstance(self.pose, Pose):
+            raise PlannerError(f"goal region: pose = {self.pose!r}: must be a Pose")
         names = [self.free] if isinstance(self.free, str) else list(self.free)
         for name in names:
             if name not in AXES:
                 raise PlannerError(f"free = {name!r}: must be of {', '.join(AXES)}")
         held = tuple(int(axis not in names) for axis in AXES)
         try:
-            region = Constraint(held, tuple(map(float, self.tolerance)), self.pose)
-        except (TypeError, ValueError) as error:
+            widths = tuple(map(float, self.tolerance))
+        except (TypeError, ValueError):
+            line = f"goal region: tolerance = {self.tolerance!r}: must be six numbers"
+            raise PlannerError(line) from None
+        try:
+            region = Constraint(held, widths, self.pose)
+        except ValueError as error:
             raise PlannerError(f"goal region: {error}") from None
         object.__setattr__(self, "region", region)
 
@@ -51,7 +60,7 @@ class GoalRegion:
     def description(self) -> str:
         """Where it is, and what is free."""
         x, y, z = self.pose.position
-        return f"a configuration with the tool in the region around ({x:.4g}, {y:.4g}, {z:.4g}) m"
+        return f"the tool in the region around ({x:.4g}, {y:.4g}, {z:.4g}) m"
 
     def configurations(
         self, manifold: ConstraintManifold, start: Float[np.ndarray, "D"]
@@ -64,7 +73,10 @@ class GoalRegion:
         near, many = (
             turned_towards(robot, seeds_of(robot, count), start) for count in (SEEDS, MANY_SEEDS)
         )
-        seeds = np.concatenate([start[None], near])
+        # a region holds its own pose: no path to it is longer than one there
+        there = solutions(robot, self.pose.position, self.pose.rotation, near=start)
+        there = there[np.argsort(np.linalg.norm(there - start, axis=1))][:NEAREST]
+        seeds = np.concatenate([start[None], there, near])
         found = nearest_on(together, start, seeds)
         if not len(found):
             yield from nearest_on(ConstraintManifold(robot, self.region), start, seeds)

@@ -7,12 +7,15 @@ import numpy as np
 from constraint_geodesics.constraints.constraint import Pose
 from constraint_geodesics.goals.goal import ConfigurationGoal, Goal, checked_configuration
 from constraint_geodesics.goals.pose import PoseGoal
+from constraint_geodesics.problem import PlannerError
 
 
 def as_goals(goal: Any, dof: int) -> tuple[Goal, ...]:
     """Goals as they are, numbers as a configuration's, a pose as a PoseGoal, and those of a list,
     or of the rows of a table.  Raises PlannerError if it is none of these, or a list of nothing.
     """
+    if goal is None or (isinstance(goal, list | tuple) and not goal):
+        raise PlannerError(f"goal has shape {np.shape(goal)}: there is no goal")
     # numbers first: asking for the protocol takes longer than looking at both ends
     if isinstance(goal, np.ndarray) and goal.ndim == 2:
         goal = list(goal)

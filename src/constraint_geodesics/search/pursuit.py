@@ -17,7 +17,7 @@ from constraint_geodesics.constraints.constraint import Constraint, ConstraintMa
 from constraint_geodesics.search.candidates import Answer, Candidate, Task, refined
 from constraint_geodesics.search.nearest import nearest_on
 
-Path = TypeVar("Path")
+Certified = TypeVar("Certified")
 
 _WORTHWHILE = 1e-4
 """Share by which another path must be shorter to be looked for."""
@@ -54,10 +54,10 @@ class Pursued:
 def shortest(
     pursued: Sequence[Pursued],
     task: Task,
-    certify: Callable[[Pursued, Candidate], tuple[Path, float] | str],
+    certify: Callable[[Pursued, Candidate], tuple[Certified, float] | str],
     more: Callable[[], Sequence[Pursued]],
     is_connected: Callable[[Pursued], bool],
-) -> tuple[Path, Pursued] | None:
+) -> tuple[Certified, Pursued] | None:
     """The shortest path that is certified, and whose it is; None where there is none.
 
     pursued: the nearest first.  certify: gives the path and its length, or why it is none.  more:
@@ -69,22 +69,21 @@ def shortest(
     if pursuit.least > _ALMOST * pursued[0].distance:
         left += pursuit.go_on(more(), _CHEAP_ROUNDS)
     left = sorted(left, key=lambda one: one.distance)[:_PATIENTLY]
-    if (
-        pursuit.best is not None
-    ):  # the graph hardly ever errs: no trees to where it says there is no way
+    if pursuit.best is not None:
+        # the graph hardly ever errs: no trees are grown to where it says that there is no way
         left = [one for one in left if is_connected(one)]
     pursuit.go_on(left)
     return pursuit.best
 
 
-class _Pursuit(Generic[Path]):
+class _Pursuit(Generic[Certified]):
     """The best path so far, and its length."""
 
     def __init__(
-        self, task: Task, certify: Callable[[Pursued, Candidate], tuple[Path, float] | str]
+        self, task: Task, certify: Callable[[Pursued, Candidate], tuple[Certified, float] | str]
     ) -> None:
         self.task, self.certify = task, certify
-        self.best: tuple[Path, Pursued] | None = None
+        self.best: tuple[Certified, Pursued] | None = None
         self.least = np.inf
 
     @property

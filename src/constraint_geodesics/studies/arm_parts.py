@@ -17,12 +17,11 @@ from constraint_geodesics.planner import Planner
 from constraint_geodesics.studies.arm_queries import (
     Row,
     between_configurations,
-    held_angle,
     to_free_yaw,
     to_poses,
     to_redundant_poses,
 )
-from constraint_geodesics.studies.arms import ARMS, REDUNDANT, arm_planner, first_paths
+from constraint_geodesics.studies.arms import ARMS, REDUNDANT, first_paths
 
 Table = Literal["first_path", "configurations", "pose", "free_yaw", "redundant_pose", "held_angle"]
 PIPELINE_ARM = "xArm 6 on its table"
@@ -113,15 +112,19 @@ def _rows(part: Part) -> list[Row]:
             for k, path in enumerate(paths)
         ]
     with (
-        Planner.load(part.planner) if part.arm == PIPELINE_ARM else arm_planner(part.arm) as planner
+        Planner.load(part.planner)
+        if part.arm == PIPELINE_ARM
+        else ARMS[part.arm].planner() as planner
     ):
         if isinstance(part.queries, tuple):
             ask = to_poses if part.table == "pose" else to_free_yaw
             return ask(planner, part.queries)
         if part.table == "redundant_pose":
             return to_redundant_poses(planner, part.queries, SEED)
-        draw = held_angle if part.table == "held_angle" else between_configurations
-        return draw(planner, part.constraint, part.queries, SEED)
+        everywhere = part.table == "configurations"
+        return between_configurations(
+            planner, part.constraint, part.queries, SEED, ask_all=everywhere
+        )
 
 
 def table_of(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
@@ -131,7 +134,7 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 def read_arms(file: Path) -> pd.DataFrame:
     """The rows as the stage wrote them, a comment line for each thing to know before them."""
-    texts = dict.fromkeys(("birrt_status", "given_status"), "")
+    texts = dict.fromkeys(("source", "birrt_status", "given_status"), "")
     table = pd.read_csv(file, comment="#", float_precision="round_trip", dtype={"status": str})
     return table.astype(dict.fromkeys(texts, object)).fillna(texts)
 
@@ -166,6 +169,7 @@ def figures_of(rows: pd.DataFrame) -> dict[str, Any]:
     found = {
         "queries": len(rows),
         "solved": int(solved.sum()),
+        "straight": _share(rows["source"] == "straight", solved),
         "not_connected": int((rows["status"] == "not_connected").sum()),
         "solvable": int(known.sum()),
         "success": _share(solved & known, known),
@@ -193,4 +197,4 @@ def _quantiles(name: str, values: pd.Series) -> dict[str, float | None]:
 
 
 def _number(value: Any) -> float | None:
-    return None if np.isnan(value) else round(float(value), 6)
+    return round(float(value), 6) if np.isfinite(value) else None

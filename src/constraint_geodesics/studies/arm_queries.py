@@ -6,7 +6,7 @@ import itertools
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -20,8 +20,8 @@ from constraint_geodesics.peers.ompl import SamplingPlanner
 from constraint_geodesics.peers.wrappers import band_after
 from constraint_geodesics.planner import Planner, limits_of
 from constraint_geodesics.problem import PlanningProblem, Solution
-from constraint_geodesics.robot.inverse_kinematics import Search, solutions, spread
-from constraint_geodesics.robot.kinematics import rotation_from_rpy
+from constraint_geodesics.robot.inverse_kinematics import Search, solutions, spread, turned_towards
+from constraint_geodesics.robot.kinematics import SerialRobot, rotation_from_rpy
 from constraint_geodesics.scene.clearance import ClearanceModel, clearance_model
 from constraint_geodesics.search.preparation import free_configurations
 from constraint_geodesics.trajectory import Trajectory
@@ -34,6 +34,8 @@ YAWS = 120
 """Tool poses of a grid over a free yaw."""
 REPRESENTATIVES, SEEDS = 512, 2048
 """Configurations spread over the family that reaches a pose, and what they are found from."""
+REFERENCES = 5
+"""Poses that a constraint is held at, each for a part of the queries."""
 NEAREST = 3
 """Of these, how many BiRRT is asked to go to, where nothing else finds a path."""
 AXES = {
@@ -43,7 +45,7 @@ AXES = {
     "pitch": (0, 0, 0, 0, 1, 0),
     "yaw": (0, 0, 0, 0, 0, 1),
 }
-"""Constraints that hold their axes where the tool is at a random configuration."""
+"""Constraints that hold their axes where the tool is at random configurations."""
 DRAWN = 400
 """Configurations that are drawn for one that touches nothing."""
 
@@ -55,8 +57,9 @@ class Row:
     """One query.  best_known_rad: the shortest certified path to what was asked that anything here
     found, the planner's own among them; nan where nothing found one.
 
-    birrt_status: "" where it was not asked.  given_…: to the query's own configuration instead of
-    its tool pose.  prepared_s: of the constraint's roadmap, before.
+    source: the proposal that the path came from.  birrt_status: "" where it was not asked.
+    given_…: to the query's own configuration instead of its tool pose.  prepared_s: of the
+    constraint's roadmap, before.
     """
 
     query: int
@@ -64,6 +67,7 @@ class Row:
     length_rad: float
     time_ms: float
     best_known_rad: float = np.nan
+    source: str = ""
     birrt_status: str = ""
     birrt_length_rad: float = np.nan
     birrt_time_ms: float = np.nan
@@ -155,42 +159,54 @@ def drawn_pairs(birrt: BiRRT, count: int, seed: int) -> list[Pair]:
     checks, robot = birrt.certifier.collisions, birrt.planner.robot
     rng = np.random.default_rng(seed)
     q = free_configurations(birrt.manifold, checks, robot.sample, 2 * count, rng)
-    return list(zip(q[:-1:2], q[1::2], strict=False))
+    pairs = zip(q[:-1:2], q[1::2], strict=False)
+    return [(start, _nearest_turn(robot, goal, start)) for start, goal in pairs]
 
 
-def between_configurations(planner: Planner, name: str, count: int, seed: int) -> list[Row]:
-    """Random pairs under one of AXES; BiRRT is asked all of them."""
-    constraint = drawn_constraint(planner, name, seed)
-    began = time.perf_counter()
-    planner.prepare(constraint)
-    prepared_s, rows = time.perf_counter() - began, []
-    with birrt_beside(planner, constraint) as birrt:
-        for query, (start, goal) in enumerate(drawn_pairs(birrt, count, seed)):
-            answer, time_ms = _timed(planner, start, goal, constraint)
-            theirs, best = birrt.ask(start, goal), answer.length_rad
-            if answer.status == "solved":
-                best = planner.plan(start, goal, constraint, budget_s=LONGER_S).length_rad
-            best = _least(answer.length_rad, best, theirs.length_rad)
-            ours = query, answer.status, answer.length_rad, time_ms, best
-            rows.append(Row(*ours, *_of(theirs), prepared_s=prepared_s))
+def _nearest_turn(
+    robot: SerialRobot, q: Float[np.ndarray, "D"], other: Float[np.ndarray, "D"]
+) -> Float[np.ndarray, "D"]:
+    """The same angles of continuous joints as near to another configuration as can be: what the
+    planner takes for one goal, and what BiRRT is asked for.
+    """
+    turned = turned_towards(robot, q[None], other)[0]
+    continuous = np.array([name in robot.continuous for name in robot.joint_names])
+    return np.where(continuous, turned, q)
+
+
+def between_configurations(
+    planner: Planner, name: str, count: int, seed: int, *, ask_all: bool = True
+) -> list[Row]:
+    """Random pairs under one of AXES, held at REFERENCES poses one after another.  ask_all: BiRRT
+    is asked all of them, else those that the planner does not solve.
+    """
+    rows = list[Row]()
+    for k, some in enumerate(np.array_split(np.arange(count), REFERENCES if name != "free" else 1)):
+        if not len(some):
+            continue
+        constraint = drawn_constraint(planner, name, seed + k)
+        began = time.perf_counter()
+        planner.prepare(constraint)
+        prepared_s = time.perf_counter() - began
+        with birrt_beside(planner, constraint) as birrt:
+            for start, goal in drawn_pairs(birrt, len(some), seed + k):
+                row = _between(planner, birrt, (start, goal), ask_all)
+                rows.append(replace(row, query=len(rows), prepared_s=prepared_s))
     return rows
 
 
-def held_angle(planner: Planner, name: str, count: int, seed: int) -> list[Row]:
-    """Random pairs under one of AXES; BiRRT is asked those that the planner does not solve."""
-    constraint = drawn_constraint(planner, name, seed)
-    began = time.perf_counter()
-    planner.prepare(constraint)
-    prepared_s, rows = time.perf_counter() - began, []
-    with birrt_beside(planner, constraint) as birrt:
-        for query, (start, goal) in enumerate(drawn_pairs(birrt, count, seed)):
-            answer, time_ms = _timed(planner, start, goal, constraint)
-            asked = answer.status != "solved"
-            theirs = birrt.ask(start, goal) if asked else Found("", np.nan, np.nan)
-            best = _least(answer.length_rad, theirs.length_rad)
-            ours = query, answer.status, answer.length_rad, time_ms, best
-            rows.append(Row(*ours, *_of(theirs), prepared_s=prepared_s))
-    return rows
+def _between(planner: Planner, birrt: BiRRT, ends: Pair, ask_all: bool) -> Row:
+    """One query, still without its number."""
+    constraint = birrt.manifold.constraint
+    answer, time_ms = _timed(planner, *ends, constraint)
+    solved = answer.status == "solved"
+    theirs = birrt.ask(*ends) if ask_all or not solved else Found("", np.nan, np.nan)
+    longer = np.nan
+    if ask_all and solved:
+        longer = planner.plan(*ends, constraint, budget_s=LONGER_S).length_rad
+    best = _least(answer.length_rad, longer, theirs.length_rad)
+    ours = 0, answer.status, answer.length_rad, time_ms, best, answer.source
+    return Row(*ours, *_of(theirs))
 
 
 def to_poses(planner: Planner, queries: Sequence[Query]) -> list[Row]:
@@ -208,7 +224,7 @@ def to_poses(planner: Planner, queries: Sequence[Query]) -> list[Row]:
             if not np.linalg.norm(branch - query.start) >= best:
                 best = _least(best, planner.plan(query.start, branch, name).length_rad)
         given = planner.plan(query.start, query.goal, name)
-        ours = query.number, answer.status, answer.length_rad, time_ms, best
+        ours = query.number, answer.status, answer.length_rad, time_ms, best, answer.source
         rows.append(Row(*ours, given_status=given.status, given_length_rad=given.length_rad))
     return rows
 
@@ -224,7 +240,8 @@ def to_free_yaw(planner: Planner, queries: Sequence[Query]) -> list[Row]:
         turned = (Pose(pose.position, turn @ pose.rotation) for turn in turns)
         lengths = [planner.plan(query.start, other, name).length_rad for other in turned]
         best = _least(answer.length_rad, *lengths)
-        rows.append(Row(query.number, answer.status, answer.length_rad, time_ms, best))
+        ours = query.number, answer.status, answer.length_rad, time_ms, best, answer.source
+        rows.append(Row(*ours))
     return rows
 
 
@@ -252,7 +269,7 @@ def to_redundant_poses(planner: Planner, count: int, seed: int) -> list[Row]:
                     if theirs.status == "solved":
                         break
             best = _least(answer.length_rad, listed, theirs.length_rad)
-            ours = query, answer.status, answer.length_rad, time_ms, best
+            ours = query, answer.status, answer.length_rad, time_ms, best, answer.source
             rows.append(Row(*ours, *_of(theirs)))
     return rows
 

@@ -31,22 +31,32 @@ TRIES = 100
 
 class ArmFile(NamedTuple):
     """A URDF, the link that carries the tool, and whether it is one of example-robot-data's; the
-    others are pybullet_data's.
+    others are pybullet_data's.  srdf: beside it, where the links that may touch are not to be found
+    by sampling.
     """
 
     urdf: str
     tool_link: str
     in_robot_data: bool = True
+    srdf: str = ""
 
     @property
     def path(self) -> Path:
         """Where it lies.  Raises MissingExtraError where example-robot-data is not installed."""
         return robots_folder() / self.urdf if self.in_robot_data else find_urdf(self.urdf)
 
+    def planner(self) -> Planner:
+        """A planner for it, alone in its scene."""
+        srdf = robots_folder() / self.srdf if self.srdf else None
+        return Planner.from_urdf(self.path, self.tool_link, srdf)
+
 
 ARMS = {
     "xArm 6": ArmFile("xarm/xarm6_robot.urdf", "link6", False),
-    "UR5": ArmFile("ur_description/urdf/ur5_robot.urdf", "tool0"),
+    # its upper arm's hull touches the base's wherever it turns over: its SRDF allows that
+    "UR5": ArmFile(
+        "ur_description/urdf/ur5_robot.urdf", "tool0", srdf="ur_description/srdf/ur5.srdf"
+    ),
     "Kinova": ArmFile("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
     "iiwa": ArmFile("kuka_iiwa/model.urdf", "lbr_iiwa_link_7", False),
     "Panda": ArmFile("franka_panda/panda.urdf", "panda_grasptarget", False),
@@ -72,12 +82,6 @@ def robots_folder() -> Path:
     return Path(str(installed.locate_file(_FOLDER)))
 
 
-def arm_planner(arm: str) -> Planner:
-    """A planner for one of the arms, alone in its scene."""
-    file = ARMS[arm]
-    return Planner.from_urdf(file.path, file.tool_link)
-
-
 @dataclass(frozen=True)
 class FirstPath:
     """How the first path came about.  made_s: the planner from the URDF; planned_s: from then to
@@ -98,9 +102,8 @@ def first_path(arm: str, seed: int) -> FirstPath:
     imports when it needs it does, and so does reading the compiled kernels.
     """
     warmup.ensure()
-    file, rng = ARMS[arm].path, np.random.default_rng(seed)
-    began = time.perf_counter()
-    with Planner.from_urdf(file, ARMS[arm].tool_link) as planner:
+    rng, began = np.random.default_rng(seed), time.perf_counter()
+    with ARMS[arm].planner() as planner:
         made = time.perf_counter()
         asked, solved = 0, False
         while not solved and asked < TRIES:
