@@ -15,7 +15,8 @@ def as_goals(goal: Any, dof: int) -> tuple[Goal, ...]:
     or of the rows of a table.  Raises PlannerError if it is none of these, or a list of nothing.
     """
     if goal is None or (isinstance(goal, list | tuple) and not goal):
-        raise PlannerError(f"goal has shape {np.shape(goal)}: there is no goal")
+        # numpy takes None too
+        raise PlannerError(f"goal has shape {np.shape(goal)}: there is no goal")  # type: ignore[arg-type]
     # numbers first: asking for the protocol takes longer than looking at both ends
     if isinstance(goal, np.ndarray) and goal.ndim == 2:
         goal = list(goal)
