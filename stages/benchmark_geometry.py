@@ -5,8 +5,8 @@ import sys
 from dataclasses import replace
 
 from constraint_geodesics.constraints.constraint import constraint_manifold
-from constraint_geodesics.geodesics.policy_search import load_policy
 from constraint_geodesics.geodesics.problem import ChartProblem, Samples
+from constraint_geodesics.geodesics.proposals import MeanPolicy
 from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
@@ -39,7 +39,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     ) as run:
         benchmark = GeometryBenchmark(plain, retracted, settings, params.geometry)
         figures = benchmark.figures(
-            {name: load_policy(layout.analytic(name), settings.seeds[0]) for name in names}
+            {name: MeanPolicy.load(layout.analytic(name), settings.seeds[0]) for name in names}
         )
         trained = {
             name: json.loads(layout.report("train_analytic", name).read_text()) for name in names

@@ -1,18 +1,18 @@
-"""Stage: the files of the paper's system as a method of the planner, from the run's manifold,
-policies and sub-manifolds.
+"""Stage: the files of the paper's system as a method of the planner, from the run's policies'
+chart, the first of them, and the sub-manifolds.
 """
 
 import sys
 
-import numpy as np
 from safetensors.numpy import load_file
 
 from constraint_geodesics.geodesics.learned_method import LearnedFiles
-from constraint_geodesics.learning.inference import WEIGHTS
+from constraint_geodesics.learning.learned_manifold import chart_named
 from constraint_geodesics.learning.submanifold import GraphSubmanifold, load_submanifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.scene.scene import robot_from
 from constraint_geodesics.search.roadmap import Roadmap
 
 
@@ -20,17 +20,15 @@ def main(params: Params, layout: Layout) -> None:
     """Write data/learned/."""
     manifold = params.geodesics.searched[0]
     graphs = {n: load_submanifold(layout.submanifold(manifold, n)) for n in params.constraints}
-    policies: dict[str, np.ndarray] = {}
-    for seed in params.geodesics.seeds:
-        actor = load_file(layout.policies(manifold) / f"policy-{seed}.safetensors")
-        policies |= {f"{seed}/{name}": values for name, values in actor.items()}
     submanifolds = {
         name: Roadmap(g.joints, g.edges, g.lengths, g.labels)
         for name, g in graphs.items()
         if isinstance(g, GraphSubmanifold)
     }
-    weights = load_file(layout.manifold(manifold) / WEIGHTS)
-    files = LearnedFiles(params.robot, params.policy_settings(), weights, policies, submanifolds)
+    name, settings = params.policies.chart, params.policy_settings()
+    chart = chart_named(name, layout.manifold(name), robot_from(params.robot))
+    policy = load_file(layout.policies(name) / f"policy-{settings.seeds[0]}.safetensors")
+    files = LearnedFiles(params.robot, settings, chart.arrays(), policy, submanifolds)
     files.write(layout.learned)
 
 

@@ -1,14 +1,15 @@
-"""Stage: train one policy a seed on one manifold under one constraint, and search the queries'
-geodesics with each.
+"""Stage: search the queries' geodesics under one constraint with a policy a seed: the shared ones
+where curves are retracted, their own where they are not, as in the paper.
 """
 
 import shutil
 import sys
 
 from constraint_geodesics.constraints.constraint import constraint_manifold
+from constraint_geodesics.geodesics.proposals import MeanPolicy
 from constraint_geodesics.learning.dataset import read_joints, read_queries
-from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.submanifold import load_submanifold
+from constraint_geodesics.learning.learned_manifold import LearnedManifold, chart_named
+from constraint_geodesics.learning.submanifold import Surface, load_submanifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
@@ -21,6 +22,7 @@ from constraint_geodesics.studies.geodesic_search import (
     connected_queries,
     geodesic_figures,
     geodesic_problem,
+    policy_problem,
     run_seed,
     save_seeds,
     straight_rows,
@@ -39,17 +41,28 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     )
     scene = Scene.from_params(params)
     constrained = constraint_manifold(scene.robot, params.constraints[constraint])
-    chart = LearnedManifold.load(layout.manifold(manifold))
-    problem = geodesic_problem(
-        params, chart, constrained, read_joints(sources[0]).free_joints, manifold
+    learned, joints = (
+        LearnedManifold.load(layout.manifold(manifold)),
+        read_joints(sources[0]).free_joints,
     )
+    policies: dict[int, MeanPolicy] = {}
+    settings = params.geodesics
+    if params.manifolds[manifold].retract:
+        name = params.policies.chart
+        chart = chart_named(name, layout.manifold(name), scene.robot)
+        problem = policy_problem(params, chart, scene, constrained, joints)
+        folder = layout.policies(name)
+        policies = {seed: MeanPolicy.load(folder, seed) for seed in settings.seeds}
+        settings = params.policy_settings().model_copy(update={"seeds": settings.seeds})
+    else:
+        problem = geodesic_problem(params, learned, constrained, joints, manifold)
     queries = read_queries(sources[1])
     submanifold = load_submanifold(layout.submanifold(manifold, constraint))
     with scene.world() as world:
+        surface = Surface(learned, constrained, world.free)
         connected, connection_s = connected_queries(
-            submanifold, problem, queries, world.free, params.submanifold
+            submanifold, surface, queries, params.submanifold
         )
-    settings = params.policy_settings(separate=True) if problem.retract else params.geodesics
     about = subject_of(params, constraint=constraint, manifold=manifold, reward=settings.reward)
     with tracked_stage(
         Work(STAGE, item, settings.of_training("length_degree", "rollouts"), sources, about),
@@ -59,6 +72,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         tasks = [
             SeedTask(
                 problem,
+                learned,
                 scene,
                 settings,
                 params.judge,
@@ -69,13 +83,13 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
                 seed,
                 layout.scratch(STAGE, f"{item}-{seed}"),
                 run.child(f"seed {seed}", {"seed": seed}),
+                policies.get(seed),
             )
             for seed in settings.seeds
         ]
         results = parallel_map(run_seed, tasks, params.compute, description=f"policy search {item}")
-        run.summarise(
-            [result.figures() for result in results], [result.policy.curve for result in results]
-        )
+        curves = [result.policy.curve for result in results if result.policy is not None]
+        run.summarise([result.figures() for result in results], curves)
         folder = layout.geodesics(manifold, constraint)
         save_seeds(results, queries, folder, layout.report(STAGE, f"{item}-learning", "csv"))
         rows, paths = straight_rows(tasks[0])

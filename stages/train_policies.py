@@ -1,4 +1,4 @@
-"""Stage: one policy a seed for all constraints together, conditioned on the constraint."""
+"""Stage: one policy a seed for all constraints together, with and without an obstacle."""
 
 import shutil
 import sys
@@ -6,7 +6,7 @@ import sys
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.geodesics.policy_search import save_policy
 from constraint_geodesics.learning.dataset import read_joints
-from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.learning.learned_manifold import chart_named
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
@@ -14,8 +14,10 @@ from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.geodesic_search import (
     TrainingTask,
-    shared_problem,
+    policy_problem,
     train_seed,
+    training_figures,
+    training_problem,
     write_rows,
 )
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
@@ -23,21 +25,28 @@ from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_s
 STAGE = "train_policies"
 
 
-def main(params: Params, layout: Layout, manifold: str) -> None:
-    """Write data/policies/<manifold>/, learning curves and figures."""
+def main(params: Params, layout: Layout, chart: str) -> None:
+    """Write data/policies/<chart>/, learning curves and figures."""
     scene, settings = Scene.from_params(params), params.policy_settings()
     sources = [layout.joints(name) for name in params.constraints]
-    manifolds = {
-        name: constraint_manifold(scene.robot, constraint)
-        for name, constraint in params.constraints.items()
-    }
-    joints = {name: read_joints(layout.joints(name)).free_joints for name in params.constraints}
-    problem = shared_problem(
-        params, LearnedManifold.load(layout.manifold(manifold)), manifolds, joints, manifold
+    space = chart_named(chart, layout.manifold(chart), scene.robot)
+    problem = training_problem(
+        params,
+        scene,
+        [
+            policy_problem(
+                params,
+                space,
+                scene,
+                constraint_manifold(scene.robot, constraint),
+                read_joints(layout.joints(name)).free_joints,
+            )
+            for name, constraint in params.constraints.items()
+        ],
     )
-    about = subject_of(params, manifold=manifold, reward=settings.reward)
+    about = subject_of(params, manifold=chart, reward=settings.reward)
     with tracked_stage(
-        Work(STAGE, manifold, settings.of_training("length_degree"), sources, about),
+        Work(STAGE, chart, settings.of_training("length_degree"), sources, about),
         params.tracking.experiment,
         layout.root,
     ) as run:
@@ -46,27 +55,26 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
                 problem,
                 settings,
                 seed,
-                layout.scratch(STAGE, f"{manifold}-{seed}"),
+                layout.scratch(STAGE, f"{chart}-{seed}"),
                 run.child(f"seed {seed}", {"seed": seed}),
             )
             for seed in settings.seeds
         ]
-        policies = parallel_map(
-            train_seed, tasks, params.compute, description=f"policies {manifold}"
-        )
+        policies = parallel_map(train_seed, tasks, params.compute, description=f"policies {chart}")
         learning = [
             {"seed": task.seed, **row}
             for task, p in zip(tasks, policies, strict=True)
             for row in p.curve
         ]
         for task, policy in zip(tasks, policies, strict=True):
-            save_policy(policy, layout.policies(manifold), task.seed)
-        write_rows(learning, layout.report(STAGE, f"{manifold}-learning", "csv"))
-        figures = [{"final_saving": policy.curve[-1]["saving"]} for policy in policies]
+            save_policy(policy, layout.policies(chart), task.seed)
+        write_rows(learning, layout.report(STAGE, f"{chart}-learning", "csv"))
+        figures = [training_figures(policy.curve) for policy in policies]
         run.summarise(figures, [policy.curve for policy in policies])
+        means = {name: [own[name] for own in figures] for name in figures[0]}
         run.report(
-            {"final_saving_mean": sum(f["final_saving"] for f in figures) / len(figures)},
-            layout.report(STAGE, manifold),
+            {f"{name}_mean": sum(values) / len(values) for name, values in means.items()},
+            layout.report(STAGE, chart),
         )
         for task in tasks:  # finished: the next run of this stage starts from nothing
             shutil.rmtree(task.scratch, ignore_errors=True)

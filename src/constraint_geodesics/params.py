@@ -223,7 +223,11 @@ class SubmanifoldParams(_Record):
 
 
 class RewardParams(_Record):
-    """Eq. 15: r = K_L R_L + K_Δ R_Δ with R(x) = exp(−b exp(−c x))."""
+    """Eq. 15: r = K_L R_L + K_Δ R_Δ with R(x) = exp(−b exp(−c x)).
+
+    Besides, `feasible_weight` for a feasible curve, and `set_weight` times what a curve adds to its
+    set (`episodes.contributions`).
+    """
 
     form: Literal["corrected", "printed"]
     b: Positive
@@ -231,6 +235,8 @@ class RewardParams(_Record):
     length_weight: NonNegative
     reduction_weight: NonNegative
     inclusion_weight: NonNegative
+    feasible_weight: NonNegative = 0.0
+    set_weight: NonNegative = 0.0
 
     @model_validator(mode="after")
     def _bounded(self) -> "RewardParams":
@@ -259,16 +265,46 @@ class PpoParams(_Record):
     descent_scale: Positive = 0.5
 
 
-class PolicyParams(_Record):
-    """Policies on a learned manifold whose curves are retracted; what is not here is as in
-    `geodesics`.
+class ObstacleParams(_Record):
+    """Spheres that policies train with: `count` of each constraint, with radii [m] between two
+    bounds, in a share of the episodes.
     """
 
+    count: Count
+    radii_m: tuple[Positive, Positive]
+    share: Share
+
+
+class PolicyParams(_Record):
+    """Policies whose curves are retracted; what is not here is as in `geodesics`."""
+
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    chart: Name
     steps: Count
-    separate_steps: Count
+    length_degree: Annotated[int, Field(ge=4, multiple_of=4)]
+    environments: Count
     episode_steps: Count
+    heads: Count
+    random_starts: Annotated[float, Field(ge=0, le=1)]
+    rollouts: Count
+    kept: Count
+    rounds: Count
+    obstacles: ObstacleParams
     reward: RewardParams
     ppo: PpoParams
+
+    @model_validator(mode="after")
+    def _fitting(self) -> "PolicyParams":
+        if self.environments % self.heads:
+            raise ValueError(
+                f"environments={self.environments}: must be a multiple of heads={self.heads}"
+            )
+        if not self.heads <= self.rollouts >= self.kept:
+            raise ValueError(
+                f"rollouts={self.rollouts}: must be at least heads={self.heads} and "
+                f"kept={self.kept}"
+            )
+        return self
 
 
 class GeodesicParams(_Record):
@@ -290,12 +326,25 @@ class GeodesicParams(_Record):
     ppo: PpoParams
     rollouts: Count
     checkpoint_steps: Count
+    heads: Count = 1
+    random_starts: Annotated[float, Field(ge=0, le=1)] = 0.5
+    kept: Count = 4
+    rounds: Count = 3
 
     def of_training(self, *more: str) -> dict[str, Any]:
         """What one policy is trained with, and what else is named; the rest says what is trained
         besides.
         """
-        own = {"seeds", "degree", "steps", "environments", "episode_steps", "reward", "ppo"}
+        own = {
+            "seeds",
+            "degree",
+            "steps",
+            "environments",
+            "episode_steps",
+            "heads",
+            "reward",
+            "ppo",
+        }
         return self.model_dump(mode="json", include=own | set(more))
 
 
@@ -452,14 +501,10 @@ class Params(_Record):
     recording: RecordingParams
     tracking: TrackingParams
 
-    def policy_settings(self, *, separate: bool = False) -> GeodesicParams:
-        """How policies are trained where curves are retracted: for all constraints together, or one
-        for each.
-        """
-        own = self.policies
-        changed: dict[str, Any] = {n: getattr(own, n) for n in ("episode_steps", "reward", "ppo")}
-        changed["steps"] = own.separate_steps if separate else own.steps
-        return self.geodesics.model_copy(update=changed)
+    def policy_settings(self) -> GeodesicParams:
+        """How policies are trained, and asked, where curves are retracted."""
+        shared = set(PolicyParams.model_fields) & set(GeodesicParams.model_fields)
+        return self.geodesics.model_copy(update={n: getattr(self.policies, n) for n in shared})
 
     @property
     def all_constraints(self) -> dict[str, ConstraintParams]:

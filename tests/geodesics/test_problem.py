@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from constraint_geodesics.constraints.constraint import constraint_manifold
-from constraint_geodesics.geodesics.problem import LearnedProblem, repeated
+from constraint_geodesics.geodesics.learned_problem import LearnedProblem
+from constraint_geodesics.geodesics.problem import repeated
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.dataset import ShardTask, draw_free
 

@@ -3,13 +3,13 @@ import pytest
 
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.geodesics.episodes import begin, observation_size, observe
+from constraint_geodesics.geodesics.learned_problem import LearnedProblem, ProblemSet
 from constraint_geodesics.geodesics.policy_search import (
     follow,
     load_policy,
     save_policy,
     train_policy,
 )
-from constraint_geodesics.geodesics.problem import LearnedProblem, ProblemSet
 from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.manifold import GeometryError

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from constraint_geodesics.constraints.constraint import constraint_manifold
-from constraint_geodesics.geodesics.problem import LearnedProblem
+from constraint_geodesics.geodesics.learned_problem import LearnedProblem
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.learned_manifold import JointManifold
 

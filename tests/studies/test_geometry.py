@@ -9,7 +9,8 @@ import torch
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.graph_search import GraphSolver
-from constraint_geodesics.geodesics.problem import ChartBox, ChartProblem, LearnedProblem, Samples
+from constraint_geodesics.geodesics.learned_problem import LearnedProblem
+from constraint_geodesics.geodesics.problem import ChartBox, ChartProblem, Samples
 from constraint_geodesics.geometry.analytic import Sphere
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.geometry.length import curve_length

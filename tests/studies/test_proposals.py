@@ -17,7 +17,7 @@ from constraint_geodesics.constraints.constraint import (
 )
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.geodesics.episodes import observation_size
-from constraint_geodesics.geodesics.problem import LearnedProblem
+from constraint_geodesics.geodesics.learned_problem import LearnedProblem
 from constraint_geodesics.geodesics.proposals import MeanPolicy
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.learned_manifold import JointManifold

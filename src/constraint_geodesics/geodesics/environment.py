@@ -22,22 +22,30 @@ from constraint_geodesics.geodesics.problem import GeodesicProblem
 from constraint_geodesics.params import GeodesicParams
 
 
-def _spaces(problem: GeodesicProblem) -> tuple[spaces.Box, spaces.Box]:
-    observation = spaces.Box(-np.inf, np.inf, (observation_size(problem),), np.float32)
+def _spaces(problem: GeodesicProblem, params: GeodesicParams) -> tuple[spaces.Box, spaces.Box]:
+    observation = spaces.Box(-np.inf, np.inf, (observation_size(problem, params),), np.float32)
     return observation, spaces.Box(-1.0, 1.0, (problem.curve.coefficients,), np.float32)
 
 
 class CurveVecEnv(VecEnv):
-    """Many curves at once.  Episodes end by time alone (truncation) and restart by themselves."""
+    """Many curves at once, as many of each set as the policy has heads.
+
+    Episodes end by time alone, which the policy sees: an end like any other, after which nothing
+    can be earned.  They restart by themselves.  Raises ValueError unless `count` is a multiple of
+    the heads.
+    """
 
     def __init__(
         self, problem: GeodesicProblem, params: GeodesicParams, count: int, seed: int
     ) -> None:
-        super().__init__(count, *_spaces(problem))
+        if count % params.heads:
+            raise ValueError(f"environments={count}: must be a multiple of heads={params.heads}")
+        super().__init__(count, *_spaces(problem, params))
         self.problem, self.params = problem, params
         self.rng = np.random.default_rng(seed)
-        self.states = draw_episodes(problem, count, self.rng)
+        self.states = draw_episodes(problem, params, count, self.rng)
         self.savings: list[float] = []
+        self.solved: list[bool] = []
         self.returns = np.zeros(count)
         self.episode_returns: list[float] = []
         self._actions = np.zeros((count, problem.curve.coefficients))
@@ -47,7 +55,7 @@ class CurveVecEnv(VecEnv):
         if self._seeds and self._seeds[0] is not None:
             self.rng = np.random.default_rng(self._seeds[0])
         self._reset_seeds()
-        self.states = draw_episodes(self.problem, self.num_envs, self.rng)
+        self.states = draw_episodes(self.problem, self.params, self.num_envs, self.rng)
         self.returns[:] = 0.0
         return observe(self.params, self.states)
 
@@ -65,28 +73,30 @@ class CurveVecEnv(VecEnv):
         if done.any():
             rows = np.flatnonzero(done)
             for row in rows:
-                infos[row] = {
-                    "terminal_observation": observation[row].copy(),
-                    "TimeLimit.truncated": True,
-                }
+                infos[row] = {"terminal_observation": observation[row]}
             self.savings += (
                 1.0 - self.states.best_cost[rows] / self.states.straight_cost[rows]
             ).tolist()
+            usable = np.isfinite(self.states.best_feasible[rows]).reshape(-1, self.params.heads)
+            self.solved += usable.any(axis=1).tolist()
             self.episode_returns += self.returns[rows].tolist()
             self.returns[rows] = 0.0
             self.states = self.states.replaced(
-                rows, draw_episodes(self.problem, len(rows), self.rng)
+                rows, draw_episodes(self.problem, self.params, len(rows), self.rng)
             )
             observation = observe(self.params, self.states)
         return observation, reward.astype(np.float32), done, infos
 
     def pop_figures(self) -> dict[str, float]:
-        """Mean saving over the straight line, and return, of episodes finished since last time."""
+        """Mean saving over the straight line, and return, of episodes finished since last time; and
+        the share of their sets that met a feasible curve.
+        """
         figures = {
             "saving": float(np.mean(self.savings)) if self.savings else 0.0,
             "return": float(np.mean(self.episode_returns)) if self.episode_returns else 0.0,
+            "feasible": float(np.mean(self.solved)) if self.solved else 0.0,
         }
-        self.savings, self.episode_returns = [], []
+        self.savings, self.episode_returns, self.solved = [], [], []
         return figures
 
     def close(self) -> None:
@@ -117,11 +127,11 @@ class CurveVecEnv(VecEnv):
 
 
 class CurveEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One curve with gymnasium's interface, on the same functions."""
+    """One curve with gymnasium's interface, on the same functions; a set of one head."""
 
     def __init__(self, problem: GeodesicProblem, params: GeodesicParams) -> None:
-        self.problem, self.params = problem, params
-        self.observation_space, self.action_space = _spaces(problem)
+        self.problem, self.params = problem, params.model_copy(update={"heads": 1})
+        self.observation_space, self.action_space = _spaces(problem, self.params)
         self.states: CurveStates | None = None
 
     def reset(
@@ -129,7 +139,7 @@ class CurveEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, dict]:
         """A fresh episode."""
         super().reset(seed=seed)
-        self.states = draw_episodes(self.problem, 1, self.np_random)
+        self.states = draw_episodes(self.problem, self.params, 1, self.np_random)
         return observe(self.params, self.states)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:

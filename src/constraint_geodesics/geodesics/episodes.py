@@ -17,6 +17,8 @@ LEAST_STRIDE = 1e-3
 """Least change of a coefficient by an action of 1, in units of the ends' distance: at a minimum the
 descent is 0.
 """
+NOTHING_FOUND = 3.0
+"""What a set without a feasible curve is worth, as a cost in units of the straight line's."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,8 @@ class CurveStates:
     """B curves under way, and the cheapest one that each has met.
 
     phi: in the chart's unit.  descent, features: of what is `Observed` at it.  step: steps taken.
+    best_feasible: cost of the cheapest feasible curve met, inf before there is one.  head: which of
+    the policy's ways of answering a query each curve follows.
     """
 
     phi: Phi
@@ -37,6 +41,11 @@ class CurveStates:
     step: Int[np.ndarray, "B"]
     best_phi: Phi
     best_cost: Float[np.ndarray, "B"]
+    best_feasible: Float[np.ndarray, "B"]
+    head: Int[np.ndarray, "B"]
+
+    def __getitem__(self, rows: np.ndarray) -> "CurveStates":
+        return CurveStates(**{name: values[rows] for name, values in vars(self).items()})
 
     def replaced(self, rows: np.ndarray, other: "CurveStates") -> "CurveStates":
         """A copy with the given rows taken from `other`."""
@@ -50,8 +59,10 @@ class CurveStates:
         return CurveStates(**fields)
 
 
-def begin(problem: GeodesicProblem, ends: Ends, phi: Phi) -> CurveStates:
-    """First states of B episodes."""
+def begin(
+    problem: GeodesicProblem, ends: Ends, phi: Phi, head: Int[np.ndarray, "B"] | None = None
+) -> CurveStates:
+    """First states of B episodes; head 0 unless given."""
     now = problem.observed(phi, ends)
     costs, straight_cost = now.costs, now.costs.cost.copy()
     bent = np.flatnonzero(phi.any(axis=1))
@@ -70,31 +81,64 @@ def begin(problem: GeodesicProblem, ends: Ends, phi: Phi) -> CurveStates:
         np.zeros(len(phi), dtype=np.int64),
         np.where(better[:, None], phi, 0.0),
         np.minimum(costs.cost, straight_cost),
+        np.where(costs.feasible, costs.cost, np.inf),
+        np.zeros(len(phi), dtype=np.int64) if head is None else head,
     )
 
 
-def draw_episodes(problem: GeodesicProblem, count: int, rng: np.random.Generator) -> CurveStates:
-    """Episodes on random ends; every other one starts from a random curve, to meet bad ones."""
-    ends = problem.sample_ends(count, rng)
-    phi = problem.sample_curves(ends, rng) * rng.integers(2, size=(count, 1))
-    return begin(problem, ends, phi)
+def draw_episodes(
+    problem: GeodesicProblem, params: GeodesicParams, count: int, rng: np.random.Generator
+) -> CurveStates:
+    """Episodes on random ends, a set of `heads` for each pair; a share of the sets starts from
+    random curves, to meet bad ones.
+    """
+    sets = count // params.heads
+    ends = problem.sample_ends(sets, rng)[np.repeat(np.arange(sets), params.heads)]
+    bent = np.repeat(rng.random(sets) < params.random_starts, params.heads)
+    phi = problem.sample_curves(ends, rng) * bent[:, None]
+    return begin(problem, ends, phi, np.tile(np.arange(params.heads), sets))
 
 
 def advance(
     problem: GeodesicProblem, params: GeodesicParams, states: CurveStates, actions: Phi
 ) -> tuple[CurveStates, Float[np.ndarray, "B"]]:
-    """One step of B episodes: new states and rewards (eq. 15).
+    """One step of B episodes: new states and rewards (eq. 15, and what `RewardParams` adds)."""
+    after, settings = moved(problem, params, states, actions), params.reward
+    reward = rewards(settings, states.cost, after.cost, states.straight_cost)
+    reward += settings.feasible_weight * after.feasible
+    if settings.set_weight > 0.0:
+        reward += settings.set_weight * contributions(params.heads, after)
+    return after, reward
 
-    An action of 1 changes a coefficient by `strides`: a near pair needs as fine a bend, in
-    proportion, as a far one, and a curve near its minimum as small a step, in proportion, as one
-    far from it.
+
+def moved(
+    problem: GeodesicProblem, params: GeodesicParams, states: CurveStates, actions: Phi
+) -> CurveStates:
+    """B curves after one action each."""
+    return placed(problem, states, displaced(params, states, actions))
+
+
+def displaced(params: GeodesicParams, states: CurveStates, actions: Phi) -> Phi:
+    """Coefficients after one action each.
+
+    A feasible curve that is under way takes its problem's descent, where that knows one: without
+    an action it would go on like this.  An action of 1 adds `strides` to a coefficient: a near pair
+    needs as fine a bend, in proportion, as a far one, and a curve near its minimum as small a step,
+    in proportion, as one far from it.
     """
-    phi = states.phi + strides(params, states)[:, None] * np.clip(actions, -1.0, 1.0)
+    changed = states.phi + strides(params, states)[:, None] * np.clip(actions, -1.0, 1.0)
+    if states.descent.shape[1]:
+        changed += np.where(_under_way(states)[:, None], states.descent, 0.0)
+    return changed
+
+
+def placed(problem: GeodesicProblem, states: CurveStates, phi: Phi) -> CurveStates:
+    """The same episodes one step on, at other curves."""
     now = problem.observed(phi, states.ends)
     costs = now.costs
-    reward = rewards(params.reward, states.cost, costs.cost, states.straight_cost)
     better = costs.cost < states.best_cost
-    moved = replace(
+    usable = np.where(costs.feasible, costs.cost, np.inf)
+    return replace(
         states,
         phi=phi,
         length=costs.length,
@@ -105,23 +149,42 @@ def advance(
         step=states.step + 1,
         best_phi=np.where(better[:, None], phi, states.best_phi),
         best_cost=np.minimum(states.best_cost, costs.cost),
+        best_feasible=np.minimum(states.best_feasible, usable),
     )
-    return moved, reward
+
+
+def contributions(heads: int, states: CurveStates) -> Float[np.ndarray, "B"]:
+    """What each curve of a set adds to it: how much cheaper the set's best feasible curve is for
+    it, in units of the straight line's cost, at most 1; 0 for all but the best.
+
+    Heads that answer a query alike earn nothing from each other's company, so that they part.
+    """
+    usable = np.isfinite(states.best_feasible)
+    price = states.best_feasible / np.maximum(states.straight_cost, 1e-9)
+    price = np.where(usable, price, NOTHING_FOUND).reshape(-1, heads)
+    ordered = np.sort(price, axis=1)
+    saved = np.clip(ordered[:, 1:2] - ordered[:, :1], 0.0, 1.0)
+    return np.where(price == ordered[:, :1], saved, 0.0).ravel()
 
 
 def strides(params: GeodesicParams, states: CurveStates) -> Float[np.ndarray, "B"]:
     """What an action of 1 changes a coefficient by, in the chart's unit: `action_scale` times the
     ends' distance, for a feasible curve whose problem knows a descent at most `descent_scale` times
-    the descent's step.
+    the descent's step.  From the straight line the first move chooses the way round, and is long.
     """
     longest = params.ppo.action_scale * states.ends.distance
     if not states.descent.shape[1]:
         return longest
     fine = (
-        params.ppo.descent_scale * np.linalg.norm(states.descent, axis=1)
+        params.ppo.descent_scale * np.sqrt((states.descent**2).sum(axis=1))
         + LEAST_STRIDE * states.ends.distance
     )
-    return np.where(states.feasible, np.minimum(fine, longest), longest)
+    return np.where(_under_way(states), np.minimum(fine, longest), longest)
+
+
+def _under_way(states: CurveStates) -> Bool[np.ndarray, "B"]:
+    """Feasible curves that are no longer straight."""
+    return states.feasible & states.phi.any(axis=1)
 
 
 def rewards(
@@ -155,9 +218,10 @@ def gompertz(x: Float[np.ndarray, "*batch"], b: float, c: float) -> Float[np.nda
 
 def observe(params: GeodesicParams, states: CurveStates) -> Float[np.ndarray, "B o"]:
     """What the policy sees, in this order: coefficients in units of the ends' distance (p), both
-    ends in the chart (2 N), cost and best cost over the straight line's, less 1, time left (3);
-    where the problem knows a descent, its direction (p) and the logarithm of its size in units of
-    the ends' distance, and the problem's features.
+    ends in the chart (2 N), cost and best cost over the straight line's, less 1, time left, whether
+    the curve is straight (4); where the problem knows a descent, its direction (p) and the
+    logarithm of its size in units of the ends' distance, and the problem's features; which head it
+    is, of several.
     """
     scale = np.maximum(states.straight_cost, 1e-9)
     far = states.ends.distance[:, None]
@@ -168,20 +232,21 @@ def observe(params: GeodesicParams, states: CurveStates) -> Float[np.ndarray, "B
         np.clip(states.cost / scale - 1.0, -2.0, 2.0)[:, None],
         np.clip(states.best_cost / scale - 1.0, -2.0, 2.0)[:, None],
         1.0 - states.step[:, None] / params.episode_steps,
+        ~states.phi.any(axis=1, keepdims=True),
     ]
     if states.descent.shape[1]:
-        size = np.linalg.norm(states.descent, axis=1, keepdims=True)
+        size = np.sqrt((states.descent**2).sum(axis=1, keepdims=True))
         columns += [
             states.descent / np.maximum(size, 1e-9),
             np.log10(size / far + 1e-4) + 2.0,
             states.features,
         ]
+    if params.heads > 1:
+        columns.append(np.eye(params.heads)[states.head])
     return np.concatenate(columns, axis=1).astype(np.float32)
 
 
-def observation_size(problem: GeodesicProblem) -> int:
+def observation_size(problem: GeodesicProblem, params: GeodesicParams) -> int:
     """Length of an observation."""
     ends = problem.sample_ends(1, np.random.default_rng(0))
-    look = problem.observed(np.zeros((1, problem.curve.coefficients)), ends)
-    seen = look.descent.shape[1] + 1 + look.features.shape[1] if look.descent.shape[1] else 0
-    return problem.curve.coefficients + 2 * problem.curve.dim + 3 + seen
+    return observe(params, begin(problem, ends, np.zeros((1, problem.curve.coefficients)))).shape[1]

@@ -1,9 +1,9 @@
 """The paper's system as a method of the planner: one learned manifold, the constraint's part of it,
-and cubic curves that trained policies find there, alone or refined.
+and cubic curves that a trained policy finds there, alone or refined.
 
 A query's ends are joined to the sub-manifold's graph (eq. 8); where they lie in different
-components there is no path.  Otherwise every policy proposes its best latent curve (eqs. 9-15),
-which is decoded and projected onto the constraint; the planner certifies it like any other.
+components there is no path.  Otherwise the policy proposes curves in rounds (eqs. 9-15), which are
+decoded and projected onto the constraint; the planner certifies them like any others.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from pydantic import ValidationError
 
 from constraint_geodesics.bundle import (
@@ -25,10 +25,10 @@ from constraint_geodesics.bundle import (
     roadmaps_of,
     write_files,
 )
-from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.constraints.projection import Retraction
-from constraint_geodesics.geodesics.problem import Ends, LearnedProblem
-from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
+from constraint_geodesics.constraints.projection import Retraction, retract
+from constraint_geodesics.geodesics.learned_problem import LearnedProblem
+from constraint_geodesics.geodesics.problem import Ends
+from constraint_geodesics.geodesics.proposals import MeanPolicy, Met, rounds
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.inference import FrozenManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
@@ -46,15 +46,21 @@ from constraint_geodesics.search.candidates import (
 from constraint_geodesics.search.curve_kernels import CHECK_STEP
 from constraint_geodesics.search.roadmap import Roadmap
 
-FORMAT = 1
+FORMAT = 2
 FOLDER = "learned"
 """Beside the planner's folder, or in it, as in the package."""
-CARD, MANIFOLD, POLICIES, SUBMANIFOLDS = (
+CARD, MANIFOLD, POLICY, SUBMANIFOLDS = (
     "learned.json",
     "manifold.safetensors",
-    "policies.safetensors",
+    "policy.safetensors",
     "submanifolds.safetensors",
 )
+PAST = 1000
+"""Random configurations that are projected onto a constraint, for curves to bend towards."""
+MOST_CHECKED = 12
+"""Curves of a round that are looked at closely: those behind them are mostly alike."""
+TOUCHING_M = 1e-4
+"""Clearance below which a configuration counts as touching something."""
 KEPT = 32
 """Constraints whose problem is kept for the next query."""
 _FIRST_POINTS = 65
@@ -63,25 +69,25 @@ _SLACK_RAD = 1e-9
 
 @dataclass(frozen=True)
 class LearnedFiles:
-    """What the method is made of: the robot it was trained for, the policies' settings, the arrays
-    of the networks (the policies' under `seed/name`), and the sub-manifolds' graphs by constraint.
+    """What the method is made of: the robot it was trained for, the policy's settings, the arrays
+    of the networks, and the sub-manifolds' graphs by constraint.
     """
 
     robot: RobotParams
-    policy: GeodesicParams
+    settings: GeodesicParams
     manifold: Mapping[str, np.ndarray]
-    policies: Mapping[str, np.ndarray]
+    policy: Mapping[str, np.ndarray]
     submanifolds: Mapping[str, Roadmap]
 
     def write(self, folder: Path) -> None:
         """Write all files."""
         card = {
             "robot": self.robot.model_dump(mode="json"),
-            "policy": self.policy.model_dump(mode="json"),
+            "policy": self.settings.model_dump(mode="json"),
         }
         arrays = {
             MANIFOLD: self.manifold,
-            POLICIES: self.policies,
+            POLICY: self.policy,
             SUBMANIFOLDS: roadmap_arrays(self.submanifolds),
         }
         write_files(folder / CARD, FORMAT, card, arrays)
@@ -92,16 +98,16 @@ def read_learned(folder: Path) -> LearnedFiles:
 
     Raises BundleError if a file is missing, altered (its checksum differs), or of another format.
     """
-    names = (MANIFOLD, POLICIES, SUBMANIFOLDS)
+    names = (MANIFOLD, POLICY, SUBMANIFOLDS)
     card, arrays = read_files(folder / CARD, FORMAT, names)
     try:
         robot = RobotParams.model_validate(card["robot"])
-        policy = GeodesicParams.model_validate(card["policy"])
+        settings = GeodesicParams.model_validate(card["policy"])
     except (KeyError, ValidationError) as error:
         about = " ".join(str(error).split())[:200]
         raise BundleError(f"{folder / CARD}: not a learned method's card: {about}") from None
-    manifold, policies, graphs = (arrays[name] for name in names)
-    return LearnedFiles(robot, policy, manifold, policies, roadmaps_of(graphs))
+    manifold, policy, graphs = (arrays[name] for name in names)
+    return LearnedFiles(robot, settings, manifold, policy, roadmaps_of(graphs))
 
 
 @dataclass(frozen=True)
@@ -134,7 +140,7 @@ class LatentCurve:
 
 
 class LearnedMethod:
-    """The policies' curves as they are."""
+    """The policy's curves as they are."""
 
     name = "learned"
 
@@ -142,7 +148,7 @@ class LearnedMethod:
         self.files = files
         self.roadmaps: Mapping[str, Roadmap] | None = files.submanifolds
         learned = FrozenManifold(files.manifold)
-        self.draw = lambda count, rng: learned.decode(learned.sample(count, rng))
+        self.draw = learned.draw if learned.knows_data else None
         self._problems: dict[int, LearnedProblem] = {}
 
     @classmethod
@@ -160,77 +166,95 @@ class LearnedMethod:
         return cls(files)
 
     @cached_property
-    def _networks(self) -> tuple[LearnedManifold, list[MeanPolicy]]:
-        by_seed: dict[int, dict[str, np.ndarray]] = {}
-        for address, values in self.files.policies.items():
-            seed, name = address.split("/")
-            by_seed.setdefault(int(seed), {})[name] = values
-        policies = [MeanPolicy.from_arrays(by_seed[seed]) for seed in sorted(by_seed)]
-        return LearnedManifold.from_arrays(self.files.manifold), policies
+    def _networks(self) -> tuple[LearnedManifold, MeanPolicy]:
+        return (
+            LearnedManifold.from_arrays(self.files.manifold),
+            MeanPolicy.from_arrays(self.files.policy),
+        )
 
-    def _problem(self, manifold: ConstraintManifold) -> LearnedProblem:
-        key = id(manifold)  # the problem holds the manifold, so that its id stays its own
-        if key not in self._problems:
-            while len(self._problems) >= KEPT:
-                self._problems.pop(next(iter(self._problems)))
-            learned, settings = self._networks[0], self.files.policy
-            curve = PinnedPolynomial(learned.dim, settings.degree)
-            nobody, degree = np.empty((0, manifold.robot.dof)), settings.length_degree
-            self._problems[key] = LearnedProblem(
-                learned, manifold, curve, nobody, degree, True, 0.0
-            )
+    def _problem(self, task: Task) -> LearnedProblem:
+        key = id(task.manifold)  # the problem holds the manifold, so that its id stays its own
+        kept = self._problems.get(key)
+        if kept is not None and kept.clearance is task.clearance:
+            return kept
+        while len(self._problems) >= KEPT:
+            self._problems.pop(next(iter(self._problems)))
+        learned, settings = self._networks[0], self.files.settings
+        curve, degree = PinnedPolynomial(learned.dim, settings.degree), settings.length_degree
+        past = _free_configurations(task)
+        space = learned, task.manifold, curve, past, degree, True, 0.0
+        self._problems[key] = LearnedProblem(*space, clearance=task.clearance)
         return self._problems[key]
 
     def curves(
-        self,
-        manifold: ConstraintManifold,
-        start: Float[np.ndarray, "D"],
-        goal: Float[np.ndarray, "D"],
-    ) -> list[LatentCurve]:
-        """The best curve that each policy meets on its way from the straight latent line, feasible
-        ones first; under any constraint, seen in training or not.
+        self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]
+    ) -> Iterator[tuple[LatentCurve, ...]]:
+        """Rounds of curves from the straight chart line on, under any constraint, seen in training
+        or not.
         """
-        problem, policies = self._problem(manifold), self._networks[1]
+        problem = self._problem(task)
         ends = problem.ends(start[None], goal[None])
-        found = propose(problem, policies, self.files.policy, ends)
-        order = np.lexsort((found.cost[:, 0], ~found.feasible[:, 0]))
-        return [LatentCurve(problem, ends, found.phi[k, 0]) for k in order]
+        policy, settings = self._networks[1], self.files.settings
+        for met in rounds(problem, policy, settings, ends, np.random.default_rng(0)):
+            yield tuple(LatentCurve(problem, ends, met.phi[k]) for k in self.chosen(met))
+
+    def chosen(self, met: Met) -> Int[np.ndarray, "k"]:
+        """Which curves of a round are worth a look: all that seem feasible, the cheapest first."""
+        return met.usable[:MOST_CHECKED]
 
     def candidates(
         self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts
-    ) -> Iterator[Candidate | Answer]:
-        """The policies' curves, feasible ones first; none where the sub-manifold's graph holds the
-        ends to be unconnected.
+    ) -> Iterator[Candidate | Answer | None]:
+        """The policy's curves, the cheapest first, round after round; none where the sub-manifold's
+        graph holds the ends to be unconnected.
         """
         answer = connection(task, start, goal)
         if answer.status != "not_connected":
-            yield from self.sound(task, self.curves(task.manifold, start, goal))
+            for curves in self.curves(task, start, goal):
+                yield from self.sound(task, curves)
+                yield None
         yield answer
 
-    def sound(self, task: Task, curves: Sequence[LatentCurve]) -> list[Candidate]:
+    def sound(self, task: Task, curves: Sequence[LatentCurve]) -> Iterator[Candidate]:
         """Curves that are continuous and within the limits, in their order."""
         found = (sampled(task, curve) for curve in curves)
-        return [candidate for candidate in found if candidate is not None]
+        return (candidate for candidate in found if candidate is not None)
 
     def improvements(
         self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts
     ) -> Iterator[Candidate | None]:
-        """The other policies' curves, which may turn out shorter than the first."""
+        """Curves of later rounds too, which may turn out shorter than the first."""
         for candidate in self.candidates(task, start, goal, parts):
             if isinstance(candidate, Candidate):
                 yield candidate
 
 
 class RefinedLearnedMethod(LearnedMethod):
-    """The policies' curves, each relaxed by the planner's elastic band."""
+    """The policy's curves, each relaxed by the planner's elastic band."""
 
     name = "learned+band"
 
-    def sound(self, task: Task, curves: Sequence[LatentCurve]) -> list[Candidate]:
+    def chosen(self, met: Met) -> Int[np.ndarray, "k"]:
+        """The best of every roll-out: refined, the others of it become the same curve."""
+        return met.best_of_each
+
+    def sound(self, task: Task, curves: Sequence[LatentCurve]) -> Iterator[Candidate]:
         """The shortest first."""
         t = np.linspace(0.0, 1.0, task.settings.segments + 1)
         found = (refined(task, "policy", curve.decoded(t)) for curve in curves)
-        return sorted((c for c in found if c is not None), key=lambda c: c.length)
+        yield from sorted((c for c in found if c is not None), key=lambda c: c.length)
+
+
+def _free_configurations(task: Task) -> Float[np.ndarray, "n D"]:
+    """Configurations that keep constraint, limits and clearance, which random curves bend
+    towards; others where PAST draws find none.
+    """
+    robot, rng = task.manifold.robot, np.random.default_rng(0)
+    found = retract(task.manifold, robot.sample(PAST, rng))
+    kept = found.converged & (robot.limit_distance(found.joints) >= 0.0).all(axis=-1)
+    joints = found.joints[kept]
+    free = joints[task.clearance.clearance(robot, joints, TOUCHING_M) >= TOUCHING_M]
+    return free if len(free) else found.joints
 
 
 def sampled(task: Task, curve: LatentCurve) -> Candidate | None:

@@ -6,8 +6,8 @@ PPO comes from stable-baselines3; what leaves this module is a small actor netwo
 
 import json
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,41 +19,40 @@ from safetensors.torch import load_file, save_file
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
 from constraint_geodesics.geodesics.environment import CurveVecEnv
-from constraint_geodesics.geodesics.episodes import (
-    CurveStates,
-    advance,
-    begin,
-    observation_size,
-    observe,
-)
+from constraint_geodesics.geodesics.episodes import CurveStates, moved, observation_size, observe
 from constraint_geodesics.geodesics.problem import (
     ChartProblem,
-    Costs,
     Ends,
     Geodesic,
     GeodesicProblem,
     Phi,
-    SearchStatus,
-    repeated,
 )
+from constraint_geodesics.geodesics.proposals import MeanPolicy, Met, random_round, rounds
 from constraint_geodesics.geodesics.solver import to_nearest_images
 from constraint_geodesics.geometry.manifold import GeometryError
 from constraint_geodesics.params import GeodesicParams, PpoParams
 
-DRAWN_A_START = 16
-"""Random curves drawn for each of those that roll-outs start from."""
 MOST_CHECKED = 40
 """Candidates given to the exact check at most: those behind them are no shorter and mostly alike.
 """
 
+REPORTS = 50
+"""Rows of a learning curve, about."""
+DIAGNOSTICS = {
+    "approx_kl": "kl",
+    "entropy_loss": "entropy_loss",
+    "value_loss": "value_loss",
+    "explained_variance": "explained_variance",
+    "clip_fraction": "clipped",
+}
+"""PPO's own figures of its last update, by stable-baselines3's names and by ours."""
+
 Report = Callable[[int, dict[str, float]], None]
 Accept = Callable[[Float[np.ndarray, "p"]], bool]
-_Measured = tuple[Phi, Costs]
-"""Candidates of one query that were measured together: one step of the search."""
 
 
 class Actor(nn.Module):
@@ -89,6 +88,11 @@ class TrainedPolicy:
     actor: Actor
     curve: list[dict[str, float]]
 
+    @property
+    def mean(self) -> MeanPolicy:
+        """The actor's mean action, in numpy."""
+        return MeanPolicy.from_arrays({n: v.numpy() for n, v in self.actor.state_dict().items()})
+
 
 def train_policy(
     problem: GeodesicProblem, params: GeodesicParams, seed: int, scratch: Path, report: Report
@@ -97,7 +101,7 @@ def train_policy(
 
     scratch: of the checkpoints, from which an interrupted training goes on as if it had never
     stopped.
-    report: called with (environment steps, figures) after every rollout.
+    report: called with (environment steps, figures) about REPORTS times.
     """
     torch.manual_seed(seed)
     environment = CurveVecEnv(problem, params, params.environments, seed)
@@ -110,16 +114,17 @@ def train_policy(
         # itself
         model.learn(remaining, callback=log, reset_num_timesteps=False)
         log.save()
-    actor = Actor(observation_size(problem), params.ppo.hidden, problem.curve.coefficients)
+    size = observation_size(problem, params)
+    actor = Actor(size, params.ppo.hidden, problem.curve.coefficients)
     actor.load_state_dict(actor_weights(model.policy.state_dict()))
     return TrainedPolicy(actor.eval().requires_grad_(False), log.rows)
 
 
 @dataclass(frozen=True)
 class PolicySolver:
-    """Policy search as a solver: roll-outs for every query, the same seed for each."""
+    """Policy search as a solver: rounds of roll-outs for every query, the same seed for each."""
 
-    actor: Actor
+    policy: MeanPolicy
     params: GeodesicParams
     seed: int = 0
 
@@ -129,7 +134,7 @@ class PolicySolver:
 
         Raises GeometryError if the policy was trained for another family or dimension.
         """
-        wanted, trained = problem.curve.coefficients, self.actor.mean.out_features
+        wanted, trained = problem.curve.coefficients, self.policy.actions
         if wanted != trained:
             raise GeometryError(
                 f"the policy changes {trained} coefficients: must be those of the curve, {wanted}"
@@ -139,40 +144,22 @@ class PolicySolver:
         return [self.search(problem, row, lambda _: True) for row in rows]
 
     def search(self, problem: GeodesicProblem, ends: Ends, accept: Accept) -> Geodesic:
-        """The shortest acceptable curve that a batch of roll-outs meets between one pair of ends.
+        """The shortest acceptable curve of the first round that meets one (`proposals.rounds`).
 
-        The first roll-out follows the policy's mean from the straight line, the others sample its
-        actions, half of them from the cheapest of many random curves.  Every curve met counts, the
-        straight line and the random ones included.
         accept: an exact check (collision, say) of the feasible candidates, shortest first.
         """
-        began, rng, params = time.perf_counter(), np.random.default_rng(self.seed), self.params
-        count, size = params.rollouts, problem.curve.coefficients
-        drawn = _random_curves(problem, ends, DRAWN_A_START * (count // 2), rng)
-        starts = drawn[0][np.argsort(drawn[1].cost, kind="stable")[: count // 2]]
-        phi = np.concatenate([np.zeros((count - len(starts), size)), starts])
-        noise = rng.normal(size=(params.episode_steps, count, size))
-        noise[:, 0] = 0.0
-        first = begin(problem, repeated(ends, count), phi)
-        visited = follow(problem, self.actor, params, first, noise)
-        met = [(s.phi, Costs(s.length, s.cost, s.feasible)) for s in visited]
-        return _first_accepted(problem, ends, [drawn, *met], accept, began)
+        began, rng = time.perf_counter(), np.random.default_rng(self.seed)
+        asked = rounds(problem, self.policy, self.params, ends, rng)
+        return _first_accepted(problem, ends, asked, accept, began)
 
     def search_at_random(self, problem: GeodesicProblem, ends: Ends, accept: Accept) -> Geodesic:
-        """The control of `search`: as many curves, none by a policy, chosen by the same rule."""
-        began, count = time.perf_counter(), self.params.rollouts
-        number = DRAWN_A_START * (count // 2) + (self.params.episode_steps + 1) * count
-        drawn = _random_curves(problem, ends, number, np.random.default_rng(self.seed))
+        """The control of `search`: as many curves as its first round meets, none by a policy,
+        chosen by the same rule.
+        """
+        began, params = time.perf_counter(), self.params
+        number = params.rollouts + params.kept * params.episode_steps
+        drawn = random_round(problem, ends, number, np.random.default_rng(self.seed))
         return _first_accepted(problem, ends, [drawn], accept, began)
-
-
-def _random_curves(
-    problem: GeodesicProblem, ends: Ends, count: int, rng: np.random.Generator
-) -> _Measured:
-    """Many random curves and their costs: in one batch they cost next to nothing."""
-    many = repeated(ends, count)
-    drawn = problem.sample_curves(many, rng)
-    return drawn, problem.evaluate(drawn, many)
 
 
 def follow(
@@ -186,37 +173,34 @@ def follow(
     visited = [states]
     for step_noise in noise:
         action = actor.act(observe(params, visited[-1]), step_noise)
-        visited.append(advance(problem, params, visited[-1], action)[0])
+        visited.append(moved(problem, params, visited[-1], action))
     return visited
 
 
 def _first_accepted(
-    problem: GeodesicProblem, ends: Ends, steps: Sequence[_Measured], accept: Accept, began: float
+    problem: GeodesicProblem, ends: Ends, asked: Iterable[Met], accept: Accept, began: float
 ) -> Geodesic:
-    """The cheapest feasible candidate that passes the exact check, the straight line among them.
-
-    It has not converged if the last of several steps met it: another one might shorten it further.
-    """
-    zero = np.zeros((1, problem.curve.coefficients))
-    straight = problem.evaluate(zero, ends)
-    phi = np.concatenate([zero, *(phi for phi, _ in steps)])
-    cost = np.concatenate([straight.cost, *(costs.cost for _, costs in steps)])
-    feasible = np.concatenate([straight.feasible, *(costs.feasible for _, costs in steps)])
-    order = np.argsort(cost, kind="stable")
-    candidates = order[feasible[order]][:MOST_CHECKED]
-    if feasible[0] and 0 not in candidates:
-        candidates = np.append(candidates, 0)
-    row = next((int(row) for row in candidates if accept(phi[row])), None)
-    if row is None:
-        status: SearchStatus = "not_found"
-        row, length = int(order[0]), float("nan")
-    else:
-        late = len(steps) > 1 and row >= len(phi) - len(steps[-1][0])
-        status = "iteration_limit" if late else "converged"
-        length = float(problem.evaluate(phi[row][None], ends).length[0])
-    found = status, problem.curve, phi[row], ends.z_start[0], ends.z_goal[0], length
-    work = len(steps), len(phi), time.perf_counter() - began
-    return Geodesic(*found, float(straight.length[0]), *work)
+    """The cheapest feasible candidate of the first round with one that passes the exact check."""
+    evaluations = 0
+    for met in asked:
+        evaluations += len(met.phi)
+        row = next((int(r) for r in met.usable[:MOST_CHECKED] if accept(met.phi[r])), None)
+        if row is None:
+            continue
+        zero = np.zeros((1, problem.curve.coefficients))
+        return Geodesic(
+            "iteration_limit" if met.last[row] else "converged",
+            problem.curve,
+            met.phi[row],
+            ends.z_start[0],
+            ends.z_goal[0],
+            float(met.length[row]),
+            float(problem.evaluate(zero, ends).length[0]),
+            evaluations=evaluations,
+            time_s=time.perf_counter() - began,
+        )
+    none = Geodesic.nothing("not_found", problem.curve, ends.z_start[0], ends.z_goal[0])
+    return replace(none, evaluations=evaluations, time_s=time.perf_counter() - began)
 
 
 def save_policy(policy: TrainedPolicy, folder: Path, seed: int) -> None:
@@ -248,7 +232,7 @@ def ppo_model(environment: VecEnv, params: GeodesicParams, seed: int) -> PPO:
     ppo: PpoParams = params.ppo
     model = PPO(
         "MlpPolicy",
-        VecMonitor(environment),
+        environment,
         seed=seed,
         device="cpu",
         verbose=0,
@@ -281,11 +265,14 @@ class _Progress(BaseCallback):
     ) -> None:
         super().__init__()
         self.environment, self.every, self.report = environment, params.checkpoint_steps, report
+        self.total = params.steps
         # a checkpoint belongs to its inputs: with other data, parameters or seed it is not found
         key = joblib.hash((environment.problem.fingerprint(), params.model_dump(), seed))
         self.file = scratch / f"{key}.pt"
         self.rows: list[dict[str, float]] = []
-        self._saved_at = 0
+        self._saved_at = self._reported_at = 0
+        self._began, self._before_s, self._reported_s = time.perf_counter(), 0.0, 0.0
+        self._before: dict[str, float] = {}
 
     def _on_step(self) -> bool:
         return True
@@ -295,9 +282,27 @@ class _Progress(BaseCallback):
             self.save()
 
     def _on_rollout_end(self) -> None:
-        figures = self.environment.pop_figures()
+        """Report once in a while: episodes since last time, and the update before this rollout."""
+        done = int(REPORTS * self.num_timesteps / self.total)
+        if done == int(REPORTS * self._reported_at / self.total):
+            return
+        figures, seconds = self.environment.pop_figures(), self._seconds()
+        rate = (self.num_timesteps - self._reported_at) / max(seconds - self._reported_s, 1e-9)
+        figures |= {"seconds": seconds, "steps_per_s": rate}
+        self._reported_at, self._reported_s = self.num_timesteps, seconds
+        figures |= self._diagnostics()
         self.rows.append({"steps": float(self.num_timesteps), **figures})
         self.report(self.num_timesteps, figures)
+
+    def _diagnostics(self) -> dict[str, float]:
+        """PPO's figures of its last update."""
+        met = self.logger.name_to_value
+        found = {own: met.get(f"train/{name}") for name, own in DIAGNOSTICS.items()}
+        return self._before | {own: float(v) for own, v in found.items() if v is not None}
+
+    def _seconds(self) -> float:
+        """Time spent on this training, before an interruption too."""
+        return self._before_s + time.perf_counter() - self._began
 
     def save(self) -> None:
         """Called where all that is still to come depends on this state alone."""
@@ -316,6 +321,10 @@ class _Progress(BaseCallback):
             "ends": {name: torch.from_numpy(value) for name, value in vars(states.ends).items()},
             "returns": torch.from_numpy(environment.returns),
             "steps": self.num_timesteps,
+            "seconds": self._seconds(),
+            "diagnostics": self._diagnostics(),
+            "reported": [float(self._reported_at), self._reported_s],
+            "unreported": [environment.savings, environment.episode_returns, environment.solved],
             "rows": self.rows,
         }
         self.file.parent.mkdir(parents=True, exist_ok=True)
@@ -343,4 +352,7 @@ class _Progress(BaseCallback):
         model.num_timesteps = self._saved_at = content["steps"]
         model._last_obs = observe(environment.params, environment.states)
         model._last_episode_starts = environment.states.step == 0
-        self.rows = content["rows"]
+        self.rows, self._before = content["rows"], content["diagnostics"]
+        self._before_s, self._began = content["seconds"], time.perf_counter()
+        self._reported_at, self._reported_s = int(content["reported"][0]), content["reported"][1]
+        environment.savings, environment.episode_returns, environment.solved = content["unreported"]

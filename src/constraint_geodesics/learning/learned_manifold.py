@@ -19,6 +19,7 @@ from torch import Tensor
 from constraint_geodesics.geometry.manifold import pullback_metric
 from constraint_geodesics.learning.inference import CARD, WEIGHTS, ManifoldFileError
 from constraint_geodesics.learning.vae import JointVae
+from constraint_geodesics.robot.kinematics import SerialRobot
 
 PIECE = 1024
 """Points embedded at once: the temporaries of many more leave the processor's cache."""
@@ -73,6 +74,13 @@ class LearnedManifold:
                 .reshape(*z.shape[:-1], -1)
             )
 
+    def decode_all(
+        self, z: Float[np.ndarray, "*batch N"]
+    ) -> tuple[Float[np.ndarray, "*batch D"], Float[np.ndarray, "*batch A"]]:
+        """Decoder mean and, where it is not the same everywhere, deviation [rad] of many points."""
+        embedded = self.embed_points(z).astype(np.float64)
+        return embedded[..., : self.vae.dof], embedded[..., self.vae.dof :]
+
     def embed_joints(self, q: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "*batch A"]:
         """The embedding of encoded configurations: where a joint path lies on the manifold."""
         with torch.no_grad():
@@ -103,9 +111,15 @@ class LearnedManifold:
         }
         (folder / CARD).write_text(json.dumps(card, indent=2, sort_keys=True) + "\n")
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The network's state, as `from_arrays` reads it."""
+        return {name: values.numpy() for name, values in self.vae.state_dict().items()}
+
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> "LearnedManifold":
-        """From the arrays of a network's state, whose shapes say how large it is."""
+        """From the arrays of a network's state, whose shapes say how large it is; one without
+        variance centres is a `JointManifold`.
+        """
         layers = sorted(
             int(name.split(".")[2])
             for name in arrays
@@ -114,10 +128,12 @@ class LearnedManifold:
         hidden = [len(arrays[f"encoder.nonlinear.{layer}.bias"]) for layer in layers[:-1]]
         centres, latent_dim = arrays["precision.centres"].shape
         vae = JointVae(len(arrays["centre"]), latent_dim, hidden, centres)
+        vae = vae if centres else vae.double()
         vae.load_state_dict(
             {name: torch.from_numpy(np.array(values)) for name, values in arrays.items()}
         )
-        return cls(vae.eval().requires_grad_(False))
+        vae = vae.eval().requires_grad_(False)
+        return cls(vae) if centres else JointManifold(vae)
 
     @classmethod
     def load(cls, folder: Path) -> "LearnedManifold":
@@ -134,6 +150,10 @@ class LearnedManifold:
             raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None
 
 
+JOINT_SPACE = "joint_space"
+"""Name of the chart that is not learned."""
+SPREAD_OVER = 1000
+"""Random configurations that its centre and scale are taken from."""
 PRECISION = 1e12
 """Precision of every joint [1/rad²], the same everywhere: the deviation adds nothing to a length.
 """
@@ -171,3 +191,17 @@ class JointManifold(LearnedManifold):
         vae.precision.floor.fill_(PRECISION)
         vae.precision.spread.fill_(torch.inf)  # the floor never falls
         return cls(vae.eval())
+
+    def decode_all(
+        self, z: Float[np.ndarray, "*batch N"]
+    ) -> tuple[Float[np.ndarray, "*batch D"], Float[np.ndarray, "*batch A"]]:
+        """Decoder mean [rad]; the deviation is the same everywhere."""
+        centre, scale = self.vae.centre.numpy(), self.vae.scale.numpy()
+        return z * scale + centre, np.empty((*z.shape[:-1], 0))
+
+
+def chart_named(name: str, folder: Path, robot: SerialRobot) -> LearnedManifold:
+    """The robot's joint space for JOINT_SPACE, else the learned manifold saved in `folder`."""
+    if name != JOINT_SPACE:
+        return LearnedManifold.load(folder)
+    return JointManifold.of(robot.sample(SPREAD_OVER, np.random.default_rng(0)))

@@ -17,7 +17,8 @@ from jaxtyping import Float
 from pydantic import Field
 
 from constraint_geodesics.fields import Count, Name, NonNegative, Positive
-from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem
+from constraint_geodesics.geodesics.learned_problem import LearnedProblem
+from constraint_geodesics.geodesics.problem import Costs, Ends
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.learned_manifold import JointManifold, LearnedManifold
 from constraint_geodesics.peers.baseline import MANIFOLD, BaselineSettings, Context

@@ -17,7 +17,8 @@ from pydantic import Field
 from scipy import optimize
 
 from constraint_geodesics.fields import Count
-from constraint_geodesics.geodesics.problem import Ends, LearnedProblem, repeated
+from constraint_geodesics.geodesics.learned_problem import LearnedProblem
+from constraint_geodesics.geodesics.problem import Ends, repeated
 from constraint_geodesics.geometry.curves import PinnedSpline
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import corrected, retracted

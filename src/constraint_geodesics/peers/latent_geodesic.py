@@ -5,7 +5,8 @@ from jaxtyping import Float
 
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
-from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, repeated
+from constraint_geodesics.geodesics.learned_problem import LearnedProblem
+from constraint_geodesics.geodesics.problem import Costs, Ends, repeated
 from constraint_geodesics.geometry.curves import CurveFamily
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import as_executed

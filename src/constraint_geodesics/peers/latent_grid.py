@@ -20,7 +20,8 @@ from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.fields import Count, Name
 from constraint_geodesics.geodesics.graph_search import fitted, neighbours_on_grid
-from constraint_geodesics.geodesics.problem import Ends, LearnedProblem
+from constraint_geodesics.geodesics.learned_problem import LearnedProblem
+from constraint_geodesics.geodesics.problem import Ends
 from constraint_geodesics.geometry.curves import PinnedSpline
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.graph import OUTSIDE, shortest_path

@@ -13,36 +13,38 @@ from constraint_geodesics.pipeline.layout import Layout, in_checkout
 from constraint_geodesics.report.cells import fixed, markdown_table, share, short
 from constraint_geodesics.report.page import Links, Recorded, Table, runs_link
 from constraint_geodesics.report.results import read_metrics
-from constraint_geodesics.studies.proposals import (
-    DESCENT,
-    JOINTS,
-    LEARNED,
-    ONE_SEED,
-    POLICIES,
-    RANDOM,
-    SEPARATE,
-    STRAIGHT,
-)
+from constraint_geodesics.studies.proposals import DESCENT, OWN, POLICY, RANDOM, STRAIGHT
 
 POLICY_COLUMNS = (
-    *("one cubic, not refined", "feasible", "length / shortest cubic, mean", "median", "p95"),
-    *("curves looked at", "time [ms], next to another process"),
+    *("one cubic, not refined", "certified, of what anything solves", "95 % interval"),
+    *("length / shortest, median", "p95", "curves looked at"),
+    *("time with its check [ms]", "chance that the policy solves more", "is shorter"),
 )
 EXECUTION_COLUMNS = (
     *("path", "executed", "spheres kept, mean", "worst", "largest tilt [°]", "collisions"),
     *("tracking error [rad]", "duration [s]"),
 )
-METHODS = (STRAIGHT, RANDOM, DESCENT, ONE_SEED, POLICIES, SEPARATE)
-"""The order of the proposals, each on the learned manifold first."""
+METHODS = (POLICY, OWN, RANDOM, DESCENT, STRAIGHT)
+"""The order of the proposals."""
+SCENES = {"table": "", "keep_out": ", one sphere on the way"}
+"""What a block's title says of each scene."""
 
 
 def policy_blocks(params: Params, layout: Layout) -> list[Table]:
-    """What the policies propose before any refinement, one block a constraint."""
-    found = read_metrics(layout.report("benchmark_policies", params.geodesics.searched[0]))
-    names = [name for name in (params.studies.constraint, *params.unseen) if name in found]
-    named = [f"{method}, {chart}" for method in METHODS for chart in (LEARNED, JOINTS)]
-    link = Links(runs_link("benchmark_policies", params.geodesics.searched[0]))
-    return [_policy_block(name, _ordered(found[name], named), link) for name in names]
+    """What the policies propose before any refinement: the studied constraint, all that they were
+    trained on, each that they were not, and the same with a sphere on the way.
+    """
+    found = read_metrics(layout.report("benchmark_policies", "policies"))
+    names = [params.studies.constraint, "trained on", *params.unseen]
+    link = Links(runs_link("benchmark_policies", params.policies.chart))
+    shown = [(name, "table") for name in names]
+    shown += [
+        (name, "keep_out") for name in (params.studies.constraint, "trained on", "never seen")
+    ]
+    return [
+        _policy_block(f"{name}{SCENES[scene]}", _ordered(found[name][scene], METHODS), link)
+        for name, scene in shown
+    ]
 
 
 def execution_block(params: Params, layout: Layout) -> Table:
@@ -111,23 +113,31 @@ def _markdown(block: Table) -> str:
     return f"**{block.title}** ({block.note}):\n\n{markdown_table([block.header, *block.rows])}"
 
 
-def _policy_block(constraint: str, rows: Mapping[str, Mapping[str, Any]], link: Links) -> Table:
+def _policy_block(title: str, rows: Mapping[str, Mapping[str, Any]], link: Links) -> Table:
     first = next(iter(rows.values()))
+    family = first["optimum_median_iqm"] is not None
+    over = "optimum" if family else "ratio"
     note = (
-        f"{first['queries']} queries, {first['solvable']} of which have a curve of the family; "
-        f"ratios over the {first['shared']} that every method solves"
+        f"{first['queries']} queries, {first['solvable']} of which anything solves; interquartile "
+        f"means over {first['seeds']} seeds of the policy; lengths over "
+        + ("the family's shortest curve" if family else "the shortest certified path known")
     )
     cells = [
         [
             method,
-            share(row["feasible"], 1),
-            *(fixed(row[f"shared_ratio_{what}"], 4) for what in ("mean", "median", "p95")),
-            str(row["curves"]),
-            short(row["time_median_ms"]),
+            share(row["solved_iqm"], 1),
+            f"{share(row['solved_low'], 1)} to {share(row['solved_high'], 1)}",
+            *(fixed(row[f"{over}_{what}_iqm"], 4) for what in ("median", "p95")),
+            short(row["curves"]),
+            short(row["time_ms_iqm"]),
+            *(
+                share(row[f"beaten_in_{what}"]) if f"beaten_in_{what}" in row else ""
+                for what in ("solved", "ratio_p95")
+            ),
         ]
         for method, row in rows.items()
     ]
     links = [link] * len(rows)
     return Table(
-        f"{constraint}, proposals", note, POLICY_COLUMNS, cells, planners=list(rows), links=links
+        f"{title}, proposals", note, POLICY_COLUMNS, cells, planners=list(rows), links=links
     )

@@ -17,10 +17,12 @@ import pandas as pd
 import torch
 from jaxtyping import Bool, Float
 
-from constraint_geodesics.benchmark.judge import Free, judge_limits, measure_path
+from constraint_geodesics.benchmark.judge import judge_limits, measure_path
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.geodesics.episodes import begin
+from constraint_geodesics.geodesics.learned_problem import LearnedProblem, ProblemSet
+from constraint_geodesics.geodesics.obstacles import with_spheres
 from constraint_geodesics.geodesics.policy_search import (
     PolicySolver,
     TrainedPolicy,
@@ -28,15 +30,8 @@ from constraint_geodesics.geodesics.policy_search import (
     save_policy,
     train_policy,
 )
-from constraint_geodesics.geodesics.problem import (
-    ChartBox,
-    ChartProblem,
-    Ends,
-    Geodesic,
-    LearnedProblem,
-    ProblemSet,
-    repeated,
-)
+from constraint_geodesics.geodesics.problem import ChartBox, ChartProblem, Ends, Geodesic, repeated
+from constraint_geodesics.geodesics.proposals import MeanPolicy
 from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
 from constraint_geodesics.geometry.curves import CurveFamily, Curves, PinnedPolynomial, PinnedSpline
 from constraint_geodesics.geometry.manifold import MeasuredManifold
@@ -49,8 +44,11 @@ from constraint_geodesics.learning.submanifold import (
     component_of,
 )
 from constraint_geodesics.params import GeodesicParams, JudgeParams, Params, SubmanifoldParams
+from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
 
+OBSTACLES_SEED = 5
+"""Of the spheres that policies are trained with."""
 PLANNER, RANDOM, STRAIGHT = "learned_geodesic", "random_curves", "straight_latent_line"
 
 
@@ -64,9 +62,13 @@ class SeedLog(Protocol):
 
 @dataclass(frozen=True)
 class SeedTask:
-    """Everything one seed needs; picklable, to run elsewhere."""
+    """Everything one seed needs; picklable, to run elsewhere.
+
+    manifold: learned, on which the lengths of paths are measured besides.
+    """
 
     problem: LearnedProblem
+    manifold: LearnedManifold
     scene: Scene
     params: GeodesicParams
     judge: JudgeParams
@@ -78,18 +80,18 @@ class SeedTask:
     seed: int
     scratch: Path
     run: AbstractContextManager[SeedLog]
-    policy: TrainedPolicy | None = None
-    """A policy trained before, on all constraints together for example; None trains one on this
-    problem.
-    """
+    policy: MeanPolicy | None = None
+    """A policy trained before, on all constraints together; None trains one on this problem."""
 
 
 @dataclass(frozen=True)
 class SeedResult:
-    """A trained policy, rows and joint paths (with the policy, then without), and its curves."""
+    """Rows and joint paths (with the policy, then without) and its curves; the policy itself where
+    it was trained here.
+    """
 
     seed: int
-    policy: TrainedPolicy
+    policy: TrainedPolicy | None
     rows: list[dict[str, Any]]
     paths: list[Float[np.ndarray, "T D"]]
     phi: Float[np.ndarray, "Q p"]
@@ -104,7 +106,6 @@ class SeedResult:
             "success": float(np.mean([row["valid"] for row in learned])),
             "success_at_random": float(np.mean([row["valid"] for row in random])),
             "length_median_rad": float(np.median(lengths)) if lengths else float("nan"),
-            "final_saving": self.policy.curve[-1]["saving"] if self.policy.curve else float("nan"),
         }
 
 
@@ -125,14 +126,29 @@ def train_seed(task: TrainingTask) -> TrainedPolicy:
         return train_policy(task.problem, task.params, task.seed, task.scratch, run.log)
 
 
+def training_figures(curve: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """What is compared between trainings: saving and share of feasible sets at the end, and how
+    fast it was.
+    """
+    last = curve[-1]
+    rate = float(np.median([row["steps_per_s"] for row in curve]))
+    return {
+        "final_saving": last["saving"],
+        "final_feasible": last["feasible"],
+        "steps_per_s": rate,
+        "seconds": last["seconds"],
+    }
+
+
 def run_seed(task: SeedTask) -> SeedResult:
     """Train one policy; search every query with it and, as a control, without it; measure."""
+    policy, mean = None, task.policy
     with task.run as run:
-        policy = task.policy or train_policy(
-            task.problem, task.params, task.seed, task.scratch, run.log
-        )
+        if mean is None:
+            policy = train_policy(task.problem, task.params, task.seed, task.scratch, run.log)
+            mean = policy.mean
     rows, paths, coefficients = [], [], []
-    problem, solver = task.problem, PolicySolver(policy.actor, task.params, task.seed)
+    problem, solver = task.problem, PolicySolver(mean, task.params, task.seed)
     searches = ((PLANNER, solver.search), (RANDOM, solver.search_at_random))
     with Certifier(task.scene, judge_limits(task.judge)) as certifier:
         for query in range(len(task.queries)):
@@ -170,11 +186,7 @@ def straight_rows(task: SeedTask) -> tuple[list[dict[str, Any]], list[Float[np.n
 
 
 def connected_queries(
-    submanifold: Submanifold,
-    problem: LearnedProblem,
-    queries: Queries,
-    free: Free,
-    params: SubmanifoldParams,
+    submanifold: Submanifold, surface: Surface, queries: Queries, params: SubmanifoldParams
 ) -> tuple[Bool[np.ndarray, "Q"], Float[np.ndarray, "Q"]]:
     """Which queries have both ends in one component of the sampled graph, and the time it took [s].
 
@@ -183,7 +195,6 @@ def connected_queries(
     """
     if not isinstance(submanifold, GraphSubmanifold):
         return np.ones(len(queries), dtype=bool), np.zeros(len(queries))
-    surface = Surface(problem.chart, problem.manifold, free)
     connected, seconds = [], []
     for pair in zip(queries.starts, queries.goals, strict=True):
         began = time.perf_counter()
@@ -200,24 +211,43 @@ def geodesic_problem(
     joints: Float[np.ndarray, "n D"],
     name: str,
 ) -> LearnedProblem:
-    """The problem that params.yaml describes on the learned manifold `name`."""
+    """The problem that params.yaml describes on the learned manifold `name`: the paper's, where
+    curves are not retracted.
+    """
     geodesics = params.geodesics
     curve = PinnedPolynomial(chart.dim, geodesics.degree)
     retract, weight = params.manifolds[name].retract, geodesics.reward.inclusion_weight
     return LearnedProblem(chart, manifold, curve, joints, geodesics.length_degree, retract, weight)
 
 
-def shared_problem(
+def policy_problem(
     params: Params,
     chart: LearnedManifold,
-    manifolds: Mapping[str, ConstraintManifold],
-    joints: Mapping[str, Float[np.ndarray, "n D"]],
-    name: str,
+    scene: Scene,
+    manifold: ConstraintManifold,
+    joints: Float[np.ndarray, "n D"],
+) -> LearnedProblem:
+    """What policies are asked under one constraint in a workcell, in their chart."""
+    settings = params.policy_settings()
+    curve = PinnedPolynomial(chart.dim, settings.degree)
+    clearance = clearance_model(scene.robot, scene.workcell)
+    space = chart, manifold, curve, joints, settings.length_degree, True, 0.0
+    return LearnedProblem(*space, clearance=clearance)
+
+
+def training_problem(
+    params: Params, scene: Scene, problems: Sequence[LearnedProblem]
 ) -> ProblemSet:
-    """One problem of all constraints, by name, on the learned manifold `name`: one policy's."""
-    return ProblemSet(
-        [geodesic_problem(params, chart, manifolds[key], joints[key], name) for key in manifolds]
-    )
+    """All constraints as one problem, each alone and with spheres on the way."""
+    settings, rng = params.policies.obstacles, np.random.default_rng(OBSTACLES_SEED)
+    around = [
+        member
+        for problem in problems
+        for member in with_spheres(problem, scene.workcell, settings.count, settings.radii_m, rng)
+    ]
+    alone = np.full(len(problems), (1.0 - settings.share) / len(problems))
+    beset = np.full(len(around), settings.share / max(len(around), 1))
+    return ProblemSet((*problems, *around), np.concatenate([alone, beset]))
 
 
 def query_ends(problem: LearnedProblem, queries: Queries, query: int) -> Ends:
@@ -246,7 +276,7 @@ def _measured(
         ends.q_start[0],
         ends.q_goal[0],
         problem.manifold,
-        {task.manifold_name: problem.chart},
+        {task.manifold_name: task.manifold},
         certifier,
         task.judge.spacing_rad,
     )
@@ -258,15 +288,17 @@ def _measured(
 def save_seeds(
     results: Sequence[SeedResult], queries: Queries, folder: Path, learning: Path
 ) -> None:
-    """Weights and curves into a folder, the learning curves into a table."""
+    """Curves, and weights trained here, into a folder, the latter's learning into a table."""
     folder.mkdir(parents=True, exist_ok=True)
-    for result in results:
-        save_policy(result.policy, folder, result.seed)
+    trained = [(result.seed, result.policy) for result in results if result.policy is not None]
+    for seed, policy in trained:
+        save_policy(policy, folder, seed)
     phi, seeds = np.array([r.phi for r in results]), np.array([r.seed for r in results])
     with (folder / "curves.npz").open("wb") as file:
         np.savez_compressed(file, phi=phi, seeds=seeds, starts=queries.starts, goals=queries.goals)
-    rows = [{"seed": result.seed, **row} for result in results for row in result.policy.curve]
-    write_rows(rows, learning)
+    rows = [{"seed": seed, **row} for seed, policy in trained for row in policy.curve]
+    if rows:
+        write_rows(rows, learning)
 
 
 def write_rows(rows: Sequence[Mapping[str, Any]], file: Path, **columns: str) -> None:

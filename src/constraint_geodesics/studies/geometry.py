@@ -20,14 +20,15 @@ from torch import Tensor
 from constraint_geodesics.geodesics.environment import CurveEnv, CurveVecEnv, scalar_environments
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.graph_search import CombinedSolver, GraphSolver
-from constraint_geodesics.geodesics.policy_search import Actor, PolicySolver, ppo_model
+from constraint_geodesics.geodesics.learned_problem import LearnedProblem
+from constraint_geodesics.geodesics.policy_search import PolicySolver, ppo_model
 from constraint_geodesics.geodesics.problem import (
     ChartProblem,
     Ends,
     GeodesicProblem,
     GeodesicSolver,
-    LearnedProblem,
 )
+from constraint_geodesics.geodesics.proposals import MeanPolicy
 from constraint_geodesics.geodesics.solver import geodesics_between
 from constraint_geodesics.geometry.curves import Curves
 from constraint_geodesics.geometry.length import (
@@ -83,8 +84,8 @@ class GeometryBenchmark:
         """The learned manifold."""
         return self.retracted.chart
 
-    def figures(self, actors: Mapping[str, Actor]) -> dict[str, Any]:
-        """Rates, errors and solvers.  actors: a trained policy of every analytic manifold."""
+    def figures(self, policies: Mapping[str, MeanPolicy]) -> dict[str, Any]:
+        """Rates, errors and solvers.  policies: a trained policy of every analytic manifold."""
         parts: dict[str, Callable[[], Any]] = {
             "curve_length": self.curve_length,
             "curve_length_retracted": self.curve_length_retracted,
@@ -92,8 +93,8 @@ class GeometryBenchmark:
             "environment_retracted": lambda: self.environment(self.retracted),
         }
         parts |= {
-            f"solvers/{name}": partial(self.analytic_solvers, name, actor)
-            for name, actor in actors.items()
+            f"solvers/{name}": partial(self.analytic_solvers, name, policy)
+            for name, policy in policies.items()
         }
         parts["solvers/learned"] = self.learned_solvers
         found: dict[str, Any] = {}
@@ -229,14 +230,14 @@ class GeometryBenchmark:
             "ratio_to_dummy_vec_env": ours / usual,
         }
 
-    def analytic_solvers(self, name: str, actor: Actor) -> dict[str, dict[str, float]]:
+    def analytic_solvers(self, name: str, policy: MeanPolicy) -> dict[str, dict[str, float]]:
         """Every solver on an analytic manifold; the graph stands on random points of the domain."""
         problem, box = analytic_problem(name, curve_family(2, self.geodesics)), MANIFOLDS[name].box
         ends, exact = unseen_pairs(name, problem)
         points = box.sample(self.settings.graph_points, np.random.default_rng(SEED))
         graph = GraphSolver.over_points(problem.manifold, points)
         solvers: dict[str, GeodesicSolver] = {
-            "policy_search": PolicySolver(actor, self.geodesics),
+            "policy_search": PolicySolver(policy, self.geodesics),
             "gradient": GradientSolver(),
             "graph": graph,
             "grid": GraphSolver.over_grid(problem.manifold, box.low, box.high, GRID),

@@ -1,537 +1,407 @@
-"""What policies add to the straight line, plain descent, random curves and the best of the family.
+"""What a policy adds, with one curve and no refinement, to random curves and to a descent that are
+given the same time.
 
-Every method answers one query at a time with the best curve that it met, feasible ones first, then
-the cheapest, at the problem's own accuracy.  Then `measured` judges all answers alike, and
-`family_optimum` looks for the shortest curve of the same family.
+Every method offers curves of one family for a query at a time.  They are checked alike, the
+cheapest first: sampled, drawn as the rows that a robot executes, and certified; the first that is
+certified is the method's answer.  `family_optimum` looks for the shortest curve of the family, and
+the planner for any path at all.
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
-from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.constraints.projection import Retraction
-from constraint_geodesics.geodesics.problem import Costs, Ends, LearnedProblem, Phi, repeated
-from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
-from constraint_geodesics.geometry.curves import PinnedPolynomial
-from constraint_geodesics.learning.dataset import ShardTask, draw_free, draw_queries, seed_of
-from constraint_geodesics.learning.learned_manifold import JointManifold, LearnedManifold
-from constraint_geodesics.params import GeodesicParams
+from constraint_geodesics.benchmark.judge import judge_limits
+from constraint_geodesics.benchmark.queries import TABLE, Query, draw_benchmark, shortest_of
+from constraint_geodesics.certification.certifier import Certifier
+from constraint_geodesics.constraints.constraint import ConstraintManifold, constraint_manifold
+from constraint_geodesics.geodesics.learned_method import LatentCurve, sampled
+from constraint_geodesics.geodesics.learned_problem import LearnedProblem
+from constraint_geodesics.geodesics.problem import Costs, Ends, Phi, repeated
+from constraint_geodesics.geodesics.proposals import MeanPolicy, rounds
+from constraint_geodesics.learning.dataset import ShardTask, draw_free, seed_of
+from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.params import GeodesicParams, Params
+from constraint_geodesics.peers.registry import BaselineBuilder
+from constraint_geodesics.problem import PathPlanner, PlanningProblem
+from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.search.candidates import ROW_SAFETY, Task, rows_of
+from constraint_geodesics.studies.geodesic_search import policy_problem
+from constraint_geodesics.studies.optimum import INFEASIBLE, OptimumSettings, family_optimum
+from constraint_geodesics.studies.statistics import (
+    bootstrap_interval,
+    interquartile_mean,
+    probability_of_improvement,
+)
 
-STRAIGHT, ONE_SEED, POLICIES = "straight latent line", "policy, one seed", "policies"
-SEPARATE, DESCENT, RANDOM = "separate policies", "descent", "random curves"
-FINE_DEGREE, POLISH_DEGREE = 64, 32
-"""Degrees of the polynomials that lengths are measured with at last, and while curves are polished.
-"""
-EXACT = Retraction(accuracy=1e-6, iterations=20)
-ROW_SPACING, LONGEST_STEP = 0.05, 0.1
-"""Distance of a path's rows, and the longest one that is no jump [rad]."""
-LIMIT_SLACK, VIOLATION_SLACK = 1e-3, 1e-6
-"""What a path may exceed joint limits by between the points that the search looked at, and the
-constraint by [rad].
-"""
-INFEASIBLE = 1e3
-"""Added to the cost of a curve that is not feasible [rad]: more than any curve costs."""
-LONGEST_STRIDE = 1.5
-"""Largest multiple of the problem's descent that is taken in one step."""
-NEAR = 0.02
-"""Curves whose coefficients differ by less, in units of the ends' distance, are polished once."""
-DIFFERENCE = 3e-4
-"""Half step of central differences, in units of the ends' distance: a cost is known to single
-precision.
-"""
-FIRST_STEP = 0.1
-"""Longest step of the polish, in units of the ends' distance."""
-HALVINGS, SUFFICIENT = 6, 1e-4
-"""Of the polish's line search: cuts by SHORTENED at most, and the share of the expected decrease
-that it asks for.
-"""
-SHORTENED = 0.35
-GAIN = 1e-6
-"""Relative decrease below which a curve is polished no more."""
+STRAIGHT, POLICY, OWN = "straight line", "policy", "policy, its own branches alone"
+RANDOM, DESCENT = "random curves, same time", "random curves and descent, same time"
+CONTROLS = 5
+"""Seeds of the methods that use chance but no policy."""
+MOST_CHECKED = 12
+"""Curves of one offer that are checked at most: those behind them are mostly alike."""
+DRAWN, KEPT = 32, 4
+"""Curves that the controls draw at once, and how many of them go down the descent together."""
+GROWN, CUT, LONGEST = 1.3, 0.4, 1.5
+"""Factors of a descent's stride after a better and a worse step, and the longest one."""
+PAST_ROWS = 1000
+"""Configurations of the constraint that random curves are bent past."""
+PLANNER = "planner"
+"""Of the benchmark: it solves all that any other of its planners solves."""
 
 
-@dataclass(frozen=True)
-class OptimumSettings:
-    """Work spent on the optimum of each query.
-
-    random_starts: cheapest of `drawn` random curves, added to the given starts.  descent_steps:
-    from every start.  polished: curves that quasi-Newton goes on with.  polish_steps: its
-    iterations at most.
+class Offer(NamedTuple):
+    """Curves (n, p) of one method in the order in which they are checked, and how many it looked at
+    to find them.
     """
 
-    random_starts: int = 32
-    drawn: int = 256
-    descent_steps: int = 20
-    polished: int = 4
-    polish_steps: int = 40
-    seed: int = 0
+    phi: Phi
+    curves: int
+
+
+Offers = Iterator[Offer]
+Method = Callable[["Asked", float], Offers]
+"""Offers for a query; the time [s] is what the controls may spend on their search."""
 
 
 @dataclass(frozen=True)
-class FamilyOptimum:
-    """The shortest feasible curve found for each query; length [rad] is nan where there is none."""
+class Asked:
+    """One query, what the methods see of it, and who certifies their answers."""
 
-    phi: Float[np.ndarray, "Q p"]
-    length: Float[np.ndarray, "Q"]
-    feasible: Bool[np.ndarray, "Q"]
+    problem: LearnedProblem
+    ends: Ends
+    number: int
+    certifier: Certifier
+
+    @property
+    def task(self) -> Task:
+        """The query's constraint and surroundings, as the planner knows them."""
+        return Task(self.problem.manifold, self.problem.clearance, lambda: None)
+
+    def certified_length(self, phi: Float[np.ndarray, "p"]) -> float | None:
+        """Length of a curve's path [rad]; None unless it is certified."""
+        candidate = sampled(self.task, LatentCurve(self.problem, self.ends, phi))
+        if candidate is None:
+            return None
+        joints = rows_of(candidate, ROW_SAFETY * self.certifier.limits.violation_tolerance)
+        constraint = self.problem.manifold.constraint
+        start, goal = self.ends.q_start[0], self.ends.q_goal[0]
+        found = self.certifier.certify(joints, constraint, start, goal)
+        return found.length_rad if found.valid else None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A method's answer to one query: the curve (p,) and its length [rad], nan where none was
+    certified; seconds spent on the search and on the checks, curves looked at and checked.
+    """
+
+    phi: Float[np.ndarray, "p"]
+    length: float
+    search_s: float
+    check_s: float
+    curves: int
+    checked: int
+
+    @property
+    def solved(self) -> bool:
+        """Whether a curve was certified."""
+        return bool(np.isfinite(self.length))
+
+
+def answered(asked: Asked, offers: Offers) -> Answer:
+    """The first certified curve of the offers."""
+    search = check = 0.0
+    curves = checked = 0
+    began = time.perf_counter()
+    for offer in offers:
+        found = time.perf_counter()
+        search, curves = search + found - began, curves + offer.curves
+        for phi in offer.phi[:MOST_CHECKED]:
+            length, checked = asked.certified_length(phi), checked + 1
+            if length is not None:
+                check += time.perf_counter() - found
+                return Answer(phi, length, search, check, curves, checked)
+        began = time.perf_counter()
+        check += began - found
+    nothing = np.zeros(asked.problem.curve.coefficients)
+    return Answer(nothing, np.nan, search, check, curves, checked)
+
+
+def by_policy(policy: MeanPolicy, settings: GeodesicParams, seed: int) -> Method:
+    """The policy's rounds."""
+
+    def offers(asked: Asked, _: float) -> Offers:
+        rng = np.random.default_rng((seed, asked.number))
+        for met in rounds(asked.problem, policy, settings, asked.ends, rng):
+            yield Offer(met.phi[met.usable], len(met.phi))
+
+    return offers
+
+
+def straight(asked: Asked, _: float) -> Offers:
+    """The straight line of the chart."""
+    phi = np.zeros((1, asked.problem.curve.coefficients))
+    yield Offer(phi[asked.problem.evaluate(phi, asked.ends).feasible], 1)
+
+
+def at_random(seed: int) -> Method:
+    """Random curves until the time is over, the straight line among them."""
+
+    def offers(asked: Asked, seconds: float) -> Offers:
+        problem, many = asked.problem, repeated(asked.ends, DRAWN)
+        began, rng = time.perf_counter(), np.random.default_rng((seed, asked.number))
+        met: list[tuple[Phi, Costs]] = []
+        while not met or time.perf_counter() - began < seconds:
+            drawn = problem.sample_curves(many, rng)
+            drawn[0] *= bool(met)
+            met.append((drawn, problem.evaluate(drawn, many)))
+        phi = np.concatenate([drawn for drawn, _ in met])
+        cost = np.concatenate([np.where(c.feasible, c.cost, np.inf) for _, c in met])
+        order = np.argsort(cost, kind="stable")[: int(np.isfinite(cost).sum())]
+        yield Offer(phi[order], len(phi))
+
+    return offers
+
+
+def by_descent(seed: int) -> Method:
+    """The cheapest of a batch of random curves, and the straight line among those, down the
+    problem's own descent until the time is over.
+    """
+
+    def offers(asked: Asked, seconds: float) -> Offers:
+        problem, many = asked.problem, repeated(asked.ends, DRAWN)
+        began, rng = time.perf_counter(), np.random.default_rng((seed, asked.number))
+        drawn = problem.sample_curves(many, rng)
+        drawn[0] = 0.0
+        first = problem.evaluate(drawn, many)
+        order = np.lexsort((first.cost, ~first.feasible))
+        few, phi, curves = repeated(asked.ends, KEPT), drawn[order[:KEPT]], DRAWN
+        now, stride = problem.observed(phi, few), np.ones(KEPT)
+        descent, costs = now.descent, now.costs
+        rank = np.where(costs.feasible, costs.cost, INFEASIBLE + costs.cost)
+        while time.perf_counter() - began < seconds:
+            tried = phi + stride[:, None] * descent
+            now, curves = problem.observed(tried, few), curves + KEPT
+            new = np.where(now.costs.feasible, now.costs.cost, INFEASIBLE + now.costs.cost)
+            better = new < rank
+            phi = np.where(better[:, None], tried, phi)
+            descent = np.where(better[:, None], now.descent, descent)
+            rank = np.where(better, new, rank)
+            stride = np.where(better, np.minimum(GROWN * stride, LONGEST), CUT * stride)
+        best = np.argsort(rank)[: int((rank < INFEASIBLE).sum())]
+        others = order[: int(first.feasible.sum())]
+        yield Offer(np.concatenate([phi[best], drawn[others]]), curves)
+
+    return offers
 
 
 @dataclass(frozen=True)
 class Compared:
-    """Whose proposals are compared.
+    """Policies by seed, and how they are asked."""
 
-    policies: seeds of one policy; with none, their methods are left out.  separate: policies
-    trained on this constraint alone.  settings: of their episodes.  random_curves: as many as
-    `policies` meet unless given.  seed: of the random curves.
-    """
-
-    policies: Sequence[MeanPolicy]
-    separate: Sequence[MeanPolicy] | None
+    policies: Mapping[int, MeanPolicy]
     settings: GeodesicParams
-    seed: int = 0
-    random_curves: int | None = None
 
-
-def policy_rows(
-    problem: LearnedProblem, ends: Ends, compared: Compared, optimum: OptimumSettings | None = None
-) -> pd.DataFrame:
-    """One row a query and method (and seed, for one policy alone): its answer and what it costs.
-
-    Columns: method, seed, query, feasible, length_rad (nan where not feasible), optimum_rad
-    (`family_optimum` or an answer, whichever is shorter; nan where there is neither), curves (met,
-    the straight line once), time_ms (of the answer, on a problem that has answered before).
-    """
-    methods = _methods(problem, compared)
-    queries, count = len(ends), len(methods)
-    phi, rows = np.empty((queries, count, problem.curve.coefficients)), []
-    claimed = np.empty((queries, count), dtype=bool)
-    for method in methods:
-        method.answer(ends[np.arange(1)], 0)
-    for query in range(queries):
-        one = ends[np.array([query])]
-        # in turn, so that what else the machine does disturbs all alike
-        for k, method in enumerate(methods):
-            began = time.perf_counter()
-            phi[query, k], claimed[query, k] = method.answer(one, query)
-            spent = 1e3 * (time.perf_counter() - began)
-            rows.append((method.name, method.seed, query, method.curves, spent))
-    each = ends[np.repeat(np.arange(queries), count)]
-    costs = measured(problem, phi.reshape(queries * count, -1), each)
-    feasible = claimed & costs.feasible.reshape(queries, count)
-    length = np.where(feasible, costs.length.reshape(queries, count), np.nan)
-    shortest = family_optimum(problem, ends, phi, optimum).length
-    best = np.fmin(shortest, np.fmin.reduce(length, axis=1))
-    table = pd.DataFrame(rows, columns=["method", "seed", "query", "curves", "time_ms"])
-    table.insert(3, "feasible", feasible.ravel())
-    table.insert(4, "length_rad", length.ravel())
-    table.insert(5, "optimum_rad", best[table["query"]])
-    return table
-
-
-def policy_table(rows: pd.DataFrame) -> pd.DataFrame:
-    """One row a method of one constraint: feasible share, length over the optimum, curves, time.
-
-    ratio_*: over the method's own feasible answers.  shared_ratio_*: over the `shared` queries that
-    every method answers, the only ones that compare methods.  solvable: queries with an optimum.
-    """
-    rows = rows.reset_index(drop=True)
-    solved = rows.groupby("query")["feasible"].all()
-    shared = rows["query"].map(solved)
-    ratio = rows["length_rad"] / rows["optimum_rad"]
-    rows = rows.assign(
-        solvable=rows["query"].where(rows["optimum_rad"].notna()),
-        ratio=ratio.where(rows["feasible"]),
-        shared_ratio=ratio.where(shared),
-    )
-    groups = rows.groupby("method", sort=False)
-    table = groups.agg(
-        queries=("query", "nunique"),
-        solvable=("solvable", "nunique"),
-        feasible=("feasible", "mean"),
-    )
-    table = table.join(_spread("ratio", groups)).assign(shared=int(solved.sum()))
-    table = table.join(_spread("shared_ratio", groups))
-    table["curves"], table["time_median_ms"] = groups["curves"].max(), groups["time_ms"].median()
-    return table.reset_index()
-
-
-def spaces_together(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Rows of the same queries in several spaces, by their names, as one table with one optimum.
-
-    A method becomes "method, space"; optimum_rad is the shortest of any space's family.
-    """
-    named = [table.assign(method=table["method"] + f", {name}") for name, table in tables.items()]
-    rows = pd.concat(named, ignore_index=True)
-    rows["optimum_rad"] = rows.groupby("query")["optimum_rad"].transform("min")
-    return rows
-
-
-def family_optimum(
-    problem: LearnedProblem,
-    ends: Ends,
-    starts: Float[np.ndarray, "Q K p"],
-    settings: OptimumSettings | None = None,
-) -> FamilyOptimum:
-    """The shortest feasible curve of the family for each query, as far as many starts find it.
-
-    From every start the problem's own descent, then BFGS on the cost, all queries in one batch.
-    Starts and what the descent made of them count too, so no feasible start is shorter than the
-    answer.
-    """
-    settings = settings or OptimumSettings()
-    queries, size = len(ends), problem.curve.coefficients
-    phi = np.concatenate([starts, _random_starts(problem, ends, settings)], axis=1)
-    each = ends[np.repeat(np.arange(queries), phi.shape[1])]
-    moved = descended(problem, phi.reshape(-1, size), each, settings.descent_steps)
-    met = np.concatenate([phi, moved.reshape(phi.shape)], axis=1)
-    finer = replace(problem, degree=POLISH_DEGREE, retraction=EXACT)
-    costs = finer.evaluate(met.reshape(-1, size), ends[np.repeat(np.arange(queries), met.shape[1])])
-    picked = _picked(problem, met, _lengths(costs).reshape(met.shape[:2]), ends, settings.polished)
-    final = np.take_along_axis(met, np.maximum(picked, 0)[..., None], axis=1)
-    query, place = np.nonzero(picked >= 0)
-    final[query, place] = polished(finer, final[query, place], ends[query], settings.polish_steps)
-    return _shortest(problem, np.concatenate([final, met], axis=1), ends)
-
-
-def measured(problem: LearnedProblem, phi: Phi, ends: Ends) -> Costs:
-    """Costs at FINE_DEGREE; a feasible curve's executed path is sound besides."""
-    costs = _fine(problem).evaluate(phi, ends)
-    feasible = costs.feasible.copy()
-    for row in np.flatnonzero(feasible):
-        feasible[row] = is_sound(problem, phi[row], ends[np.array([row])])
-    return replace(costs, feasible=feasible)
-
-
-def is_sound(problem: LearnedProblem, phi: Float[np.ndarray, "p"], ends: Ends) -> bool:
-    """Whether one curve's path has no step above LONGEST_STEP and keeps limits and constraint.
-
-    Lengths look at a curve at a few points, between which it may change its branch unseen.
-    """
-    path = problem.path(phi, ends, ROW_SPACING)
-    return bool(
-        np.linalg.norm(np.diff(path, axis=0), axis=1).max() <= LONGEST_STEP
-        and problem.manifold.robot.limit_distance(path).min() >= -LIMIT_SLACK
-        and problem.manifold.violation(path).max() <= VIOLATION_SLACK
-    )
-
-
-def descended(problem: LearnedProblem, phi: Phi, ends: Ends, steps: int) -> Phi:
-    """Curves after steps along the problem's descent, with step sizes of their own; none worse."""
-    now = problem.observed(phi, ends)
-    rank, descent, stride = _ranks(now.costs), now.descent, np.ones(len(phi))
-    for _ in range(steps):
-        moved = phi + stride[:, None] * descent
-        now = problem.observed(moved, ends)
-        new = _ranks(now.costs)
-        better = new < rank
-        phi = np.where(better[:, None], moved, phi)
-        descent = np.where(better[:, None], now.descent, descent)
-        rank = np.where(better, new, rank)
-        stride = np.where(better, np.minimum(1.3 * stride, LONGEST_STRIDE), 0.4 * stride)
-    return phi
-
-
-def polished(problem: LearnedProblem, phi: Phi, ends: Ends, steps: int) -> Phi:
-    """Curves after BFGS on the cost with central differences (Nocedal and Wright, alg. 6.1).
-
-    Every feasible curve goes on until a step gains less than GAIN; none gets worse or infeasible.
-    """
-    phi, size = phi.copy(), phi.shape[1]
-    value = _ranks(problem.evaluate(phi, ends)) if len(phi) else np.empty(0)
-    rows = np.flatnonzero(value < INFEASIBLE)
-    gradient = _gradients(problem, phi, ends, rows)
-    inverse = np.tile(np.eye(size), (len(phi), 1, 1))
-    fresh = np.ones(len(phi), dtype=bool)
-    for _ in range(steps):
-        if not len(rows):
-            break
-        direction = -(inverse[rows] @ gradient[rows, :, None])[..., 0]
-        far, length = FIRST_STEP * ends.distance[rows], np.linalg.norm(direction, axis=1)
-        direction *= np.minimum(1.0, far / np.maximum(length, 1e-12))[:, None]
-        slope = (direction * gradient[rows]).sum(axis=1)
-        line = _Line(phi[rows], ends[rows], value[rows], direction, slope)
-        moved, new = _line_search(problem, line)
-        stuck = new >= value[rows]
-        going = np.where(stuck, ~fresh[rows], value[rows] - new > GAIN * value[rows])
-        # a kink spoils the Hessian: once more without
-        inverse[rows[stuck]], fresh[rows[stuck]] = np.eye(size), True
-        on = rows[going & ~stuck]
-        change = (moved - phi[rows])[going & ~stuck]
-        phi[rows], value[rows] = moved, new
-        slopes = _gradients(problem, phi, ends, on)
-        _update(inverse, fresh, on, change, slopes[on] - gradient[on])
-        gradient[on] = slopes[on]
-        rows = rows[going]
-    return phi
-
-
-@dataclass(frozen=True)
-class _Method:
-    """Answers a query (its ends and number) with coefficients (p,) and whether they are feasible.
-
-    curves: that it meets for one query.
-    """
-
-    name: str
-    seed: int
-    curves: int
-    answer: Callable[[Ends, int], tuple[Float[np.ndarray, "p"], bool]]
-
-
-def _methods(problem: LearnedProblem, compared: Compared) -> list[_Method]:
-    steps, drawn = compared.settings.episode_steps, compared.random_curves
-    policies, separate = compared.policies, compared.separate
-    drawn = len(policies) * steps + 1 if drawn is None else drawn
-    asked: list[tuple[str, int, Sequence[MeanPolicy]]] = [
-        (ONE_SEED, k, [policy]) for k, policy in enumerate(policies)
-    ]
-    asked += [(POLICIES, 0, policies)] if policies else []
-    asked += [(SEPARATE, 0, separate)] if separate else []
-    return [
-        _Method(STRAIGHT, 0, 1, lambda ends, _: _straight(problem, ends)),
-        *(
-            _Method(name, k, len(own) * steps + 1, partial(_proposed, problem, own, compared))
-            for name, k, own in asked
-        ),
-        _Method(DESCENT, 0, steps + 1, lambda ends, _: _followed(problem, steps, ends)),
-        _Method(RANDOM, 0, drawn, partial(_at_random, problem, drawn, compared.seed)),
-    ]
-
-
-def _straight(problem: LearnedProblem, ends: Ends) -> tuple[Float[np.ndarray, "p"], bool]:
-    phi = np.zeros((1, problem.curve.coefficients))
-    return phi[0], bool(problem.evaluate(phi, ends).feasible[0])
-
-
-def _proposed(
-    problem: LearnedProblem, policies: Sequence[MeanPolicy], compared: Compared, ends: Ends, _: int
-) -> tuple[Float[np.ndarray, "p"], bool]:
-    found = propose(problem, policies, compared.settings, ends)
-    return _best(found.phi[:, 0], found.cost[:, 0], found.feasible[:, 0])
-
-
-def _followed(
-    problem: LearnedProblem, steps: int, ends: Ends
-) -> tuple[Float[np.ndarray, "p"], bool]:
-    """The problem's descent alone, whole steps from the straight line."""
-    phi = np.zeros((steps + 1, problem.curve.coefficients))
-    looks = [problem.observed(phi[:1], ends)]
-    for step in range(1, steps + 1):
-        phi[step] = phi[step - 1] + looks[-1].descent[0]
-        looks.append(problem.observed(phi[step : step + 1], ends))
-    cost = np.concatenate([look.costs.cost for look in looks])
-    return _best(phi, cost, np.concatenate([look.costs.feasible for look in looks]))
-
-
-def _at_random(
-    problem: LearnedProblem, count: int, seed: int, ends: Ends, query: int
-) -> tuple[Float[np.ndarray, "p"], bool]:
-    """The straight line and random curves, `count` in all."""
-    many = repeated(ends, count)
-    phi = problem.sample_curves(many, np.random.default_rng((seed, query)))
-    phi[0] = 0.0
-    costs = problem.evaluate(phi, many)
-    return _best(phi, costs.cost, costs.feasible)
-
-
-def _best(
-    phi: Phi, cost: Float[np.ndarray, "B"], feasible: Bool[np.ndarray, "B"]
-) -> tuple[Float[np.ndarray, "p"], bool]:
-    row = int(np.lexsort((cost, ~feasible))[0])
-    return phi[row], bool(feasible[row])
-
-
-def _ranks(costs: Costs) -> Float[np.ndarray, "B"]:
-    """Costs, with those of all curves that are not feasible behind the others'."""
-    return np.where(costs.feasible, costs.cost, costs.cost + INFEASIBLE)
-
-
-def _fine(problem: LearnedProblem) -> LearnedProblem:
-    return replace(problem, degree=FINE_DEGREE, retraction=EXACT)
-
-
-def _random_starts(
-    problem: LearnedProblem, ends: Ends, settings: OptimumSettings
-) -> Float[np.ndarray, "Q {settings.random_starts} p"]:
-    """The cheapest of many random curves for each query."""
-    queries, drawn = len(ends), settings.drawn
-    many = ends[np.repeat(np.arange(queries), drawn)]
-    phi = problem.sample_curves(many, np.random.default_rng(settings.seed))
-    order = np.argsort(_ranks(problem.evaluate(phi, many)).reshape(queries, drawn), axis=1)
-    kept = order[:, : settings.random_starts, None]
-    return np.take_along_axis(phi.reshape(queries, drawn, -1), kept, axis=1)
-
-
-def _shortest(
-    problem: LearnedProblem, phi: Float[np.ndarray, "Q M p"], ends: Ends
-) -> FamilyOptimum:
-    """The shortest sound curve of each query, as `measured` has it."""
-    queries, count, size = phi.shape
-    costs = _fine(problem).evaluate(
-        phi.reshape(-1, size), ends[np.repeat(np.arange(queries), count)]
-    )
-    length = _lengths(costs).reshape(queries, count)
-    best = _picked(problem, phi, length, ends, 1)
-    feasible, row = best[:, 0] >= 0, np.maximum(best, 0)
-    found = np.take_along_axis(phi, row[..., None], axis=1)[:, 0]
-    return FamilyOptimum(
-        np.where(feasible[:, None], found, 0.0),
-        np.where(feasible, np.take_along_axis(length, row, axis=1)[:, 0], np.nan),
-        feasible,
-    )
-
-
-def _picked(
-    problem: LearnedProblem,
-    phi: Float[np.ndarray, "Q M p"],
-    length: Float[np.ndarray, "Q M"],
-    ends: Ends,
-    count: int,
-) -> Int[np.ndarray, "Q {count}"]:
-    """Each query's shortest sound curves, none near another; -1 where there are no more."""
-    picked = np.full((len(phi), count), -1)
-    for query in range(len(phi)):
-        one, near, found = ends[np.array([query])], NEAR * ends.distance[query], 0
-        for k in np.argsort(length[query], kind="stable"):
-            if found == count or not np.isfinite(length[query, k]):
-                break
-            apart = np.linalg.norm(phi[query, picked[query, :found]] - phi[query, k], axis=1)
-            if (apart >= near).all() and is_sound(problem, phi[query, k], one):
-                picked[query, found] = k
-                found += 1
-    return picked
-
-
-def _lengths(costs: Costs) -> Float[np.ndarray, "B"]:
-    """Lengths of what is feasible, inf for the rest."""
-    return np.where(costs.feasible, costs.length, np.inf)
-
-
-def _gradients(problem: LearnedProblem, phi: Phi, ends: Ends, rows: Int[np.ndarray, "b"]) -> Phi:
-    """Of the cost, by central differences; zero but in the given rows."""
-    gradients, count, size = np.zeros_like(phi), len(rows), phi.shape[1]
-    if not count:
-        return gradients
-    step = DIFFERENCE * ends.distance[rows]
-    moves = np.concatenate([np.eye(size), -np.eye(size)])
-    tried = (phi[rows, None] + step[:, None, None] * moves).reshape(-1, size)
-    cost = problem.evaluate(tried, ends[np.repeat(rows, 2 * size)]).cost.reshape(count, 2, size)
-    gradients[rows] = (cost[:, 0] - cost[:, 1]) / (2.0 * step[:, None])
-    return gradients
-
-
-class _Line(NamedTuple):
-    """Curves with their cost, and a direction (B, p) to search along with the cost's slope."""
-
-    phi: Phi
-    ends: Ends
-    value: Float[np.ndarray, "B"]
-    direction: Phi
-    slope: Float[np.ndarray, "B"]
-
-
-def _line_search(problem: LearnedProblem, line: _Line) -> tuple[Phi, Float[np.ndarray, "B"]]:
-    """The first of ever shorter steps whose decrease is sufficient (Armijo), else no step."""
-    phi, new, share = line.phi.copy(), line.value.copy(), 1.0
-    rows = np.arange(len(phi))
-    for _ in range(HALVINGS):
-        tried = phi[rows] + share * line.direction[rows]
-        cost = _ranks(problem.evaluate(tried, line.ends[rows]))
-        enough = cost < line.value[rows] + SUFFICIENT * share * line.slope[rows]
-        phi[rows[enough]], new[rows[enough]] = tried[enough], cost[enough]
-        rows, share = rows[~enough], SHORTENED * share
-        if not len(rows):
-            break
-    return phi, new
-
-
-def _update(
-    inverse: Float[np.ndarray, "B p p"],
-    fresh: Bool[np.ndarray, "B"],
-    rows: np.ndarray,
-    change: Float[np.ndarray, "b p"],
-    turn: Float[np.ndarray, "b p"],
-) -> None:
-    """BFGS update of the inverse Hessians in `rows`, in place; skipped where the curvature is not
-    positive.
-
-    Before the first one a Hessian is scaled to the curvature met (Nocedal and Wright, eq. 6.20).
-    """
-    curvature = (change * turn).sum(axis=1)
-    kept = curvature > 1e-10
-    rows, s, y, sy = rows[kept], change[kept], turn[kept], curvature[kept]
-    scale = np.where(fresh[rows], sy / (y * y).sum(axis=1), 1.0)
-    h = scale[:, None, None] * inverse[rows]
-    left = np.eye(s.shape[1]) - s[:, :, None] * y[:, None] / sy[:, None, None]
-    inverse[rows] = (
-        left @ h @ left.transpose(0, 2, 1) + s[:, :, None] * s[:, None] / sy[:, None, None]
-    )
-    fresh[rows] = False
-
-
-def _spread(name: str, groups: Any) -> pd.DataFrame:
-    """Mean, median and 95th percentile of a column by group; nan where there is no value."""
-    column = groups[name]
-    spread = {"mean": column.mean(), "median": column.median(), "p95": column.quantile(0.95)}
-    return pd.DataFrame(spread).add_prefix(f"{name}_")
-
-
-PAST_ROWS = 1000
-"""Configurations of the constraint that random curves are bent past."""
-LEARNED, JOINTS = "learned manifold", "joint space"
+    def methods(self) -> list[tuple[str, int, Method]]:
+        """Name, seed and offers of each; the first policy comes first, for its time is what the
+        controls get.
+        """
+        own = own_branches(self.settings)
+        found: list[tuple[str, int, Method]] = [
+            (POLICY, seed, by_policy(policy, self.settings, seed))
+            for seed, policy in self.policies.items()
+        ]
+        found += [
+            (OWN, seed, by_policy(policy, own, seed)) for seed, policy in self.policies.items()
+        ]
+        found.append((STRAIGHT, 0, straight))
+        found += [(RANDOM, seed, at_random(seed)) for seed in range(CONTROLS)]
+        return found + [(DESCENT, seed, by_descent(seed)) for seed in range(CONTROLS)]
+
+
+def own_branches(settings: GeodesicParams) -> GeodesicParams:
+    """The same with the heads' own first moves alone, and no second round."""
+    own = settings.heads
+    return settings.model_copy(update={"rollouts": own, "kept": own, "rounds": 1})
+
+
+def query_answers(asked: Asked, compared: Compared) -> list[tuple[str, int, Answer]]:
+    """Name, seed and answer of every method."""
+    answers: list[tuple[str, int, Answer]] = []
+    spent = 0.0
+    for name, seed, method in compared.methods():
+        found = answered(asked, method(asked, spent))
+        if not answers:
+            spent = found.search_s
+        answers.append((name, seed, found))
+    return answers
 
 
 @dataclass(frozen=True)
 class PolicyTask:
-    """One constraint; picklable.  Folders of the policies for all, and of its own, or None."""
+    """One constraint's queries; picklable.  policies: folder of the trained ones."""
 
     name: str
-    scene: Scene
-    manifold: ConstraintManifold
+    params: Params
+    root: Path
     chart: LearnedManifold
-    settings: GeodesicParams
     policies: Path
-    separate: Path | None
-    queries: int
-    seed: int
 
 
 def run_policies(task: PolicyTask) -> pd.DataFrame:
-    """Rows of all methods in the learned chart, and of those that need no policy in joint space."""
-    queries = draw_queries(task.scene, task.manifold, task.name, task.queries, task.seed)
-    seed = (*seed_of(task.name, task.seed), 2)
-    past = draw_free(ShardTask(task.scene, task.manifold, PAST_ROWS, seed))
-    shared = [MeanPolicy.load(task.policies, seed) for seed in task.settings.seeds]
-    separate = None
-    if task.separate is not None:
-        separate = [MeanPolicy.load(task.separate, seed) for seed in task.settings.seeds]
-    joint_space = JointManifold.of(task.scene.robot.sample(PAST_ROWS, np.random.default_rng(0)))
-    settings, tables = task.settings, {}
-    for name, chart in ((LEARNED, task.chart), (JOINTS, joint_space)):
-        curve = PinnedPolynomial(chart.dim, settings.degree)
-        space = chart, task.manifold, curve, past
-        problem = LearnedProblem(*space, settings.length_degree, True, 0.0)
-        policies = (shared, separate) if chart is task.chart else ([], None)
-        drawn = len(shared) * settings.episode_steps + 1
-        compared = Compared(*policies, settings, task.seed, drawn)
-        tables[name] = policy_rows(problem, problem.ends(queries.starts, queries.goals), compared)
-    return spaces_together(tables)
+    """One row a query, method and seed, in the workcell and with a sphere on the way.
+
+    Columns: constraint, scene, query, method, seed, solved, length_rad (nan where not solved),
+    best_rad (of the shortest certified path that is known, the planner's or an answer's; nan where
+    there is none), optimum_rad (of the family's shortest curve that is known; under the studied
+    constraint, without a sphere), curves (looked at), checked, search_ms and time_ms (with the
+    check).
+    """
+    params, settings = task.params, task.params.policy_settings()
+    scene, constraint = Scene.from_params(params), params.all_constraints[task.name]
+    manifold = constraint_manifold(scene.robot, constraint)
+    seed = (*seed_of(task.name, params.studies.seed), 2)
+    past = draw_free(ShardTask(scene, manifold, PAST_ROWS, seed))
+    problem = policy_problem(params, task.chart, scene, manifold, past)
+    policies = {own: MeanPolicy.load(task.policies, own) for own in settings.seeds}
+    compared, rows, phi = Compared(policies, settings), list[dict[str, Any]](), list[Phi]()
+    with BaselineBuilder(params, task.root)((PLANNER,), scene, task.name, manifold) as built:
+        planner = built[0][PLANNER]
+        queries = _queries(params, scene, manifold, task.name, planner)
+        for query in queries:
+            found, answers = _query_rows(query, problem, compared, params, planner)
+            rows += found
+            phi.append(np.array([answer.phi for answer in answers]))
+    table = pd.DataFrame(rows).assign(optimum_rad=np.nan)
+    if task.name != params.studies.constraint:
+        return table
+    alone = [k for k, query in enumerate(queries) if query.obstacle is None]
+    starts, goals = (np.array([getattr(queries[k], name) for k in alone]) for name in _ENDS)
+    shortest = family_optimum(
+        problem, problem.ends(starts, goals), np.array([phi[k] for k in alone]), OptimumSettings()
+    )
+    free = table["scene"] == TABLE
+    met = table[free].groupby("query")["length_rad"].min()
+    known = pd.Series(np.fmin(met.to_numpy(), shortest.length), index=met.index)
+    table.loc[free, "optimum_rad"] = table.loc[free, "query"].map(known)
+    return table
 
 
-def policy_figures(table: pd.DataFrame) -> dict[str, Any]:
-    """Constraint → method → figures."""
-    figures: dict[str, Any] = {}
-    for row in table.to_dict("records"):
-        constraint, method = str(row.pop("constraint")), str(row.pop("method"))
-        own = {str(name): None if pd.isna(value) else value for name, value in row.items()}
-        figures.setdefault(constraint, {})[method] = own
+_ENDS = ("start", "goal")
+
+
+def _queries(
+    params: Params, scene: Scene, manifold: ConstraintManifold, name: str, planner: PathPlanner
+) -> list[Query]:
+    """The study's own, spheres on the planner's way."""
+    studies = params.studies
+    changed = {"queries": studies.queries, "seed": studies.seed}
+    with Certifier(scene, judge_limits(params.judge)) as certifier, scene.world() as world:
+        clearance = clearance_model(scene.robot, scene.workcell, certifier.collisions.apart)
+
+        def plan(
+            start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]
+        ) -> Float[np.ndarray, "T D"]:
+            problem = PlanningProblem(start, goal, manifold, world.is_free, clearance)
+            return shortest_of({PLANNER: planner}, problem, certifier)
+
+        settings = params.benchmark.model_copy(update=changed)
+        return draw_benchmark(scene, manifold, name, settings, plan)
+
+
+def _query_rows(
+    query: Query, problem: LearnedProblem, compared: Compared, params: Params, planner: PathPlanner
+) -> tuple[list[dict[str, Any]], list[Answer]]:
+    """One query's rows, and the answers that they are of."""
+    scene = query.in_scene(Scene.from_params(params))
+    manifold, ends = problem.manifold, problem.ends(query.start[None], query.goal[None])
+    with Certifier(scene, judge_limits(params.judge)) as certifier, scene.world() as world:
+        clearance = clearance_model(scene.robot, scene.workcell, certifier.collisions.apart)
+        asked = Asked(replace(problem, clearance=clearance), ends, query.number, certifier)
+        answered(asked, straight(asked, 0.0))  # what is loaded late is no method's
+        answers = query_answers(asked, compared)
+        known = PlanningProblem(query.start, query.goal, manifold, world.is_free, clearance)
+        path = shortest_of({PLANNER: planner}, known, certifier)
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    lengths = [float(steps.sum()) if len(path) > 1 else np.nan]
+    best = float(np.fmin.reduce([*lengths, *(answer.length for _, _, answer in answers)]))
+    about = {"constraint": query.constraint, "scene": query.scene, "query": query.number}
+    rows = [
+        about
+        | {"method": name, "seed": seed, "solved": answer.solved, "length_rad": answer.length}
+        | {"best_rad": best, "curves": answer.curves, "checked": answer.checked}
+        | {"search_ms": 1e3 * answer.search_s, "time_ms": 1e3 * (answer.search_s + answer.check_s)}
+        for name, seed, answer in answers
+    ]
+    return rows, [answer for _, _, answer in answers]
+
+
+SHARES = ("solved", "ratio_median", "ratio_p95", "optimum_median", "optimum_p95", "time_ms")
+"""Figures of one seed: solved share of what anything solves, length over the best known path and
+over the family's shortest curve, over the seed's own answers, and median time [ms].
+"""
+
+
+def seed_figures(rows: pd.DataFrame) -> pd.DataFrame:
+    """One row a method and seed, of any rows of `run_policies`: the columns of SHARES."""
+    able = rows[rows["best_rad"].notna()]
+    able = able.assign(
+        ratio=able["length_rad"] / able["best_rad"],
+        over_optimum=able["length_rad"] / able["optimum_rad"],
+    )
+    groups = able.groupby(["method", "seed"], sort=False)
+    return groups.agg(
+        solved=("solved", "mean"),
+        ratio_median=("ratio", "median"),
+        ratio_p95=("ratio", _p95),
+        optimum_median=("over_optimum", "median"),
+        optimum_p95=("over_optimum", _p95),
+        time_ms=("time_ms", "median"),
+        curves=("curves", "median"),
+    ).reset_index()
+
+
+def policy_figures(rows: pd.DataFrame) -> dict[str, Any]:
+    """Method → figures of any rows of `run_policies`, over seeds.
+
+    Each of SHARES has its mean, interquartile mean and the 95 % bootstrap interval of the latter;
+    beaten_in_*: probability that a seed of the policy solves more, or has a smaller p95, than one
+    of the method (Agarwal et al. 2021).
+    """
+    seeds, figures = seed_figures(rows), dict[str, Any]()
+    scores = {str(name): own for name, own in seeds.groupby("method", sort=False)}
+    able = rows[rows["best_rad"].notna()]
+    counts = {
+        "queries": int(rows.groupby(["constraint", "query"]).ngroups),
+        "solvable": int(able.groupby(["constraint", "query"]).ngroups),
+    }
+    for name, own in scores.items():
+        found: dict[str, Any] = counts | {"seeds": len(own), "curves": float(own["curves"].mean())}
+        for column in SHARES:
+            values = own[column].to_numpy(float)
+            low, high = bootstrap_interval(values, interquartile_mean)
+            found |= {f"{column}_mean": float(values.mean()), f"{column}_low": low}
+            found |= {f"{column}_iqm": interquartile_mean(values), f"{column}_high": high}
+        if name != POLICY:
+            for column, sign in (("solved", 1.0), ("ratio_p95", -1.0)):
+                mine, theirs = (sign * scores[k][column].to_numpy(float) for k in (POLICY, name))
+                found[f"beaten_in_{column}"] = probability_of_improvement(mine, theirs)
+        figures[name] = {key: _json(value) for key, value in found.items()}
     return figures
+
+
+def _p95(values: pd.Series) -> float:
+    return float(values.quantile(0.95))
+
+
+def _json(value: Any) -> Any:
+    """Not a number is nothing in JSON."""
+    return None if isinstance(value, float) and np.isnan(value) else value
