@@ -74,7 +74,7 @@ def test_where_it_is_not_caught_its_paths_are_about_as_short_as_a_band(
 def test_waypoints_keep_the_constraint_and_their_distance(world: World) -> None:
     asked = problems(world, "level_cup", 2)[0]
     task, settings = task_of(asked, BandSettings()), RecedingHorizonSettings()
-    nodes, moves = Legs(task, asked.goal, settings).from_(asked.start)
+    nodes, moves = Legs(task, asked.goal, settings, asked.keeps_clear).from_(asked.start)
     assert nodes is not None
     assert moves <= settings.moves
     np.testing.assert_array_equal(nodes[[0, -1]], [asked.start, asked.goal])

@@ -2,10 +2,9 @@
 
 As in motion planning by diffusion [Janner et al. 2022; Carvalho et al. 2023], a network turns noise
 into paths between the two ends; here it also sees what the constraint does to the straight line
-between them (learning/path_diffusion.py).  In the last steps the path that it expects is projected
-onto the constraint, into the limits and out of what it touches before the step is taken
-[Christopher et al. 2024]: of the scene the network knows no more than the paths that it learned
-from show.
+between them (learning/path_diffusion.py).  Before a step is taken, the path that it expects is
+projected onto the constraint, into the limits and out of what it touches [Christopher et al. 2024]:
+of the scene the network knows no more than the paths that it learned from show.
 """
 
 import time
@@ -25,13 +24,8 @@ from constraint_geodesics.learning.path_diffusion import (
     straight,
 )
 from constraint_geodesics.peers.baseline import BaselineSettings, Context
-from constraint_geodesics.peers.elastic_band import (
-    answer,
-    first_free,
-    settled,
-    task_of,
-    without_path,
-)
+from constraint_geodesics.peers.elastic_band import answer, settled, task_of, without_path
+from constraint_geodesics.peers.kept_rows import first_kept
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.search.band import BandSettings, project
 from constraint_geodesics.search.candidates import Task, refined
@@ -47,9 +41,9 @@ class PathDiffusionSettings(BaselineSettings):
     family: ClassVar = "other"
     made_by: ClassVar = (STAGE,)
 
-    proposals: Count = 16
-    steps: Count = 8
-    projected: Annotated[int, Field(ge=0)] = 3
+    proposals: Count = 32
+    steps: Count = 4
+    projected: Annotated[int, Field(ge=0)] = 4
 
     def make(self, context: Context) -> PathPlanner:
         """From the files of its stage."""
@@ -86,7 +80,7 @@ class DiffusionPlanner:
             for curve in self.proposed(problem, task, seed)
         ]
         shortest_first = sorted((c for c in found if c is not None), key=lambda c: c.length)
-        rows, _ = first_free(problem, shortest_first)
+        rows = first_kept(problem, shortest_first)
         return answer(rows, problem, began, self.settings.proposals)
 
     def proposed(

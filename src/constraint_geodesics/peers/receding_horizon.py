@@ -25,11 +25,11 @@ from constraint_geodesics.peers.baseline import BaselineSettings, Context
 from constraint_geodesics.peers.elastic_band import (
     answer,
     bent_lines,
-    free_rows,
     settled,
     task_of,
     uniform_configurations,
 )
+from constraint_geodesics.peers.kept_rows import first_kept
 from constraint_geodesics.peers.trajectory_optimisation import Course, Nodes, demands_of
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.search.band import BandSettings, project, step_lengths
@@ -58,11 +58,11 @@ class RecedingHorizonSettings(BaselineSettings):
 
     family: ClassVar = "optimisation"
 
-    horizon: Count = 8
+    horizon: Count = 12
     step_rad: Positive = 0.25
-    taken: Count = 2
+    taken: Count = 3
     moves: Count = 60
-    vias: Count = 12
+    vias: Count = 16
     iterations: Count = 30
     accuracy: Positive = 1e-6
 
@@ -94,7 +94,7 @@ class RecedingHorizon:
             moves += moved
             # zero iterations of a band: the curve through the waypoints, looked at for jumps
             candidate = None if nodes is None else refined(task, "straight", nodes, refine=False)
-            rows = None if candidate is None else free_rows(problem, candidate)
+            rows = None if candidate is None else first_kept(problem, [candidate])
             if rows is not None:
                 return answer(rows, problem, began, moves)
         return answer(None, problem, began, moves)
@@ -104,19 +104,21 @@ class RecedingHorizon:
     ) -> Iterator[tuple[Nodes | None, int]]:
         """Waypoints, None where an attempt is caught, and its moves."""
         start, goal = problem.start, problem.goal
-        yield self._through(task, start, goal)
-        back, moved = self._through(task, goal, start)
+        yield self._through(problem, task, start, goal)
+        back, moved = self._through(problem, task, goal, start)
         yield None if back is None else back[::-1], moved
         bends = bent_lines(problem, 2, 1 + self.settings.vias, uniform_configurations, seed)
         for _, via, _ in bends[1:]:
             project(task.open, via[None])
-            yield self._through(task, start, via, goal)
+            yield self._through(problem, task, start, via, goal)
 
-    def _through(self, task: Task, *stops: Float[np.ndarray, "D"]) -> tuple[Nodes | None, int]:
+    def _through(
+        self, problem: PlanningProblem, task: Task, *stops: Float[np.ndarray, "D"]
+    ) -> tuple[Nodes | None, int]:
         """Waypoints by way of all stops, and the moves that they took."""
         whole, moves = stops[0][None], 0
         for goal in stops[1:]:
-            legs = Legs(task, goal, self.settings)
+            legs = Legs(task, goal, self.settings, problem.keeps_clear)
             nodes, moved = legs.from_(whole[-1])
             moves += moved
             if nodes is None:
@@ -132,6 +134,7 @@ class Legs:
     task: Task
     goal: Float[np.ndarray, "D"]
     settings: RecedingHorizonSettings
+    keeps_clear: Callable[[Nodes], bool]
 
     def from_(self, start: Float[np.ndarray, "D"]) -> tuple[Nodes | None, int]:
         """Waypoints from a start to the goal, both included, None where the way is caught; and how
@@ -167,7 +170,8 @@ class Legs:
 
     def _guess(self, known: Nodes) -> Nodes:
         """Known waypoints, the first of which is where the horizon begins, with more on the
-        straight line to the goal; without the first.
+        straight line to the goal, up to where that touches something: from beyond, the optimiser
+        would push waypoints out on the far side.  Without the first.
         """
         missing = self.settings.horizon + 1 - len(known)
         away = self._away(known[-1])
@@ -175,17 +179,22 @@ class Legs:
         shares = np.linspace(0.0, reach, missing + 1)[1:, None]
         more = known[-1] + shares * (self.goal - known[-1])
         project(self.task.open, more)
-        return np.concatenate([known[1:], more])
+        ahead = np.concatenate([known, more])
+        blocked = np.flatnonzero((self._clearances(ahead[1:]) < 0.0).any(axis=1))
+        if len(blocked):
+            ahead[blocked[0] + 1 :] = ahead[blocked[0]]
+        return ahead[1:]
 
     def _last(self, q: Float[np.ndarray, "D"]) -> Nodes | None:
         """The waypoints from q to the goal; None where it is out of reach, or the leg fails."""
-        steps = int(np.ceil(self._away(q) / self.settings.step_rad))
-        if steps > self.settings.horizon:
+        own = self.settings
+        if self._away(q) > own.horizon * own.step_rad:
             return None
-        line = np.linspace(q, self.goal, max(steps, 2) + 1)
-        course = Course.through(line)
+        course = Course.through(np.linspace(q, self.goal, own.horizon + 1))
         nodes = self._optimised(course, course.energy)
-        return None if nodes is None else np.concatenate([nodes, self.goal[None]])
+        if nodes is None or not self.keeps_clear(np.stack([q, *nodes, self.goal])):
+            return None
+        return np.concatenate([nodes, self.goal[None]])
 
     def _drawn(self, q: Float[np.ndarray, "D"], ahead: Nodes) -> tuple[Course, Energy]:
         """The horizon from q whose last waypoint is drawn to the goal, beginning at `ahead`."""
