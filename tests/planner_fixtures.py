@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
+import torch
 
 from constraint_geodesics import bundle
 from constraint_geodesics.bundle import Bundle, read_bundle
@@ -14,6 +15,8 @@ from constraint_geodesics.constraints.constraint import Constraint, ConstraintMa
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.geodesics.learned_method import FOLDER, LearnedFiles, read_learned
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.learning.path_diffusion import PathDiffusion
+from constraint_geodesics.learning.path_diffusion_training import Denoiser
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.robot.kinematics import SerialRobot
@@ -72,6 +75,19 @@ def pairs_of(
 @cache
 def packaged_chart() -> LearnedManifold:
     return LearnedManifold.from_arrays(packaged_learned().manifold)
+
+
+@cache
+def untrained_diffusion() -> PathDiffusion:
+    """A diffusion model of paths that learned nothing: what it draws hangs on noise alone."""
+    torch.manual_seed(0)
+    weights = Denoiser(4 * 6, 120, 8, 1).state_dict()
+    scales = {
+        "scale": np.full((4, 6), 0.05, np.float32),
+        "seen_mean": np.zeros(120, np.float32),
+        "seen_scale": np.ones(120, np.float32),
+    }
+    return PathDiffusion({name: value.numpy() for name, value in weights.items()} | scales)
 
 
 def length(joints: np.ndarray) -> float:

@@ -38,14 +38,18 @@ FAMILIES = {
         ("straight latent line", "gradient geodesic", "latent g"),
     ),
     "band": Family(GREEN, "straight line and elastic band", ("straight", "band from")),
-    "optimisation": Family(BLACK, "trajectory optimisation", ("slsqp", "trust-constr")),
+    "optimisation": Family(
+        BLACK,
+        "trajectory optimisation, also with a receding horizon",
+        ("slsqp", "trust-constr", "receding horizon"),
+    ),
     "birrt": Family(BLUE, "BiRRT", ("birrt",)),
     "prm": Family(PURPLE, "PRM", ("prm",)),
     "rrt_star": Family(SKY, "RRT*", ("rrt*", "informed rrt*")),
     "other": Family(
         GREY,
-        "random curves, descent, Bayesian optimisation",
-        ("random curves", "descent", "bayesian"),
+        "random curves, descent, Bayesian optimisation, path diffusion",
+        ("random curves", "descent", "bayesian", "path diffusion"),
     ),
 }
 """The families by name; within one, planners differ by line style or marker."""

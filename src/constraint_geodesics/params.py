@@ -438,6 +438,25 @@ class BenchmarkParams(_Record):
         return self
 
 
+class PathDiffusionParams(_Record):
+    """The diffusion model of paths, a baseline: how many of the planner's paths it learns from,
+    how large it is, and how long it is trained.
+
+    queries: planned for each constraint; modes: sines for each joint; width: of a layer.
+    """
+
+    queries: Count
+    query_seed: Seed
+    modes: Count
+    width: Count
+    blocks: Count
+    steps: Count
+    batch_size: Count
+    learning_rate: Positive
+    held_out: Share
+    seed: Seed
+
+
 class StudyParams(_Record):
     """On what the policies' proposals and executed paths are looked at."""
 
@@ -493,6 +512,7 @@ class Params(_Record):
     geometry: GeometryParams
     policies: PolicyParams
     planner: PlannerParams
+    path_diffusion: PathDiffusionParams
     unseen: dict[Name, ConstraintParams]
     studies: StudyParams
     execution: ExecutionParams

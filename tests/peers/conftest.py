@@ -3,10 +3,11 @@
 from collections.abc import Iterator
 
 import pytest
-from tests.planner_fixtures import packaged_chart, packaged_planner
+from tests.planner_fixtures import packaged_chart, packaged_planner, untrained_diffusion
 
 from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.learning.path_diffusion import PathDiffusion
 from constraint_geodesics.scene.world import World
 
 
@@ -25,3 +26,8 @@ def chart() -> LearnedManifold:
 def certifier() -> Iterator[Certifier]:
     with Certifier(packaged_planner().scene, Limits()) as loaded:
         yield loaded
+
+
+@pytest.fixture(scope="session")
+def blank_diffusion() -> PathDiffusion:
+    return untrained_diffusion()

@@ -11,6 +11,7 @@ from tests.planner_fixtures import (
     packaged_learned,
     problem,
     problems,
+    untrained_diffusion,
     walled,
 )
 
@@ -23,6 +24,8 @@ from constraint_geodesics.peers.gradient_geodesic import GradientGeodesic, Gradi
 from constraint_geodesics.peers.many_bands import MultiStartBand
 from constraint_geodesics.peers.ompl import SamplingPlanner
 from constraint_geodesics.peers.ompl_settings import OmplSettings
+from constraint_geodesics.peers.path_diffusion import DiffusionPlanner
+from constraint_geodesics.peers.receding_horizon import RecedingHorizon, RecedingHorizonSettings
 from constraint_geodesics.peers.straight_band import StraightBand
 from constraint_geodesics.peers.straight_latent import StraightLatent
 from constraint_geodesics.peers.trajectory_optimisation import (
@@ -42,6 +45,8 @@ TRUST = TrajectoryOptimisation(
 DECODER = DecoderSampling(
     FrozenManifold(packaged_learned().manifold), DecoderSettings(budget_s=60.0, iterations=200)
 )
+RECEDING = RecedingHorizon(RecedingHorizonSettings(vias=2))
+DIFFUSION = DiffusionPlanner(untrained_diffusion())
 FEW = GradientGeodesicSettings(drawn=32, starts=4, rounds=1)
 ON_THE_CHART: tuple[PathPlanner, ...] = (
     StraightLatent(packaged_chart()),
@@ -55,7 +60,7 @@ def each(*planners: PathPlanner) -> pytest.MarkDecorator:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@each(*BANDS, SLSQP, DECODER)
+@each(*BANDS, SLSQP, RECEDING, DIFFUSION, DECODER)
 def test_paths_are_certified(
     planner: PathPlanner, name: str, world: World, certifier: Certifier
 ) -> None:
@@ -70,7 +75,7 @@ def test_paths_are_certified(
     assert solved
 
 
-@each(*BANDS, SLSQP, TRUST)
+@each(*BANDS, SLSQP, TRUST, RECEDING, DIFFUSION)
 def test_seed_fixes_the_path(planner: PathPlanner, world: World) -> None:
     first, other = problems(world, "level_cup", 2)
     once = planner.plan(first, seed=5)
@@ -80,7 +85,7 @@ def test_seed_fixes_the_path(planner: PathPlanner, world: World) -> None:
     np.testing.assert_array_equal(once.joints, again.joints)
 
 
-@each(*BANDS, SLSQP, DECODER, BIRRT, *ON_THE_CHART)
+@each(*BANDS, SLSQP, RECEDING, DIFFUSION, DECODER, BIRRT, *ON_THE_CHART)
 def test_refused_problems_say_why(planner: PathPlanner, world: World) -> None:
     asked = problems(world, "level_cup", 1)[0]
     tilted = asked.start + np.array([0, 0, 0, 0, 0.3, 0])
@@ -98,7 +103,7 @@ def test_refused_problems_say_why(planner: PathPlanner, world: World) -> None:
         assert (path.status, path.joints.shape, path.iterations) == (status, (0, 6), 0)
 
 
-@each(StraightBand(), MultiStartBand(4))
+@each(StraightBand(), MultiStartBand(4), RECEDING, DIFFUSION)
 def test_ends_that_coincide_are_a_path(planner: PathPlanner, world: World) -> None:
     asked = problems(world, "level_cup", 1)[0]
     path = planner.plan(replace(asked, goal=asked.start.copy()), seed=0)
@@ -106,7 +111,7 @@ def test_ends_that_coincide_are_a_path(planner: PathPlanner, world: World) -> No
     np.testing.assert_array_equal(path.joints, [asked.start, asked.start])
 
 
-@each(StraightBand(), MultiStartBand(4), SLSQP)
+@each(StraightBand(), MultiStartBand(4), SLSQP, RECEDING, DIFFUSION)
 def test_what_the_boxes_do_not_say_is_checked(planner: PathPlanner, world: World) -> None:
     path = planner.plan(walled(world.robot, lambda q: bool(abs(q[0]) > 0.2)), seed=0)
     assert (path.status, path.joints.shape) == ("not_found", (0, 6))

@@ -37,6 +37,7 @@ SMALL: dict[str, Any] = {
     "geometry": {"rounds": 1, "batch": 256, "checked": 32, "graph_points": 200, "pairs": 4},
     "policies": {"steps": 1920, "separate_steps": 1920, "ppo": {"batch_size": 320}},
     "planner": {"roadmap_nodes": 200},
+    "path_diffusion": {"queries": 40, "width": 32, "blocks": 1, "steps": 60, "batch_size": 32},
     "studies": {"queries": 3},
     "execution": {"queries": 1, "spheres": 4},
     "benchmark": {"queries": 2, "compared": {"seeds": 1}},
@@ -51,6 +52,7 @@ QUICK: dict[str, Any] = {
         "polish_steps": 2,
         "rounds": 1,
     },
+    "receding_horizon": {"vias": 2},
     "bayesian_optimisation": {"drawn": 64, "kept": 10, "initial": 4, "evaluations": 6},
 }
 """Settings of the benchmark's planners that take long."""

@@ -209,7 +209,9 @@ def _data_of(run: Run, settings: BaselineSettings) -> str:
     layout, folders = run.layout, []
     if settings.uses_bundle:
         folders.append(layout.planner)
-    if settings.trained:
+    if "train_path_diffusion" in settings.trained:
+        folders.append(layout.path_diffusion)
+    elif settings.trained:
         folders += [layout.manifold(name) for name in run.params.manifolds]
         folders += [layout.submanifolds, layout.learned]
     return data_digest(*folders)

@@ -101,6 +101,11 @@ class Layout:
         """Folder of the policies trained on all constraints together."""
         return self.root / "data" / "policies" / manifold
 
+    @property
+    def path_diffusion(self) -> Path:
+        """Folder of the diffusion model of paths (safetensors and JSON)."""
+        return self.root / "data" / "path_diffusion"
+
     def analytic(self, manifold: str) -> Path:
         """Folder of the policies and curves found on an analytic manifold."""
         return self.root / "data" / "analytic" / manifold
