@@ -10,7 +10,8 @@ _PIPELINE = (
     *("gymnasium", "sklearn", "joblib", "dask", "distributed", "sqlalchemy", "filelock"),
     *("jinja2", "packaging", "threadpoolctl", *_RECORD),
 )
-EXTRAS = {"record": _RECORD, "pipeline": _PIPELINE, "bench": ("ompl", "bayes_opt", *_PIPELINE)}
+_BENCH = ("ompl", "bayes_opt", "gpytorch", *_PIPELINE)
+EXTRAS = {"record": _RECORD, "pipeline": _PIPELINE, "bench": _BENCH}
 """The modules that each extra of pyproject.toml brings."""
 
 

@@ -211,6 +211,53 @@ class ManifoldParams(_Record):
     seed: Seed
 
 
+class GplvmParams(_Record):
+    """One Gaussian-process latent variable model.  noise: variance of the likelihood when training
+    begins, in squares of joints scaled to [−1, 1].
+    """
+
+    latent_dim: Count
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
+    inducing: Count
+    noise: Positive
+    steps: Count
+    batch_size: Count
+    learning_rate: Positive
+    centres: Annotated[int, Field(ge=2)]
+
+
+class GanParams(_Record):
+    """One generative adversarial network.  critic_steps: for one of the generator.  penalty: weight
+    of the critic's slope.  average: memory of the generator's running average.
+    """
+
+    latent_dim: Count
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
+    steps: Count
+    critic_steps: Count
+    batch_size: Count
+    learning_rate: Positive
+    penalty: Positive
+    average: Share
+    encoder_steps: Count
+
+
+class CompareManifoldsParams(_Record):
+    """Learners of joint space on the same rows.  vae: which of `manifolds`.  samples: drawn from
+    each; checked: of these for collisions and constraints.
+    """
+
+    vae: Name
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    split_seed: Seed
+    held_out: Count
+    samples: Count
+    checked: Count
+    pairs: Count
+    gplvm: GplvmParams
+    gan: GanParams
+
+
 class SubmanifoldParams(_Record):
     """How a constraint's sub-manifold is drawn or sampled in the latent space."""
 
@@ -514,6 +561,7 @@ class Params(_Record):
     planner: PlannerParams
     path_diffusion: PathDiffusionParams
     unseen: dict[Name, ConstraintParams]
+    compare_manifolds: CompareManifoldsParams
     studies: StudyParams
     execution: ExecutionParams
     benchmark: BenchmarkParams
@@ -546,6 +594,11 @@ class Params(_Record):
         if again:
             raise ValueError(
                 f"unseen={sorted(again)}: these are among the constraints that are trained on"
+            )
+        if self.compare_manifolds.vae not in self.manifolds:
+            raise ValueError(
+                f"compare_manifolds.vae={self.compare_manifolds.vae!r}: must be one of "
+                f"{sorted(self.manifolds)}"
             )
         geodesics = self.geodesics
         for entry, names, known in (

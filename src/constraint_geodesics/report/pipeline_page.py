@@ -13,6 +13,7 @@ from constraint_geodesics.recording.png import save_png
 from constraint_geodesics.report import pipeline_tables, study_report
 from constraint_geodesics.report.arms_page import arm_tables, arms_markdown
 from constraint_geodesics.report.figures import PLANNERS
+from constraint_geodesics.report.manifolds_page import manifolds_markdown
 from constraint_geodesics.report.page import Picture, write_page
 from constraint_geodesics.report.pipeline_figures import Drawn, draw_data_cards, draw_figures
 from constraint_geodesics.report.results import (
@@ -54,6 +55,8 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
         (reports / "policies.md").write_text(study_report.policies_markdown(params, layout))
     if "arms" in studies:
         (reports / "arms.md").write_text(arms_markdown(layout))
+    if "manifolds" in studies:
+        (reports / "manifolds.md").write_text(manifolds_markdown(params, layout))
     pictures, described = ([save_figure(layout, one) for one in own] for own in (drawn, cards))
     ablated = [picture for picture in pictures if picture.name == ABLATION]
     others = [picture for picture in pictures if picture.name != ABLATION]

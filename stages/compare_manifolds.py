@@ -1,0 +1,39 @@
+"""Stage: the VAE, a GPLVM, a GAN and uniform joints on the same configurations, five seeds each; a
+quarter of an hour on two cores.
+"""
+
+import sys
+
+from constraint_geodesics.benchmark.row import write_table
+from constraint_geodesics.learning.dataset import read_joints
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import machine, run_header
+from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.studies.manifolds import measure, summary, table_of, tasks_of
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
+
+STAGE = "compare_manifolds"
+
+
+def main(params: Params, layout: Layout) -> None:
+    """Write reports/compare_manifolds.csv and compare_manifolds.json."""
+    source, reports = layout.joints("free"), layout.root / "reports"
+    with tracked_stage(
+        Work(STAGE, STAGE, params.compare_manifolds, [source]),
+        params.tracking.experiment,
+        layout.root,
+    ) as run:
+        joints = read_joints(source).free_joints
+        tasks = tasks_of(params, joints, layout.scratch(STAGE, "vae"))
+        found = parallel_map(measure, tasks, params.compute, description="learners")
+        table = table_of([row for rows in found for row in rows])
+        write_table(table, reports / f"{STAGE}.csv", run_header(layout.root))
+        counts = {"rows": len(tasks[0].rows), "held_out": len(tasks[0].held_out)}
+        figures = {**summary(table), **counts, "machine": machine()}
+        run.report(figures, reports / f"{STAGE}.json")
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])
