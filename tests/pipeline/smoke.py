@@ -38,6 +38,7 @@ SMALL: dict[str, Any] = {
     "policies": {"steps": 1920, "separate_steps": 1920, "ppo": {"batch_size": 320}},
     "planner": {"roadmap_nodes": 200},
     "studies": {"queries": 3},
+    "sweep": {"seeds": [0, 1], "steps": 1920, "queries": 3},
     "execution": {"queries": 1, "spheres": 4},
     "benchmark": {"queries": 2, "compared": {"seeds": 1}},
     "recording": {"queries": 2},

@@ -1,0 +1,54 @@
+"""`make sweep`: configurations of policies trained and judged in parallel, each kept as a DVC
+experiment, and their ranking.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+from constraint_geodesics.errors import ParamsError
+from constraint_geodesics.pipeline.experiments import (
+    ExperimentError,
+    experiment_names,
+    run_experiment,
+)
+from constraint_geodesics.pipeline.layout import SWEEP_FOLDER, Layout
+from constraint_geodesics.pipeline.stage import complain
+from constraint_geodesics.pipeline.threads import ONE_THREAD
+from constraint_geodesics.report.sweep_table import write_ranking
+from constraint_geodesics.studies.search_space import read_space
+from constraint_geodesics.studies.sweep import Configuration, Sweep, configurations_of, run_sweep
+from constraint_geodesics.tracking.store import tracking_uri
+
+TARGET = "stages/sweep/dvc.yaml:sweep_policies"
+
+
+def main(space: Path) -> None:
+    """Train what is not trained, record what is not recorded, and rank after each configuration.
+
+    Raises ExperimentError at the end if DVC did not take an experiment: the next call tries again.
+    """
+    layout, failed = Layout(Path().resolve()), list[str]()
+    configurations = configurations_of(read_space(space), layout)
+    known = experiment_names(layout.root)
+    shared = {SWEEP_FOLDER: str(layout.sweep), "MLFLOW_TRACKING_URI": tracking_uri(layout.root)}
+
+    def finished(own: Configuration) -> None:
+        write_ranking(configurations, layout)
+        if own.name not in known:
+            try:
+                run_experiment(layout.root, own.name, own.changes, TARGET, shared)
+            except ExperimentError as error:
+                failed.append(str(error))
+
+    run_sweep(Sweep(configurations, layout, finished))
+    if failed:
+        raise ExperimentError(f"{len(failed)} experiments are not recorded, the first: {failed[0]}")
+
+
+if __name__ == "__main__":
+    os.environ.update(ONE_THREAD)
+    try:
+        main(Path(sys.argv[1]))
+    except (ParamsError, OSError, RuntimeError) as error:
+        raise SystemExit(complain(error)) from None
