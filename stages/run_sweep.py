@@ -17,7 +17,13 @@ from constraint_geodesics.pipeline.stage import complain
 from constraint_geodesics.pipeline.threads import ONE_THREAD
 from constraint_geodesics.report.sweep_table import write_ranking
 from constraint_geodesics.studies.search_space import read_space
-from constraint_geodesics.studies.sweep import Configuration, Sweep, configurations_of, run_sweep
+from constraint_geodesics.studies.sweep import (
+    Configuration,
+    Sweep,
+    configurations_of,
+    run_sweep,
+    tell_ranks,
+)
 from constraint_geodesics.tracking.store import tracking_uri
 
 TARGET = "stages/sweep/dvc.yaml:sweep_policies"
@@ -34,14 +40,19 @@ def main(space: Path) -> None:
     shared = {SWEEP_FOLDER: str(layout.sweep), "MLFLOW_TRACKING_URI": tracking_uri(layout.root)}
 
     def finished(own: Configuration) -> None:
+        if own.name in known:
+            return
         write_ranking(configurations, layout)
-        if own.name not in known:
-            try:
-                run_experiment(layout.root, own.name, own.changes, TARGET, shared)
-            except ExperimentError as error:
-                failed.append(str(error))
+        try:
+            run_experiment(layout.root, own.name, own.changes, TARGET, shared)
+        except ExperimentError as error:
+            failed.append(str(error))
 
-    run_sweep(Sweep(configurations, layout, finished))
+    sweep = Sweep(configurations, layout, finished)
+    run_sweep(sweep)
+    ranked = write_ranking(configurations, layout)
+    if experiment_names(layout.root) != known:
+        tell_ranks(sweep, ranked)
     if failed:
         raise ExperimentError(f"{len(failed)} experiments are not recorded, the first: {failed[0]}")
 

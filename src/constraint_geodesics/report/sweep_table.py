@@ -21,9 +21,9 @@ that a seed of the configuration scores higher than one of params.yaml's own.  L
 answers, over the best of the curve family."""
 
 
-def write_ranking(configurations: Sequence[Configuration], layout: Layout) -> None:
+def write_ranking(configurations: Sequence[Configuration], layout: Layout) -> list[dict[str, Any]]:
     """Write `seeds` and `ranking` as CSV and the ranking as Markdown, of all configurations that
-    have a finished seed; the first one is params.yaml's own.
+    have a finished seed; the first one is params.yaml's own.  Returns the ranking's rows.
     """
     found = {own.name: own.results(layout) for own in configurations}
     rows = seed_rows({name: results for name, results in found.items() if results})
@@ -37,6 +37,7 @@ def write_ranking(configurations: Sequence[Configuration], layout: Layout) -> No
     pd.DataFrame(ranked).to_csv(layout.report(STAGE, "ranking", "csv"), index=False)
     text = f"{ranking_markdown(ranked)}\n\n{NOTE}\n"
     layout.report(STAGE, "ranking", "md").write_text(text)
+    return ranked
 
 
 def ranking_markdown(ranked: Sequence[Mapping[str, Any]]) -> str:

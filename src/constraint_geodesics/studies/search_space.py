@@ -24,6 +24,8 @@ DIGITS = 3
 DRAWN_IN_VAIN = 1000
 """Draws without a new configuration after which a space is taken for exhausted."""
 
+LETTERS = {"length_weight": "K_L", "reduction_weight": "K_Δ"}
+
 Changes = dict[str, Any]
 """Entries of params.yaml, by their paths, and their values."""
 
@@ -129,6 +131,12 @@ def read_space(file: Path) -> SearchSpace:
 
 
 def label_of(changes: Mapping[str, Any]) -> str:
-    """Changes in a few characters: the last word of each entry and its value."""
-    words = (f"{name.rpartition('.')[2]}={value}" for name, value in changes.items())
-    return " ".join(words) or "as in params.yaml"
+    """Changes in a few characters: the last word of each entry, or its letter of eq. 15, and its
+    value.
+    """
+    named = []
+    for name, value in changes.items():
+        word = name.rpartition(".")[2]
+        shown = f"{value:g}" if isinstance(value, float) else str(value)
+        named.append(f"{LETTERS.get(word, word)}={shown}")
+    return " ".join(named) or "as in params.yaml"

@@ -6,6 +6,7 @@ touches is done again.
 """
 
 import json
+import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -19,8 +20,9 @@ from constraint_geodesics.pipeline.code import code_of, digest
 from constraint_geodesics.pipeline.compute import as_finished
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.studies.search_space import Changes, SearchSpace, label_of
-from constraint_geodesics.studies.sweep_ranking import seed_figures
+from constraint_geodesics.studies.sweep_ranking import FIGURES, seed_figures
 from constraint_geodesics.tracking.experiment import (
+    MetricLogger,
     StageRun,
     Subject,
     Work,
@@ -150,6 +152,7 @@ def _run_seeds(sweep: Sweep, left: Sequence[tuple[Configuration, int]]) -> None:
         for place, result in outcomes:
             own, seed = left[place]
             own.keep(sweep.layout, seed, result)
+            shutil.rmtree(tasks[place].scratch, ignore_errors=True)
             if not own.seeds_left(sweep.layout):
                 _finish(own, sweep)
                 del runs[own.key]
@@ -160,26 +163,46 @@ def _run_seeds(sweep: Sweep, left: Sequence[tuple[Configuration, int]]) -> None:
 
 
 def configuration_figures(own: Configuration, layout: Layout) -> Record:
-    """What DVC and MLflow show of a configuration: means over its seeds, and each seed's."""
-    seeds = {f"seed_{row['seed']}": seed_figures(row) for row in own.results(layout)}
-    names = next(iter(seeds.values()), {})
-    means = {name: sum(s[name] for s in seeds.values()) / len(seeds) for name in names}
-    return {"seeds": len(seeds), **means, **seeds}
+    """What DVC and MLflow show of a configuration: means over its seeds, and what each seed has, in
+    their order.
+    """
+    seeds = [seed_figures(result) for result in own.results(layout)]
+    each = {name: [figures[name] for figures in seeds] for name in FIGURES}
+    means = {name: sum(values) / len(values) for name, values in each.items() if values}
+    return means | {"seeds": len(seeds), "each_seed": each}
+
+
+def tell_ranks(sweep: Sweep, ranked: Sequence[Mapping[str, Any]]) -> None:
+    """Scores and ranks, which hang on all configurations, to the run of each that is done.
+
+    ranked: rows of `sweep_ranking.ranking`.
+    """
+    shown = ("rank", "score", "score_low", "score_high")
+    rows = {row["configuration"]: {name: row[name] for name in shown} for row in ranked}
+    for own in sweep.configurations:
+        file = _told(own, sweep.layout)
+        if file.is_file() and own.name in rows:
+            told = json.loads(file.read_text())
+            MetricLogger(told["tracking_uri"], told["run_id"])(0, rows[own.name])
 
 
 def _finish(own: Configuration, sweep: Sweep) -> None:
     """Of a configuration whose seeds are done: what MLflow is to know, unless it does, and what the
     caller makes of it.
     """
-    told = sweep.layout.sweep / own.name / "told.json"
-    seeds = {"seeds": own.params.sweep.seeds}
-    if not told.is_file() or json.loads(told.read_text()) != stable(seeds):
-        _tell(own, sweep)
-        _write(told, seeds)
+    told, seeds = _told(own, sweep.layout), list(own.params.sweep.seeds)
+    if not told.is_file() or json.loads(told.read_text())["seeds"] != seeds:
+        run = _tell(own, sweep)
+        _write(told, {"seeds": seeds, "tracking_uri": run.tracking_uri, "run_id": run.run_id})
     sweep.finished(own)
 
 
-def _tell(own: Configuration, sweep: Sweep) -> None:
+def _told(own: Configuration, layout: Layout) -> Path:
+    """Which seeds MLflow was told of, and which run they are."""
+    return layout.sweep / own.name / "told.json"
+
+
+def _tell(own: Configuration, sweep: Sweep) -> StageRun:
     """What the seeds are worth together.  Those that the store does not know, as one that was begun
     anew, get their run now.
     """
@@ -193,6 +216,7 @@ def _tell(own: Configuration, sweep: Sweep) -> None:
     run.summarise([seed_figures(result) for result in own.results(layout)])
     run.report(configuration_figures(own, layout), layout.sweep / own.name / "configuration.json")
     end_run(run, "FINISHED")
+    return run
 
 
 def _task(

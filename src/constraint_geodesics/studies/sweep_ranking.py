@@ -19,20 +19,23 @@ from constraint_geodesics.studies.statistics import (
 )
 
 Record = dict[str, Any]
-FIGURES = ("feasible", "ratio_p50", "ratio_p95", "time_ms", "steps_per_second")
+FIGURES = ("efficiency", "feasible", "ratio_p50", "ratio_p95", "time_ms", "steps_per_second")
 
 
 def figures_of(seed: Mapping[str, Any], constraint: str) -> dict[str, float]:
     """Of one seed's policy under one constraint, from what `train_and_judge` returned.
 
-    feasible: share of the queries.  ratio_p50, ratio_p95: length over the family's best, of the
+    efficiency: the score, held against the best of its own family and itself alone.  feasible:
+    share of the queries.  ratio_p50, ratio_p95: length over the family's best, of the
     feasible ones; nan where there is none.  time_ms: median of a query.
     """
     own = seed["constraints"][constraint]
-    ratio = _array(own["length_rad"]) / _array(own["optimum_rad"])
+    length, optimum = _array(own["length_rad"]), _array(own["optimum_rad"])
+    ratio = length / optimum
     known = ratio[np.isfinite(ratio)]
     p50, p95 = np.quantile(known, [0.5, 0.95]) if len(known) else (np.nan, np.nan)
     return {
+        "efficiency": _score(length, np.fmin(length, optimum)),
         "feasible": float(np.mean(own["feasible"])),
         "ratio_p50": float(p50),
         "ratio_p95": float(p95),
@@ -70,10 +73,9 @@ def seed_rows(configurations: Mapping[str, Sequence[Mapping[str, Any]]]) -> list
         for seed in seeds:
             for constraint, best in known.items():
                 length = _array(seed["constraints"][constraint]["length_rad"])
-                share = np.nan_to_num(best / length)[np.isfinite(best)]
                 about = {"configuration": name, "seed": seed["seed"], "constraint": constraint}
-                score = float(share.mean()) if len(share) else float("nan")
-                rows.append(about | {"score": score} | figures_of(seed, constraint))
+                about["score"] = _score(length, best)
+                rows.append(about | figures_of(seed, constraint))
     return rows
 
 
@@ -106,6 +108,12 @@ def _scores(rows: Sequence[Mapping[str, Any]]) -> Float[np.ndarray, "n T"]:
     of = {(row["seed"], row["constraint"]): row["score"] for row in rows}
     tasks = list(dict.fromkeys(c for (_, c), score in of.items() if np.isfinite(score)))
     return np.array([[of[seed, constraint] for constraint in tasks] for seed in seeds])
+
+
+def _score(length: Float[np.ndarray, "Q"], best: Float[np.ndarray, "Q"]) -> float:
+    """Over the queries that somebody solved; nan if there is none."""
+    share = np.nan_to_num(best / length)[np.isfinite(best)]
+    return float(share.mean()) if len(share) else float("nan")
 
 
 def _array(values: Sequence[float | None]) -> Float[np.ndarray, "n"]:
