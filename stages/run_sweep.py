@@ -3,14 +3,15 @@ experiment, and their ranking.
 """
 
 import os
+import shutil
 import sys
 from pathlib import Path
 
 from constraint_geodesics.errors import ParamsError
 from constraint_geodesics.pipeline.experiments import (
+    ExperimentClone,
     ExperimentError,
     experiment_names,
-    run_experiment,
 )
 from constraint_geodesics.pipeline.layout import SWEEP_FOLDER, Layout
 from constraint_geodesics.pipeline.stage import complain
@@ -37,14 +38,19 @@ def main(space: Path) -> None:
     layout, failed = Layout(Path().resolve()), list[str]()
     configurations = configurations_of(read_space(space), layout)
     known = experiment_names(layout.root)
-    shared = {SWEEP_FOLDER: str(layout.sweep), "MLFLOW_TRACKING_URI": tracking_uri(layout.root)}
+    environment = {
+        SWEEP_FOLDER: str(layout.sweep),
+        "MLFLOW_TRACKING_URI": tracking_uri(layout.root),
+    }
+    clone = ExperimentClone(layout.root, layout.sweep / "checkout", environment)
+    shutil.rmtree(clone.folder, ignore_errors=True)  # that of an earlier commit
 
     def finished(own: Configuration) -> None:
         if own.name in known:
             return
         write_ranking(configurations, layout)
         try:
-            run_experiment(layout.root, own.name, own.changes, TARGET, shared)
+            clone.run(own.name, own.changes, TARGET)
         except ExperimentError as error:
             failed.append(str(error))
 

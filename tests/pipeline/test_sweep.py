@@ -16,9 +16,9 @@ import yaml
 from mlflow import MlflowClient
 
 from constraint_geodesics.pipeline.experiments import (
+    ExperimentClone,
     ExperimentError,
     experiment_names,
-    run_experiment,
 )
 from tests.pipeline import smoke
 
@@ -186,6 +186,8 @@ def test_a_sweep_that_is_done_does_nothing(resumed) -> None:
     assert len(runs(resumed)) == known
 
 
-def test_an_experiment_that_dvc_refuses_is_named_in_one_line(resumed) -> None:
-    with pytest.raises(ExperimentError, match=r"^odd: dvc exp run .*nowhere"):
-        run_experiment(resumed, "odd", {}, "nowhere", {})
+def test_an_experiment_that_dvc_refuses_is_named_in_one_line(resumed, tmp_path) -> None:
+    clone = ExperimentClone(resumed, tmp_path / "clone", {})
+    with pytest.raises(ExperimentError, match=r"^dvc exp run .*--name odd nowhere: .*'nowhere'"):
+        clone.run("odd", {}, "nowhere")
+    assert "odd" not in experiment_names(resumed)
