@@ -11,7 +11,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
 from constraint_geodesics.errors import ParamsError
 from constraint_geodesics.fields import Count, Finite, Seed
@@ -56,6 +64,13 @@ class Range(BaseModel):
         return float(f"{value:.{DIGITS}g}")
 
 
+Dimension = Annotated[
+    Annotated[list[Any], Field(min_length=1), Tag("<values>")] | Annotated[Range, Tag("<range>")],
+    Discriminator(lambda given: "<range>" if isinstance(given, dict | Range) else "<values>"),
+]
+"""Values, or a range of them."""
+
+
 class SearchSpace(BaseModel):
     """A grid, or a random search, over entries of params.yaml.
 
@@ -68,9 +83,7 @@ class SearchSpace(BaseModel):
     search: Literal["grid", "random"]
     configurations: Count = 24
     seed: Seed = 0
-    space: Annotated[
-        dict[str, Annotated[list[Any], Field(min_length=1)] | Range], Field(min_length=1)
-    ]
+    space: Annotated[dict[str, Dimension], Field(min_length=1)]
 
     @model_validator(mode="after")
     def _consistent(self) -> "SearchSpace":
