@@ -19,7 +19,7 @@ from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import ShardTask, draw_shard, shard_tasks
 from constraint_geodesics.params import ComputeParams, Params
 from constraint_geodesics.pipeline import compute
-from constraint_geodesics.pipeline.compute import ComputeError, parallel_map
+from constraint_geodesics.pipeline.compute import ComputeError, as_finished, parallel_map
 from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.threads import ONE_THREAD
 from constraint_geodesics.scene.scene import Scene
@@ -40,6 +40,15 @@ def products(seed: int) -> tuple[float, float, float]:
 
 def threads(_: int) -> tuple[int, set[int]]:
     return torch.get_num_threads(), {pool["num_threads"] for pool in threadpool_info()}
+
+
+def slow_first(item: int) -> int:
+    time.sleep(2.0 if item == 0 else 0.2 * item)
+    return 10 * item
+
+
+def touch(file: Path) -> None:
+    file.touch()
 
 
 def fail_at_three(item: int) -> int:
@@ -116,6 +125,22 @@ def test_results_are_those_of_a_plain_loop_in_its_order() -> None:
     for settings in (ONE, TWO, ComputeParams(backend="loky", workers=0)):
         assert parallel_map(square, range(7), settings) == [0, 1, 4, 9, 16, 25, 36]
     assert parallel_map(square, [], TWO) == []
+
+
+def test_results_are_there_as_soon_as_they_are_finished(dask: ComputeParams) -> None:
+    for settings, order in ((ONE, [0, 1, 2]), (TWO, [1, 2, 0]), (dask, [1, 2, 0])):
+        found = list(as_finished(slow_first, range(3), settings))
+        assert [place for place, _ in found] == order, settings.backend
+        assert dict(found) == {0: 0, 1: 10, 2: 20}
+    assert list(as_finished(slow_first, [], TWO)) == []
+
+
+def test_what_is_no_longer_wanted_is_not_begun(tmp_path: Path) -> None:
+    items = [tmp_path / str(k) for k in range(50)]
+    outcomes = as_finished(touch, items, ONE)
+    next(outcomes)
+    outcomes.close()
+    assert [file.name for file in tmp_path.iterdir()] == ["0"]
 
 
 def test_dask_loky_and_this_process_give_the_same_bits(dask: ComputeParams) -> None:
