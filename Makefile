@@ -58,7 +58,7 @@ smoke: env  ## the same pipeline on small parameters, in a copy of this checkout
 bench: env  ## all planners on all queries, and the studies (three hours; go on after an interruption by calling it again)
 	geodesics params
 	python stages/draw_benchmark_queries.py
-	dvc repro stages/dvc.yaml
+	dvc repro stages/dvc.yaml stages/sweep/dvc.yaml
 	dvc repro --single-item --force report
 
 bench-quick: env  ## the same table on one query of each constraint and scene (minutes), after `make repro`

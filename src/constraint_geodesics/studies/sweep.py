@@ -123,6 +123,7 @@ def configuration(params: Params, layout: Layout, changes: Changes) -> Configura
     """A configuration that params describe, with what it changes in params.yaml."""
     trained = params.policy_settings().of_training("length_degree")
     del trained["seeds"]  # another seed changes nothing of those that are done
+    del trained["steps"]  # a sweep has its own
     judged = params.sweep.model_dump(include={"steps", "queries", "query_seed"})
     return Configuration(changes, params, fingerprint(trained, judged, _shared(params, layout)))
 

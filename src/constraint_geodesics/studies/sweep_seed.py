@@ -82,7 +82,7 @@ def train_and_judge(task: SweepTask) -> Record:
     feasible), optimum_rad (of the family), time_ms.
     """
     params, layout, settings = task.params, task.layout, training_settings(task.params)
-    pace = _Pace()
+    pace = Pace()
     with task.run as run:
         problem = shared_problem(
             params, _chart(params, layout), *_constraints(params, layout), _manifold(params)
@@ -99,12 +99,14 @@ def train_and_judge(task: SweepTask) -> Record:
 
 
 @dataclass
-class _Pace:
+class Pace:
     """Steps a second between the first report and the last: a resumed training counts its own."""
 
     marks: list[tuple[int, float]] = field(default_factory=list)
 
     def also(self, report: Callable[[int, dict[str, float]], None]) -> Callable[..., None]:
+        """A report that is timed besides."""
+
         def reported(step: int, figures: dict[str, float]) -> None:
             self.marks = [*self.marks[:1], (step, time.perf_counter())]
             report(step, figures)
@@ -113,6 +115,7 @@ class _Pace:
 
     @property
     def steps_per_second(self) -> float:
+        """Nan with fewer than two reports."""
         if len(self.marks) < 2:
             return float("nan")
         (first, began), (last, ended) = self.marks
