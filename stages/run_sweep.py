@@ -35,7 +35,7 @@ def main(space: Path) -> None:
 
     Raises ExperimentError at the end if DVC did not take an experiment: the next call tries again.
     """
-    layout, failed = Layout(Path().resolve()), list[str]()
+    layout, failed, recorded = Layout(Path().resolve()), list[str](), list[str]()
     configurations = configurations_of(read_space(space), layout)
     known = experiment_names(layout.root)
     environment = {
@@ -46,18 +46,21 @@ def main(space: Path) -> None:
     shutil.rmtree(clone.folder, ignore_errors=True)  # that of an earlier commit
 
     def finished(own: Configuration) -> None:
-        if own.name in known:
+        mark, seeds = layout.sweep / own.name / "experiment.txt", str(own.params.sweep.seeds)
+        if own.name in known and mark.is_file() and mark.read_text() == seeds:
             return
         write_ranking(configurations, layout)
         try:
             clone.run(own.name, own.changes, TARGET)
+            mark.write_text(seeds)
+            recorded.append(own.name)
         except ExperimentError as error:
             failed.append(str(error))
 
     sweep = Sweep(configurations, layout, finished)
     run_sweep(sweep)
     ranked = write_ranking(configurations, layout)
-    if experiment_names(layout.root) != known:
+    if recorded:
         tell_ranks(sweep, ranked)
     if failed:
         raise ExperimentError(f"{len(failed)} experiments are not recorded, the first: {failed[0]}")
