@@ -8,7 +8,7 @@ FIRST_START = 1.329923 -0.584036 -3.766650 -2.008429 0.728803 -2.581396
 FIRST_GOAL = 1.071549 -0.217480 -1.682647 -2.906655 -0.337949 1.348704
 
 .PHONY: help env plan repro pretrained dag smoke bench bench-quick draw-queries bench-geometry test lint format results readme \
-	docs notebook plots experiments ui replay clean test-browser screenshots
+	docs notebook plots experiments sweep ui replay clean test-browser screenshots
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
@@ -58,7 +58,7 @@ smoke: env  ## the same pipeline on small parameters, in a copy of this checkout
 bench: env  ## all planners on all queries, and the studies (three hours; go on after an interruption by calling it again)
 	geodesics params
 	python stages/draw_benchmark_queries.py
-	dvc repro stages/dvc.yaml
+	dvc repro stages/dvc.yaml stages/sweep/dvc.yaml
 	dvc repro --single-item --force report
 
 bench-quick: env  ## the same table on one query of each constraint and scene (minutes), after `make repro`
@@ -123,6 +123,14 @@ plots: env $(DOCS)/installed  ## learning curves of two commits, a line a seed, 
 
 experiments: env  ## run the experiments of docs/experiments.md in a copy and write their tables there (half an hour)
 	python docs/make/experiments.py
+
+SPACE ?= stages/sweep/space.yaml
+
+sweep: env  ## try settings of policies, ranked by `geodesics results --experiments`, after `make repro`: SPACE=... (minutes to hours; go on after an interruption by calling it again)
+	geodesics params
+	dvc repro --quiet digest_code
+	python stages/run_sweep.py $(SPACE)
+	geodesics results --experiments
 
 ui: env  ## MLflow's dashboard, on this machine only
 	geodesics ui

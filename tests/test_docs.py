@@ -30,6 +30,7 @@ from constraint_geodesics import cli
 from constraint_geodesics.bundle import PACKAGED
 from constraint_geodesics.params import load_params
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.studies.search_space import read_space
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 from constraint_geodesics.tracking.registry import register_planner
 from tests.readme import EXPERIMENTS as TIMES_PAGE
@@ -202,9 +203,25 @@ def test_the_notebook_holds_its_pictures_and_is_small() -> None:
     assert set(re.findall(r"\]\(([^)#]+)", told)) <= set(PAGES)
 
 
+def entries(page: str) -> list[str]:
+    """Blocks that belong into params.yaml."""
+    return [block for block in blocks(page, "yaml") if not block.startswith("search:")]
+
+
+def test_every_search_space_is_valid(tmp_path) -> None:
+    spaces = [block for page in PAGES for block in blocks(page, "yaml") if "search:" in block]
+    assert len(spaces) == 1
+    for block in spaces:
+        (tmp_path / "space.yaml").write_text(block)
+        found = read_space(tmp_path / "space.yaml").changes()
+        assert len(found) == 6, "as many as the page says"
+        for changes in found:
+            load_params(ROOT / "params.yaml", changes)
+
+
 @pytest.mark.parametrize("page", having("yaml"))
 def test_every_entry_of_params_is_valid(page, tmp_path) -> None:
-    for block in blocks(page, "yaml"):
+    for block in entries(page):
         file = tmp_path / "params.yaml"
         file.write_text(yaml.safe_dump(merged(PARAMS, yaml.safe_load(block))))
         params = load_params(file)

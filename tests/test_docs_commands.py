@@ -40,6 +40,10 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "geodesics ik": HERE,
     "geodesics package": ("tests/test_bundle.py", "package"),
     "geodesics results": HERE,
+    "geodesics results --experiments": (
+        "tests/pipeline/test_sweep.py",
+        '"results", "--experiments"',
+    ),
     "geodesics replay": HERE,
     "geodesics replay FILE": ("tests/recording/test_recording.py", "open_recordings"),
     "geodesics bench": ("tests/test_cli_json.py", '"bench"'),
@@ -73,6 +77,8 @@ def kind_of(words: list[str]) -> str:
     """The name of a command in COVERED."""
     if words[:2] == ["geodesics", "replay"] and words[2:]:
         return "geodesics replay FILE"
+    if words[:3] == ["geodesics", "results", "--experiments"]:
+        return " ".join(words[:3])
     length = {
         "geodesics": 2,
         "dvc": 3 if words[1:2] in (["exp"], ["metrics"], ["params"], ["plots"]) else 2,

@@ -197,20 +197,29 @@ def bench(
 
 
 @app.command("results")
-def show_results(as_json: bool = JSON) -> None:
+def show_results(
+    experiments: bool = typer.Option(
+        False, "--experiments", help="The ranking of `make sweep`'s configurations instead."
+    ),
+    as_json: bool = JSON,
+) -> None:
     """Print the committed result table and how to look further."""
-    table = Layout().root / "reports" / ("table.csv" if as_json else "table.md")
+    name, made_by = ("sweep_policies/ranking", "sweep") if experiments else ("table", "repro")
+    table = Layout().root / "reports" / f"{name}.{'csv' if as_json else 'md'}"
     if not table.is_file():
-        raise FileNotFoundError(f"{table}: no results yet; run `make repro`")
+        raise FileNotFoundError(f"{table}: no results yet; run `make {made_by}`")
     if as_json:
         require("pipeline")
         import pandas as pd
 
         print(json.dumps({"rows": _records(pd.read_csv(table, float_precision="round_trip"))}))
         return
-    recordings = _recordings(Path())
     print(table.read_text().rstrip())
     print("\nOpen the runs in MLflow:    make ui")
+    if experiments:
+        print("Compare them in DVC:        dvc exp show --only-changed")
+        return
+    recordings = _recordings(Path())
     if recordings:
         print(f"Replay a path in Rerun:     make replay FILE={recordings[0].file}")
     print("Read the report offline:    reports/index.html")

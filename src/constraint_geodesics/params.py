@@ -1,6 +1,7 @@
 """params.yaml as typed, frozen records: every field is checked before a stage does any work."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -512,6 +513,17 @@ class StudyParams(_Record):
     seed: Seed
 
 
+class SweepParams(_Record):
+    """How each configuration of `make sweep` is trained and judged: its seeds, environment steps of
+    each in place of `policies.steps`, and queries that nothing else uses.
+    """
+
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    steps: Count
+    queries: Count
+    query_seed: Seed
+
+
 class ExecutionParams(_Record):
     """Timed paths followed by simulated position control, with a cup that may spill."""
 
@@ -563,6 +575,7 @@ class Params(_Record):
     unseen: dict[Name, ConstraintParams]
     compare_manifolds: CompareManifoldsParams
     studies: StudyParams
+    sweep: SweepParams
     execution: ExecutionParams
     benchmark: BenchmarkParams
     judge: JudgeParams
@@ -612,19 +625,16 @@ class Params(_Record):
         return self
 
 
-def load_params(path: Path = Path("params.yaml")) -> Params:
-    """Read and check params.yaml.
+def load_params(
+    path: Path = Path("params.yaml"), changes: Mapping[str, Any] | None = None
+) -> Params:
+    """Read and check params.yaml, with other values of some entries, by their paths.
 
     Raises ParamsError, one line: the file, the entry, its value and what is allowed.
     """
-    from ruamel.yaml.error import YAMLError
-
-    try:
-        raw = _yaml(path.read_text())
-    except OSError as error:
-        raise ParamsError(f"{path}: {error.strerror}") from None
-    except YAMLError as error:
-        raise ParamsError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    raw = read_yaml(path)
+    for entry, value in (changes or {}).items():
+        _change(raw, entry, value, path)
     try:
         # in JSON's strict mode lists may become tuples, but neither "5" nor true becomes a number
         return Params.model_validate_json(json.dumps(raw, default=str), strict=True)
@@ -632,13 +642,30 @@ def load_params(path: Path = Path("params.yaml")) -> Params:
         raise ParamsError(f"{path}: {one_line(error)}") from None
 
 
-def _yaml(text: str) -> Any:
-    """YAML 1.2, read as DVC reads and writes it: 2e-05 is a number there, which YAML 1.1 takes for
-    a text.
+def _change(raw: Any, entry: str, value: Any, path: Path) -> None:
+    *outer, last = entry.split(".")
+    for name in outer:
+        raw = raw.get(name) if isinstance(raw, dict) else None
+    if not isinstance(raw, dict) or last not in raw:
+        raise ParamsError(f"{path}: {entry}={value!r}: there is no such parameter")
+    raw[last] = value
+
+
+def read_yaml(path: Path) -> Any:
+    """A file of YAML 1.2, read as DVC reads and writes it: 2e-05 is a number there, which YAML 1.1
+    takes for a text.
+
+    Raises ParamsError, one line, if it can't be read.
     """
     from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
 
-    return YAML(typ="safe", pure=True).load(text)
+    try:
+        return YAML(typ="safe", pure=True).load(path.read_text())
+    except OSError as error:
+        raise ParamsError(f"{path}: {error.strerror}") from None
+    except YAMLError as error:
+        raise ParamsError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
 
 
 def one_line(error: ValidationError) -> str:

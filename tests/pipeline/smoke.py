@@ -39,6 +39,7 @@ SMALL: dict[str, Any] = {
     "planner": {"roadmap_nodes": 200},
     "path_diffusion": {"queries": 40, "width": 32, "blocks": 1, "steps": 60, "batch_size": 32},
     "studies": {"queries": 3},
+    "sweep": {"seeds": [0, 1], "steps": 1920, "queries": 3},
     "execution": {"queries": 1, "spheres": 4},
     "benchmark": {"queries": 2, "compared": {"seeds": 1}},
     "recording": {"queries": 2},

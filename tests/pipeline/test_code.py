@@ -10,7 +10,7 @@ from constraint_geodesics.pipeline.code import DRAWING, code_of
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "src" / "constraint_geodesics"
-PIPELINES = ("dvc.yaml", "stages/dvc.yaml")
+PIPELINES = ("dvc.yaml", "stages/dvc.yaml", "stages/sweep/dvc.yaml")
 FILES = {
     "geometry/length.py": "from package.geometry import curves\n\n\ndef length():\n    return 1\n",
     "geometry/curves.py": 'DEGREE = 3\n"""Of a curve."""\n',

@@ -19,7 +19,7 @@ from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import ShardTask, draw_shard, shard_tasks
 from constraint_geodesics.params import ComputeParams, Params
 from constraint_geodesics.pipeline import compute
-from constraint_geodesics.pipeline.compute import ComputeError, parallel_map
+from constraint_geodesics.pipeline.compute import ComputeError, as_finished, parallel_map
 from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.threads import ONE_THREAD
 from constraint_geodesics.scene.scene import Scene
@@ -40,6 +40,18 @@ def products(seed: int) -> tuple[float, float, float]:
 
 def threads(_: int) -> tuple[int, set[int]]:
     return torch.get_num_threads(), {pool["num_threads"] for pool in threadpool_info()}
+
+
+def first_waits_for_last(file: Path) -> str:
+    while file.name == "0" and not file.with_name("3").is_file():
+        time.sleep(0.01)
+    time.sleep(0.5 if file.name == "0" else 0.0)  # until the others' results have arrived
+    file.touch()
+    return file.name
+
+
+def touch(file: Path) -> None:
+    file.touch()
 
 
 def fail_at_three(item: int) -> int:
@@ -74,7 +86,9 @@ def dask(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ComputeParams]:
     folder = tmp_path_factory.mktemp("dask")
     file, command = folder / "scheduler.json", [sys.executable, "-m", "dask"]
     loopback = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    root = Path(__file__).parents[2]
+    sources = os.pathsep.join([str(root), str(root / "src")])
+    environment = {**os.environ, "PYTHONPATH": sources}
     environment |= {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
     environment |= {
         "OMP_NUM_THREADS": "2",
@@ -116,6 +130,26 @@ def test_results_are_those_of_a_plain_loop_in_its_order() -> None:
     for settings in (ONE, TWO, ComputeParams(backend="loky", workers=0)):
         assert parallel_map(square, range(7), settings) == [0, 1, 4, 9, 16, 25, 36]
     assert parallel_map(square, [], TWO) == []
+
+
+def test_results_are_there_as_soon_as_they_are_finished(dask: ComputeParams, tmp_path) -> None:
+    for settings in (TWO, dask):
+        folder = tmp_path / settings.backend
+        folder.mkdir()
+        files = [folder / str(k) for k in range(4)]
+        found = list(as_finished(first_waits_for_last, files, settings))
+        assert found[-1] == (0, "0"), "the first task ends when all others have"
+        assert sorted(found) == [(k, str(k)) for k in range(4)]
+    assert list(as_finished(touch, [tmp_path / "a", tmp_path / "b"], ONE)) == [(0, None), (1, None)]
+    assert list(as_finished(touch, [], TWO)) == []
+
+
+def test_what_is_no_longer_wanted_is_not_begun(tmp_path: Path) -> None:
+    items = [tmp_path / str(k) for k in range(50)]
+    outcomes = as_finished(touch, items, ONE)
+    next(outcomes)
+    outcomes.close()
+    assert [file.name for file in tmp_path.iterdir()] == ["0"]
 
 
 def test_dask_loky_and_this_process_give_the_same_bits(dask: ComputeParams) -> None:

@@ -31,6 +31,9 @@ from constraint_geodesics.tracking.experiment import (
     ChildRun,
     Subject,
     Work,
+    begin_run,
+    continue_run,
+    end_run,
     subject_of,
     tracked_stage,
 )
@@ -135,6 +138,31 @@ def test_a_stage_is_a_parent_its_seeds_are_children(root: Path) -> None:
     history = client.get_metric_history(child.info.run_id, "loss")
     assert [(point.step, point.value) for point in history] == [(0, 4.0), (1, 3.5), (2, 3 + 1 / 3)]
     assert child.data.metrics == {"loss": 3 + 1 / 3, "final/length": 3.0}
+
+
+def test_a_run_that_was_killed_is_continued_with_the_children_it_has(root: Path) -> None:
+    work_of = Work("sweep", "b=1 K_Δ=0.5 (12ab)", {"b": 1})
+    killed = begin_run(work_of, "sweeps", root)
+    with killed.child("seed 0", {"seed": 0}):
+        pass
+    killed.child("seed 1", {"seed": 1}).__enter__()  # its process died: nothing ended either
+    run = continue_run(work_of, "sweeps", root)
+    assert run.run_id == killed.run_id
+    assert run.child_names() == ["seed 0", "seed 1"]
+    with run.child("seed 1", {"seed": 1}):
+        pass
+    end_run(run, "FINISHED")
+    client = MlflowClient(run.tracking_uri)
+    of_parent = f"tags.`mlflow.parentRunId` = '{run.run_id}'"
+    children = client.search_runs([run.experiment_id], of_parent)
+    ended = sorted((child.data.tags["child"], child.info.status) for child in children)
+    assert ended == [("seed 0", "FINISHED"), ("seed 1", "FINISHED"), ("seed 1", "KILLED")]
+    assert client.get_run(run.run_id).info.status == "FINISHED"
+    assert client.get_run(run.run_id).data.params == {"b": "1"}
+    other = continue_run(Work("sweep", "b=3 (34cd)", {"b": 3}), "sweeps", root)
+    assert other.run_id != run.run_id
+    end_run(other, "KILLED")
+    assert len(client.search_runs([run.experiment_id], "tags.stage = 'sweep'")) == 5
 
 
 def test_a_run_says_where_its_paths_are_recorded(root: Path) -> None:

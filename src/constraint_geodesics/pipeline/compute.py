@@ -59,18 +59,30 @@ def parallel_map(
     Raises ComputeError, one line, for the first item that fails, a worker that dies, or a scheduler
     that does not answer; the tasks that have not started are dropped.
     """
+    results = dict(as_finished(function, items, settings, description=description))
+    return [results[index] for index in range(len(items))]
+
+
+def as_finished(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    settings: ComputeParams,
+    *,
+    description: str = "",
+) -> Generator[tuple[int, Result], None, None]:
+    """The same results, each with its item's place, as soon as it is there: to be kept before the
+    next.  The other tasks go on while the caller works with one.
+    """
     if not items:
-        return []
+        return
     task = _Task(function, description or getattr(function, "__name__", "parallel work"))
-    results: dict[int, Result] = {}
     with (
         progress(description, len(items)) as advance,
         closing(_outcomes(task, items, settings)) as outcomes,
     ):
-        for index, result in outcomes:
-            results[index] = result
+        for outcome in outcomes:
             advance()
-    return [results[index] for index in range(len(items))]
+            yield outcome
 
 
 @dataclass(frozen=True)

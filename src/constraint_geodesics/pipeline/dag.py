@@ -9,7 +9,7 @@ from dvc.commands.dag import _build
 from dvc.dagascii import draw
 from dvc.repo import Repo
 
-LEFT_OUT = ("digest_code", "stages/dvc.yaml:")
+LEFT_OUT = ("digest_code", "stages/")
 """Beginnings of the names of stages that are not drawn."""
 
 

@@ -2,9 +2,12 @@
 git.
 """
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
+SWEEP_FOLDER = "GEODESICS_SWEEP"
+"""The environment's name of the folder in which a sweep finds what is done."""
 RECORDINGS = "data/recordings"
 """Where the stages' recordings lie, relative to the checkout."""
 
@@ -105,6 +108,14 @@ class Layout:
     def path_diffusion(self) -> Path:
         """Folder of the diffusion model of paths (safetensors and JSON)."""
         return self.root / "data" / "path_diffusion"
+
+    @property
+    def sweep(self) -> Path:
+        """Folder of what a sweep has found so far, a folder a configuration (JSON).  An experiment
+        runs in a copy of the checkout: there it is the folder of the checkout that started it.
+        """
+        started = os.environ.get(SWEEP_FOLDER)
+        return Path(started) if started else self.root / ".geodesics" / "sweep"
 
     def analytic(self, manifold: str) -> Path:
         """Folder of the policies and curves found on an analytic manifold."""

@@ -13,7 +13,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import fmean, pstdev
 from threading import Timer
@@ -238,6 +238,10 @@ class StageRun:
             file.write_text("\n".join(lines) + "\n")
             keep_copy(self.tracking_uri, self.run_id, file)
 
+    def child_names(self) -> list[str]:
+        """Of the runs below this one that were started, by whatever process."""
+        return list(self._child_ids())
+
     def _child_ids(self) -> dict[str, str]:
         return {run.data.tags["child"]: run.info.run_id for run in _children(self)}
 
@@ -270,6 +274,73 @@ def tracked_stage(work: Work, experiment: str, root: Path) -> Iterator[StageRun]
     Raises TrackingError, one line, before any work: an input is missing, or the store can't be
     reached.
     """
+    run = begin_run(work, experiment, root)
+    try:
+        with _system_metrics(run.tracking_uri, run.run_id):
+            yield run
+    except BaseException as error:
+        with suppress(Exception):  # the body's error is the one to see
+            end_run(run, _status(error))
+        raise
+    end_run(run, "FINISHED")
+
+
+def begin_run(work: Work, experiment: str, root: Path) -> StageRun:
+    """A run that `end_run` ends.
+
+    Raises TrackingError as `tracked_stage` does.
+    """
+    run = _run_of(work, experiment, root)
+    shown = {"mlflow.runName": _named(f"{work.stage} {work.item}", run.tags)}
+    shown["mlflow.note.content"] = _note(work.stage, run.tags)
+    with explained(run.tracking_uri):
+        client, tags = client_of(run.tracking_uri), {**run.tags, **shown}
+        run = replace(run, run_id=client.create_run(run.experiment_id, tags=tags).info.run_id)
+        try:
+            log_params(client, run.run_id, run.params)
+            client.log_inputs(run.run_id, [dataset_of(file, root) for file in work.inputs])
+        except BaseException as error:
+            with suppress(Exception):
+                end_run(run, _status(error))
+            raise
+    return run
+
+
+def continue_run(work: Work, experiment: str, root: Path) -> StageRun:
+    """The last run of the same stage and item, open again whatever became of it; a new one where
+    there is none.  `end_run` ends it.
+
+    Raises TrackingError as `tracked_stage` does.
+    """
+    run = _run_of(work, experiment, root)
+    with explained(run.tracking_uri):
+        client = client_of(run.tracking_uri)
+        own = f"tags.stage = '{work.stage}' and tags.item = '{work.item}'"
+        found = client.search_runs(
+            [run.experiment_id], own, order_by=["attributes.start_time DESC"]
+        )
+        parents = [old for old in found if "child" not in old.data.tags]
+        if not parents:
+            return begin_run(work, experiment, root)
+        client.update_run(parents[0].info.run_id, status="RUNNING")
+    return replace(run, run_id=parents[0].info.run_id)
+
+
+def end_run(run: StageRun, status: str) -> None:
+    """End a run, and what workers that died left running below it.
+
+    status: FINISHED, FAILED or KILLED.
+    """
+    with explained(run.tracking_uri):
+        client, left = client_of(run.tracking_uri), "KILLED" if status == "FINISHED" else status
+        for child in _children(run):
+            if child.info.status == "RUNNING":
+                client.set_terminated(child.info.run_id, left)
+        client.set_terminated(run.run_id, status)
+
+
+def _run_of(work: Work, experiment: str, root: Path) -> StageRun:
+    """Without a run in the store yet."""
     uri, name = tracking_uri(root), f"{work.stage} {work.item}"
     tags = {"stage": work.stage, "item": work.item, **work.subject.tags, **source_tags(root)}
     params = {**stored(work.settings), **stored(work.subject.params)}
@@ -277,23 +348,8 @@ def tracked_stage(work: Work, experiment: str, root: Path) -> Iterator[StageRun]
         if not file.exists():
             raise TrackingError(f"{name}: its input {file} does not exist")
     with explained(uri):
-        client, experiment_id = open_store(uri, experiment)
-        shown = {"mlflow.runName": _named(name, tags)}
-        shown["mlflow.note.content"] = _note(work.stage, tags)
-        run_id = client.create_run(experiment_id, tags=tags | shown).info.run_id
-    run = StageRun(uri, experiment_id, run_id, tags, params, [])
-    try:
-        with explained(uri):
-            log_params(client, run_id, params)
-            client.log_inputs(run_id, [dataset_of(file, root) for file in work.inputs])
-        with _system_metrics(uri, run_id):
-            yield run
-    except BaseException as error:
-        with suppress(Exception):  # the body's error is the one to see
-            _end(run, _status(error))
-        raise
-    with explained(uri):
-        _end(run, "FINISHED")
+        _, experiment_id = open_store(uri, experiment)
+    return StageRun(uri, experiment_id, "", tags, params, [])
 
 
 @contextmanager
@@ -343,15 +399,6 @@ def _children(run: StageRun) -> list[Any]:
     query, order = f"tags.`mlflow.parentRunId` = '{run.run_id}'", ["attributes.start_time ASC"]
     client = client_of(run.tracking_uri)
     return list(client.search_runs([run.experiment_id], query, order_by=order))
-
-
-def _end(run: StageRun, status: str) -> None:
-    """End a run, and what workers that died left running below it."""
-    client, left = client_of(run.tracking_uri), "KILLED" if status == "FINISHED" else status
-    for child in _children(run) if run.children else ():
-        if child.info.status == "RUNNING":
-            client.set_terminated(child.info.run_id, left)
-    client.set_terminated(run.run_id, status)
 
 
 def _status(error: BaseException | None) -> str:
