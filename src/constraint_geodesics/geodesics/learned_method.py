@@ -32,7 +32,7 @@ from constraint_geodesics.geodesics.proposals import MeanPolicy, Met, rounds
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.inference import FrozenManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.lift import jump_excess
+from constraint_geodesics.learning.lift import closely
 from constraint_geodesics.params import GeodesicParams, RobotParams
 from constraint_geodesics.search.band import ACCURACY, step_lengths
 from constraint_geodesics.search.candidates import (
@@ -63,7 +63,6 @@ TOUCHING_M = 1e-4
 """Clearance below which a configuration counts as touching something."""
 KEPT = 32
 """Constraints whose problem is kept for the next query."""
-_FIRST_POINTS = 65
 _SLACK_RAD = 1e-9
 
 
@@ -261,15 +260,17 @@ def sampled(task: Task, curve: LatentCurve) -> Candidate | None:
     """The curve through its points about CHECK_STEP apart; None where it jumps, leaves the
     constraint or the joint limits.
     """
-    shares = np.linspace(0.0, 1.0, _FIRST_POINTS)
-    points, left = curve.at(shares)
-    longest = step_lengths(points).max()
-    if np.isfinite(longest) and longest > CHECK_STEP:
-        pieces = int(np.ceil((_FIRST_POINTS - 1) * longest / CHECK_STEP))
-        shares = np.linspace(0.0, 1.0, min(pieces, 8 * _FIRST_POINTS) + 1)
-        points, left = curve.at(shares)
-    robot = curve.problem.manifold.robot
+    worst = 0.0
+
+    def at(times: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n D"]:
+        nonlocal worst
+        points, left = curve.at(times)
+        worst = max(worst, left)
+        return points
+
+    _, points = closely(at, CHECK_STEP)
+    robot, steps = curve.problem.manifold.robot, step_lengths(points)
     inside = robot.limit_distance(points).min() >= -_SLACK_RAD
-    if not (left <= 1e3 * ACCURACY and inside and jump_excess(points, shares) == 0.0):
+    if not (worst <= 1e3 * ACCURACY and inside and steps.max() <= CHECK_STEP):
         return None
-    return Candidate("policy", task.open, points, float(step_lengths(points).sum()), points)
+    return Candidate("policy", task.open, points, float(steps.sum()), points)

@@ -60,6 +60,8 @@ largest.
 """
 LIMIT_ROUNDING = 1e-9
 """What the sum of all that lies outside the limits may be [rad]."""
+LONGEST_STEP = 0.1
+"""Of the points of a curve that its rows are drawn through [rad]."""
 LONGEST_DESCENT = 0.5
 """Longest step of the descent, in units of the ends' distance: at a jump the pull has no scale."""
 
@@ -267,19 +269,21 @@ class LearnedProblem:
         """The joint path of one curve, rows about `spacing` [rad] apart unless the curve has a
         jump.
 
-        The curve itself is evaluated until its points are 0.1 rad apart; the rows between them are
-        drawn as those of any other planner's path.
+        The curve itself is evaluated at points that are LONGEST_STEP apart; the rows between them
+        are drawn as those of any other planner's path.
         """
         exact = Retraction() if self.retract else None
-        points = 65
-        while True:
-            t = np.linspace(0.0, 1.0, points)
-            joints = self.lifted_at(phi[None], ends, t, exact).joints[0]
-            if np.linalg.norm(np.diff(joints, axis=0), axis=-1).max() <= 0.1 or points > 1000:
-                if self.retract:
-                    return as_executed(self.manifold, joints, spacing)
-                return densify(joints, spacing)
-            points = 2 * points - 1
+
+        def at(times: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n D"]:
+            """With both ends, which the correction needs."""
+            t = np.concatenate([[0.0], times, [1.0]])
+            return self.lifted_at(phi[None], ends, t, exact).joints[0, 1:-1]
+
+        _, joints = closely(at, LONGEST_STEP)
+        joints[0], joints[-1] = ends.q_start[0], ends.q_goal[0]
+        if self.retract:
+            return as_executed(self.manifold, joints, spacing)
+        return densify(joints, spacing)
 
     def ends(self, start: Float[np.ndarray, "B D"], goal: Float[np.ndarray, "B D"]) -> Ends:
         """Ends from configurations [rad]."""

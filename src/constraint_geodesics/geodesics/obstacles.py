@@ -17,7 +17,7 @@ FEWEST_PAIRS = 3
 """Pairs of ends on whose way a sphere has to be."""
 NEAR_M = 1e-4
 """Distance beyond which nothing is measured."""
-PAIRS, CURVES = 400, 16
+PAIRS, CURVES = 200, 16
 """Pairs that spheres are looked for between, and random curves of each, of which the cheapest
 counts.
 """

@@ -1,5 +1,6 @@
 """From a decoded latent curve to a joint path: the ends corrected, every point retracted."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -84,6 +85,38 @@ def jump_excess(
     """How far a curve's steps exceed the allowed ones [rad]; above 0 where it changes branch."""
     steps = np.linalg.norm(np.diff(joints, axis=-2), axis=-1)
     return np.maximum(steps - allowed_steps(joints, t), 0.0).sum(axis=-1)
+
+
+FIRST_POINTS = 65
+"""Points of a curve that are looked at first."""
+FINEST = 1e-6
+"""Times that lie closer together are not parted: what is far apart there is a jump."""
+MOST_POINTS = 4000
+
+
+def closely(
+    at: Callable[[Float[np.ndarray, "n"]], Float[np.ndarray, "n D"]], longest: float
+) -> tuple[Float[np.ndarray, "T"], Float[np.ndarray, "T D"]]:
+    """Times from 0 to 1 and a curve's points there [rad], no further apart than `longest` unless
+    the curve jumps.
+
+    Where a curve on a constraint passes close by a singular configuration it is steep: points are
+    added there alone.
+    """
+    times = np.linspace(0.0, 1.0, FIRST_POINTS)
+    points = at(times)
+    while len(times) < MOST_POINTS:
+        steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        wide = np.flatnonzero((steps > longest) & (np.diff(times) > FINEST))
+        if not len(wide):
+            break
+        pieces = np.ceil(np.minimum(steps[wide] / longest, 8.0)).astype(int)
+        places = np.repeat(wide, pieces - 1)
+        share = np.concatenate([np.arange(1, n) / n for n in pieces])
+        added = times[places] + share * (times[places + 1] - times[places])
+        times = np.insert(times, places + 1, added)
+        points = np.insert(points, places + 1, at(added), axis=0)
+    return times, points
 
 
 def densify(joints: Float[np.ndarray, "T D"], spacing: float) -> Float[np.ndarray, "n D"]:

@@ -7,24 +7,27 @@ All that a sweep knows of policies is in this module.
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from constraint_geodesics.benchmark.judge import judge_limits
+from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import constraint_manifold
+from constraint_geodesics.geodesics.learned_problem import LearnedProblem, ProblemSet
 from constraint_geodesics.geodesics.policy_search import train_policy
-from constraint_geodesics.geodesics.problem import Ends, LearnedProblem
-from constraint_geodesics.geodesics.proposals import MeanPolicy, propose
+from constraint_geodesics.geodesics.problem import Ends
 from constraint_geodesics.learning.dataset import draw_queries, read_joints
-from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.learning.learned_manifold import chart_named
 from constraint_geodesics.params import GeodesicParams, Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.studies.geodesic_search import SeedLog, geodesic_problem, shared_problem
-from constraint_geodesics.studies.proposals import family_optimum, measured
+from constraint_geodesics.studies.geodesic_search import SeedLog, policy_problem, training_problem
+from constraint_geodesics.studies.optimum import family_optimum
+from constraint_geodesics.studies.proposals import Asked, Method, answered, by_policy
 
 Record = dict[str, Any]
 
@@ -76,22 +79,19 @@ def optimum_lengths(task: OptimumTask) -> list[float]:
 
 
 def train_and_judge(task: SweepTask) -> Record:
-    """Train one seed's policy, then answer each query with the best curve that its mean meets.
+    """Train one seed's policy, then answer each query with its first certified curve.
 
-    Returns steps_per_second, and by constraint of each query: feasible, length_rad (nan where not
-    feasible), optimum_rad (of the family), time_ms.
+    Returns steps_per_second, and by constraint of each query: feasible (certified), length_rad (nan
+    where not), optimum_rad (of the family), time_ms (with the check).
     """
     params, layout, settings = task.params, task.layout, training_settings(task.params)
     pace = Pace()
     with task.run as run:
-        problem = shared_problem(
-            params, _chart(params, layout), *_constraints(params, layout), _manifold(params)
-        )
+        problem = _training(params, layout)
         trained = train_policy(problem, settings, task.seed, task.scratch, pace.also(run.log))
-        state = trained.actor.state_dict()
-        policy = MeanPolicy.from_arrays({name: value.numpy() for name, value in state.items()})
+        answer = by_policy(trained.mean, settings, task.seed)
         judged = {
-            name: _judged(policy, settings, *_queries(params, layout, name))
+            name: _judged(answer, params, *_queries(params, layout, name))
             | {"optimum_rad": list(task.optimum[name])}
             for name in judged_constraints(params)
         }
@@ -122,44 +122,54 @@ class Pace:
         return (last - first) / (ended - began)
 
 
-def _judged(
-    policy: MeanPolicy, settings: GeodesicParams, problem: LearnedProblem, ends: Ends
-) -> Record:
-    phi, claimed, times = np.empty((len(ends), problem.curve.coefficients)), [], []
-    propose(problem, [policy], settings, ends[np.arange(1)])  # what is loaded late is no query's
-    for query in range(len(ends)):
-        began = time.perf_counter()
-        found = propose(problem, [policy], settings, ends[np.array([query])])
-        times.append(1e3 * (time.perf_counter() - began))
-        phi[query] = found.phi[0, 0]
-        claimed.append(bool(found.feasible[0, 0]))
-    costs = measured(problem, phi, ends)
-    feasible = np.array(claimed) & costs.feasible
-    lengths = np.where(feasible, costs.length, np.nan)
-    return {"feasible": feasible.tolist(), "length_rad": lengths.tolist(), "time_ms": times}
+def _judged(answer: Method, params: Params, problem: LearnedProblem, ends: Ends) -> Record:
+    feasible, lengths, times = list[bool](), list[float](), list[float]()
+    with Certifier(Scene.from_params(params), judge_limits(params.judge)) as certifier:
+        for query in range(len(ends)):
+            asked = Asked(problem, ends[np.array([query])], query, certifier)
+            if not query:
+                answered(asked, answer(asked, 0.0))  # what is loaded late is no query's
+            found = answered(asked, answer(asked, 0.0))
+            feasible.append(found.solved)
+            lengths.append(found.length)
+            times.append(1e3 * (found.search_s + found.check_s))
+    return {"feasible": feasible, "length_rad": lengths, "time_ms": times}
 
 
 def _queries(params: Params, layout: Layout, constraint: str) -> tuple[LearnedProblem, Ends]:
     """One constraint's problem, and the queries that the sweep judges by."""
     scene, sweep = Scene.from_params(params), params.sweep
-    manifold = constraint_manifold(scene.robot, params.constraints[constraint])
-    queries = draw_queries(scene, manifold, constraint, sweep.queries, sweep.query_seed)
-    joints = read_joints(layout.joints(constraint)).free_joints
-    chart = _chart(params, layout)
-    problem = geodesic_problem(params, chart, manifold, joints, _manifold(params))
+    problem = _alone(params, layout, scene, constraint)
+    name, manifold = constraint, problem.manifold
+    queries = draw_queries(scene, manifold, name, sweep.queries, sweep.query_seed)
     return problem, problem.ends(queries.starts, queries.goals)
 
 
-def _constraints(params: Params, layout: Layout) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Manifolds and data of all constraints, by name."""
-    robot = Scene.from_params(params).robot
-    manifolds = {name: constraint_manifold(robot, own) for name, own in params.constraints.items()}
-    return manifolds, {name: read_joints(layout.joints(name)).free_joints for name in manifolds}
+def _alone(params: Params, layout: Layout, scene: Scene, constraint: str) -> LearnedProblem:
+    name = params.policies.chart
+    chart = chart_named(name, layout.manifold(name), scene.robot)
+    manifold = constraint_manifold(scene.robot, params.constraints[constraint])
+    joints = read_joints(layout.joints(constraint)).free_joints
+    return policy_problem(params, chart, scene, manifold, joints)
 
 
-def _manifold(params: Params) -> str:
-    return params.geodesics.searched[0]
+_KEPT: dict[str, ProblemSet] = {}
+"""What a worker has trained on last: spheres take longer to place than few steps to train."""
 
 
-def _chart(params: Params, layout: Layout) -> LearnedManifold:
-    return LearnedManifold.load(layout.manifold(_manifold(params)))
+def _training(params: Params, layout: Layout) -> ProblemSet:
+    """What policies train on; the same for configurations that differ in nothing it depends on."""
+    own = params.policies
+    key = str((layout.root, params.geodesics.degree, own.chart, own.length_degree, own.obstacles))
+    if key not in _KEPT:
+        scene = Scene.from_params(params)
+        # one chart for all: members of a set share it
+        first, *others = params.constraints
+        problem = _alone(params, layout, scene, first)
+        alone = [problem]
+        for name in others:
+            member = _alone(params, layout, scene, name)
+            alone.append(replace(member, chart=problem.chart, clearance=problem.clearance))
+        _KEPT.clear()
+        _KEPT[key] = training_problem(params, scene, alone)
+    return _KEPT[key]
