@@ -1,5 +1,5 @@
-"""Stage: the files of the paper's system as a method of the planner, from the run's policies'
-chart, the first of them, and the sub-manifolds.
+"""Stage: the files of the paper's system as a method of the planner, from the run's manifold, the
+first of its policies and the sub-manifolds.
 """
 
 import sys
@@ -7,12 +7,11 @@ import sys
 from safetensors.numpy import load_file
 
 from constraint_geodesics.geodesics.learned_method import LearnedFiles
-from constraint_geodesics.learning.learned_manifold import chart_named
+from constraint_geodesics.learning.inference import WEIGHTS
 from constraint_geodesics.learning.submanifold import GraphSubmanifold, load_submanifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
-from constraint_geodesics.scene.scene import robot_from
 from constraint_geodesics.search.roadmap import Roadmap
 
 
@@ -26,9 +25,9 @@ def main(params: Params, layout: Layout) -> None:
         if isinstance(g, GraphSubmanifold)
     }
     name, settings = params.policies.chart, params.policy_settings()
-    chart = chart_named(name, layout.manifold(name), robot_from(params.robot))
+    weights = load_file(layout.manifold(manifold) / WEIGHTS)
     policy = load_file(layout.policies(name) / f"policy-{settings.seeds[0]}.safetensors")
-    files = LearnedFiles(params.robot, settings, chart.arrays(), policy, submanifolds)
+    files = LearnedFiles(params.robot, name, settings, weights, policy, submanifolds)
     files.write(layout.learned)
 
 

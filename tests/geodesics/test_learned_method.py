@@ -17,7 +17,7 @@ from constraint_geodesics.geodesics.learned_method import (
     CARD,
     FOLDER,
     MANIFOLD,
-    POLICIES,
+    POLICY,
     SUBMANIFOLDS,
     read_learned,
 )
@@ -92,12 +92,12 @@ def test_an_unknown_method_is_misuse() -> None:
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     packaged_learned().write(tmp_path)
-    for name in (CARD, MANIFOLD, POLICIES, SUBMANIFOLDS):
+    for name in (CARD, MANIFOLD, POLICY, SUBMANIFOLDS):
         original = bundle.PACKAGED / FOLDER / name
         assert (tmp_path / name).read_bytes() == original.read_bytes()
-    content = (tmp_path / POLICIES).read_bytes()
-    (tmp_path / POLICIES).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    with pytest.raises(BundleError, match=POLICIES):
+    content = (tmp_path / POLICY).read_bytes()
+    (tmp_path / POLICY).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    with pytest.raises(BundleError, match=POLICY):
         read_learned(tmp_path)
 
 

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.graph_search import CombinedSolver, GraphSolver
-from constraint_geodesics.geodesics.policy_search import Actor, PolicySolver
+from constraint_geodesics.geodesics.policy_search import Actor, PolicySolver, TrainedPolicy
 from constraint_geodesics.geodesics.problem import ChartBox, ChartProblem
 from constraint_geodesics.geodesics.solver import geodesics_between
 from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
@@ -181,7 +181,7 @@ def test_policy_search_is_a_solver_like_the_others(params, tmp_path) -> None:
     small = params.geodesics.model_copy(update={"steps": 5120, "rollouts": 8})
     task = AnalyticTask("torus", curve_family(2, small), small, 0, tmp_path, nullcontext(Quiet()))
     result = run_analytic(task)
-    solver = PolicySolver(result.policy.actor, small)
+    solver = PolicySolver(result.policy.mean, small)
     problem = ChartProblem(Torus(), CUBIC, ChartBox((-1.0, -1.0), (1.0, 1.0)))
     ends = problem.sample_ends(4, np.random.default_rng(0))
     found = geodesics_between(solver, problem, ends.z_start, ends.z_goal)
@@ -325,18 +325,19 @@ def test_what_a_graph_found_is_not_lost_to_a_descent_that_sees_no_border() -> No
 
 
 def test_a_policy_takes_the_near_image_of_a_goal(params) -> None:
-    actor = Actor(CUBIC.coefficients + 7, (4,), CUBIC.coefficients)
+    actor = Actor(CUBIC.coefficients + 8, (4,), CUBIC.coefficients)
+    mean = TrainedPolicy(actor, []).mean
     small = params.geodesics.model_copy(update={"rollouts": 2, "episode_steps": 1})
     problem = ChartProblem(Sphere(), CUBIC, WHOLE["sphere"][1])
     (found,) = geodesics_between(
-        PolicySolver(actor, small), problem, np.array([[0.0, 3.0]]), np.array([[0.0, -3.0]])
+        PolicySolver(mean, small), problem, np.array([[0.0, 3.0]]), np.array([[0.0, -3.0]])
     )
     assert found.length == pytest.approx(2 * math.pi - 6, rel=1e-6)
     assert found.straight_length == pytest.approx(2 * math.pi - 6, rel=1e-6)
     with pytest.raises(
         GeometryError, match="the policy changes 4 coefficients: must be those of the curve, 8"
     ):
-        PolicySolver(actor, small).solve(
+        PolicySolver(mean, small).solve(
             replace(problem, curve=PinnedPolynomial(2, 5)), problem.ends(*np.zeros((2, 1, 2)))
         )
 

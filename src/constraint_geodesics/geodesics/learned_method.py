@@ -31,9 +31,10 @@ from constraint_geodesics.geodesics.problem import Ends
 from constraint_geodesics.geodesics.proposals import MeanPolicy, Met, rounds
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.inference import FrozenManifold
-from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.learning.learned_manifold import JOINT_SPACE, LearnedManifold, joint_space
 from constraint_geodesics.learning.lift import closely
 from constraint_geodesics.params import GeodesicParams, RobotParams
+from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.search.band import ACCURACY, step_lengths
 from constraint_geodesics.search.candidates import (
     Answer,
@@ -68,11 +69,12 @@ _SLACK_RAD = 1e-9
 
 @dataclass(frozen=True)
 class LearnedFiles:
-    """What the method is made of: the robot it was trained for, the policy's settings, the arrays
-    of the networks, and the sub-manifolds' graphs by constraint.
+    """What the method is made of: the robot it was trained for, the name of the policy's chart and
+    its settings, the arrays of the networks, and the sub-manifolds' graphs by constraint.
     """
 
     robot: RobotParams
+    chart: str
     settings: GeodesicParams
     manifold: Mapping[str, np.ndarray]
     policy: Mapping[str, np.ndarray]
@@ -82,6 +84,7 @@ class LearnedFiles:
         """Write all files."""
         card = {
             "robot": self.robot.model_dump(mode="json"),
+            "chart": self.chart,
             "policy": self.settings.model_dump(mode="json"),
         }
         arrays = {
@@ -100,13 +103,13 @@ def read_learned(folder: Path) -> LearnedFiles:
     names = (MANIFOLD, POLICY, SUBMANIFOLDS)
     card, arrays = read_files(folder / CARD, FORMAT, names)
     try:
-        robot = RobotParams.model_validate(card["robot"])
+        robot, chart = RobotParams.model_validate(card["robot"]), str(card["chart"])
         settings = GeodesicParams.model_validate(card["policy"])
     except (KeyError, ValidationError) as error:
         about = " ".join(str(error).split())[:200]
         raise BundleError(f"{folder / CARD}: not a learned method's card: {about}") from None
     manifold, policy, graphs = (arrays[name] for name in names)
-    return LearnedFiles(robot, settings, manifold, policy, roadmaps_of(graphs))
+    return LearnedFiles(robot, chart, settings, manifold, policy, roadmaps_of(graphs))
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,7 @@ class LearnedMethod:
         self.files = files
         self.roadmaps: Mapping[str, Roadmap] | None = files.submanifolds
         learned = FrozenManifold(files.manifold)
-        self.draw = learned.draw if learned.knows_data else None
+        self.draw = learned.draw
         self._problems: dict[int, LearnedProblem] = {}
 
     @classmethod
@@ -165,11 +168,13 @@ class LearnedMethod:
         return cls(files)
 
     @cached_property
-    def _networks(self) -> tuple[LearnedManifold, MeanPolicy]:
-        return (
-            LearnedManifold.from_arrays(self.files.manifold),
-            MeanPolicy.from_arrays(self.files.policy),
-        )
+    def _policy(self) -> MeanPolicy:
+        return MeanPolicy.from_arrays(self.files.policy)
+
+    def _chart(self, robot: SerialRobot) -> LearnedManifold:
+        if self.files.chart == JOINT_SPACE:
+            return joint_space(robot)
+        return LearnedManifold.from_arrays(self.files.manifold)
 
     def _problem(self, task: Task) -> LearnedProblem:
         key = id(task.manifold)  # the problem holds the manifold, so that its id stays its own
@@ -178,7 +183,7 @@ class LearnedMethod:
             return kept
         while len(self._problems) >= KEPT:
             self._problems.pop(next(iter(self._problems)))
-        learned, settings = self._networks[0], self.files.settings
+        learned, settings = self._chart(task.manifold.robot), self.files.settings
         curve, degree = PinnedPolynomial(learned.dim, settings.degree), settings.length_degree
         past = _free_configurations(task)
         space = learned, task.manifold, curve, past, degree, True, 0.0
@@ -193,7 +198,7 @@ class LearnedMethod:
         """
         problem = self._problem(task)
         ends = problem.ends(start[None], goal[None])
-        policy, settings = self._networks[1], self.files.settings
+        policy, settings = self._policy, self.files.settings
         for met in rounds(problem, policy, settings, ends, np.random.default_rng(0)):
             yield tuple(LatentCurve(problem, ends, met.phi[k]) for k in self.chosen(met))
 

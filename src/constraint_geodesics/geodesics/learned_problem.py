@@ -28,7 +28,14 @@ from constraint_geodesics.geometry.curves import CurveFamily
 from constraint_geodesics.geometry.length import Collocation, Quadrature
 from constraint_geodesics.geometry.manifold import GeometryError
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
-from constraint_geodesics.learning.lift import Lifted, as_executed, corrected, densify, retracted
+from constraint_geodesics.learning.lift import (
+    Lifted,
+    as_executed,
+    closely,
+    corrected,
+    densify,
+    retracted,
+)
 from constraint_geodesics.scene.clearance import NO_CLEARANCE, ClearanceModel
 
 Paths = Float[np.ndarray, "B S D"]

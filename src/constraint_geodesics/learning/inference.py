@@ -48,11 +48,6 @@ class FrozenManifold:
         decoded = perceptron(self.arrays, "decoder", np.asarray(z, np.float32))
         return (self.arrays["centre"] + self.arrays["scale"] * decoded).astype(np.float64)
 
-    @property
-    def knows_data(self) -> bool:
-        """Whether it was trained on data, whose spread it knows."""
-        return len(self.arrays["precision.centres"]) > 0
-
     def draw(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count D"]:
         """Configurations spread like the training data [rad]."""
         return self.decode(self.sample(count, rng))

@@ -111,15 +111,9 @@ class LearnedManifold:
         }
         (folder / CARD).write_text(json.dumps(card, indent=2, sort_keys=True) + "\n")
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The network's state, as `from_arrays` reads it."""
-        return {name: values.numpy() for name, values in self.vae.state_dict().items()}
-
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> "LearnedManifold":
-        """From the arrays of a network's state, whose shapes say how large it is; one without
-        variance centres is a `JointManifold`.
-        """
+        """From the arrays of a network's state, whose shapes say how large it is."""
         layers = sorted(
             int(name.split(".")[2])
             for name in arrays
@@ -128,12 +122,10 @@ class LearnedManifold:
         hidden = [len(arrays[f"encoder.nonlinear.{layer}.bias"]) for layer in layers[:-1]]
         centres, latent_dim = arrays["precision.centres"].shape
         vae = JointVae(len(arrays["centre"]), latent_dim, hidden, centres)
-        vae = vae if centres else vae.double()
         vae.load_state_dict(
             {name: torch.from_numpy(np.array(values)) for name, values in arrays.items()}
         )
-        vae = vae.eval().requires_grad_(False)
-        return cls(vae) if centres else JointManifold(vae)
+        return cls(vae.eval().requires_grad_(False))
 
     @classmethod
     def load(cls, folder: Path) -> "LearnedManifold":
@@ -202,6 +194,9 @@ class JointManifold(LearnedManifold):
 
 def chart_named(name: str, folder: Path, robot: SerialRobot) -> LearnedManifold:
     """The robot's joint space for JOINT_SPACE, else the learned manifold saved in `folder`."""
-    if name != JOINT_SPACE:
-        return LearnedManifold.load(folder)
+    return joint_space(robot) if name == JOINT_SPACE else LearnedManifold.load(folder)
+
+
+def joint_space(robot: SerialRobot) -> JointManifold:
+    """The chart of all configurations within the robot's limits."""
     return JointManifold.of(robot.sample(SPREAD_OVER, np.random.default_rng(0)))
