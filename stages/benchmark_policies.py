@@ -12,7 +12,7 @@ from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import robot_from
-from constraint_geodesics.studies.proposals import PolicyTask, policy_figures, run_policies
+from constraint_geodesics.studies.proposals import PolicyTask, grouped_figures, run_policies
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "benchmark_policies"
@@ -37,20 +37,7 @@ def main(params: Params, layout: Layout) -> None:
             file.parent.mkdir(parents=True, exist_ok=True)
             rows.round(6).to_csv(file, index=False, compression={"method": "gzip", "mtime": 0})
         every = pd.concat(tables, ignore_index=True)
-        figures = {
-            group: {
-                scene: policy_figures(rows)
-                for scene, rows in every[every["constraint"].isin(names)].groupby("scene")
-            }
-            for group, names in groups(params).items()
-        }
-        run.report(figures, layout.report(STAGE, "policies"))
-
-
-def groups(params: Params) -> dict[str, list[str]]:
-    """Every constraint alone, those trained on together, and those that were not."""
-    own = {name: [name] for name in params.all_constraints}
-    return own | {"trained on": list(params.constraints), "never seen": list(params.unseen)}
+        run.report(grouped_figures(every, params), layout.report(STAGE, "policies"))
 
 
 if __name__ == "__main__":

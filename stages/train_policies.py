@@ -25,9 +25,13 @@ from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_s
 STAGE = "train_policies"
 
 
-def main(params: Params, layout: Layout, chart: str) -> None:
+def main(params: Params, layout: Layout) -> None:
     """Write data/policies/<chart>/, learning curves and figures."""
-    scene, settings = Scene.from_params(params), params.policy_settings()
+    scene, settings, chart = (
+        Scene.from_params(params),
+        params.policy_settings(),
+        params.policies.chart,
+    )
     sources = [layout.joints(name) for name in params.constraints]
     space = chart_named(chart, layout.manifold(chart), scene.robot)
     problem = training_problem(

@@ -120,8 +120,9 @@ REFUSED: list[tuple[Change, tuple[str, ...]]] = [
     ),
     (
         lambda p: p["policies"]["ppo"].update(batch_size=5000),
-        ("policies.ppo.batch_size=5000", "at most 2560"),
+        ("policies.ppo.batch_size=5000", "at most 1536"),
     ),
+    (lambda p: p["policies"].update(chart="paprika"), ("policies.chart='paprika'", "joint_space")),
     (lambda p: p["execution"].update(least_tilt_rad=4.0), ("execution.least_tilt_rad=4.0", "π")),
     (
         lambda p: p["studies"].update(constraint="free"),

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator
 from xml.etree.ElementTree import ParseError
 
+from constraint_geodesics.learning.learned_manifold import JOINT_SPACE
 from constraint_geodesics.params import Params, ParamsError
 from constraint_geodesics.peers import registry
 from constraint_geodesics.peers.baseline import BaselineError
@@ -65,12 +66,16 @@ def _problems(params: Params) -> Iterator[str]:
             )
     for block in ("geodesics", "policies"):
         settings = getattr(params, block)
-        rows = params.geodesics.environments * settings.ppo.rollout_steps
+        rows = settings.environments * settings.ppo.rollout_steps
         if settings.ppo.batch_size > rows:
             yield (
                 f"{block}.ppo.batch_size={settings.ppo.batch_size}: must be at most {rows}, "
-                f"geodesics.environments times rollout_steps"
+                f"{block}.environments times rollout_steps"
             )
+    chart = params.policies.chart
+    if chart != JOINT_SPACE and chart not in params.manifolds:
+        known = ", ".join([JOINT_SPACE, *sorted(params.manifolds)])
+        yield f"policies.chart={chart!r}: must be one of {known}"
     if not execution.least_tilt_rad < math.pi:
         yield f"execution.least_tilt_rad={execution.least_tilt_rad}: must be below π"
     carried = params.studies.constraint

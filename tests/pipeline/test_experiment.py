@@ -27,7 +27,7 @@ REPORT, CURVES = "reports/train_analytic/plane.json", "reports/train_analytic/pl
 IN_PLACE = {
     "train_analytic@sphere": STAGE,
     "reports/train_analytic/sphere.json": REPORT,
-    "reports/train_policies/planner-learning.csv": CURVES,
+    "reports/train_policies/joint_space-learning.csv": CURVES,
     "tilt-5": NAME,
     "tilt-5-temp": NAME,
 }

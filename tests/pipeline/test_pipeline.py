@@ -23,7 +23,7 @@ from tests.recording.files import same_recordings
 
 pytestmark = pytest.mark.timeout(1200)
 
-SHARED = {"train_policies@planner", "build_planner", "build_learned", "record_paths", "report"}
+SHARED = {"train_policies", "build_planner", "build_learned", "record_paths", "report"}
 """What is made from all constraints together."""
 STUDIES = """
 import importlib, sys
@@ -35,7 +35,7 @@ for name, *items in (
     ("ablate_manifold", "paper"),
     ("ablate_manifold", "planner"),
     ("benchmark_geometry", "planner", "level_cup"),
-    ("benchmark_policies", "planner"),
+    ("benchmark_policies",),
     ("report",),
 ):
     importlib.import_module(name).main(load_params(), Layout(), *items)

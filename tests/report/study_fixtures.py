@@ -12,29 +12,34 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.arms_page import TABLES
 from constraint_geodesics.studies.arm_parts import figures, table_of
 from constraint_geodesics.studies.execution import PLANNED, STRAIGHT
-from constraint_geodesics.studies.proposals import policy_figures, policy_table
+from constraint_geodesics.studies.proposals import POLICY, RANDOM, grouped_figures
 
 
-def policy_rows() -> pd.DataFrame:
-    """Rows of `policy_rows`: the policy solves both queries, the straight line one of them."""
+def policy_rows(params: Params) -> pd.DataFrame:
+    """Rows of `run_policies`: the policy solves both queries of each constraint, random curves one
+    of them.
+    """
+    answers = ((POLICY, 0, 2.02), (POLICY, 1, 2.04), (RANDOM, 0, 2.2), (RANDOM, 1, np.nan))
     return pd.DataFrame(
         [
             {
-                "method": method,
+                "constraint": constraint,
+                "scene": scene,
                 "query": query,
+                "method": method,
                 "seed": 0,
-                "feasible": feasible,
+                "solved": np.isfinite(length),
                 "length_rad": length,
-                "optimum_rad": 2.0,
+                "best_rad": 2.0,
+                "optimum_rad": 2.0 if constraint == params.studies.constraint else np.nan,
                 "curves": 5,
+                "checked": 1,
+                "search_ms": 3.0,
                 "time_ms": 4.0,
             }
-            for method, query, feasible, length in (
-                ("policy", 0, True, 2.02),
-                ("policy", 1, True, 2.04),
-                ("straight line", 0, True, 2.2),
-                ("straight line", 1, False, np.nan),
-            )
+            for constraint in params.all_constraints
+            for scene in ("table", "keep_out")
+            for method, query, length in answers
         ]
     )
 
@@ -91,11 +96,9 @@ def write_arm_report(layout: Layout) -> None:
 
 def write_study_reports(params: Params, layout: Layout) -> None:
     """reports/benchmark_policies and execute_paths of this layout."""
-    policies = policy_figures(
-        policy_table(policy_rows()).assign(constraint=params.studies.constraint)
-    )
+    policies = grouped_figures(policy_rows(params), params)
     for file, content in (
-        (layout.report("benchmark_policies", params.geodesics.searched[0]), policies),
+        (layout.report("benchmark_policies", "policies"), policies),
         (layout.report("execute_paths", params.studies.constraint), execution_figures()),
     ):
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -291,13 +291,17 @@ def _draw_components(
 
 
 def _draw_learning(params: Params, layout: Layout) -> Drawn:
-    panels: dict[str, dict[str, pd.DataFrame]] = {}
+    chart, own = params.policies.chart, dict[str, dict[str, pd.DataFrame]]()
+    shared = pd.read_csv(layout.report("train_policies", f"{chart}-learning", "csv"))
+    panels = {"all constraints": {chart: shared}}
     for manifold, constraint in searched_items(params):
-        file = layout.report("train_geodesics", f"{manifold}-{constraint}-learning", "csv")
-        panels.setdefault(constraint, {})[manifold] = pd.read_csv(file)
+        if not params.manifolds[manifold].retract:
+            file = layout.report("train_geodesics", f"{manifold}-{constraint}-learning", "csv")
+            own.setdefault(constraint, {})[manifold] = pd.read_csv(file)
+    panels |= own
     caption = (
         "How much less the best curve of an episode costs than the straight line, mean over the "
-        "episodes of a rollout; line and band: mean and standard deviation over the seeds."
+        "episodes since the row before; line and band: mean and standard deviation over the seeds."
     )
     figure = figures.learning_curves(panels)
     return Drawn("learning_curves", "Policy search while it learns", caption, figure)

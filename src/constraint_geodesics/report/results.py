@@ -145,7 +145,7 @@ def result_table(layout: Layout) -> str:
 
 def studies_at_hand(params: Params, layout: Layout) -> frozenset[str]:
     """Which studies of `make bench` have left all of their reports: the pipeline runs without."""
-    manifold, analytic = params.geodesics.searched[0], map(str, params.geodesics.analytic)
+    analytic = map(str, params.geodesics.analytic)
     files = {
         "geometry": [
             layout.root / "reports" / "geometry.json",
@@ -155,7 +155,7 @@ def studies_at_hand(params: Params, layout: Layout) -> frozenset[str]:
             *(layout.report("ablate_analytic", name) for name in analytic),
             *(layout.report("ablate_manifold", name) for name in params.manifolds),
         ],
-        "policies": [layout.report("benchmark_policies", manifold)],
+        "policies": [layout.report("benchmark_policies", "policies")],
         "arms": [layout.root / "reports" / "arms.json"],
         "manifolds": [layout.root / "reports" / "compare_manifolds.json"],
     }

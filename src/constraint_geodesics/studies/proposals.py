@@ -398,6 +398,21 @@ def policy_figures(rows: pd.DataFrame) -> dict[str, Any]:
     return figures
 
 
+def grouped_figures(rows: pd.DataFrame, params: Params) -> dict[str, Any]:
+    """`policy_figures` by group and scene: of every constraint alone, of those that policies were
+    trained on together, and of those that they were not.
+    """
+    own = {name: [name] for name in params.all_constraints}
+    groups = own | {"trained on": list(params.constraints), "never seen": list(params.unseen)}
+    return {
+        group: {
+            str(scene): policy_figures(found)
+            for scene, found in rows[rows["constraint"].isin(names)].groupby("scene")
+        }
+        for group, names in groups.items()
+    }
+
+
 def _p95(values: pd.Series) -> float:
     return float(values.quantile(0.95))
 
