@@ -205,12 +205,13 @@ def test_several_shapes_leave_the_smallest_distance() -> None:
 
 
 def test_a_kind_is_known_in_its_own_file_and_among_the_shapes() -> None:
-    """A new kind takes two files.  The benchmarks choose a sphere as what stands in the way, so
-    does the warm-up; the proof of collisions is tried among spheres and boxes, ways among thin
-    boxes.
+    """A new kind takes two files.  The benchmarks choose a sphere as what stands in the way, so do
+    the warm-up and the training of policies; the proof of collisions is tried among spheres and
+    boxes, ways among thin boxes.
     """
     package = Path(__file__).resolve().parents[2] / "src" / "constraint_geodesics"
     chosen = {"benchmark/queries.py", "benchmark/runner.py", "studies/growth.py", "kernel_jobs.py"}
+    chosen |= {"geodesics/obstacles.py"}
     tried = {"studies/collision_proof.py"}
     others = {Sphere: chosen | tried, Box: tried | {"studies/thin_shapes.py"}}
     for kind in (Box, Sphere, Capsule, Body):

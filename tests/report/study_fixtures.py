@@ -31,7 +31,9 @@ def policy_rows(params: Params) -> pd.DataFrame:
                 "solved": np.isfinite(length),
                 "length_rad": length,
                 "best_rad": 2.0,
-                "optimum_rad": 2.0 if constraint == params.studies.constraint else np.nan,
+                "optimum_rad": 2.0
+                if (constraint, scene) == (params.studies.constraint, "table")
+                else np.nan,
                 "curves": 5,
                 "checked": 1,
                 "search_ms": 3.0,

@@ -19,12 +19,21 @@ def reported(params, tmp_path_factory):
     return params, layout
 
 
-def test_policies_are_compared_where_every_method_answers(reported):
-    (block,) = policy_blocks(*reported)
-    rows = {row[0]: row[1:] for row in block.rows}
-    assert rows["policy"] == ["100.0%", "1.0100", "1.0100", "1.0100", "5", "4"]
-    assert rows["straight line"][:2] == ["50.0%", "1.1000"]
-    assert "ratios over the 1 that every method solves" in block.note
+def test_policies_are_compared_over_what_anything_solves(reported):
+    params, _ = reported
+    blocks = policy_blocks(*reported)
+    first = blocks[0]
+    rows = {row[0]: row[1:] for row in first.rows}
+    cells = ["100.0%", "100.0% to 100.0%", "1.0150", "1.0195", "5", "4", "", ""]
+    assert rows["policy"] == cells
+    cells = ["50.0%", "50.0% to 50.0%", "1.1000", "1.1000", "5", "4", "100%", "100%"]
+    assert rows["random curves, same time"] == cells
+    assert "2 queries, 2 of which anything solves" in first.note
+    assert "the family's shortest curve" in first.note
+    others = {block.title: block.note for block in blocks[1:]}
+    assert len(others) == 1 + len(params.unseen) + 3
+    assert all("the shortest certified path known" in note for note in others.values())
+    assert any("one sphere on the way" in title for title in others)
 
 
 def test_the_cup_on_both_paths(reported):
@@ -43,4 +52,4 @@ def test_markdown_holds_every_row(reported):
     text = execution_markdown(*reported)
     assert "| straight joint line" in text
     assert "| planned path" in text
-    assert "| straight line" in policies_markdown(*reported)
+    assert "| random curves, same time" in policies_markdown(*reported)

@@ -112,7 +112,7 @@ def test_a_bad_space_is_one_line_with_the_entry(tmp_path, text, said) -> None:
         ({"policies.steps.more": 1}, "policies.steps.more=1: there is no such parameter"),
         ({"policies.reward.b": -1}, "policies.reward.b=-1: "),
         ({"geodesics.degree": 3.5}, "geodesics.degree=3.5: "),
-        ({"policies.reward.length_weight": 0.8}, "must lie in"),
+        ({"policies.reward.length_weight": 0.9}, "must lie in"),
     ],
 )
 def test_a_value_that_params_cannot_have_is_one_line(changes, said) -> None:
