@@ -353,9 +353,10 @@ over the family's shortest curve, over the seed's own answers, and median time [
 def seed_figures(rows: pd.DataFrame) -> pd.DataFrame:
     """One row a method and seed, of any rows of `run_policies`: the columns of SHARES."""
     able = rows[rows["best_rad"].notna()]
+    # of some queries alone it would be no figure of all
+    optimum = able["optimum_rad"] if able["optimum_rad"].notna().all() else np.nan
     able = able.assign(
-        ratio=able["length_rad"] / able["best_rad"],
-        over_optimum=able["length_rad"] / able["optimum_rad"],
+        ratio=able["length_rad"] / able["best_rad"], over_optimum=able["length_rad"] / optimum
     )
     groups = able.groupby(["method", "seed"], sort=False)
     return groups.agg(
