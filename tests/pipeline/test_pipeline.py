@@ -170,7 +170,8 @@ def test_runs_are_grouped_in_mlflow(finished: Path) -> None:
         LEARNED,
         LEARNED.replace("seed0", "seed1"),
     }
-    assert len(client.get_metric_history(parent.info.run_id, "seeds/saving_mean")) > 1
+    shared = parents["train_policies joint_space"]
+    assert len(client.get_metric_history(shared.info.run_id, "seeds/saving_mean")) > 1
     assert parent.data.tags["dvc_stage"] == "train_geodesics@planner-level_cup"
     assert {run.info.status for run in runs} == {"FINISHED"}
 
