@@ -1,7 +1,8 @@
 """Geodesics by a shortest path on a graph over points of the manifold: data, or a grid for N = 2.
 
 The path is fitted with one curve of the problem's family; `CombinedSolver` then lets it slide down
-to a geodesic.
+to a geodesic.  Among walls that family may not follow the path: there a spline with as many pieces
+as the path has steps does (`taut`).
 """
 
 import time
@@ -11,17 +12,25 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.problem import ChartProblem, Ends, Geodesic
 from constraint_geodesics.geodesics.solver import (
+    LENGTH_TOLERANCE,
     Candidates,
     Work,
     nearest_image,
     shortest_of,
     with_goals_bits,
+)
+from constraint_geodesics.geodesics.taut import (
+    Corners,
+    Taut,
+    drawn_along,
+    pulled_along,
+    stays_inside,
 )
 from constraint_geodesics.geometry.curves import CurveFamily, Curves, PinnedPolynomial
 from constraint_geodesics.geometry.graph import nearest_neighbour_edges, shortest_path
@@ -31,6 +40,7 @@ from constraint_geodesics.geometry.manifold import (
     EmbeddedManifold,
     GeometryError,
     Manifold,
+    WalledManifold,
     require_inside,
 )
 
@@ -38,10 +48,20 @@ FITTED = 129
 """Points of a graph's path that a curve is fitted to."""
 ON_EDGE = 65
 """Points of an edge that are looked up to tell whether it stays inside a bounded manifold."""
+ROOM = 0.05
+"""Distance to the walls that an edge keeps, in steps: one that touches a corner is no way."""
+EDGES = 8192
+"""Edges looked up at once."""
+NEAR_WALLS = 16
+"""Nodes of a grid that an end among walls is joined to: the nearest may be blocked."""
 KNIGHT = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
 """Steps to half of the 16 neighbours of a grid node: with 8 alone a path is up to 8 % too long,
 with 16 up to 3 %.
 """
+
+
+Ways = dict[int, Float[np.ndarray, "k N"]]
+"""Corners of a path for the queries that have one."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +113,8 @@ class GraphSolver:
             for low, high, count in zip(lower, upper, shape, strict=True)
         ]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-        return cls._with_edges(manifold, points, neighbours_on_grid(shape), 4)
+        links = NEAR_WALLS if isinstance(manifold, BoundedManifold) else 4
+        return cls._with_edges(manifold, points, neighbours_on_grid(shape), links)
 
     @classmethod
     def _with_edges(
@@ -106,21 +127,32 @@ class GraphSolver:
         offsets = nearest_image(manifold, points[edges[:, 1]] - points[edges[:, 0]])
         lengths = _straight_lengths(manifold, points[edges[:, 0]], offsets)
         kept = np.isfinite(lengths)
+        if isinstance(manifold, WalledManifold):
+            kept[kept] = _have_room(manifold, points[edges[kept, 0]], offsets[kept])
         return cls(manifold, points, edges[kept], lengths[kept], links)
 
     def solve(self, problem: ChartProblem, ends: Ends) -> list[Geodesic]:
         """The shortest path of the graph between each start and goal, as the nearest curve of the
         problem's family.
 
-        "not_connected" where there is no path, "not_found" where the family cannot follow it on the
+        Among walls (WalledManifold) a path that the family cannot follow is drawn as a spline of
+        many pieces, as `curve` of the record says.
+        "not_connected" where there is no path, "not_found" where no curve tried follows it on the
         manifold.
         """
         return _answers(self, problem, ends, None)
 
     def candidates(self, problem: ChartProblem, ends: Ends) -> Candidates:
         """Fitted curves of the queries that have a path."""
+        return self.fits(problem, ends, self.ways(ends))
+
+    def ways(self, ends: Ends) -> Ways:
+        """Corners of the shortest paths, of the queries that have one."""
         paths = map(self.path, ends.z_start, ends.z_goal)
-        ways = {query: path for query, path in enumerate(paths) if path is not None}
+        return {query: path for query, path in enumerate(paths) if path is not None}
+
+    def fits(self, problem: ChartProblem, ends: Ends, ways: Ways) -> Candidates:
+        """The paths as curves of the problem's family."""
         found = np.array(list(ways), dtype=np.int64)
         fits = [fitted(problem.curve, w, _sides(problem.manifold, w)) for w in ways.values()]
         phi = np.reshape(fits, (-1, problem.curve.coefficients))
@@ -173,7 +205,11 @@ class CombinedSolver:
     gradient: GradientSolver = field(default_factory=lambda: GradientSolver(starts=1))
 
     def solve(self, problem: ChartProblem, ends: Ends) -> list[Geodesic]:
-        """The shortest minimum from the graph's path and from the gradient's own starts."""
+        """The shortest minimum from the graph's path and from the gradient's own starts.
+
+        Among walls (WalledManifold) it is the path pulled tight as a spline of many pieces, as
+        `curve` of the record says, unless the path in the problem's family is as short.
+        """
         return _answers(self.graph, problem, ends, self.gradient)
 
 
@@ -181,24 +217,74 @@ def _answers(
     graph: GraphSolver, problem: ChartProblem, ends: Ends, gradient: GradientSolver | None
 ) -> list[Geodesic]:
     began = time.perf_counter()
-    fitted = graph.candidates(problem, ends)
+    ways = graph.ways(ends)
     results = [
         Geodesic.nothing("not_connected", problem.curve, start, goal)
         for start, goal in zip(ends.z_start, ends.z_goal, strict=True)
     ]
-    joined = fitted.query
-    if not len(joined):
+    if not ways:
         return results
-    own, among = replace(fitted, query=np.arange(len(joined))), ends[joined]
-    if gradient is None:
-        work = Work(1, len(joined), time.perf_counter() - began)
-        found = shortest_of(problem, among, own, np.ones(len(joined), dtype=bool), work)
+    fitted = graph.fits(problem, ends, ways)
+    own, among = replace(fitted, query=np.arange(len(ways))), ends[fitted.query]
+    manifold = problem.manifold
+    if gradient is None or isinstance(manifold, WalledManifold):
+        work = Work(1, len(ways), time.perf_counter() - began)
+        found = shortest_of(problem, among, own, np.ones(len(ways), dtype=bool), work)
     else:
-        starts = Candidates.join([own, gradient.candidates(problem, among)])
-        found = gradient.refine(problem, among, starts, given=own, began=began)
-    for query, result in zip(joined, found, strict=True):
+        simpler = gradient.simpler(problem, among)
+        starts = Candidates.join([own, *simpler, gradient.candidates(problem, among)])
+        given = Candidates.join([own, *simpler])
+        found = gradient.refine(problem, among, starts, given=given, began=began)
+    if isinstance(manifold, WalledManifold):
+        follow = _drawn if gradient is None else _tightened
+        found = [follow(manifold, *pair) for pair in zip(found, ways.values(), strict=True)]
+    for query, result in zip(ways, found, strict=True):
         results[query] = result
     return results
+
+
+def _drawn(manifold: WalledManifold, fit: Geodesic, way: Corners) -> Geodesic:
+    """The fitted curve where it stays on the manifold, a spline drawn along the path otherwise."""
+    began = time.perf_counter()
+    if fit.found and stays_inside(manifold, _curves(fit)):
+        return fit
+    return _with_spline(manifold, fit, drawn_along(manifold, way), began)
+
+
+def _tightened(manifold: WalledManifold, fit: Geodesic, way: Corners) -> Geodesic:
+    """The path pulled tight, or the fitted curve where that is as short."""
+    began = time.perf_counter()
+    taut = _with_spline(manifold, fit, pulled_along(manifold, way), began)
+    if not fit.found or not fit.length <= taut.length * (1 + LENGTH_TOLERANCE):
+        return taut
+    if not stays_inside(manifold, _curves(fit)):
+        return taut
+    return replace(taut, **{name: getattr(fit, name) for name in ("curve", "phi", "length")})
+
+
+def _curves(fit: Geodesic) -> Curves:
+    return Curves(fit.curve, *(torch.from_numpy(x) for x in (fit.phi, fit.start, fit.goal)))
+
+
+def _with_spline(
+    manifold: WalledManifold, fit: Geodesic, spline: Taut | None, began: float
+) -> Geodesic:
+    """The record of a fitted curve with a spline in its place; "not_found" without one."""
+    if spline is None:
+        spent = fit.time_s + time.perf_counter() - began
+        return replace(fit, status="not_found", length=np.nan, time_s=spent)
+    with torch.no_grad():
+        measured = estimate_length(manifold, spline.curves(), LENGTH_TOLERANCE)
+    return replace(
+        fit,
+        status="converged" if spline.converged else "iteration_limit",
+        curve=spline.curve,
+        phi=spline.phi,
+        length=float(measured.length),
+        iterations=fit.iterations + spline.steps,
+        evaluations=fit.evaluations + spline.steps + 1,
+        time_s=fit.time_s + time.perf_counter() - began,
+    )
 
 
 def neighbours_on_grid(shape: tuple[int, int]) -> Int[np.ndarray, "m 2"]:
@@ -247,6 +333,20 @@ def _straight_lengths(
         inside = manifold.contains((1 - t) * first[:, None] + t * last[:, None]).all(-1).numpy()
         lengths = np.where(inside, lengths, np.inf)
     return lengths
+
+
+def _have_room(
+    manifold: WalledManifold, start: Float[np.ndarray, "m N"], offset: Float[np.ndarray, "m N"]
+) -> Bool[np.ndarray, "m"]:
+    """Whether straight chart lines keep ROOM to the walls."""
+    t = torch.linspace(0.0, 1.0, ON_EDGE, dtype=torch.float64)[:, None]
+    parts = zip(
+        torch.from_numpy(start).split(EDGES), torch.from_numpy(offset).split(EDGES), strict=True
+    )
+    least = [
+        manifold.clearance(first[:, None] + t * step[:, None]).amin(-1) for first, step in parts
+    ]
+    return torch.cat(least).numpy() >= ROOM
 
 
 def _position(manifold: Manifold, points: Float[np.ndarray, "n N"]) -> Float[np.ndarray, "n A"]:
