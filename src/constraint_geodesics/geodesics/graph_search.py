@@ -5,15 +5,18 @@ to a geodesic.  Among walls that family may not follow the path: there a spline 
 as the path has steps does (`taut`).
 """
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
+from torch import Tensor
 
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.problem import ChartProblem, Ends, Geodesic
@@ -54,12 +57,10 @@ EDGES = 8192
 """Edges looked up at once."""
 NEAR_WALLS = 16
 """Nodes of a grid that an end among walls is joined to: the nearest may be blocked."""
-KNIGHT = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
-"""Steps to half of the 16 neighbours of a grid node: with 8 alone a path is up to 8 % too long,
-with 16 up to 3 %.
+REACH = 2
+"""Rows and columns that a grid's edges lead over at most: with 1, to 8 neighbours, a path is up to
+8 % too long, with 2, to 16, up to 3 %.
 """
-
-
 Ways = dict[int, Float[np.ndarray, "k N"]]
 """Corners of a path for the queries that have one."""
 
@@ -101,10 +102,11 @@ class GraphSolver:
         lower: Sequence[float],
         upper: Sequence[float],
         shape: tuple[int, int],
+        reach: int = REACH,
     ) -> "GraphSolver":
-        """Regular grid of a 2-D chart, every node joined to 16 around it; its borders are joined to
-        nothing, so that a periodic chart is better served by `over_points`.  Raises GeometryError
-        unless N = 2.
+        """Regular grid of a 2-D chart, every node joined to those around it that are up to `reach`
+        rows and columns away, to 16 by default; its borders are joined to nothing, so that a
+        periodic chart is better served by `over_points`.  Raises GeometryError unless N = 2.
         """
         if manifold.dim != 2:
             raise GeometryError(f"dim = {manifold.dim}: a grid is for 2; take over_points")
@@ -114,7 +116,7 @@ class GraphSolver:
         ]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
         links = NEAR_WALLS if isinstance(manifold, BoundedManifold) else 4
-        return cls._with_edges(manifold, points, neighbours_on_grid(shape), links)
+        return cls._with_edges(manifold, points, neighbours_on_grid(shape, reach), links)
 
     @classmethod
     def _with_edges(
@@ -287,13 +289,16 @@ def _with_spline(
     )
 
 
-def neighbours_on_grid(shape: tuple[int, int]) -> Int[np.ndarray, "m 2"]:
-    """Every node of a grid, numbered row by row, and those of the 16 around it that come after
-    it.
+def neighbours_on_grid(shape: tuple[int, int], reach: int = REACH) -> Int[np.ndarray, "m 2"]:
+    """Every node of a grid, numbered row by row, and those up to `reach` rows and columns away that
+    come after it and that no other node lies before.
     """
     numbers = np.arange(shape[0] * shape[1]).reshape(shape)
+    steps = product(range(reach + 1), range(-reach, reach + 1))
     pairs = []
-    for down, right in KNIGHT:
+    for down, right in steps:
+        if math.gcd(down, right) != 1 or (down, right) == (0, -1):
+            continue
         near = numbers[: shape[0] - down, max(0, -right) : shape[1] - max(0, right)]
         far = numbers[down:, max(0, right) : shape[1] + min(0, right)]
         pairs.append(np.stack([near.ravel(), far.ravel()], axis=-1))
@@ -323,16 +328,23 @@ def _straight_lengths(
     manifold: Manifold, start: Float[np.ndarray, "m N"], offset: Float[np.ndarray, "m N"]
 ) -> Float[np.ndarray, "m"]:
     """Length of straight chart lines; inf where one leaves the manifold or its metric."""
-    line, first = PinnedPolynomial(manifold.dim, 1), torch.from_numpy(start)
-    last = first + torch.from_numpy(offset)
+    parts = zip(
+        torch.from_numpy(start).split(EDGES), torch.from_numpy(offset).split(EDGES), strict=True
+    )
     with torch.no_grad():
-        lines = Curves(line, first.new_zeros(len(first), 0), first, last)
-        lengths = estimate_length(manifold, lines).length.numpy()
-    if isinstance(manifold, BoundedManifold):
-        t = torch.linspace(0.0, 1.0, ON_EDGE, dtype=first.dtype)[:, None]
-        inside = manifold.contains((1 - t) * first[:, None] + t * last[:, None]).all(-1).numpy()
-        lengths = np.where(inside, lengths, np.inf)
-    return lengths
+        lengths = [_lengths_of_lines(manifold, first, first + step) for first, step in parts]
+    return torch.cat(lengths).numpy()
+
+
+def _lengths_of_lines(manifold: Manifold, first: Tensor, last: Tensor) -> Tensor:
+    line = PinnedPolynomial(manifold.dim, 1)
+    lines = Curves(line, first.new_zeros(len(first), 0), first, last)
+    lengths = estimate_length(manifold, lines).length
+    if not isinstance(manifold, BoundedManifold):
+        return lengths
+    t = torch.linspace(0.0, 1.0, ON_EDGE, dtype=first.dtype)[:, None]
+    inside = manifold.contains((1 - t) * first[:, None] + t * last[:, None]).all(-1)
+    return torch.where(inside, lengths, torch.inf)
 
 
 def _have_room(

@@ -29,9 +29,7 @@ HALVINGS = 12
 """Times that a step which does not lower the value is halved."""
 RIDGE = 1e-9
 """What is added to the second derivatives, relative to the largest."""
-
-
-ATTEMPTS = ((1, 0.2, 0.2), (2, 0.25, 1.0), (4, 0.35, 3.0))
+ATTEMPTS = ((1, 0.2, 0.2), (2, 0.25, 1.0))
 """Pieces a step, and margin [steps] and height of the fence, tried until a curve is inside."""
 ITERATIONS = 60
 """Newton steps at most."""
@@ -39,6 +37,8 @@ TOLERANCE = 2e-5
 """Share of its value that a settled curve's last step gained at most."""
 LOOKED_UP = 32
 """Points a step that are looked up to tell whether a curve stays inside."""
+BLOCK = 4096
+"""Points looked up at once."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def pulled_along(manifold: WalledManifold, corners: Corners) -> Taut | None:
     on the manifold; what is drawn along it where none does.
     """
     for pieces, margin, height in ATTEMPTS:
-        fenced = manifold.fenced(margin, height)
+        fenced = manifold.fenced(margin, height, torch.from_numpy(corners[[0, -1]]))
         taut = pulled(fenced, _drawn(manifold, corners, pieces), ITERATIONS, TOLERANCE)
         if stays_inside(manifold, taut.curves()):
             return taut
@@ -95,7 +95,7 @@ def stays_inside(manifold: WalledManifold, curves: Curves) -> bool:
     # as many times between every two as the longest of them needs
     count = math.ceil(LOOKED_UP * float(sides.max()) / manifold.step) * len(sides)
     t = torch.linspace(0.0, 1.0, count + 1, dtype=torch.float64)
-    return bool(manifold.contains(curves.at(t)[0]).all())
+    return all(bool(manifold.contains(curves.at(part)[0]).all()) for part in t.split(BLOCK))
 
 
 def _drawn(manifold: WalledManifold, corners: Corners, pieces: int) -> Taut:

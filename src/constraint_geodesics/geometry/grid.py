@@ -21,6 +21,9 @@ Bounds = tuple[float, float]
 WALL = 100.0
 """How steeply g rises into blocked cells: in multiples of the largest free value, a step."""
 
+OPENING = 0.3
+"""How much of the distance from a door a fence takes back of its margin."""
+
 
 class GridError(GeometryError):
     """Arrays or bounds that are no grid of a metric; names the input and what is allowed."""
@@ -117,9 +120,13 @@ class GridManifold:
             factor = factor + self._slope * (-self._room(z)).clamp(min=0)
         return _conformal(factor)
 
-    def fenced(self, margin: float, height: float) -> "FencedGrid":
-        """The same metric with a fence that begins `margin` steps before walls and edge."""
-        return FencedGrid(self, margin, height)
+    def fenced(
+        self, margin: float, height: float, doors: Float[Tensor, "k N"] | None = None
+    ) -> "FencedGrid":
+        """The same metric with a fence that begins `margin` steps before walls and edge, and leaves
+        the doors free.
+        """
+        return FencedGrid(self, margin, height, doors)
 
     def clearance(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch"]:
         """Distance of each point to walls and edge in steps, negative beyond them; 0 on the border.
@@ -182,11 +189,14 @@ class FencedGrid:
 
     margin: steps from the border at which the fence begins.  height: how steep it is, in multiples
     of the grid's own walls; it rises with the square of the depth, so that its foot has no kink.
+    doors: points at which it stands back as far as they do, and returns to the margin with OPENING
+    of the distance from them: an end on the border would be thrown off it, and a spline swing out.
     """
 
     grid: GridManifold
     margin: float
     height: float
+    doors: Float[Tensor, "k 2"] | None = None
 
     dim = 2
 
@@ -194,8 +204,16 @@ class FencedGrid:
         """The matrix g(z) I, differentiable in z; finite and positive everywhere."""
         require_dim(z, self.dim, "z")
         grid = self.grid
-        depth = (self.margin - grid.clearance(z)).clamp(min=0)
+        depth = (self._foot(z) - grid.clearance(z)).clamp(min=0)
         return _conformal(grid._free(z) + self.height * grid._slope * depth.square())
+
+    def _foot(self, z: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*#batch"]:
+        """Steps from the border at which the fence begins at each point."""
+        foot = torch.tensor(self.margin, dtype=z.dtype, device=z.device)
+        for door in () if self.doors is None else self.doors.to(z):
+            far = torch.linalg.vector_norm(z - door, dim=-1) / self.grid.step
+            foot = torch.minimum(foot, self.grid.clearance(door).clamp(min=0) + OPENING * far)
+        return foot
 
 
 def _nodes(

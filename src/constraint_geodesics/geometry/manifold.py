@@ -104,9 +104,13 @@ class WalledManifold(BoundedManifold, Protocol):
         """Distance of each point to the border in steps, negative beyond it."""
         ...
 
-    def fenced(self, margin: float, height: float) -> Manifold:
+    def fenced(
+        self, margin: float, height: float, doors: Float[Tensor, "k N"] | None = None
+    ) -> Manifold:
         """The manifold with a fence that begins `margin` steps before its border, for descents that
         must not touch it; `height` times as steep as a plain one, and smooth.
+
+        doors: points that it leaves free, ends of curves that lie nearer to the border.
         """
         ...
 
