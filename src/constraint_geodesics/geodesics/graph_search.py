@@ -53,6 +53,8 @@ ON_EDGE = 65
 """Points of an edge that are looked up to tell whether it stays inside a bounded manifold."""
 ROOM = 0.05
 """Distance to the walls that an edge keeps, in steps: one that touches a corner is no way."""
+ROUNDING = 1e-9
+"""What a distance to the walls may be off by rounding, in steps."""
 EDGES = 8192
 """Edges looked up at once."""
 NEAR_WALLS = 16
@@ -129,8 +131,6 @@ class GraphSolver:
         offsets = nearest_image(manifold, points[edges[:, 1]] - points[edges[:, 0]])
         lengths = _straight_lengths(manifold, points[edges[:, 0]], offsets)
         kept = np.isfinite(lengths)
-        if isinstance(manifold, WalledManifold):
-            kept[kept] = _have_room(manifold, points[edges[kept, 0]], offsets[kept])
         return cls(manifold, points, edges[kept], lengths[kept], links)
 
     def solve(self, problem: ChartProblem, ends: Ends) -> list[Geodesic]:
@@ -343,22 +343,18 @@ def _lengths_of_lines(manifold: Manifold, first: Tensor, last: Tensor) -> Tensor
     if not isinstance(manifold, BoundedManifold):
         return lengths
     t = torch.linspace(0.0, 1.0, ON_EDGE, dtype=first.dtype)[:, None]
-    inside = manifold.contains((1 - t) * first[:, None] + t * last[:, None]).all(-1)
+    points = (1 - t) * first[:, None] + t * last[:, None]
+    inside = manifold.contains(points).all(-1)
+    if isinstance(manifold, WalledManifold):
+        inside &= _have_room(manifold, points)
     return torch.where(inside, lengths, torch.inf)
 
 
-def _have_room(
-    manifold: WalledManifold, start: Float[np.ndarray, "m N"], offset: Float[np.ndarray, "m N"]
-) -> Bool[np.ndarray, "m"]:
-    """Whether straight chart lines keep ROOM to the walls."""
-    t = torch.linspace(0.0, 1.0, ON_EDGE, dtype=torch.float64)[:, None]
-    parts = zip(
-        torch.from_numpy(start).split(EDGES), torch.from_numpy(offset).split(EDGES), strict=True
-    )
-    least = [
-        manifold.clearance(first[:, None] + t * step[:, None]).amin(-1) for first, step in parts
-    ]
-    return torch.cat(least).numpy() >= ROOM
+def _have_room(manifold: WalledManifold, points: Float[Tensor, "m T N"]) -> Bool[Tensor, "m"]:
+    """Whether lines keep ROOM to the walls, or what their ends have where that is less."""
+    clear = manifold.clearance(points)
+    ends = torch.minimum(clear[:, 0], clear[:, -1]).clamp(max=ROOM)
+    return clear.amin(-1) >= ends - ROUNDING
 
 
 def _position(manifold: Manifold, points: Float[np.ndarray, "n N"]) -> Float[np.ndarray, "n A"]:

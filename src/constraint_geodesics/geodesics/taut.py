@@ -6,8 +6,10 @@ with the path's length, not with its cube.
 """
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -68,24 +70,32 @@ class _Nodes(NamedTuple):
 
 
 def drawn_along(manifold: WalledManifold, corners: Corners) -> Taut | None:
-    """The spline of fewest pieces drawn along a polygon that stays on the manifold, if one does."""
-    for pieces, _, _ in ATTEMPTS:
-        drawn = _drawn(manifold, corners, pieces)
-        if stays_inside(manifold, drawn.curves()):
-            return drawn
-    return None
+    """The spline of fewest pieces drawn along a polygon that stays on the manifold; where none
+    does, one pulled tight, if that does.
+    """
+    return _first_inside(manifold, chain(_drawings(manifold, corners), _pulls(manifold, corners)))
 
 
 def pulled_along(manifold: WalledManifold, corners: Corners) -> Taut | None:
     """A spline pulled tight from a polygon, with pieces and fence of the first attempt that ends
     on the manifold; what is drawn along it where none does.
     """
+    return _first_inside(manifold, chain(_pulls(manifold, corners), _drawings(manifold, corners)))
+
+
+def _first_inside(manifold: WalledManifold, curves: Iterable[Taut]) -> Taut | None:
+    return next((taut for taut in curves if stays_inside(manifold, taut.curves())), None)
+
+
+def _drawings(manifold: WalledManifold, corners: Corners) -> Iterator[Taut]:
+    return (_drawn(manifold, corners, pieces) for pieces, _, _ in ATTEMPTS)
+
+
+def _pulls(manifold: WalledManifold, corners: Corners) -> Iterator[Taut]:
+    doors = torch.from_numpy(corners[[0, -1]])
     for pieces, margin, height in ATTEMPTS:
-        fenced = manifold.fenced(margin, height, torch.from_numpy(corners[[0, -1]]))
-        taut = pulled(fenced, _drawn(manifold, corners, pieces), ITERATIONS, TOLERANCE)
-        if stays_inside(manifold, taut.curves()):
-            return taut
-    return drawn_along(manifold, corners)
+        fenced = manifold.fenced(margin, height, doors)
+        yield pulled(fenced, _drawn(manifold, corners, pieces), ITERATIONS, TOLERANCE)
 
 
 def stays_inside(manifold: WalledManifold, curves: Curves) -> bool:
