@@ -166,7 +166,8 @@ def estimate_length(
 
     The estimate is twice the change from the rule of half the degree.  It is no bound: where a
     curve turns back both rules may err alike, and about one such curve in a hundred misses the
-    tolerance; on grids with walls, whose metric has kinks, far more do.  Curves that no degree
+    tolerance.  On a manifold with walls, whose metric has kinks, pieces are cut to STEPS of its
+    steps first.  Curves that no degree
     resolves keep the last length, and their estimate says so.  An embedding in single precision
     adds its rounding, about 1e-7 of its values.  Both are inf where a curve meets points at which
     the metric is not finite.

@@ -32,8 +32,8 @@ NODES = 150
 """Nodes along each axis."""
 LOW, HIGH = (-3.0, -3.0), (3.0, 3.0)
 QUERIES = 100
-FEW = 10
-"""Queries that the gradient is asked: it has no graph, and takes long."""
+SHARE = 10
+"""Queries to one that the gradient is asked as well: it has no graph, and takes long."""
 SEEDS = {"gaps": 0, "labyrinth": 5}
 """Of the metrics; their queries have the next."""
 SHAPE = PinnedPolynomial(2, 3)
@@ -145,8 +145,8 @@ def _figures(grid: WalledGrid, count: int, seed: int) -> dict[str, Any]:
     solvers: dict[str, tuple[GeodesicSolver, CurveFamily, int]] = {
         "combined": (CombinedSolver(graph), SHAPE, count),
         "graph": (graph, SHAPE, count),
-        "gradient, cubic": (gradient, SHAPE, min(FEW, count)),
-        "gradient, 4 segments": (gradient, PinnedSpline(2, 4), min(FEW, count)),
+        "gradient, cubic": (gradient, SHAPE, -(-count // SHARE)),
+        "gradient, 4 segments": (gradient, PinnedSpline(2, 4), -(-count // SHARE)),
     }
     found: dict[str, list[Geodesic]] = {}
     for name, (solver, family, asked) in solvers.items():
