@@ -154,15 +154,16 @@ def _figures(grid: WalledGrid, count: int, seed: int) -> dict[str, Any]:
         ends = zip(grid.points[start[:asked]], grid.points[goal[:asked]], strict=True)
         found[name] = [geodesics_between(solver, problem, a[None], b[None])[0] for a, b in ends]
     reference = _references(grid, start, goal, found["combined"])
-    return {name: _judged(manifold, curves, dijkstra, reference) for name, curves in found.items()}
+    return {name: judged(manifold, curves, dijkstra, reference) for name, curves in found.items()}
 
 
-def _judged(
+def judged(
     manifold: GridManifold,
     found: list[Geodesic],
     dijkstra: Float[np.ndarray, "B"],
     reference: Float[np.ndarray, "B"],
 ) -> dict[str, Any]:
+    """What a solver found of the first queries, over the lengths of two others."""
     usable = np.array([geodesic.found for geodesic in found])
     curves = [geodesic for geodesic in found if geodesic.found]
     chords, inside = _looked_at(manifold, curves)
