@@ -216,6 +216,23 @@ def test_a_way_of_one_node_along_the_edge_is_found() -> None:
         assert manifold.contains(points).all()
 
 
+@pytest.mark.parametrize("low", [-3.0, 0.1])
+def test_a_goal_on_the_edge_is_reached_to_the_bit(low) -> None:
+    """A sum of steps over such bounds ends a rounding beyond the edge."""
+    lower, upper = (low, low), (3.0, 3.0)
+    blocked = torch.zeros(30, 30, dtype=torch.bool)
+    blocked[10:12, :26] = True
+    manifold = GridManifold(torch.ones(30, 30).double(), lower, upper, blocked)
+    lattice = GraphSolver.over_grid(manifold, lower, upper, (30, 30))
+    nodes = manifold.nodes().numpy().reshape(30, 30, 2)
+    start, goal = nodes[[2, 3, 5, 7], [5, 9, 2, 8]], nodes[[29, 20, 23, 16], [3, 0, 0, 0]]
+    case = ChartProblem(manifold, CUBIC, ChartBox(lower, upper))
+    for solver in (lattice, CombinedSolver(lattice)):
+        for found, last in zip(geodesics_between(solver, case, start, goal), goal, strict=True):
+            assert found.found
+            np.testing.assert_array_equal(found.points(np.array([1.0]))[0], last)
+
+
 def test_what_only_touches_at_a_corner_is_not_joined() -> None:
     blocked = torch.zeros(8, 8, dtype=torch.bool)
     blocked[:4, 4:] = True

@@ -28,13 +28,7 @@ from constraint_geodesics.geodesics.solver import (
     shortest_of,
     with_goals_bits,
 )
-from constraint_geodesics.geodesics.taut import (
-    Corners,
-    Taut,
-    drawn_along,
-    pulled_along,
-    stays_inside,
-)
+from constraint_geodesics.geodesics.taut import Corners, Taut, drawn_along, pulled_along
 from constraint_geodesics.geometry.curves import CurveFamily, Curves, PinnedPolynomial
 from constraint_geodesics.geometry.graph import nearest_neighbour_edges, shortest_path
 from constraint_geodesics.geometry.length import estimate_length
@@ -158,14 +152,16 @@ class GraphSolver:
         found = np.array(list(ways), dtype=np.int64)
         fits = [fitted(problem.curve, w, _sides(problem.manifold, w)) for w in ways.values()]
         phi = np.reshape(fits, (-1, problem.curve.coefficients))
-        last = np.reshape([way[-1] for way in ways.values()], (-1, problem.curve.dim))
-        goals = with_goals_bits(last, ends.z_goal[found])
+        goals = np.reshape([way[-1] for way in ways.values()], (-1, problem.curve.dim))
         return Candidates(found, phi, ends.z_start[found], goals)
 
     def path(
         self, start: Float[np.ndarray, "N"], goal: Float[np.ndarray, "N"]
     ) -> Float[np.ndarray, "k N"] | None:
-        """Corners of the shortest path from start to an image of goal; None if not joined."""
+        """Corners of the shortest path from start to an image of goal; None if not joined.
+
+        A coordinate of the last that is no turn away from the goal's has its bits.
+        """
         n = len(self.nodes)
         tails, heads, lengths = self._links(start, goal)
         edges = np.concatenate([self.edges, np.stack([tails, heads], axis=-1)])
@@ -174,7 +170,9 @@ class GraphSolver:
             return None
         points = np.concatenate([self.nodes, start[None], goal[None]])[route]
         steps = nearest_image(self.manifold, np.diff(points, axis=0))
-        return start + np.concatenate([np.zeros((1, len(start))), np.cumsum(steps, axis=0)])
+        corners = start + np.concatenate([np.zeros((1, len(start))), np.cumsum(steps, axis=0)])
+        corners[-1] = with_goals_bits(corners[-1], goal)
+        return corners
 
     @cached_property
     def _tree(self) -> KDTree:
@@ -248,7 +246,7 @@ def _answers(
 def _drawn(manifold: WalledManifold, fit: Geodesic, way: Corners) -> Geodesic:
     """The fitted curve where it stays on the manifold, a spline drawn along the path otherwise."""
     began = time.perf_counter()
-    if fit.found and stays_inside(manifold, _curves(fit)):
+    if fit.found:
         return fit
     return _with_spline(manifold, fit, drawn_along(manifold, way), began)
 
@@ -259,13 +257,7 @@ def _tightened(manifold: WalledManifold, fit: Geodesic, way: Corners) -> Geodesi
     taut = _with_spline(manifold, fit, pulled_along(manifold, way), began)
     if not fit.found or not fit.length <= taut.length * (1 + LENGTH_TOLERANCE):
         return taut
-    if not stays_inside(manifold, _curves(fit)):
-        return taut
     return replace(taut, **{name: getattr(fit, name) for name in ("curve", "phi", "length")})
-
-
-def _curves(fit: Geodesic) -> Curves:
-    return Curves(fit.curve, *(torch.from_numpy(x) for x in (fit.phi, fit.start, fit.goal)))
 
 
 def _with_spline(
