@@ -141,17 +141,62 @@ def test_points_off_the_grid_and_not_finite_are_not_contained():
         require_inside(constant(), tensor([[0, 3], [9, 3]]), "z")
 
 
-def test_walls_rise_away_from_the_free_nodes():
+def test_walls_rise_away_from_the_free_cells():
     everywhere = [(row, column) for row in range(5) for column in range(1, 7)]
     grid = constant(g=3.0, blocked=wall(*everywhere))
     depths = grid.metric(grid.nodes())[:, 0, 0].reshape(5, 7) / 3.0
     torch.testing.assert_close(depths[:, 0], torch.ones(5).double(), rtol=1e-14, atol=0)
-    torch.testing.assert_close(
-        depths[:, 1:], WALL * torch.arange(1, 7).double().expand(5, 6), rtol=1e-14, atol=0
-    )
-    z = tensor([[0.1, 2.2], [0.3, 3.4], [-0.9, 4.9]]).requires_grad_()
+    # the border of the free cells lies halfway between the first and the second column
+    expected = 1 + WALL * (torch.arange(1, 7).double() - 0.5).expand(5, 6)
+    torch.testing.assert_close(depths[:, 1:], expected, rtol=1e-14, atol=0)
+    z = tensor([[0.1, 2.3], [0.3, 3.4], [-0.9, 4.9]]).requires_grad_()
     (gradient,) = torch.autograd.grad(grid.metric(z)[:, 0, 0].sum(), z)
     assert (gradient[:, 1] > 0).all()
+
+
+def test_free_cells_are_measured_by_free_values_alone():
+    grid = constant(g=3.0, blocked=wall((2, 3), (2, 4), (1, 1)))
+    z = torch.rand(2000, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    z = tensor(LOWER) + z * (tensor(UPPER) - tensor(LOWER))
+    free = grid.contains(z)
+    assert 0 < (~free).sum() < 300
+    factor = grid.metric(z)[:, 0, 0]
+    torch.testing.assert_close(factor[free], torch.full((int(free.sum()),), 3.0).double())
+    assert (factor[~free] > 3.0).all()
+
+
+def test_infinite_values_block_as_named_nodes_do():
+    values = torch.rand(5, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(3)) + 1
+    named = GridManifold(values, LOWER, UPPER, wall((1, 2), (3, 3)))
+    infinite = GridManifold(values.masked_fill(wall((1, 2), (3, 3)), math.inf), LOWER, UPPER)
+    both = GridManifold(values.masked_fill(wall((1, 2)), math.inf), LOWER, UPPER, wall((3, 3)))
+    z = tensor(LOWER) + torch.rand(500, 2, dtype=torch.float64) * 3.0
+    for grid in (infinite, both):
+        assert torch.equal(grid.contains(z), named.contains(z))
+        torch.testing.assert_close(grid.metric(z), named.metric(z), rtol=0, atol=0)
+        torch.testing.assert_close(grid.clearance(z), named.clearance(z), rtol=0, atol=0)
+
+
+def test_clearance_is_the_distance_to_walls_and_edge_in_steps():
+    grid = constant(blocked=wall(*[(row, 3) for row in range(5)]))  # cells from 3.25 to 3.75
+    z = tensor([[0, 3.5], [0, 3.25], [0.3, 3.0], [0.1, 2.7], [-0.8, 4.4], [0.0, 5.2], [0.95, 2.5]])
+    expected = tensor([-0.5, 0.0, 0.5, 1.1, 0.4, -0.4, 0.1])
+    torch.testing.assert_close(grid.clearance(z), expected, rtol=0, atol=1e-12)
+    z = torch.rand(2000, 2, dtype=torch.float64) * tensor([2.2, 3.2]) + tensor([-1.1, 1.9])
+    clear = grid.clearance(z)
+    assert grid.contains(z[clear > 0]).all()
+    assert not grid.contains(z[clear < 0]).any()
+
+
+def test_a_fence_stands_before_the_border_and_leaves_its_doors_free():
+    grid, door = constant(g=3.0, blocked=wall((2, 3))), tensor([[-1.0, 3.0]])
+    fenced, open_at = grid.fenced(0.2, 1.0), grid.fenced(0.2, 1.0, door)
+    z = tensor([[0.5, 2.5], [0.0, 3.2], [0.95, 2.5], [1.0, 4.0]])
+    factor = fenced.metric(z)[:, 0, 0]
+    assert (factor[:1] == 3.0).all(), "away from the border nothing changes"
+    assert (factor[1:] > 3.0).all()
+    torch.testing.assert_close(open_at.metric(z), fenced.metric(z), rtol=0, atol=0)
+    assert open_at.metric(door)[0, 0, 0] == 3.0 < fenced.metric(door)[0, 0, 0]
 
 
 def test_a_curve_relaxed_on_the_grid_goes_round_a_blocked_region():
@@ -263,7 +308,8 @@ def test_what_a_bounded_manifold_does_not_contain_is_blocked():
         ),
         (tensor([[1, -2], [1, 1]]), LOWER, UPPER, r"values\[0, 1\] = -2\.0"),
         (tensor([[1, 1], [1, math.nan]]), LOWER, UPPER, r"values\[1, 1\] = nan"),
-        (tensor([[math.inf, 1], [1, 1]]), LOWER, UPPER, r"values\[0, 0\] = inf"),
+        (tensor([[-math.inf, 1], [1, 1]]), LOWER, UPPER, r"values\[0, 0\] = -inf"),
+        (torch.full((2, 2), math.inf), LOWER, UPPER, "every node is, at least one must be free"),
     ],
 )
 def test_what_is_no_grid_is_refused(values, lower, upper, message):

@@ -10,8 +10,16 @@ from torch import Tensor
 
 from constraint_geodesics.geodesics.problem import ChartProblem, Ends, Geodesic
 from constraint_geodesics.geodesics.solver import Candidates, Work, goal_images, shortest_of
-from constraint_geodesics.geometry.length import Objective, energy_function, length_function, rules
-from constraint_geodesics.geometry.manifold import GeometryError
+from constraint_geodesics.geometry.curves import Curves, PinnedPolynomial
+from constraint_geodesics.geometry.length import (
+    Collocation,
+    Objective,
+    energy_function,
+    length_function,
+    resolved,
+    rules,
+)
+from constraint_geodesics.geometry.manifold import GeometryError, Manifold, WalledManifold
 
 BLOCK = 64
 """Curves whose second derivatives are taken at once."""
@@ -19,6 +27,8 @@ HAIR = 1e-3
 """Bend of the straight start over that of the others."""
 PROMISING = 1.2
 """Energy over the least one of the same query up to which a minimum is followed further."""
+FENCE = (0.2, 0.2)
+"""Where the fence before a wall begins [steps], and its height."""
 DAMPING = (1e-4, 1e8)
 """First damping, relative to the largest curvature of the energy, and the one at which a curve is
 given up.
@@ -55,7 +65,24 @@ class GradientSolver:
 
     def solve(self, problem: ChartProblem, ends: Ends) -> list[Geodesic]:
         """The shortest minimum found between each start and goal."""
-        return self.refine(problem, ends, self.candidates(problem, ends))
+        simpler = self.simpler(problem, ends)
+        starts = Candidates.join([*simpler, self.candidates(problem, ends)])
+        return self.refine(problem, ends, starts, given=simpler[0] if simpler else None)
+
+    def simpler(self, problem: ChartProblem, ends: Ends) -> list[Candidates]:
+        """The cubics found, as curves of a family that has more freedom; none for one that has not.
+
+        In many dimensions random starts are worse ones: a spline would end above the cubic.
+        """
+        cubic = PinnedPolynomial(problem.curve.dim, 3)
+        if problem.curve.functions <= cubic.functions:
+            return []
+        found = self.solve(replace(problem, curve=cubic), ends)
+        t = np.linspace(0.0, 1.0, 4 * problem.curve.functions + 3)
+        points = torch.from_numpy(np.stack([geodesic.points(t) for geodesic in found]))
+        phi = problem.curve.fit(points, torch.from_numpy(t)).numpy()
+        start, goal = (np.stack([getattr(one, end) for one in found]) for end in ("start", "goal"))
+        return [Candidates(np.arange(len(found)), phi, start, goal)]
 
     def candidates(self, problem: ChartProblem, ends: Ends) -> Candidates:
         """The starts: straight and bent curves to every image of the goals."""
@@ -86,9 +113,9 @@ class GradientSolver:
         began: clock reading [s] from which the time counts; now by default.
         """
         began = time.perf_counter() if began is None else began
-        rule = rules(tuple(problem.curve.breaks))[1]
-        energy = energy_function(problem.manifold, problem.curve, rule)
-        length = length_function(problem.manifold, problem.curve, rule)
+        manifold, rule = _descended(problem, candidates)
+        energy = energy_function(manifold, problem.curve, rule)
+        length = length_function(manifold, problem.curve, rule)
         first = minimise(energy, candidates, self.iterations, self.tolerance)
         inside = problem.stays_inside(first.phi, candidates.ends())
         rows = _promising(candidates.query, np.where(inside, first.value, np.inf))
@@ -104,6 +131,18 @@ class GradientSolver:
         evaluations = first.evaluations + second.evaluations
         work = Work(first.steps + second.steps, evaluations, spent)
         return shortest_of(problem, ends, found, converged, work)
+
+
+def _descended(problem: ChartProblem, candidates: Candidates) -> tuple[Manifold, Collocation]:
+    """What curves descend on and by which rule: among walls before a fence, with points as close
+    as its steps.
+    """
+    manifold, family = problem.manifold, problem.curve
+    if not isinstance(manifold, WalledManifold):
+        return manifold, rules(tuple(family.breaks))[1]
+    arrays = (candidates.phi, candidates.start, candidates.goal)
+    curves = Curves(family, *(torch.from_numpy(np.array(values)) for values in arrays))
+    return manifold.fenced(*FENCE), rules(resolved(manifold, curves))[0]
 
 
 def _promising(query: Int[np.ndarray, "C"], energy: Float[np.ndarray, "C"]) -> Int[np.ndarray, "K"]:

@@ -6,6 +6,7 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 
 from constraint_geodesics.geodesics.problem import (
@@ -15,7 +16,9 @@ from constraint_geodesics.geodesics.problem import (
     GeodesicSolver,
     SearchStatus,
 )
-from constraint_geodesics.geometry.manifold import Manifold, PeriodicManifold
+from constraint_geodesics.geodesics.taut import stays_inside
+from constraint_geodesics.geometry.curves import Curves
+from constraint_geodesics.geometry.manifold import Manifold, PeriodicManifold, WalledManifold
 
 LENGTH_TOLERANCE = 1e-6
 """Relative error aimed at for the lengths that candidates are ranked by and results carry."""
@@ -121,7 +124,7 @@ def shortest_of(
     """
     curves = candidates.phi, candidates.ends()
     length = problem.lengths(*curves, LENGTH_TOLERANCE)
-    length = np.where(problem.stays_inside(*curves), length, np.inf)
+    length = np.where(_inside(problem, *curves), length, np.inf)
     lines = np.zeros((len(ends), problem.curve.coefficients))
     straight = problem.lengths(lines, to_nearest_images(problem, ends), LENGTH_TOLERANCE)
     # of curves that are alike to within their accuracy one that has converged is the answer
@@ -140,6 +143,20 @@ def shortest_of(
         line = float(straight[query])
         results.append(Geodesic(status, problem.curve, *found, own, line, *spent))
     return results
+
+
+def _inside(
+    problem: ChartProblem, phi: Float[np.ndarray, "C p"], ends: Ends
+) -> Bool[np.ndarray, "C"]:
+    """Whether each curve stays on the manifold; among walls it is looked up at every step."""
+    inside = problem.stays_inside(phi, ends)
+    manifold = problem.manifold
+    if isinstance(manifold, WalledManifold):
+        arrays = (torch.from_numpy(np.asarray(x)) for x in (phi, ends.z_start, ends.z_goal))
+        curves = Curves(problem.curve, *arrays)
+        for row in np.flatnonzero(inside):
+            inside[row] = stays_inside(manifold, curves[int(row)])
+    return inside
 
 
 def _periods(manifold: Manifold) -> Float[np.ndarray, "N"]:

@@ -286,7 +286,10 @@ class PinnedSpline(CurveFamily):
         piece = scaled.detach().long().clamp(0, self.segments - 1)
         ordinates = torch.from_numpy(_bezier_ordinates(self.segments, order)).to(t)
         # In Bernstein form the zeros at both ends, and the values that pieces share, are exact.
-        return (_bernstein(scaled - piece, 3 - order)[..., None] * ordinates[piece]).sum(-2)
+        values = (_bernstein(scaled - piece, 3 - order)[..., None] * ordinates[piece]).sum(-2)
+        columns = piece[..., None] + torch.arange(4, device=t.device)
+        whole = values.new_zeros(*t.shape, self.segments + 3).scatter(-1, columns, values)
+        return whole[..., 1:-1]
 
 
 def shifted_legendre(
@@ -320,8 +323,9 @@ def _bernstein(u: Tensor, degree: int) -> Tensor:
 
 
 @cache
-def _bezier_ordinates(segments: int, order: int) -> Float[np.ndarray, "S d m"]:
-    """Bézier ordinates (S, 4 − order, S + 1) of the inner B-splines' derivatives on each piece.
+def _bezier_ordinates(segments: int, order: int) -> Float[np.ndarray, "S d 4"]:
+    """Bézier ordinates (S, 4 − order, 4) of the derivatives of the four B-splines on each piece,
+    of which the first is the piece's own number of all S + 3.
 
     Ordinate j of the piece [k, k + 1] is the blossom at 3 − j times k and j times k + 1 (Ramshaw,
     Blossoms are polar forms, 1989), in units of the pieces.  Each derivative of a Bézier curve of
@@ -335,13 +339,13 @@ def _bezier_ordinates(segments: int, order: int) -> Float[np.ndarray, "S d m"]:
     )
     for degree in range(3, 3 - order, -1):
         ordinates = segments * degree * np.diff(ordinates, axis=1)
-    return np.ascontiguousarray(ordinates[..., 1:-1])
+    return ordinates
 
 
-def _blossom(segments: int, piece: int, arguments: list[int]) -> Float[np.ndarray, "S+3"]:
-    """Blossom at three arguments of every cubic B-spline on one piece, by de Boor's algorithm."""
+def _blossom(segments: int, piece: int, arguments: list[int]) -> Float[np.ndarray, "4"]:
+    """Blossom at three arguments of the cubic B-splines on one piece, by de Boor's algorithm."""
     knots = [0, 0, 0, *range(segments + 1), segments, segments, segments]
-    control = list(np.eye(segments + 3)[piece : piece + 4])
+    control = list(np.eye(4))
     for r, x in enumerate(arguments, start=1):
         for j in range(3, r - 1, -1):
             left, right = knots[piece + j], knots[piece + j + 4 - r]

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy import ndimage
@@ -18,7 +19,10 @@ from constraint_geodesics.geometry.manifold import (
 Bounds = tuple[float, float]
 
 WALL = 100.0
-"""Metric of a blocked node next to a free one, in multiples of the largest free value."""
+"""How steeply g rises into blocked cells: in multiples of the largest free value, a step."""
+
+OPENING = 0.3
+"""How much of the distance from a door a fence takes back of its margin."""
 
 
 class GridError(GeometryError):
@@ -29,14 +33,15 @@ class GridError(GeometryError):
 class GridManifold:
     """The metric M(z) = g(z) I on a rectangle, g given at the nodes of a grid and bilinear between.
 
-    values: g (rows, columns), rows along the first coordinate, positive.  lower, upper: chart
-    coordinates of the first and last node of both axes.
-    blocked: nodes that don't belong to the manifold, None for none; what `values` holds there is
-    never read.  A point is blocked where its nearest node is.  There g still leads out: a blocked
-    node carries WALL times the largest free value, times its distance to the nearest free node in
-    steps of the finer axis.
+    values: g (rows, columns), rows along the first coordinate, positive; +inf blocks a node.
+    lower, upper: chart coordinates of the first and last node of both axes.
+    blocked: nodes that don't belong to the manifold, beside those of infinite value, None for no
+    other; what `values` holds there is never read.  A point is blocked where its nearest node is.
+    For the points in between a blocked node carries the value of the free node nearest to it, so
+    that free cells are measured by free values alone.  Inside blocked cells g leads out: WALL times
+    the largest free value is added for each step of depth, a step being that of the finer axis.
     Raises GridError on a shape that is no grid, bounds that don't rise, values that aren't positive
-    and finite at the free nodes, or if every node is blocked.
+    at the free nodes, or if every node is blocked.
     """
 
     values: Float[Tensor, "rows columns"]
@@ -44,12 +49,15 @@ class GridManifold:
     upper: Bounds
     blocked: Bool[Tensor, "rows columns"] | None = None
     _filled: Float[Tensor, "rows columns"] = field(init=False, repr=False)
+    _clearance: Float[Tensor, "rows2 columns2"] | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         _require_grid(self.values.shape, self.lower, self.upper)
-        _require_values(self.values, self._walls)
+        _require_values(self.values, self.blocked)
+        walls = self._walls
         # A frozen dataclass has no other way to keep what it derives.
-        object.__setattr__(self, "_filled", _with_walls(self.values, self._walls, self.spacing))
+        object.__setattr__(self, "_filled", _without_walls(self.values, walls, self.spacing))
+        object.__setattr__(self, "_clearance", _clearance(walls, self.spacing))
 
     @classmethod
     def from_manifold(
@@ -94,6 +102,11 @@ class GridManifold:
         rows, columns = self.values.shape
         return _nodes((rows, columns), self.lower, self.upper, self.values)
 
+    @property
+    def step(self) -> float:
+        """The finer axis's distance of neighbouring nodes."""
+        return min(self.spacing)
+
     def metric(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch N N"]:
         """The matrix g(z) I, differentiable in z; finite and positive everywhere.
 
@@ -102,16 +115,31 @@ class GridManifold:
         checked once, by who measures.
         """
         require_dim(z, self.dim, "z")
-        place = self._place(z)
-        last_cell = torch.tensor([count - 2 for count in self.values.shape], device=z.device)
-        corner = torch.minimum(torch.nan_to_num(place.detach()).floor().long(), last_cell)
-        row, column = corner.unbind(-1)
-        across, along = (place - corner).unbind(-1)
-        g = self._filled.to(place)
-        low = (1 - along) * g[row, column] + along * g[row, column + 1]
-        high = (1 - along) * g[row + 1, column] + along * g[row + 1, column + 1]
-        factor = (1 - across) * low + across * high
-        return factor[..., None, None] * torch.eye(self.dim, dtype=factor.dtype, device=z.device)
+        factor = self._free(z)
+        if self._clearance is not None:
+            factor = factor + self._slope * (-self._room(z)).clamp(min=0)
+        return _conformal(factor)
+
+    def fenced(
+        self, margin: float, height: float, doors: Float[Tensor, "k N"] | None = None
+    ) -> "FencedGrid":
+        """The same metric with a fence that begins `margin` steps before walls and edge, and leaves
+        the doors free.
+        """
+        return FencedGrid(self, margin, height, doors)
+
+    def clearance(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch"]:
+        """Distance of each point to walls and edge in steps, negative beyond them; 0 on the border.
+
+        Between the nodes and the points halfway between them it is bilinear.
+        """
+        require_dim(z, self.dim, "z")
+        lower, upper = (
+            torch.tensor(bound, dtype=z.dtype, device=z.device)
+            for bound in (self.lower, self.upper)
+        )
+        edge = torch.minimum(z - lower, upper - z).amin(-1) / self.step
+        return edge if self._clearance is None else torch.minimum(edge, self._room(z))
 
     def contains(self, z: Float[Tensor, "*batch N"]) -> Bool[Tensor, "*batch"]:
         """Whether each point is finite, on the grid or its border, and nearest to a free node."""
@@ -128,11 +156,22 @@ class GridManifold:
 
     @property
     def _walls(self) -> Bool[Tensor, "rows columns"]:
-        return (
-            torch.zeros_like(self.values, dtype=torch.bool)
-            if self.blocked is None
-            else self.blocked
-        )
+        infinite = self.values == torch.inf
+        return infinite if self.blocked is None else infinite | self.blocked
+
+    @property
+    def _slope(self) -> Tensor:
+        """Rise of g a step into a wall."""
+        return WALL * self._filled.max()
+
+    def _free(self, z: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
+        """The free values between the nodes."""
+        return _bilinear(self._filled, self._place(z))
+
+    def _room(self, z: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
+        """Distance to the walls in steps, negative inside them."""
+        assert self._clearance is not None
+        return _bilinear(self._clearance, 2 * self._place(z))
 
     def _place(self, z: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         """Position in steps of the grid, clamped to it."""
@@ -141,6 +180,40 @@ class GridManifold:
             for pair in (self.lower, self.spacing, [count - 1 for count in self.values.shape])
         )
         return ((z - lower) / spacing).clamp(torch.zeros_like(last), last)
+
+
+@dataclass(frozen=True, eq=False)
+class FencedGrid:
+    """The metric of a grid with a fence before its walls and its edge, for descents that must not
+    touch them.
+
+    margin: steps from the border at which the fence begins.  height: how steep it is, in multiples
+    of the grid's own walls; it rises with the square of the depth, so that its foot has no kink.
+    doors: points at which it stands back as far as they do, and returns to the margin with OPENING
+    of the distance from them: an end on the border would be thrown off it, and a spline swing out.
+    """
+
+    grid: GridManifold
+    margin: float
+    height: float
+    doors: Float[Tensor, "k 2"] | None = None
+
+    dim = 2
+
+    def metric(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch N N"]:
+        """The matrix g(z) I, differentiable in z; finite and positive everywhere."""
+        require_dim(z, self.dim, "z")
+        grid = self.grid
+        depth = (self._foot(z) - grid.clearance(z)).clamp(min=0)
+        return _conformal(grid._free(z) + self.height * grid._slope * depth.square())
+
+    def _foot(self, z: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*#batch"]:
+        """Steps from the border at which the fence begins at each point."""
+        foot = torch.tensor(self.margin, dtype=z.dtype, device=z.device)
+        for door in () if self.doors is None else self.doors.to(z):
+            far = torch.linalg.vector_norm(z - door, dim=-1) / self.grid.step
+            foot = torch.minimum(foot, self.grid.clearance(door).clamp(min=0) + OPENING * far)
+        return foot
 
 
 def _nodes(
@@ -153,13 +226,61 @@ def _nodes(
     return torch.cartesian_prod(*lines)
 
 
-def _with_walls(
-    values: Float[Tensor, "rows columns"], blocked: Bool[Tensor, "rows columns"], spacing: Bounds
+def _bilinear(
+    values: Float[Tensor, "rows columns"], place: Float[Tensor, "*batch 2"]
+) -> Float[Tensor, "*batch"]:
+    """Values between the nodes at positions in steps."""
+    last_cell = torch.tensor([count - 2 for count in values.shape], device=place.device)
+    corner = torch.minimum(torch.nan_to_num(place.detach()).floor().long(), last_cell)
+    row, column = corner.unbind(-1)
+    across, along = (place - corner).unbind(-1)
+    g = values.to(place)
+    low = (1 - along) * g[row, column] + along * g[row, column + 1]
+    high = (1 - along) * g[row + 1, column] + along * g[row + 1, column + 1]
+    return (1 - across) * low + across * high
+
+
+def _conformal(factor: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 2"]:
+    return factor[..., None, None] * torch.eye(2, dtype=factor.dtype, device=factor.device)
+
+
+def _without_walls(
+    values: Float[Tensor, "rows columns"], walls: Bool[Tensor, "rows columns"], spacing: Bounds
 ) -> Float[Tensor, "rows columns"]:
-    """The values, with blocked nodes as walls that rise with the distance to the free ones."""
-    depth = ndimage.distance_transform_edt(blocked.cpu().numpy(), sampling=spacing) / min(spacing)
-    walls = WALL * values[~blocked].max() * torch.from_numpy(depth).to(values)
-    return torch.where(blocked, walls, values)
+    """The values, with those of blocked nodes taken from the free node nearest to each."""
+    row, column = ndimage.distance_transform_edt(
+        walls.cpu().numpy(), sampling=spacing, return_distances=False, return_indices=True
+    )
+    return values[torch.from_numpy(row).long(), torch.from_numpy(column).long()]
+
+
+def _clearance(
+    walls: Bool[Tensor, "rows columns"], spacing: Bounds
+) -> Float[Tensor, "rows2 columns2"] | None:
+    """Distance to the walls in steps, negative inside them, at the nodes and halfway between.
+
+    Those halfway are the borders and corners of the nodes' cells, so that it is 0 exactly there,
+    and between four of them nowhere of both signs.  None without walls.
+    """
+    if not walls.any():
+        return None
+    blocked = walls.cpu().numpy()
+    step, sampling = min(spacing), tuple(width / 2 for width in spacing)
+    to_wall, to_free = (
+        ndimage.distance_transform_edt(~_closed(cells), sampling=sampling) / step
+        for cells in (blocked, ~blocked)
+    )
+    return torch.from_numpy(to_wall - to_free)
+
+
+def _closed(cells: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows2 columns2"]:
+    """Which nodes and points halfway lie in some of the cells or on their border."""
+    rows, columns = (2 * count - 1 for count in cells.shape)
+    closed = np.zeros((rows, columns), dtype=bool)
+    closed[::2, ::2] = cells
+    closed[1::2, ::2] = cells[:-1] | cells[1:]
+    closed[:, 1::2] = closed[:, :-1:2] | closed[:, 2::2]
+    return closed
 
 
 def _require_grid(shape: tuple[int, ...], lower: Bounds, upper: Bounds) -> None:
@@ -176,20 +297,23 @@ def _require_grid(shape: tuple[int, ...], lower: Bounds, upper: Bounds) -> None:
             raise GridError(f"lower[{k}] = {low}: must be below upper[{k}] = {high}")
 
 
-def _require_values(values: Tensor, blocked: Tensor) -> None:
+def _require_values(values: Tensor, blocked: Tensor | None) -> None:
     if not values.is_floating_point():
         raise GridError(f"values has dtype {values.dtype}: must be floating point")
-    if blocked.dtype != torch.bool or blocked.shape != values.shape:
+    if blocked is not None and (blocked.dtype != torch.bool or blocked.shape != values.shape):
         raise GridError(
             f"blocked has shape {tuple(blocked.shape)} and dtype {blocked.dtype}: "
             f"must have that of values, {tuple(values.shape)}, and torch.bool"
         )
-    if blocked.all():
+    free = values != torch.inf
+    if blocked is not None:
+        free = free & ~blocked
+    if not free.any():
         raise GridError("blocked: every node is, at least one must be free")
-    bad = torch.nonzero(~blocked & ~(torch.isfinite(values) & (values > 0)))
+    bad = torch.nonzero(free & ~(torch.isfinite(values) & (values > 0)))
     if len(bad):
         row, column = bad[0].tolist()
         raise GridError(
             f"values[{row}, {column}] = {values[row, column]}: must be positive and finite, "
-            f"or blocked"
+            f"or blocked (+inf blocks a node)"
         )

@@ -7,9 +7,10 @@ half the degree are among them, so the error estimate costs no further point, an
 estimate is too large are measured again with twice as many.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -22,6 +23,7 @@ from constraint_geodesics.geometry.manifold import (
     EmbeddedManifold,
     GeometryError,
     Manifold,
+    WalledManifold,
     require_finite,
 )
 
@@ -35,6 +37,12 @@ ACCIDENT = 32.0
 """What a piecewise curve's change of length from a quarter of the degree to half counts less than
 that to the whole: with many pieces two rules now and then agree by accident, three hardly ever.
 """
+STEPS = 8
+"""Steps of a manifold with walls that a piece of a curve measured at once may pass."""
+COUNTED = 17
+"""Points of a piece that its steps are counted by."""
+LONGEST = 256
+"""Parts that one piece of a curve is cut into at most."""
 BLOCK = 4096
 """Points embedded at once: the temporaries of many more leave the processor's cache."""
 
@@ -73,16 +81,15 @@ class Collocation:
     """Lengths from values at the Chebyshev-Lobatto points of every piece of a curve, both ends
     included.
 
-    times: (S,) the points.  derivative: (Q, S) takes values there to the slopes of the polynomials
-    through them, at the nodes of a Gauss-Legendre rule with `weights` (Q,); twice as many nodes as
-    the degree, since the norm of a polynomial is not one.  own_weights: (S,) Clenshaw-Curtis
-    weights of the points themselves, for integrands that need no derivative.  half: the rule of
-    half the degree, on every other point; None for an odd degree.
+    times: (S,) the points.  weights: (Q,) of the nodes of a Gauss-Legendre rule; twice as many
+    nodes as the degree, since the norm of a polynomial is not one.  own_weights: (S,)
+    Clenshaw-Curtis weights of the points themselves, for integrands that need no derivative.  half:
+    the rule of half the degree, on every other point; None for an odd degree.
     """
 
     degree: int
+    breaks: Breaks
     times: Float[Tensor, "S"]
-    derivative: Float[Tensor, "Q S"]
     weights: Float[Tensor, "Q"]
     own_weights: Float[Tensor, "S"]
     half: "Collocation | None"
@@ -97,10 +104,21 @@ class Collocation:
             raise GeometryError(f"degree = {degree}: must be at least 2")
         _require_breaks(breaks)
         half = cls.chebyshev(degree // 2, breaks) if degree % 2 == 0 and degree >= 4 else None
-        times, derivative, weights, own = (
-            torch.from_numpy(values) for values in _collocation(degree, breaks)
-        )
-        return cls(degree, times, derivative, weights, own, half)
+        times, weights, own = (torch.from_numpy(values) for values in _collocation(degree, breaks))
+        return cls(degree, tuple(breaks), times, weights, own, half)
+
+    @property
+    def derivative(self) -> Float[Tensor, "Q S"]:
+        """Takes values at `times` to the slopes of the polynomials through them, at the nodes of
+        the Gauss-Legendre rule.
+        """
+        return torch.from_numpy(self._derivative)
+
+    @cached_property
+    def _derivative(self) -> Float[np.ndarray, "Q S"]:
+        # Made where it is needed, as it grows with the square of the pieces; no tensor, since one
+        # that is made while a function is transformed can't be kept.
+        return _derivative(self.degree, self.breaks)
 
     def slopes(self, values: Float[Tensor, "*batch S A"]) -> Float[Tensor, "*batch Q A"]:
         """Slopes at the Gauss-Legendre nodes of the polynomials through values at `times`."""
@@ -148,7 +166,8 @@ def estimate_length(
 
     The estimate is twice the change from the rule of half the degree.  It is no bound: where a
     curve turns back both rules may err alike, and about one such curve in a hundred misses the
-    tolerance; on grids with walls, whose metric has kinks, far more do.  Curves that no degree
+    tolerance.  On a manifold with walls, whose metric has kinks, pieces are cut to STEPS of its
+    steps first.  Curves that no degree
     resolves keep the last length, and their estimate says so.  An embedding in single precision
     adds its rounding, about 1e-7 of its values.  Both are inf where a curve meets points at which
     the metric is not finite.
@@ -158,7 +177,7 @@ def estimate_length(
         raise GeometryError(f"tolerance = {tolerance}: must be positive")
     _check(manifold, curves)
     batch, flat = curves.batch, curves.flat()
-    ladder = rules(tuple(curves.family.breaks))
+    ladder = rules(resolved(manifold, flat))
     length, error = _measured(manifold, flat, ladder[0])
     for rule in ladder[1:]:
         rows = torch.nonzero((error > tolerance * length) & length.isfinite()).squeeze(-1)
@@ -167,6 +186,26 @@ def estimate_length(
         finer, left = _measured(manifold, flat[rows], rule)
         length, error = length.index_copy(0, rows, finer), error.index_copy(0, rows, left)
     return LengthEstimate(length.reshape(batch), error.reshape(batch))
+
+
+def resolved(manifold: Manifold, curves: Curves) -> Breaks:
+    """The breaks of curves and, on a manifold with walls, what cuts their pieces to STEPS steps.
+
+    As many parts to each piece, a power of 2: rules are made once for every such number.
+    """
+    breaks = tuple(curves.family.breaks)
+    if not isinstance(manifold, WalledManifold) or not curves.batch.numel():
+        return breaks
+    inner = torch.linspace(0.0, 1.0, COUNTED)
+    low = torch.tensor(breaks, dtype=curves.phi.dtype)
+    times = low[:-1, None] + (low[1:] - low[:-1])[:, None] * inner.to(low)
+    with torch.no_grad():
+        points, _ = curves.at(times.flatten())
+    sides = points.unflatten(-2, times.shape).diff(dim=-2)
+    steps = float(torch.linalg.vector_norm(sides, dim=-1).sum(-1).max()) / manifold.step
+    parts = 2 ** math.ceil(math.log2(min(max(steps / STEPS, 1.0), LONGEST)))
+    cut = np.interp(np.arange(parts * (len(breaks) - 1) + 1) / parts, range(len(breaks)), breaks)
+    return tuple(cut.tolist())
 
 
 def curve_energy(
@@ -297,32 +336,44 @@ def _require_breaks(breaks: Breaks) -> None:
         raise GeometryError(f"breaks = {breaks}: must rise from 0 to 1")
 
 
-def _collocation(
-    degree: int, breaks: Breaks
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Arrays of a Collocation; neighbouring pieces share the point between them."""
-    chebyshev = np.polynomial.chebyshev
-    x = -np.cos(np.pi * np.arange(degree + 1) / degree)
-    gauss, weights = np.polynomial.legendre.leggauss(2 * degree)
-    to_coefficients = np.linalg.inv(chebyshev.chebvander(x, degree))
-    slopes = np.stack(
-        [chebyshev.chebval(gauss, chebyshev.chebder(unit)) for unit in np.eye(degree + 1)], axis=1
-    )
-    derivative = slopes @ to_coefficients
+def _collocation(degree: int, breaks: Breaks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times, weights and own weights of a Collocation; neighbouring pieces share a point."""
+    x, to_coefficients = _chebyshev(degree)
+    _, weights = np.polynomial.legendre.leggauss(2 * degree)
     # ∫ T_k over [−1, 1] is 2 / (1 − k²) for even k and 0 for odd k
     k = np.arange(degree + 1)
     own = np.where(k % 2 == 0, 2.0 / (1.0 - np.square(k) + (k == 1)), 0.0) @ to_coefficients
-    count, span = len(breaks) - 1, degree
-    times, own_weights = np.empty(count * span + 1), np.zeros(count * span + 1)
-    rows = np.zeros((count * len(gauss), count * span + 1))
-    all_weights = np.empty(count * len(gauss))
+    count = len(breaks) - 1
+    times, own_weights = np.empty(count * degree + 1), np.zeros(count * degree + 1)
+    all_weights = []
     for piece, (low, high) in enumerate(pairwise(breaks)):
-        points = slice(piece * span, (piece + 1) * span + 1)
-        nodes = slice(piece * len(gauss), (piece + 1) * len(gauss))
+        points = slice(piece * degree, (piece + 1) * degree + 1)
         half = (high - low) / 2
         times[points] = low + half * (x + 1)
         own_weights[points] += half * own
-        rows[nodes, points] = derivative / half
-        all_weights[nodes] = half * weights
+        all_weights.append(half * weights)
     times[0], times[-1] = 0.0, 1.0
-    return times, rows, all_weights, own_weights
+    return times, np.concatenate(all_weights), own_weights
+
+
+def _derivative(degree: int, breaks: Breaks) -> np.ndarray:
+    """Rows of slopes at a Collocation's Gauss-Legendre nodes."""
+    chebyshev = np.polynomial.chebyshev
+    _, to_coefficients = _chebyshev(degree)
+    gauss, _ = np.polynomial.legendre.leggauss(2 * degree)
+    slopes = np.stack(
+        [chebyshev.chebval(gauss, chebyshev.chebder(unit)) for unit in np.eye(degree + 1)], axis=1
+    )
+    derivative, count = slopes @ to_coefficients, len(breaks) - 1
+    rows = np.zeros((count * len(gauss), count * degree + 1))
+    for piece, (low, high) in enumerate(pairwise(breaks)):
+        points = slice(piece * degree, (piece + 1) * degree + 1)
+        nodes = slice(piece * len(gauss), (piece + 1) * len(gauss))
+        rows[nodes, points] = derivative / ((high - low) / 2)
+    return rows
+
+
+def _chebyshev(degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Chebyshev-Lobatto points, and what takes values there to Chebyshev coefficients."""
+    x = -np.cos(np.pi * np.arange(degree + 1) / degree)
+    return x, np.linalg.inv(np.polynomial.chebyshev.chebvander(x, degree))

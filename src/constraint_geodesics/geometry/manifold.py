@@ -18,6 +18,7 @@ __all__ = [
     "NonFiniteError",
     "OutsideError",
     "PeriodicManifold",
+    "WalledManifold",
     "pullback_metric",
     "require_dim",
     "require_finite",
@@ -87,6 +88,30 @@ class BoundedManifold(Manifold, Protocol):
 
     def contains(self, z: Float[Tensor, "*batch N"]) -> Bool[Tensor, "*batch"]:
         """Whether each point belongs to the manifold."""
+        ...
+
+
+@runtime_checkable
+class WalledManifold(BoundedManifold, Protocol):
+    """A bounded manifold whose metric and walls are known to a step of the chart."""
+
+    @property
+    def step(self) -> float:
+        """Size in the chart of the least thing in the metric and its walls."""
+        ...
+
+    def clearance(self, z: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch"]:
+        """Distance of each point to the border in steps, negative beyond it."""
+        ...
+
+    def fenced(
+        self, margin: float, height: float, doors: Float[Tensor, "k N"] | None = None
+    ) -> Manifold:
+        """The manifold with a fence that begins `margin` steps before its border, for descents that
+        must not touch it; `height` times as steep as a plain one, and smooth.
+
+        doors: points that it leaves free, ends of curves that lie nearer to the border.
+        """
         ...
 
 

@@ -192,7 +192,37 @@ def geometry_table(layout: Layout) -> str:
         gradient = geometry["solvers"][name]["gradient"]["mean_ratio"]
         domain = searched["domain"].replace("|", "\\|")
         ratios.append((name, f"{random:.3f}", f"{policy:.4f}", f"{gradient:.5f}", domain))
-    return f"{markdown_table(rates)}\n\n{markdown_table(ratios)}\n"
+    tables = [rates, ratios, _walls(geometry["grids_with_walls"])]
+    return "\n\n".join(map(markdown_table, tables)) + "\n"
+
+
+def _walls(figures: Mapping[str, Mapping[str, Any]]) -> Cells:
+    """What the solvers reach on grids with walls, a row for each metric and solver."""
+    title = "150 × 150 nodes with walls"
+    rows: Cells = [
+        (
+            *(title, "queries", "curve found", "crosses no wall"),
+            *("over 8-connected Dijkstra: mean", "p95", "max"),
+            *("over a converged reference: mean", "max", "ms"),
+        )
+    ]
+    for name, by_solver in figures.items():
+        for solver, found in by_solver.items():
+            dijkstra, reference = found["over_dijkstra"], found["over_reference"]
+            rows.append(
+                (
+                    *(f"{name}, {solver}", str(found["queries"]), f"{100 * found['found']:.0f} %"),
+                    "–" if found["inside"] is None else f"{100 * found['inside']:.0f} %",
+                    *(_or_dash(dijkstra[key], ".3f") for key in ("mean", "p95", "max")),
+                    *(_or_dash(reference[key], ".4f") for key in ("mean", "max")),
+                    f"{found['milliseconds']:.0f}",
+                )
+            )
+    return rows
+
+
+def _or_dash(value: float | None, form: str) -> str:
+    return "–" if value is None or np.isnan(value) else format(value, form)
 
 
 class Finding(NamedTuple):

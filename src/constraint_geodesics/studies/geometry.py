@@ -51,6 +51,7 @@ from constraint_geodesics.studies.geodesic_search import (
     curve_family,
     unseen_pairs,
 )
+from constraint_geodesics.studies.walls import walls_figures
 
 SMALL_BATCHES = (1, 64)
 NAIVE_POINTS = 101
@@ -97,6 +98,7 @@ class GeometryBenchmark:
             for name, policy in policies.items()
         }
         parts["solvers/learned"] = self.learned_solvers
+        parts["grids_with_walls"] = lambda: walls_figures(2 * self.settings.pairs)
         found: dict[str, Any] = {}
         with one_thread(), progress("geometry benchmark", len(parts)) as advance:
             for name, measure in parts.items():
