@@ -272,8 +272,11 @@ def test_the_studies_of_make_bench_run_and_the_report_shows_them(finished: Path)
     reports = finished / "reports"
     page, lock = (reports / "index.html").read_text(), (finished / "dvc.lock").read_text()
     assert not (reports / "geometry.md").exists(), "the pipeline needs none of them"
-    run = {"cwd": finished, "env": smoke.environment(finished), "check": True}
-    subprocess.run([sys.executable, "-c", STUDIES], capture_output=True, **run)
+    command, environment = [sys.executable, "-c", STUDIES], smoke.environment(finished)
+    run = subprocess.run(
+        command, cwd=finished, env=environment, check=False, capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr
     for name in ("geometry.md", "policies.md", "figures/ablation.png", "figures/length_rules.png"):
         assert (reports / name).stat().st_size > 100, name
     assert len((reports / "index.html").read_text()) > len(page)

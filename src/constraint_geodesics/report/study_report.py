@@ -32,7 +32,8 @@ SCENES = {"table": "", "keep_out": ", one sphere on the way"}
 
 def policy_blocks(params: Params, layout: Layout) -> list[Table]:
     """What the policies propose before any refinement: the studied constraint, all that they were
-    trained on, each that they were not, and the same with a sphere on the way.
+    trained on, each that they were not, and the same with a sphere on the way, where there are such
+    queries.
     """
     found = read_metrics(layout.report("benchmark_policies", "policies"))
     names = [params.studies.constraint, "trained on", *params.unseen]
@@ -44,6 +45,7 @@ def policy_blocks(params: Params, layout: Layout) -> list[Table]:
     return [
         _policy_block(f"{name}{SCENES[scene]}", _ordered(found[name][scene], METHODS), link)
         for name, scene in shown
+        if scene in found.get(name, {})
     ]
 
 

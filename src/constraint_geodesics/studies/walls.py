@@ -145,11 +145,13 @@ def _figures(grid: WalledGrid, count: int, seed: int) -> dict[str, Any]:
     solvers: dict[str, tuple[GeodesicSolver, CurveFamily, int]] = {
         "combined": (CombinedSolver(graph), SHAPE, count),
         "graph": (graph, SHAPE, count),
-        "gradient, cubic": (gradient, SHAPE, -(-count // SHARE)),
-        "gradient, 4 segments": (gradient, PinnedSpline(2, 4), -(-count // SHARE)),
+        "gradient, cubic": (gradient, SHAPE, count // SHARE),
+        "gradient, 4 segments": (gradient, PinnedSpline(2, 4), count // SHARE),
     }
     found: dict[str, list[Geodesic]] = {}
     for name, (solver, family, asked) in solvers.items():
+        if not asked:
+            continue
         problem = ChartProblem(manifold, family, box)
         ends = zip(grid.points[start[:asked]], grid.points[goal[:asked]], strict=True)
         found[name] = [geodesics_between(solver, problem, a[None], b[None])[0] for a, b in ends]
