@@ -18,7 +18,7 @@ STAGE = "ablate_analytic"
 
 def main(params: Params, layout: Layout, analytic: str) -> None:
     """Write reports/ablate_analytic/<analytic>.json."""
-    settings = params.geodesics.model_copy(update={"steps": params.geodesics.analytic_steps})
+    settings = params.geodesics.on_analytic()
     with tracked_stage(
         Work(STAGE, analytic, settings.of_training("ablated_segments"), []),
         params.tracking.experiment,

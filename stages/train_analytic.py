@@ -24,7 +24,7 @@ STAGE = "train_analytic"
 
 def main(params: Params, layout: Layout, analytic: str) -> None:
     """Write data/analytic/<analytic>/, its learning curves and figures."""
-    settings = params.geodesics.model_copy(update={"steps": params.geodesics.analytic_steps})
+    settings = params.geodesics.on_analytic()
     about = subject_of(params, manifold=analytic, reward=settings.reward)
     with tracked_stage(
         Work(STAGE, analytic, settings.of_training(), [], about),

@@ -363,6 +363,7 @@ class GeodesicParams(_Record):
     illustrated: tuple[Name, ...]
     illustrated_constraints: tuple[Name, ...]
     analytic_steps: Count
+    analytic_episode_steps: Count
     analytic: tuple[Literal["plane", "sphere", "torus"], ...]
     ablated_segments: tuple[Annotated[int, Field(ge=2)], ...]
     degree: Annotated[int, Field(ge=2, le=9)]
@@ -378,6 +379,11 @@ class GeodesicParams(_Record):
     random_starts: Annotated[float, Field(ge=0, le=1)] = 0.5
     kept: Count = 4
     rounds: Count = 3
+
+    def on_analytic(self) -> "GeodesicParams":
+        """The settings on manifolds with a known answer."""
+        own = {"steps": self.analytic_steps, "episode_steps": self.analytic_episode_steps}
+        return self.model_copy(update=own)
 
     def of_training(self, *more: str) -> dict[str, Any]:
         """What one policy is trained with, and what else is named; the rest says what is trained

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from constraint_geodesics.geodesics.learned_problem import LearnedProblem
 from constraint_geodesics.geodesics.problem import repeated
 from constraint_geodesics.geometry.curves import PinnedPolynomial
 from constraint_geodesics.learning.dataset import ShardTask, draw_free
+from constraint_geodesics.studies.geodesic_search import MANIFOLDS, analytic_problem
 
 
 @pytest.fixture(scope="module")
@@ -70,3 +72,35 @@ def test_the_fingerprint_knows_its_inputs(problem, scene, params) -> None:
         problem.chart, problem.manifold, problem.curve, problem.joints.copy(), 16, True, 1.0
     )
     assert problem.fingerprint() == same.fingerprint() != other.fingerprint()
+
+
+@pytest.mark.parametrize("name", sorted(MANIFOLDS))
+def test_a_descent_shortens_curves_and_leads_to_the_line_in_the_plane(name: str) -> None:
+    problem, rng = analytic_problem(name, PinnedPolynomial(2, 3)), np.random.default_rng(3)
+    ends = problem.sample_ends(64, rng)
+    phi = 0.3 * problem.sample_curves(ends, rng)
+    step, before = problem.descent(phi, ends), problem.lengths(phi, ends)
+    assert (np.linalg.norm(step, axis=1) <= 0.5 * ends.distance * (1 + 1e-9)).all()
+    assert (problem.lengths(phi + 0.05 * step, ends) < before).all()
+    for _ in range(60):
+        phi = phi + 0.5 * problem.descent(phi, ends)
+    if name == "plane":
+        np.testing.assert_allclose(problem.lengths(phi, ends), ends.distance, rtol=1e-4)
+
+
+def test_points_of_the_whole_sphere_are_uniform_by_area() -> None:
+    """The height is uniform from −1 to 1 (Archimedes)."""
+    points = analytic_problem("sphere", PinnedPolynomial(2, 3)).domain.sample(
+        20_000, np.random.default_rng(0)
+    )
+    height = np.sort(np.sin(points[:, 0]))
+    expected = np.linspace(-1.0, 1.0, len(height))
+    assert np.abs(height - expected).max() / 2 < 1.63 / np.sqrt(len(height)), "Kolmogorov, 1 %"
+
+
+def test_ends_are_trained_on_to_all_images_of_their_goals() -> None:
+    problem = analytic_problem("torus", PinnedPolynomial(2, 3))
+    ends = problem.sample_ends(2000, np.random.default_rng(0))
+    turned = np.abs(ends.z_goal - ends.z_start) > np.pi
+    shares = [(turned == choice).all(axis=1).mean() for choice in product([False, True], repeat=2)]
+    assert min(shares) > 0.2

@@ -16,6 +16,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from constraint_geodesics.geodesics.episodes import observation_size
 from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.graph_search import CombinedSolver, GraphSolver
 from constraint_geodesics.geodesics.policy_search import Actor, PolicySolver, TrainedPolicy
@@ -325,10 +326,10 @@ def test_what_a_graph_found_is_not_lost_to_a_descent_that_sees_no_border() -> No
 
 
 def test_a_policy_takes_the_near_image_of_a_goal(params) -> None:
-    actor = Actor(CUBIC.coefficients + 8, (4,), CUBIC.coefficients)
-    mean = TrainedPolicy(actor, []).mean
     small = params.geodesics.model_copy(update={"rollouts": 2, "episode_steps": 1})
     problem = ChartProblem(Sphere(), CUBIC, WHOLE["sphere"][1])
+    actor = Actor(observation_size(problem, small), (4,), CUBIC.coefficients)
+    mean = TrainedPolicy(actor, []).mean
     (found,) = geodesics_between(
         PolicySolver(mean, small), problem, np.array([[0.0, 3.0]]), np.array([[0.0, -3.0]])
     )

@@ -26,6 +26,7 @@ SMALL: dict[str, Any] = {
         "seeds": [0, 1],
         "steps": 1920,
         "analytic_steps": 1920,
+        "analytic_episode_steps": 10,
         "analytic": ["plane"],
         "environments": 64,
         "illustrated_constraints": ["level_cup"],

@@ -120,6 +120,8 @@ GEOMETRY = {
         "plane": {
             "mean_ratio": [1.001, 1.003],
             "first_mean_ratio": [1.25, 1.25],
+            "descent_mean_ratio": [1.01, 1.01],
+            "p95_ratio": [1.002, 1.004],
             "domain": "|x|, |y| ≤ 1.5",
         }
     },
@@ -674,7 +676,7 @@ def test_the_geometry_table_says_what_its_metrics_say(run, written):
     ]
     assert rows[2] == ["curve lengths, batches of 4096", "50,000", "200", "250"]
     assert rows[5][0] == "environment steps, PPO included, retracted onto level_cup"
-    assert ["plane", "1.250", "1.0030", "1.00000"] in [row[:4] for row in rows]
+    assert ["plane", "1.250", "1.0100", "1.0030", "1.0040", "1.00000"] in [r[:6] for r in rows]
     over = ["0.970", "0.990", "0.995", "1.0001", "1.0010"]
     assert rows[-2][1:] == ["100", "100 %", "100 %", *over, "250"]
     assert rows[-1] == ["gaps, gradient, cubic", "100", "0 %", *6 * ["–"], "250"]

@@ -25,7 +25,7 @@ def test_each_variant_changes_one_thing(params) -> None:
 
 def test_richer_families_reach_further(params) -> None:
     ratios = family_ratios("sphere", params.geodesics)
-    assert 1 - 1e-6 <= ratios["spline_4"] <= ratios["spline_2"] <= ratios["polynomial"] < 1.001
+    assert 1 - 1e-6 <= ratios["spline_4"] <= ratios["spline_2"] <= ratios["polynomial"] < 1.003
 
 
 def test_the_metric_without_variance_is_that_of_the_mean(trained) -> None:

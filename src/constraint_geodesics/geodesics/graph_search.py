@@ -19,15 +19,9 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from constraint_geodesics.geodesics.gradient import GradientSolver
+from constraint_geodesics.geodesics.images import nearest_image, with_goals_bits
 from constraint_geodesics.geodesics.problem import ChartProblem, Ends, Geodesic
-from constraint_geodesics.geodesics.solver import (
-    LENGTH_TOLERANCE,
-    Candidates,
-    Work,
-    nearest_image,
-    shortest_of,
-    with_goals_bits,
-)
+from constraint_geodesics.geodesics.solver import LENGTH_TOLERANCE, Candidates, Work, shortest_of
 from constraint_geodesics.geodesics.taut import Corners, Taut, drawn_along, pulled_along
 from constraint_geodesics.geometry.curves import CurveFamily, Curves, PinnedPolynomial
 from constraint_geodesics.geometry.graph import nearest_neighbour_edges, shortest_path

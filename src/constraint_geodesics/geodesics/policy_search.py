@@ -32,7 +32,7 @@ from constraint_geodesics.geodesics.problem import (
     Phi,
 )
 from constraint_geodesics.geodesics.proposals import MeanPolicy, Met, random_round, rounds
-from constraint_geodesics.geodesics.solver import to_nearest_images
+from constraint_geodesics.geodesics.solver import goal_images
 from constraint_geodesics.geometry.manifold import GeometryError
 from constraint_geodesics.params import GeodesicParams, PpoParams
 
@@ -129,8 +129,7 @@ class PolicySolver:
     seed: int = 0
 
     def solve(self, problem: ChartProblem, ends: Ends) -> list[Geodesic]:
-        """The shortest curve that `search` meets between each start and the nearest image of its
-        goal.
+        """The shortest curve that `search` meets between each start and any image of its goal.
 
         Raises GeometryError if the policy was trained for another family or dimension.
         """
@@ -139,9 +138,14 @@ class PolicySolver:
             raise GeometryError(
                 f"the policy changes {trained} coefficients: must be those of the curve, {wanted}"
             )
-        near = to_nearest_images(problem, ends)
-        rows = [near[np.array([row])] for row in range(len(ends))]
-        return [self.search(problem, row, lambda _: True) for row in rows]
+        query, goal = goal_images(problem, ends)
+        asked = Ends(ends.z_start[query], goal, ends.z_start[query], goal)
+        found = [
+            self.search(problem, asked[np.array([k])], lambda _: True) for k in range(len(asked))
+        ]
+        return [
+            _shortest([found[k] for k in np.flatnonzero(query == row)]) for row in range(len(ends))
+        ]
 
     def search(self, problem: GeodesicProblem, ends: Ends, accept: Accept) -> Geodesic:
         """The shortest acceptable curve of the first round that meets one (`proposals.rounds`).
@@ -201,6 +205,17 @@ def _first_accepted(
         )
     none = Geodesic.nothing("not_found", problem.curve, ends.z_start[0], ends.z_goal[0])
     return replace(none, evaluations=evaluations, time_s=time.perf_counter() - began)
+
+
+def _shortest(found: Sequence[Geodesic]) -> Geodesic:
+    """The shortest answer to one query, with the work of all; the first is to the nearest image."""
+    best = min(found, key=lambda one: one.length if one.found else np.inf)
+    return replace(
+        best,
+        straight_length=found[0].straight_length,
+        evaluations=sum(one.evaluations for one in found),
+        time_s=sum(one.time_s for one in found),
+    )
 
 
 def save_policy(policy: TrainedPolicy, folder: Path, seed: int) -> None:

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
+from constraint_geodesics.geodesics.images import images_between
 from constraint_geodesics.geometry.curves import CurveFamily, Curves, PinnedPolynomial
-from constraint_geodesics.geometry.length import TOLERANCE, estimate_length
+from constraint_geodesics.geometry.length import TOLERANCE, estimate_length, length_function, rules
 from constraint_geodesics.geometry.manifold import (
     BoundedManifold,
     GeometryError,
@@ -26,6 +27,12 @@ REDRAWN = 10
 """Times that a goal equal to its start is drawn again."""
 FITTED = 65
 """Points of a curve that another family's is fitted to."""
+DENSITY_SIDE = 65
+"""Points a side of the lattice that tells how dense points can be."""
+LONGEST_STEP = 0.5
+"""Of a descent, in units of the ends' distance."""
+RIDGE = 1e-3
+"""Added to a descent's stiffness, relative to its mean: at a pole the metric loses a rank."""
 INSIDE_POINTS = 1025
 """Points of a curve that are looked up to tell whether it stays inside a bounded manifold."""
 
@@ -200,6 +207,34 @@ class ChartBox:
 
 
 @dataclass(frozen=True)
+class Everywhere:
+    """Points of a box of the chart, uniform by the manifold's own area."""
+
+    manifold: Manifold
+    box: ChartBox
+
+    def sample(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "B N"]:
+        """Random points of the box, by rejection; the largest density is that of a lattice."""
+        most, found = self._largest_density, np.zeros((0, len(self.box.low)))
+        while len(found) < count:
+            drawn = self.box.sample(2 * count, rng)
+            kept = self._density(drawn) > most * rng.random(len(drawn))
+            found = np.concatenate([found, drawn[kept]])
+        return found[:count]
+
+    @property
+    def _largest_density(self) -> float:
+        sides = zip(self.box.low, self.box.high, strict=True)
+        axes = np.meshgrid(*(np.linspace(low, high, DENSITY_SIDE) for low, high in sides))
+        return float(self._density(np.stack([axis.ravel() for axis in axes], axis=1)).max())
+
+    def _density(self, z: Float[np.ndarray, "B N"]) -> Float[np.ndarray, "B"]:
+        """Area of the manifold over that of the chart."""
+        density: np.ndarray = torch.linalg.det(self.manifold.metric(torch.from_numpy(z))).numpy()
+        return np.sqrt(np.maximum(density, 0.0))
+
+
+@dataclass(frozen=True)
 class Samples:
     """Points of a given set, encoded data for example."""
 
@@ -224,8 +259,37 @@ class ChartProblem:
         return Costs(length, length, np.isfinite(length) & self.stays_inside(phi, ends))
 
     def observed(self, phi: Phi, ends: Ends) -> Observed:
-        """Costs alone."""
-        return Observed.alone(self.evaluate(phi, ends))
+        """Costs, and a step down the energy."""
+        costs = self.evaluate(phi, ends)
+        return Observed(costs, self.descent(phi, ends), np.zeros((len(phi), 0)))
+
+    def descent(self, phi: Phi, ends: Ends) -> Phi:
+        """The step that leads to the least energy, if the metric stayed what it is along each
+        curve: −H⁻¹ ∇E with H = 2 ∫ ḃ_k ḃ_l M(γ) dt, at most LONGEST_STEP of the ends' distance.
+        """
+        rule = rules(tuple(self.curve.breaks))[1]
+        length = length_function(self.manifold, self.curve, rule)
+        slope, value = torch.func.vmap(torch.func.grad_and_value(length))(
+            *tensors(phi, ends.z_start, ends.z_goal)
+        )
+        slope = 2.0 * (value[:, None] * slope).numpy()
+        with torch.no_grad():
+            points, _ = curves_of(self.curve, phi, ends).at(rule.times)
+            metric = self.manifold.metric(points).numpy()
+        rates = self.curve.basis_derivative(rule.times).numpy()
+        weights = rule.own_weights.numpy()
+        stiffness = np.einsum("t,tk,tl,btnm->bnkml", 2.0 * weights, rates, rates, metric)
+        stiffness = stiffness.reshape(len(phi), *2 * (self.curve.coefficients,))
+        scale = np.trace(stiffness, axis1=1, axis2=2) / self.curve.coefficients
+        ridge = np.maximum(RIDGE * scale, 1e-12)[:, None, None] * np.eye(self.curve.coefficients)
+        usable = np.isfinite(stiffness).all(axis=(1, 2)) & np.isfinite(slope).all(axis=1)
+        step = np.zeros_like(phi)
+        solved = np.linalg.solve((stiffness + ridge)[usable], slope[usable, :, None])
+        step[usable] = -solved[:, :, 0]
+        size = np.sqrt((step**2).sum(axis=1))
+        return (
+            step * np.minimum(1.0, LONGEST_STEP * ends.distance / np.maximum(size, 1e-12))[:, None]
+        )
 
     def lengths(self, phi: Phi, ends: Ends, tolerance: float = TOLERANCE) -> Float[np.ndarray, "B"]:
         """Lengths on the manifold, to a relative tolerance (`estimate_length`)."""
@@ -257,13 +321,18 @@ class ChartProblem:
         return Ends(start, goal, start, goal)
 
     def sample_ends(self, count: int, rng: np.random.Generator) -> Ends:
-        """Random pairs of points of the domain; pairs of one point are drawn again."""
+        """Random pairs of points of the domain; pairs of one point are drawn again.  Where the
+        chart repeats, goals are any of their images near the start.
+        """
         start, goal = self.domain.sample(count, rng), self.domain.sample(count, rng)
         for _ in range(REDRAWN):
             same = np.flatnonzero((start == goal).all(axis=1))
             if not len(same):
                 break
             goal[same] = self.domain.sample(len(same), rng)
+        images = images_between(self.manifold, start, goal)
+        if images.shape[1] > 1:
+            goal = images[np.arange(count), rng.integers(images.shape[1], size=count)]
         return Ends(start, goal, start, goal)
 
     def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Phi:

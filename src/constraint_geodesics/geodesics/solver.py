@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
+from constraint_geodesics.geodesics.images import images_between, nearest_image, with_goals_bits
 from constraint_geodesics.geodesics.problem import (
     ChartProblem,
     Ends,
@@ -18,7 +18,7 @@ from constraint_geodesics.geodesics.problem import (
 )
 from constraint_geodesics.geodesics.taut import stays_inside
 from constraint_geodesics.geometry.curves import Curves
-from constraint_geodesics.geometry.manifold import Manifold, PeriodicManifold, WalledManifold
+from constraint_geodesics.geometry.manifold import WalledManifold
 
 LENGTH_TOLERANCE = 1e-6
 """Relative error aimed at for the lengths that candidates are ranked by and results carry."""
@@ -76,38 +76,17 @@ def geodesics_between(
     ]
 
 
-def nearest_image(manifold: Manifold, offset: Float[np.ndarray, "m N"]) -> Float[np.ndarray, "m N"]:
-    """Offsets in the chart, with every periodic coordinate taken the shorter way round."""
-    period = _periods(manifold)
-    finite = np.isfinite(period)
-    turned = offset.copy()
-    turned[:, finite] -= period[finite] * np.round(offset[:, finite] / period[finite])
-    return turned
-
-
 def to_nearest_images(problem: ChartProblem, ends: Ends) -> Ends:
     """The same ends with the image of each goal that lies nearest to its start in the chart."""
     image = ends.z_start + nearest_image(problem.manifold, ends.z_goal - ends.z_start)
     return replace(ends, z_goal=with_goals_bits(image, ends.z_goal))
 
 
-def with_goals_bits(
-    images: Float[np.ndarray, "*#B N"], goal: Float[np.ndarray, "*#B N"]
-) -> Float[np.ndarray, "*B N"]:
-    """Images of goals; coordinates that are no turn away get the bits of the goal's own."""
-    return np.where(np.abs(images - goal) < 1e-9, goal, images)
-
-
 def goal_images(
     problem: ChartProblem, ends: Ends
 ) -> tuple[Int[np.ndarray, "C"], Float[np.ndarray, "C N"]]:
     """Images of the goals, both ways round each periodic coordinate, and their queries."""
-    period = _periods(problem.manifold)
-    near = to_nearest_images(problem, ends).z_goal
-    other = np.where(near >= ends.z_start, -1.0, 1.0) * np.where(np.isfinite(period), period, 0.0)
-    choices = product(*([0, 1] if np.isfinite(p) else [0] for p in period))
-    goals = np.stack([near + np.array(choice) * other for choice in choices], axis=1)
-    goals = with_goals_bits(goals, ends.z_goal[:, None])
+    goals = images_between(problem.manifold, ends.z_start, ends.z_goal)
     return np.repeat(np.arange(len(ends)), goals.shape[1]), goals.reshape(-1, goals.shape[-1])
 
 
@@ -157,9 +136,3 @@ def _inside(
         for row in np.flatnonzero(inside):
             inside[row] = stays_inside(manifold, curves[int(row)])
     return inside
-
-
-def _periods(manifold: Manifold) -> Float[np.ndarray, "N"]:
-    if isinstance(manifold, PeriodicManifold):
-        return np.array(manifold.periods)
-    return np.full(manifold.dim, np.inf)

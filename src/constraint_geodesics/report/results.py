@@ -183,15 +183,17 @@ def geometry_table(layout: Layout) -> str:
             )
     ratios: Cells = [
         (
-            *("length over exact distance, mean", "random curve", "policy (worst seed)"),
-            *("gradient", "domain of the pairs"),
+            *("length over exact distance, mean", "random curve", "descent alone"),
+            *("policy (worst seed)", "its p95", "gradient", "domain of the pairs"),
         )
     ]
     for name, searched in geometry["policy_search"].items():
         random, policy = np.mean(searched["first_mean_ratio"]), max(searched["mean_ratio"])
+        descent, p95 = np.mean(searched["descent_mean_ratio"]), max(searched["p95_ratio"])
         gradient = geometry["solvers"][name]["gradient"]["mean_ratio"]
         domain = searched["domain"].replace("|", "\\|")
-        ratios.append((name, f"{random:.3f}", f"{policy:.4f}", f"{gradient:.5f}", domain))
+        control = f"{random:.3f}", f"{descent:.4f}"
+        ratios.append((name, *control, f"{policy:.4f}", f"{p95:.4f}", f"{gradient:.5f}", domain))
     tables = [rates, ratios, _walls(geometry["grids_with_walls"])]
     return "\n\n".join(map(markdown_table, tables)) + "\n"
 

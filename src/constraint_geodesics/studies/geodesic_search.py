@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from constraint_geodesics.benchmark.judge import judge_limits, measure_path
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.geodesics.episodes import begin
+from constraint_geodesics.geodesics.episodes import begin, moved
 from constraint_geodesics.geodesics.learned_problem import LearnedProblem, ProblemSet
 from constraint_geodesics.geodesics.obstacles import with_spheres
 from constraint_geodesics.geodesics.policy_search import (
@@ -30,8 +30,16 @@ from constraint_geodesics.geodesics.policy_search import (
     save_policy,
     train_policy,
 )
-from constraint_geodesics.geodesics.problem import ChartBox, ChartProblem, Ends, Geodesic, repeated
+from constraint_geodesics.geodesics.problem import (
+    ChartBox,
+    ChartProblem,
+    Ends,
+    Everywhere,
+    Geodesic,
+    repeated,
+)
 from constraint_geodesics.geodesics.proposals import MeanPolicy
+from constraint_geodesics.geodesics.solver import goal_images
 from constraint_geodesics.geometry.analytic import Plane, Sphere, Torus
 from constraint_geodesics.geometry.curves import CurveFamily, Curves, PinnedPolynomial, PinnedSpline
 from constraint_geodesics.geometry.manifold import MeasuredManifold
@@ -318,7 +326,7 @@ def geodesic_figures(
     return figures | {"queries_connected": float(connected.mean()), "seeds": float(len(results))}
 
 
-PAIRS = 100
+PAIRS = 200
 PAIRS_SEED = 11
 DRAWN_ROLLOUTS = 12
 DRAWN = 65
@@ -327,7 +335,9 @@ DRAWN = 65
 
 @dataclass(frozen=True)
 class Member:
-    """A manifold with a known answer, and the box of its chart that ends are drawn from."""
+    """A manifold with a known answer, and the box of its chart that all of it, or a piece of it, is
+    the image of.
+    """
 
     manifold: MeasuredManifold
     box: ChartBox
@@ -337,12 +347,12 @@ class Member:
 MANIFOLDS = {
     "plane": Member(Plane(), ChartBox((-1.5, -1.5), (1.5, 1.5)), "|x|, |y| ≤ 1.5"),
     "sphere": Member(
-        Sphere(), ChartBox((-1.2, -1.4), (1.2, 1.4)), "|elevation| ≤ 1.2 rad, |azimuth| ≤ 1.4 rad"
+        Sphere(), ChartBox((-np.pi / 2, -np.pi), (np.pi / 2, np.pi)), "all of it, uniform by area"
     ),
     "torus": Member(
         Torus(),
-        ChartBox((-1.2, -1.2), (1.2, 1.2)),
-        "R = 2, r = 1, |ring angle| ≤ 1.2 rad, |tube angle| ≤ 1.2 rad",
+        ChartBox((-np.pi, -np.pi), (np.pi, np.pi)),
+        "all of it, uniform by area; R = 2, r = 1",
     ),
 }
 
@@ -363,14 +373,16 @@ class AnalyticTask:
 class AnalyticResult:
     """Length over exact distance for unseen pairs, and curves to draw.
 
-    first_ratio: of a random curve.  ratio: of the shortest one that the policy's mean meets from
-    there.  sampled: curves met while the policy searched the first pair.  learned: the best one.
+    first_ratio: of a random curve to each image of the goal, the shortest of them.  ratio: of the
+    shortest one that the policy's mean meets from there.  descent_ratio: the same without its
+    actions.  sampled: curves met while the policy searched the first pair.  learned: the best one.
     """
 
     seed: int
     policy: TrainedPolicy
     first_ratio: Float[np.ndarray, "P"]
     ratio: Float[np.ndarray, "P"]
+    descent_ratio: Float[np.ndarray, "P"]
     sampled: Float[np.ndarray, "n T 2"]
     learned: Float[np.ndarray, "T 2"]
 
@@ -380,6 +392,8 @@ class AnalyticResult:
             "mean_ratio": float(self.ratio.mean()),
             "p95_ratio": float(np.quantile(self.ratio, 0.95)),
             "first_mean_ratio": float(self.first_ratio.mean()),
+            "descent_mean_ratio": float(self.descent_ratio.mean()),
+            "descent_p95_ratio": float(np.quantile(self.descent_ratio, 0.95)),
         }
 
 
@@ -391,7 +405,7 @@ def curve_family(dim: int, params: GeodesicParams, segments: int = 0) -> CurveFa
 def analytic_problem(name: str, curve: CurveFamily) -> ChartProblem:
     """Geodesics on an analytic manifold by name."""
     member = MANIFOLDS[name]
-    return ChartProblem(member.manifold, curve, member.box)
+    return ChartProblem(member.manifold, curve, Everywhere(member.manifold, member.box))
 
 
 def unseen_pairs(name: str, problem: ChartProblem) -> tuple[Ends, Float[np.ndarray, "P"]]:
@@ -402,8 +416,8 @@ def unseen_pairs(name: str, problem: ChartProblem) -> tuple[Ends, Float[np.ndarr
 
 
 def run_analytic(task: AnalyticTask) -> AnalyticResult:
-    """Train a policy, then follow its mean on unseen pairs from curves that are anything but
-    straight.
+    """Train a policy, then follow its mean on unseen pairs, from curves that are anything but
+    straight to every image of the goal.
 
     The straight line is no start here: in the plane it is the answer.
     """
@@ -411,20 +425,31 @@ def run_analytic(task: AnalyticTask) -> AnalyticResult:
     with task.run as run:
         policy = train_policy(problem, task.params, task.seed, task.scratch, run.log)
     ends, exact = unseen_pairs(task.name, problem)
-    rng = np.random.default_rng(PAIRS_SEED + 1)
-    params, size = task.params, problem.curve.coefficients
-    first = begin(problem, ends, problem.sample_curves(ends, rng))
-    still = np.zeros((params.episode_steps, PAIRS, size))
+    query, goal = goal_images(problem, ends)
+    asked = Ends(ends.z_start[query], goal, ends.z_start[query], goal)
+    rng, params = np.random.default_rng(PAIRS_SEED + 1), task.params
+    first = begin(problem, asked, problem.sample_curves(asked, rng))
+    still = np.zeros((params.episode_steps, len(asked), problem.curve.coefficients))
     visited = follow(problem, policy.actor, params, first, still)
-    lengths = np.array([states.length for states in visited])
-    best = visited[int(lengths[:, 0].argmin())].phi[:1]
-    pair = repeated(ends, DRAWN_ROLLOUTS)
+    descended = [first]
+    for actions in still:
+        descended.append(moved(problem, params, descended[-1], actions))
+    first_ratio, ratio, descent_ratio = (
+        np.array([states.length for states in met]).min(axis=0).reshape(PAIRS, -1).min(axis=1)
+        / exact
+        for met in ([first], visited, descended)
+    )
+    lengths = np.array([states.length[query == 0] for states in visited])
+    step, image = np.unravel_index(lengths.argmin(), lengths.shape)
+    drawn = asked[np.array([image])]
+    best = visited[step].phi[image : image + 1]
+    pair = repeated(drawn, DRAWN_ROLLOUTS)
     first = begin(problem, pair, problem.sample_curves(pair, rng))
-    noise = rng.normal(size=(params.episode_steps, DRAWN_ROLLOUTS, size))
+    noise = rng.normal(size=(params.episode_steps, DRAWN_ROLLOUTS, problem.curve.coefficients))
     met = follow(problem, policy.actor, params, first, noise)
-    sampled = np.concatenate([_points(problem, states.phi, ends) for states in met])
-    ratios = lengths[0] / exact, lengths.min(axis=0) / exact
-    return AnalyticResult(task.seed, policy, *ratios, sampled, _points(problem, best, ends)[0])
+    sampled = np.concatenate([_points(problem, states.phi, drawn) for states in met])
+    ratios, learned = (first_ratio, ratio, descent_ratio), _points(problem, best, drawn)[0]
+    return AnalyticResult(task.seed, policy, *ratios, sampled, learned)
 
 
 def _points(
