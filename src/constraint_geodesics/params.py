@@ -259,6 +259,31 @@ class CompareManifoldsParams(_Record):
     gan: GanParams
 
 
+class HoleParams(_Record):
+    """A sphere that the data keeps away from; charts learned from it, and pairs to join."""
+
+    centre_m: tuple[float, float, float]
+    radius_m: Positive
+    dims: Annotated[tuple[Count, ...], Field(min_length=1)]
+    pairs: Count
+
+
+class CompareChartsParams(_Record):
+    """What a learned chart adds to the search.  vae: which of `manifolds` they are trained as, but
+    for `dims`, seeds and epochs.  steps: of each policy.
+    """
+
+    vae: Name
+    constraint: Name
+    dims: Annotated[tuple[Count, ...], Field(min_length=1)]
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    epochs: Count
+    steps: Count
+    queries: Count
+    query_seed: Seed
+    hole: HoleParams
+
+
 class SubmanifoldParams(_Record):
     """How a constraint's sub-manifold is drawn or sampled in the latent space."""
 
@@ -580,6 +605,7 @@ class Params(_Record):
     path_diffusion: PathDiffusionParams
     unseen: dict[Name, ConstraintParams]
     compare_manifolds: CompareManifoldsParams
+    compare_charts: CompareChartsParams
     studies: StudyParams
     sweep: SweepParams
     execution: ExecutionParams
@@ -614,12 +640,14 @@ class Params(_Record):
             raise ValueError(
                 f"unseen={sorted(again)}: these are among the constraints that are trained on"
             )
-        if self.compare_manifolds.vae not in self.manifolds:
-            raise ValueError(
-                f"compare_manifolds.vae={self.compare_manifolds.vae!r}: must be one of "
-                f"{sorted(self.manifolds)}"
-            )
-        geodesics = self.geodesics
+        geodesics, charts = self.geodesics, self.compare_charts
+        for study, name, taken in (
+            ("compare_manifolds.vae", self.compare_manifolds.vae, self.manifolds),
+            ("compare_charts.vae", charts.vae, self.manifolds),
+            ("compare_charts.constraint", charts.constraint, self.constraints),
+        ):
+            if name not in taken:
+                raise ValueError(f"{study}={name!r}: must be one of {sorted(taken)}")
         for entry, names, known in (
             ("searched", geodesics.searched, self.manifolds),
             ("illustrated", geodesics.illustrated, self.manifolds),

@@ -35,6 +35,14 @@ SMALL: dict[str, Any] = {
         "ablated_segments": [],
         "ppo": {"batch_size": 320},
     },
+    "compare_charts": {
+        "dims": [2],
+        "seeds": [0],
+        "epochs": 1,
+        "steps": 1920,
+        "queries": 2,
+        "hole": {"dims": [2], "pairs": 2},
+    },
     "geometry": {"rounds": 1, "batch": 256, "checked": 32, "graph_points": 200, "pairs": 4},
     "policies": {
         "seeds": [0, 1],

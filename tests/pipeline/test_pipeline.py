@@ -36,6 +36,7 @@ for name, *items in (
     ("ablate_manifold", "planner"),
     ("benchmark_geometry", "planner", "level_cup"),
     ("benchmark_policies",),
+    ("compare_charts",),
     ("report",),
 ):
     importlib.import_module(name).main(load_params(), Layout(), *items)
@@ -277,7 +278,14 @@ def test_the_studies_of_make_bench_run_and_the_report_shows_them(finished: Path)
         command, cwd=finished, env=environment, check=False, capture_output=True, text=True
     )
     assert run.returncode == 0, run.stderr
-    for name in ("geometry.md", "policies.md", "figures/ablation.png", "figures/length_rules.png"):
+    for name in (
+        "geometry.md",
+        "policies.md",
+        "charts.md",
+        "figures/charts.png",
+        "figures/ablation.png",
+        "figures/length_rules.png",
+    ):
         assert (reports / name).stat().st_size > 100, name
     assert len((reports / "index.html").read_text()) > len(page)
     assert (finished / "dvc.lock").read_text() == lock

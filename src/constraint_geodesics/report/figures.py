@@ -357,6 +357,30 @@ def length_rules(table: pd.DataFrame, tolerance: float) -> Figure:
     return _tidied(figure)
 
 
+def charts(panels: Mapping[str, Mapping[str, Sequence[tuple[int, float, float, float]]]]) -> Figure:
+    """Two figures of a search against the chart's dimension, a line for what it is learned from.
+
+    panels: "solved" and "ratio_p95" → data → dimension, mean, least and largest.  What has one
+    dimension alone is drawn across.
+    """
+    figure, axes = _panels(2, (3.6, 3.2))
+    titles = {"solved": "solved", "ratio_p95": "length over the shortest, p95"}
+    for panel, (name, found) in zip(axes, panels.items(), strict=True):
+        for (data, rows), colour in zip(found.items(), (GREY, BLUE, ORANGE), strict=False):
+            dim, mean, least, largest = np.array(rows, float).T
+            if len(dim) == 1:
+                panel.axvline(dim[0], **REFERENCE)
+                panel.axhline(mean[0], color=colour, lw=1.6, label=data)
+                continue
+            panel.plot(dim, mean, color=colour, marker="o", markersize=4, label=f"{data} data")
+            panel.fill_between(dim, least, largest, color=colour, alpha=0.15, lw=0)
+            panel.set_xticks(dim)
+        panel.set(xlabel="latent dimensions", title=titles[name])
+    axes[0].yaxis.set_major_formatter(SHARE)
+    _legend(axes[0], loc="lower right")
+    return _tidied(figure)
+
+
 def ablation(
     searched: Mapping[str, Mapping[str, Sequence[float]]],
     reached: Mapping[str, Mapping[str, float]],

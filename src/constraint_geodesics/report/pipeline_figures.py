@@ -22,6 +22,7 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report import figures
 from constraint_geodesics.report.cells import short
+from constraint_geodesics.report.charts_page import cases, chart_figures
 from constraint_geodesics.report.figures import LatentCurves
 from constraint_geodesics.report.results import (
     LEARNED,
@@ -31,6 +32,7 @@ from constraint_geodesics.report.results import (
     searched_items,
     studies_at_hand,
 )
+from constraint_geodesics.studies.charts import POLICY
 
 DRAWN_QUERY = 0
 """The query whose geodesics Fig. 4c shows: the first, which is also recorded."""
@@ -64,6 +66,7 @@ def draw_figures(params: Params, layout: Layout, table: pd.DataFrame) -> list[Dr
     studies = studies_at_hand(params, layout)
     drawn += [_draw_length_rules(layout)] if "geometry" in studies else []
     drawn += _draw_ablation(params, layout) if "ablations" in studies else []
+    drawn += [_draw_charts(params, layout)] if "charts" in studies else []
     planes = [name for name in params.geodesics.illustrated if learned[name].dim == 2]
     if planes and params.geodesics.illustrated_constraints:
         drawn += _draw_plane(params, layout, planes[0], learned[planes[0]], data[planes[0]])
@@ -121,6 +124,27 @@ def _draw_length_rules(layout: Layout) -> Drawn:
     )
     title = "Length of a curve: error against cost"
     return Drawn("length_rules", title, caption, figures.length_rules(table, TOLERANCE))
+
+
+def _draw_charts(params: Params, layout: Layout) -> Drawn:
+    found, own = chart_figures(layout), params.compare_charts
+    caption = (
+        f"One certified curve for {own.constraint}, by a policy trained with {own.steps:,} steps "
+        f"in each chart; lines: mean over {len(own.seeds)} seeds, bands: least to largest. Left: "
+        "share of the queries that are solved in any chart. Right: length over the shortest answer "
+        "of all, 95th percentile. Joint space has as many dimensions as the vertical line tells "
+        "(reports/charts.md)."
+    )
+    title = "What a learned manifold adds to the search for a curve"
+    panels: dict[str, dict[str, list[tuple[int, float, float, float]]]] = {}
+    for figure in ("solved", "ratio_p95"):
+        for data, dim, methods in cases(found["charts"]):
+            spread = methods[POLICY][figure]
+            values = [spread[name] for name in ("mean", "least", "largest")]
+            mean, least, largest = (float("nan") if v is None else v for v in values)
+            row = dim, mean, least, largest
+            panels.setdefault(figure, {}).setdefault(data, []).append(row)
+    return Drawn("charts", title, caption, figures.charts(panels))
 
 
 def _draw_ablation(params: Params, layout: Layout) -> list[Drawn]:

@@ -158,6 +158,7 @@ def studies_at_hand(params: Params, layout: Layout) -> frozenset[str]:
         "policies": [layout.report("benchmark_policies", "policies")],
         "arms": [layout.root / "reports" / "arms.json"],
         "manifolds": [layout.root / "reports" / "compare_manifolds.json"],
+        "charts": [layout.root / "reports" / "compare_charts.json"],
     }
     return frozenset(n for n, own in files.items() if all(file.is_file() for file in own))
 

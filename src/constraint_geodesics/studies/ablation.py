@@ -94,6 +94,11 @@ class LearnedAblation:
         domain, rng = Samples(self.chart.encode(self.joints)), np.random.default_rng(PAIRS_SEED)
         return self._families(domain, rng) | self._variance(domain, rng)
 
+    def variance(self) -> dict[str, dict[str, float]]:
+        """The second part alone."""
+        domain = Samples(self.chart.encode(self.joints))
+        return self._variance(domain, np.random.default_rng(PAIRS_SEED))
+
     def _families(self, domain: Samples, rng: np.random.Generator) -> dict[str, dict[str, float]]:
         """Length of the best curve of each family over the shortest of all."""
         families = _segments(self.params)
