@@ -259,11 +259,11 @@ class CompareManifoldsParams(_Record):
     gan: GanParams
 
 
-class HoleParams(_Record):
-    """A sphere that the data keeps away from; charts learned from it, and pairs to join."""
+class HoleParams(WorkcellParams):
+    """Shapes that the data keeps away from; dimensions of charts learned from it, and pairs to join
+    in them.
+    """
 
-    centre_m: tuple[float, float, float]
-    radius_m: Positive
     dims: Annotated[tuple[Count, ...], Field(min_length=1)]
     pairs: Count
 

@@ -43,9 +43,9 @@ def charts_markdown(params: Params, layout: Layout) -> str:
     )
     hole = own.hole
     held = (
-        f"Data with a hole: charts are learned from the free configurations that keep away from a "
-        f"sphere of {100 * hole.radius_m:.0f} cm that nothing else tells of. Up to {hole.pairs} "
-        f"pairs of these configurations whose straight latent line meets the sphere, or the "
+        f"Data with a hole: charts are learned from the free configurations that keep away from "
+        f"what stands in `compare_charts.hole` of params.yaml, and nothing else tells of. Up to "
+        f"{hole.pairs} pairs of these configurations whose straight latent line meets it, or the "
         f"workcell, are joined by geodesics."
     )
     said = " ".join(_sentences(charts))

@@ -23,7 +23,6 @@ from constraint_geodesics.learning.training import TrainingRun, train_manifold
 from constraint_geodesics.params import CompareChartsParams, ManifoldParams, Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.studies.ablation import LearnedAblation
 from constraint_geodesics.studies.geodesic_search import policy_problem
 from constraint_geodesics.studies.proposals import Asked, answered, by_descent, by_policy
@@ -132,13 +131,12 @@ def _trained(task: ChartTask, scene: Scene, rows: Float[np.ndarray, "n D"]) -> L
 
 
 def _hole_rows(task: ChartTask) -> list[dict[str, Any]]:
-    """Latent geodesics with and without the variance term, on a chart whose data kept away from a
-    sphere that nothing else tells of.
+    """Latent geodesics with and without the variance term, on a chart whose data kept away from
+    shapes that nothing else tells of.
     """
     params, hole = task.params, task.settings.hole
     workcell = Scene.from_params(params)
-    sphere = Sphere(name="hole", centre_m=hole.centre_m, radius_m=hole.radius_m)
-    scene = replace(workcell, workcell=(*workcell.workcell, sphere))
+    scene = replace(workcell, workcell=(*workcell.workcell, *hole.shapes.values()))
     joints = read_joints(task.layout.joints("free")).free_joints
     with scene.world() as world:
         rows = joints[world.free(joints)]
