@@ -259,11 +259,12 @@ class CompareManifoldsParams(_Record):
     gan: GanParams
 
 
-class HoleParams(WorkcellParams):
-    """Shapes that the data keeps away from; dimensions of charts learned from it, and pairs to join
-    in them.
+class HoleParams(_Record):
+    """What the data keeps away from; dimensions of charts learned from it, and pairs to join in
+    them.
     """
 
+    around: WorkcellParams
     dims: Annotated[tuple[Count, ...], Field(min_length=1)]
     pairs: Count
 

@@ -136,7 +136,7 @@ def _hole_rows(task: ChartTask) -> list[dict[str, Any]]:
     """
     params, hole = task.params, task.settings.hole
     workcell = Scene.from_params(params)
-    scene = replace(workcell, workcell=(*workcell.workcell, *hole.shapes.values()))
+    scene = replace(workcell, workcell=(*workcell.workcell, *hole.around.shapes.values()))
     joints = read_joints(task.layout.joints("free")).free_joints
     with scene.world() as world:
         rows = joints[world.free(joints)]
