@@ -120,7 +120,7 @@ REFUSED: list[tuple[Change, tuple[str, ...]]] = [
     ),
     (
         lambda p: p["policies"]["ppo"].update(batch_size=5000),
-        ("policies.ppo.batch_size=5000", "at most 1536"),
+        ("policies.ppo.batch_size=5000", "at most 3072"),
     ),
     (lambda p: p["policies"].update(chart="paprika"), ("policies.chart='paprika'", "joint_space")),
     (lambda p: p["execution"].update(least_tilt_rad=4.0), ("execution.least_tilt_rad=4.0", "π")),

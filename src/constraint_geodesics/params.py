@@ -355,6 +355,7 @@ class PolicyParams(_Record):
     seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
     chart: Name
     steps: Count
+    training_length_degree: Annotated[int, Field(ge=4, multiple_of=4)]
     length_degree: Annotated[int, Field(ge=4, multiple_of=4)]
     environments: Count
     episode_steps: Count

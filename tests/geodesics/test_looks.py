@@ -66,6 +66,7 @@ def test_figures_are_those_of_numpy(problem, looked) -> None:
     assert (look.figures[:, kernels.OUTSIDE] >= outside.max(axis=1) - 1e-12).all()
     some = look.joints[:, 2:-2:2]
     short = np.maximum(MARGIN_M - problem.clearance.clearance(robot, some, MARGIN_M), 0.0)
+    short[jumps > 0.0] = 0.0  # what jumps is not asked
     np.testing.assert_allclose(look.figures[:, kernels.DEEP], short.sum(axis=1), atol=1e-9)
     np.testing.assert_allclose(look.figures[:, kernels.DEEPEST], short.max(axis=1), atol=1e-9)
     assert (short > MARGIN_M).any(), "some of them touch something"
@@ -94,12 +95,12 @@ def test_a_push_leads_away_from_what_is_too_close(problem) -> None:
     assert better >= 0.7 * len(close)
 
 
-def test_figures_alone_cost_feasible_curves_the_same(problem, looked) -> None:
+def test_figures_alone_cost_the_same(problem, looked) -> None:
     phi, ends, look = looked
     full = problem.costs_of(look.figures)
     alone = problem.evaluate(phi, ends)
     np.testing.assert_array_equal(alone.feasible, full.feasible)
-    np.testing.assert_array_equal(alone.cost[full.feasible], full.cost[full.feasible])
+    np.testing.assert_array_equal(alone.cost, full.cost)
     assert full.feasible.any()
 
 

@@ -131,8 +131,11 @@ def test_a_rounds_roll_outs_are_the_policys_own(problems, policy, small) -> None
     problem, rng = problems.members[0], np.random.default_rng(4)
     ends = problem.sample_ends(1, rng)
     first, second = rounds(problem, policy.mean, asked, ends, np.random.default_rng(1))
-    assert len(first.phi) == 1 + 6 + 3 * (asked.episode_steps - 1)
-    assert len(second.phi) == 1 + 12 + 3 * (asked.episode_steps - 1)
+    for met, own in ((first, asked.heads), (second, 0)):
+        looked = len(met.phi) - 3 * (asked.episode_steps - 1) - 3  # roll-outs, and their rest
+        drawn, more = divmod(looked - 1 - own, asked.rollouts - asked.heads)
+        assert more == 0
+        assert drawn == 1 or met.feasible[: looked - asked.rollouts + asked.heads].sum() < 3
     np.testing.assert_array_equal(first.phi[0], 0.0)
     costs = problem.evaluate(first.phi, ends[np.zeros(len(first.phi), dtype=int)])
     np.testing.assert_allclose(costs.cost, first.cost, rtol=1e-6)
@@ -143,6 +146,26 @@ def test_a_rounds_roll_outs_are_the_policys_own(problems, policy, small) -> None
         noise = np.zeros((asked.episode_steps - 1, 1, problem.curve.coefficients))
         visited = follow(problem, policy.actor, asked, replace(states, step=states.step + 1), noise)
         np.testing.assert_allclose(visited[1].phi[0], first.phi[rows[1]], atol=1e-3)
+
+
+def test_fewer_and_fewer_curves_are_followed_and_the_last_come_to_rest(
+    problems, policy, small
+) -> None:
+    asked = small.model_copy(update={"rollouts": 40, "kept": 24})
+    problem, rng = problems.members[1], np.random.default_rng(9)
+    better = []
+    for _ in range(5):
+        ends = problem.sample_ends(1, rng)
+        met = next(rounds(problem, policy.mean, asked, ends, rng))
+        counts = np.bincount(met.rollout[met.rollout >= 0], minlength=24)
+        steps = asked.episode_steps - 1
+        assert (np.sort(counts)[::-1][:4] >= 1 + steps).all(), "some are followed to the end"
+        assert counts.sum() == 24 + 24 + 12 + 6 * (steps - 2) + 4
+        np.testing.assert_array_equal(np.flatnonzero(met.last), np.arange(-10, 0) + len(met.phi))
+        rested = met.feasible & (np.arange(len(met.phi)) >= len(met.phi) - 4)
+        before = met.feasible & (np.arange(len(met.phi)) < len(met.phi) - 4)
+        better.append(met.cost[rested].min() <= met.cost[before].min())
+    assert all(better), "the descent makes nothing worse"
 
 
 def test_what_deserves_a_check_is_diverse_and_feasible(problems, policy, small) -> None:

@@ -1,7 +1,7 @@
 """Geodesics on a learned manifold under a constraint, between configurations that satisfy it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import NamedTuple
 
@@ -20,8 +20,6 @@ from constraint_geodesics.geodesics.problem import (
     Phi,
     bent_halfway,
     content_of,
-    curves_of,
-    tensors,
 )
 from constraint_geodesics.geodesics.pull_kernels import Bounds
 from constraint_geodesics.geometry.curves import CurveFamily
@@ -69,6 +67,8 @@ LIMIT_ROUNDING = 1e-9
 """What the sum of all that lies outside the limits may be [rad]."""
 LONGEST_STEP = 0.1
 """Of the points of a curve that its rows are drawn through [rad]."""
+ROUGHLY = Retraction(accuracy=1e-3, iterations=6, last_step=0.03)
+"""How points that are only looked at are projected."""
 LONGEST_DESCENT = 0.5
 """Longest step of the descent, in units of the ends' distance: at a jump the pull has no scale."""
 
@@ -103,7 +103,7 @@ class LearnedProblem:
     degree: int
     retract: bool
     inclusion_weight: float
-    retraction: Retraction = field(default_factory=lambda: Retraction(accuracy=1e-3, iterations=6))
+    retraction: Retraction = ROUGHLY
     clearance: ClearanceModel = NO_CLEARANCE
     pairs: Float[np.ndarray, "m 2 D"] | None = None
 
@@ -141,7 +141,7 @@ class LearnedProblem:
         """Decoder mean with its ends corrected, and deviation [rad], at the times that lengths are
         measured with.
         """
-        mean, deviation = self.chart.decode_all(self._chart_points(phi, ends))
+        mean, deviation = self.chart.decode_all(self._latent(phi, ends, self._times, self._basis))
         return corrected(mean, self._times, ends.q_start, ends.q_goal), deviation
 
     def looked(self, decoded: tuple[Paths, Paths], ends: Ends, described: int) -> kernels.Looked:
@@ -189,7 +189,7 @@ class LearnedProblem:
     def _latent_costs(self, phi: Phi, ends: Ends) -> Costs:
         rule, t = _rule(self.degree), _rule(self.degree).times.numpy()
         assert rule.half is not None
-        mean, deviation = self.chart.decode_all(self._chart_points(phi, ends))
+        mean, deviation = self.chart.decode_all(self._latent(phi, ends, self._times, self._basis))
         shape = torch.from_numpy(np.concatenate([mean, deviation], axis=-1))
         fine, coarse = rule.length(shape).numpy(), rule.half.length(shape[:, ::2]).numpy()
         joints = corrected(mean, t, ends.q_start, ends.q_goal)
@@ -197,13 +197,6 @@ class LearnedProblem:
         factor = 1.0 + self.inclusion_weight * self.manifold.violation(mean).mean(-1)
         cost = (fine + np.abs(fine - coarse)) * factor + outside
         return Costs(fine, cost, outside == 0.0)
-
-    def _chart_points(self, phi: Phi, ends: Ends) -> Float[np.ndarray, "B S N"]:
-        """γ_φ, eqs. 9-11, at the times that lengths are measured with."""
-        t = self._times[:, None]
-        own = phi.reshape(len(phi), self.curve.dim, self.curve.functions)
-        bend = self._basis @ own.transpose(0, 2, 1)
-        return (1.0 - t) * ends.z_start[:, None] + t * ends.z_goal[:, None] + bend
 
     @cached_property
     def _times(self) -> Float[np.ndarray, "S"]:
@@ -255,7 +248,14 @@ class LearnedProblem:
         self, phi: Phi, ends: Ends, t: Float[np.ndarray, "T"]
     ) -> Float[np.ndarray, "B T N"]:
         """γ_φ(t) in the latent space, eqs. 9-11."""
-        return curves_of(self.curve, phi, ends).at(*tensors(t))[0].numpy()
+        return self._latent(phi, ends, t, self.curve.basis(torch.from_numpy(t)).numpy())
+
+    def _latent(
+        self, phi: Phi, ends: Ends, t: Float[np.ndarray, "T"], basis: Float[np.ndarray, "T m"]
+    ) -> Float[np.ndarray, "B T N"]:
+        own, t = phi.reshape(len(phi), self.curve.dim, self.curve.functions), t[:, None]
+        bend = basis @ own.transpose(0, 2, 1)
+        return (1.0 - t) * ends.z_start[:, None] + t * ends.z_goal[:, None] + bend
 
     def lifted_at(
         self, phi: Phi, ends: Ends, t: Float[np.ndarray, "T"], retraction: Retraction | None

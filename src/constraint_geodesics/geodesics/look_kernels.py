@@ -80,8 +80,8 @@ def look_along(manifold, around, retraction, rule, bases, deviation, looked):
     """Look at curves, whose decoded points are in looked.joints, their ends in place.
 
     Inner points are clipped to the joint limits, then retracted; ends stay.  deviation (B, S, A):
-    of the decoder, part of the length.  Where only the figures are wanted, curves that jump are not
-    asked for their clearance: that takes the longest, and changes nothing.
+    of the decoder, part of the length.  Curves that jump are not asked for their clearance: that
+    takes the longest, and they can't be used anyhow.
     """
     joints, figures = looked.joints, looked.figures
     batch, points, dof = joints.shape
@@ -98,8 +98,7 @@ def look_along(manifold, around, retraction, rule, bases, deviation, looked):
     for b in range(batch):
         own = left[b * points : (b + 1) * points]
         _measure(around, rule, joints[b], deviation[b], own, figures[b])
-        hopeless = figures[b, JUMP] > 0.0 and not wanted
-        if around.clearance.top > 0 and not hopeless:
+        if around.clearance.top > 0 and figures[b, JUMP] == 0.0:
             _keep_away(manifold.chain, around, joints[b], room, row, pushes[b], figures[b])
     if not wanted:
         return

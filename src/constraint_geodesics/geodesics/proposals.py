@@ -1,6 +1,6 @@
 """Proposals of trained policies for new queries, with numpy alone and without noise."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from safetensors.numpy import load_file
 
+from constraint_geodesics.geodesics.descent import beginning, descended
 from constraint_geodesics.geodesics.episodes import (
     CurveStates,
     begin,
@@ -17,7 +18,7 @@ from constraint_geodesics.geodesics.episodes import (
     observe,
     placed,
 )
-from constraint_geodesics.geodesics.problem import Ends, GeodesicProblem, Phi, repeated
+from constraint_geodesics.geodesics.problem import Costs, Ends, GeodesicProblem, Phi, repeated
 from constraint_geodesics.params import GeodesicParams
 
 
@@ -57,8 +58,14 @@ class MeanPolicy:
         return cls(tuple((weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names))
 
 
-AGAIN = 2
-"""How many times as many curves a later round looks at as the first."""
+MOST_LOOKS = 8
+"""Times that random curves are drawn for one round."""
+HALVED_AFTER = (1, 2)
+"""Moves after which the better half of the curves that are followed goes on."""
+SETTLED, SETTLING = 4, 5
+"""Curves that are brought to rest at the end of a round, and the steps of descent they take: the
+policy chooses the way, whose last permille is the descent's.
+"""
 
 
 @dataclass(frozen=True)
@@ -105,27 +112,46 @@ def rounds(
     """What one query's rounds of roll-outs meet, for as long as the caller asks for another.
 
     In the first round the straight line and each head's own first move from it, all in one pass of
-    the network, are looked at with as many random curves as make up `rollouts`.  The `kept`
-    cheapest follow the policy's mean to the end of the episode.  Later rounds look at random curves
-    alone, AGAIN times as many.
+    the network, are looked at with as many random curves as make up `rollouts`, and more while
+    fewer than `kept` of all are feasible.  The `kept` cheapest follow the policy's mean, fewer and
+    fewer of them; the best SETTLED of what they met go on down the problem's descent alone.  Later
+    rounds look at random curves alone.
     """
     straight = begin(problem, ends, np.zeros((1, problem.curve.coefficients)))
     heads = replace(straight[np.zeros(params.heads, dtype=int)], head=np.arange(params.heads))
     moves = displaced(params, heads, policy.act(observe(params, heads)))
-    drawn = _drawn(problem, ends, params.rollouts - params.heads, rng)
-    yield _followed(problem, policy, params, straight, np.concatenate([moves, drawn]))
-    for _ in range(params.rounds - 1):
-        drawn = _drawn(problem, ends, AGAIN * params.rollouts, rng)
-        yield _followed(problem, policy, params, straight, drawn)
+    known = [_met(straight.phi, straight, -1), _looked_at(problem, ends, moves)]
+    for _ in range(params.rounds):
+        number = params.rollouts - params.heads
+        looked = _many_looked_at(problem, ends, known, number, params.kept, rng)
+        yield _followed(problem, policy, params, straight, looked)
+        known = known[:1]
+
+
+def _many_looked_at(
+    problem: GeodesicProblem,
+    ends: Ends,
+    known: Sequence[Met],
+    number: int,
+    wanted: int,
+    rng: np.random.Generator,
+) -> Met:
+    """Known curves and random ones, so many at a time until `wanted` are feasible, MOST_LOOKS times
+    at most: where few are, the way has to be looked for.
+    """
+    met = list(known)
+    for _ in range(MOST_LOOKS):
+        met.append(_looked_at(problem, ends, _drawn(problem, ends, number, rng)))
+        if sum(int(part.feasible.sum()) for part in met) >= wanted:
+            break
+    return _joined(met)
 
 
 def random_round(problem: GeodesicProblem, ends: Ends, count: int, rng: np.random.Generator) -> Met:
     """The straight line and random curves, `count` in all."""
     zero = np.zeros((1, problem.curve.coefficients))
     phi = np.concatenate([zero, _drawn(problem, ends, count - 1, rng)])
-    costs = problem.evaluate(phi, repeated(ends, count))
-    nowhere, never = np.full(count, -1), np.zeros(count, dtype=bool)
-    return Met(phi, costs.length, costs.cost, costs.feasible, nowhere, never)
+    return _looked_at(problem, ends, phi)
 
 
 def _drawn(problem: GeodesicProblem, ends: Ends, count: int, rng: np.random.Generator) -> Phi:
@@ -137,34 +163,50 @@ def _followed(
     policy: MeanPolicy,
     params: GeodesicParams,
     straight: CurveStates,
-    drawn: Phi,
+    looked: Met,
 ) -> Met:
-    """The straight line and other curves, and what the policy's mean makes of the cheapest."""
-    first = problem.evaluate(drawn, repeated(straight.ends, len(drawn)))
-    phi, length, cost, feasible = (
-        np.concatenate(pair)
-        for pair in (
-            (straight.phi, drawn),
-            (straight.length, first.length),
-            (straight.cost, first.cost),
-            (straight.feasible, first.feasible),
-        )
-    )
-    kept = np.lexsort((cost, ~feasible))[: params.kept]
-    from_straight = straight[np.zeros(len(kept), dtype=int)]
-    states = placed(problem, replace(from_straight, head=kept % params.heads), phi[kept])
-    visited = []
-    for _ in range(params.episode_steps - 1):
+    """What was looked at, and what the policy's mean makes of the cheapest: fewer of them each time
+    that HALVED_AFTER says, and the last brought to rest.
+    """
+    kept = np.lexsort((looked.cost, ~looked.feasible))[: params.kept]
+    rollout = np.arange(len(kept))
+    looked.rollout[kept] = rollout
+    # the straight line comes first, then the heads' moves in their order
+    begun = replace(straight[np.zeros(len(kept), dtype=int)], head=(kept - 1) % params.heads)
+    states, visited = placed(problem, begun, looked.phi[kept]), [looked]
+    for step in range(1, params.episode_steps):
         states = moved(problem, params, states, policy.act(observe(params, states)))
-        visited.append(states)
-    rollout = np.full(len(phi), -1)
-    rollout[kept] = np.arange(len(kept))
-    last = np.arange(len(phi) + len(kept) * len(visited))
-    return Met(
-        np.concatenate([phi, *(s.phi for s in visited)]),
-        np.concatenate([length, *(s.length for s in visited)]),
-        np.concatenate([cost, *(s.cost for s in visited)]),
-        np.concatenate([feasible, *(s.feasible for s in visited)]),
-        np.concatenate([rollout, *(np.arange(len(kept)) for _ in visited)]),
-        (last >= len(last) - len(kept)) & (len(visited) > 0),
-    )
+        visited.append(_met(states.phi, states, rollout))
+        if step in HALVED_AFTER:
+            order = np.lexsort((states.best_cost, states.best_feasible))
+            better = np.sort(order[: max(SETTLED, len(order) // 2)])
+            states, rollout = states[better], rollout[better]
+    visited[-1].last[:] = True
+    met = _joined(visited)
+    if not straight.descent.shape[1]:
+        return met
+    rows = met.best_of_each[:SETTLED]
+    few = repeated(straight.ends, len(rows))
+    rest = descended(problem, beginning(problem, met.phi[rows], few), few, SETTLING)
+    settled = _met(rest.phi, rest.now.costs, met.rollout[rows])
+    settled.last[:] = True
+    return _joined([met, settled])
+
+
+def _looked_at(problem: GeodesicProblem, ends: Ends, phi: Phi) -> Met:
+    return _met(phi, problem.evaluate(phi, repeated(ends, len(phi))), -1)
+
+
+def _met(phi: Phi, costs: Costs | CurveStates, rollout: int | Int[np.ndarray, "n"]) -> Met:
+    """Curves as met by one roll-out each, none at its last step."""
+    of, never = np.full(len(phi), rollout), np.zeros(len(phi), dtype=bool)
+    return Met(phi, costs.length, costs.cost, costs.feasible, of, never)
+
+
+def _joined(parts: Sequence[Met]) -> Met:
+    """What was met, one after another."""
+    return Met(*(np.concatenate(values) for values in zip(*map(_fields, parts), strict=True)))
+
+
+def _fields(met: Met) -> tuple[np.ndarray, ...]:
+    return met.phi, met.length, met.cost, met.feasible, met.rollout, met.last

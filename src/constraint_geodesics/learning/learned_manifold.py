@@ -184,12 +184,16 @@ class JointManifold(LearnedManifold):
         vae.precision.spread.fill_(torch.inf)  # the floor never falls
         return cls(vae.eval())
 
+    def decode(self, z: Float[np.ndarray, "*batch N"]) -> Float[np.ndarray, "*batch D"]:
+        """Joints [rad], without a network."""
+        joints: np.ndarray = z * self.vae.scale.numpy() + self.vae.centre.numpy()
+        return joints
+
     def decode_all(
         self, z: Float[np.ndarray, "*batch N"]
     ) -> tuple[Float[np.ndarray, "*batch D"], Float[np.ndarray, "*batch A"]]:
         """Decoder mean [rad]; the deviation is the same everywhere."""
-        centre, scale = self.vae.centre.numpy(), self.vae.scale.numpy()
-        return z * scale + centre, np.empty((*z.shape[:-1], 0))
+        return self.decode(z), np.empty((*z.shape[:-1], 0))
 
 
 def chart_named(name: str, folder: Path, robot: SerialRobot) -> LearnedManifold:

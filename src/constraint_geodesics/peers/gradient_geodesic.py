@@ -17,6 +17,7 @@ from pydantic import Field
 from scipy import optimize
 
 from constraint_geodesics.fields import Count
+from constraint_geodesics.geodesics.descent import INFEASIBLE, beginning, descended, ranks
 from constraint_geodesics.geodesics.learned_problem import LearnedProblem
 from constraint_geodesics.geodesics.problem import Ends, repeated
 from constraint_geodesics.geometry.curves import PinnedSpline
@@ -27,21 +28,15 @@ from constraint_geodesics.peers.elastic_band import answer
 from constraint_geodesics.peers.latent_geodesic import (
     EXACT,
     FINE_DEGREE,
-    INFEASIBLE,
     first_curves,
     free_rows,
     on_constraint,
-    ranks,
     retracted_problem,
     turned_away,
 )
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.scene.clearance import ClearanceModel
 
-LONGEST_STRIDE, LONGER, SHORTER = 1.5, 1.3, 0.4
-"""Largest multiple of the problem's descent taken in one step; change of a curve's own multiple
-after each step.
-"""
 DIFFERENCE = 3e-4
 """Half step of central differences, in units of the ends' distance: the decoder computes in single
 precision.
@@ -123,7 +118,8 @@ class GradientGeodesic:
             steps = self.settings.descent_steps
             bent = self.settings.starts - 1
             starts = first_curves(learned, ends, self.settings.drawn, bent, rng)
-            met = descended(learned, starts, ends, steps)
+            many = repeated(ends, len(starts))
+            met = descended(learned, beginning(learned, starts, many), many, steps).phi
             iterations += steps
             for cost in costs:
                 if found is None:
@@ -152,25 +148,6 @@ class GradientGeodesic:
             if joints is not None:
                 return joints, steps
         return None, steps
-
-
-def descended(
-    learned: LearnedProblem, phi: Float[np.ndarray, "K p"], ends: Ends, steps: int
-) -> Float[np.ndarray, "K p"]:
-    """Curves between the same ends after steps along the problem's descent; none costs more than
-    before.
-    """
-    many = repeated(ends, len(phi))
-    seen = learned.observed(phi, many)
-    value, descent, stride = ranks(seen.costs), seen.descent, np.ones((len(phi), 1))
-    for _ in range(steps):
-        tried = phi + stride * descent
-        seen = learned.observed(tried, many)
-        cheaper = (ranks(seen.costs) < value)[:, None]
-        phi, descent = np.where(cheaper, tried, phi), np.where(cheaper, seen.descent, descent)
-        value = np.minimum(ranks(seen.costs), value)
-        stride = np.where(cheaper, np.minimum(LONGER * stride, LONGEST_STRIDE), SHORTER * stride)
-    return phi
 
 
 def different(

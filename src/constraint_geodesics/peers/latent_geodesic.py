@@ -5,8 +5,9 @@ from jaxtyping import Float
 
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
+from constraint_geodesics.geodesics.descent import ranks
 from constraint_geodesics.geodesics.learned_problem import LearnedProblem
-from constraint_geodesics.geodesics.problem import Costs, Ends, repeated
+from constraint_geodesics.geodesics.problem import Ends, repeated
 from constraint_geodesics.geometry.curves import CurveFamily
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import as_executed
@@ -26,8 +27,6 @@ while few are.
 EDGE_CHORDS = 8
 """Chords that the length of a straight latent line is measured by."""
 EXACT = Retraction(accuracy=1e-6, iterations=20)
-INFEASIBLE = 1e3
-"""Added to the cost of a curve that is not feasible [rad]: more than any curve costs."""
 
 
 def turned_away(
@@ -92,11 +91,6 @@ def first_curves(
     bent = learned.sample_curves(many, rng)
     order = np.argsort(ranks(learned.evaluate(bent, many)), kind="stable")
     return np.concatenate([straight, bent[order[:kept]]])
-
-
-def ranks(costs: Costs) -> Float[np.ndarray, "B"]:
-    """Costs [rad], those of all infeasible curves behind the others'."""
-    return np.where(costs.feasible, costs.cost, costs.cost + INFEASIBLE)
 
 
 def free_rows(

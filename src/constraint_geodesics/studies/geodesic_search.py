@@ -7,7 +7,7 @@ the search against exact answers.
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -246,8 +246,11 @@ def policy_problem(
 def training_problem(
     params: Params, scene: Scene, problems: Sequence[LearnedProblem]
 ) -> ProblemSet:
-    """All constraints as one problem, each alone and with spheres on the way."""
+    """All constraints as one problem, each alone and with spheres on the way, as it is measured
+    while training.
+    """
     settings, rng = params.policies.obstacles, np.random.default_rng(OBSTACLES_SEED)
+    problems = [replace(own, degree=params.policies.training_length_degree) for own in problems]
     around = [
         member
         for problem in problems

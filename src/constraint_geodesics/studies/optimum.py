@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from constraint_geodesics.constraints.projection import Retraction
+from constraint_geodesics.geodesics.descent import INFEASIBLE, beginning, descended, ranks
 from constraint_geodesics.geodesics.learned_problem import LearnedProblem
 from constraint_geodesics.geodesics.problem import Costs, Ends, Phi
 from constraint_geodesics.scene.clearance import path_stays_clear
@@ -23,10 +24,6 @@ LIMIT_SLACK, VIOLATION_SLACK = 1e-3, 1e-6
 """What a path may exceed joint limits by between the points that the search looked at, and the
 constraint by [rad].
 """
-INFEASIBLE = 1e3
-"""Added to the cost of a curve that is not feasible [rad]: more than any curve costs."""
-LONGEST_STRIDE = 1.5
-"""Largest multiple of the problem's descent that is taken in one step."""
 NEAR = 0.02
 """Curves whose coefficients differ by less, in units of the ends' distance, are polished once."""
 DIFFERENCE = 3e-4
@@ -86,8 +83,9 @@ def family_optimum(
     queries, size = len(ends), problem.curve.coefficients
     phi = np.concatenate([starts, _random_starts(problem, ends, settings)], axis=1)
     each = ends[np.repeat(np.arange(queries), phi.shape[1])]
-    moved = descended(problem, phi.reshape(-1, size), each, settings.descent_steps)
-    met = np.concatenate([phi, moved.reshape(phi.shape)], axis=1)
+    started = beginning(problem, phi.reshape(-1, size), each)
+    moved = descended(problem, started, each, settings.descent_steps)
+    met = np.concatenate([phi, moved.phi.reshape(phi.shape)], axis=1)
     finer = replace(problem, degree=POLISH_DEGREE, retraction=EXACT)
     costs = finer.evaluate(met.reshape(-1, size), ends[np.repeat(np.arange(queries), met.shape[1])])
     picked = _picked(problem, met, _lengths(costs).reshape(met.shape[:2]), ends, settings.polished)
@@ -121,29 +119,13 @@ def is_sound(problem: LearnedProblem, phi: Float[np.ndarray, "p"], ends: Ends) -
     )
 
 
-def descended(problem: LearnedProblem, phi: Phi, ends: Ends, steps: int) -> Phi:
-    """Curves after steps along the problem's descent, with step sizes of their own; none worse."""
-    now = problem.observed(phi, ends)
-    rank, descent, stride = _ranks(now.costs), now.descent, np.ones(len(phi))
-    for _ in range(steps):
-        moved = phi + stride[:, None] * descent
-        now = problem.observed(moved, ends)
-        new = _ranks(now.costs)
-        better = new < rank
-        phi = np.where(better[:, None], moved, phi)
-        descent = np.where(better[:, None], now.descent, descent)
-        rank = np.where(better, new, rank)
-        stride = np.where(better, np.minimum(1.3 * stride, LONGEST_STRIDE), 0.4 * stride)
-    return phi
-
-
 def polished(problem: LearnedProblem, phi: Phi, ends: Ends, steps: int) -> Phi:
     """Curves after BFGS on the cost with central differences (Nocedal and Wright, alg. 6.1).
 
     Every feasible curve goes on until a step gains less than GAIN; none gets worse or infeasible.
     """
     phi, size = phi.copy(), phi.shape[1]
-    value = _ranks(problem.evaluate(phi, ends)) if len(phi) else np.empty(0)
+    value = ranks(problem.evaluate(phi, ends)) if len(phi) else np.empty(0)
     rows = np.flatnonzero(value < INFEASIBLE)
     gradient = _gradients(problem, phi, ends, rows)
     inverse = np.tile(np.eye(size), (len(phi), 1, 1))
@@ -171,11 +153,6 @@ def polished(problem: LearnedProblem, phi: Phi, ends: Ends, steps: int) -> Phi:
     return phi
 
 
-def _ranks(costs: Costs) -> Float[np.ndarray, "B"]:
-    """Costs, with those of all curves that are not feasible behind the others'."""
-    return np.where(costs.feasible, costs.cost, costs.cost + INFEASIBLE)
-
-
 def _fine(problem: LearnedProblem) -> LearnedProblem:
     return replace(problem, degree=FINE_DEGREE, retraction=EXACT)
 
@@ -187,7 +164,7 @@ def _random_starts(
     queries, drawn = len(ends), settings.drawn
     many = ends[np.repeat(np.arange(queries), drawn)]
     phi = problem.sample_curves(many, np.random.default_rng(settings.seed))
-    order = np.argsort(_ranks(problem.evaluate(phi, many)).reshape(queries, drawn), axis=1)
+    order = np.argsort(ranks(problem.evaluate(phi, many)).reshape(queries, drawn), axis=1)
     kept = order[:, : settings.random_starts, None]
     return np.take_along_axis(phi.reshape(queries, drawn, -1), kept, axis=1)
 
@@ -266,7 +243,7 @@ def _line_search(problem: LearnedProblem, line: _Line) -> tuple[Phi, Float[np.nd
     rows = np.arange(len(phi))
     for _ in range(HALVINGS):
         tried = phi[rows] + share * line.direction[rows]
-        cost = _ranks(problem.evaluate(tried, line.ends[rows]))
+        cost = ranks(problem.evaluate(tried, line.ends[rows]))
         enough = cost < line.value[rows] + SUFFICIENT * share * line.slope[rows]
         phi[rows[enough]], new[rows[enough]] = tried[enough], cost[enough]
         rows, share = rows[~enough], SHORTENED * share

@@ -9,7 +9,9 @@ the planner for any path at all.
 
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +23,7 @@ from constraint_geodesics.benchmark.judge import judge_limits
 from constraint_geodesics.benchmark.queries import TABLE, Query, draw_benchmark, shortest_of
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import ConstraintManifold, constraint_manifold
+from constraint_geodesics.geodesics.descent import INFEASIBLE, beginning, stepped
 from constraint_geodesics.geodesics.learned_method import LatentCurve, sampled
 from constraint_geodesics.geodesics.learned_problem import LearnedProblem
 from constraint_geodesics.geodesics.problem import Costs, Ends, Phi, repeated
@@ -34,7 +37,7 @@ from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search.candidates import ROW_SAFETY, Task, rows_of
 from constraint_geodesics.studies.geodesic_search import policy_problem
-from constraint_geodesics.studies.optimum import INFEASIBLE, OptimumSettings, family_optimum
+from constraint_geodesics.studies.optimum import OptimumSettings, family_optimum
 from constraint_geodesics.studies.statistics import (
     bootstrap_interval,
     interquartile_mean,
@@ -49,12 +52,15 @@ MOST_CHECKED = 12
 """Curves of one offer that are checked at most: those behind them are mostly alike."""
 DRAWN, KEPT = 32, 4
 """Curves that the controls draw at once, and how many of them go down the descent together."""
-GROWN, CUT, LONGEST = 1.3, 0.4, 1.5
-"""Factors of a descent's stride after a better and a worse step, and the longest one."""
 PAST_ROWS = 1000
 """Configurations of the constraint that random curves are bent past."""
 PLANNER = "planner"
 """Of the benchmark: it solves all that any other of its planners solves."""
+LEARNERS = ("path diffusion",)
+PEERS = (PLANNER, *LEARNERS, "receding horizon")
+"""Planners of the benchmark that are asked besides; those in which chance plays a part as often as
+the controls.
+"""
 
 
 class Offer(NamedTuple):
@@ -184,21 +190,12 @@ def by_descent(seed: int) -> Method:
         first = problem.evaluate(drawn, many)
         order = np.lexsort((first.cost, ~first.feasible))
         few, phi, curves = repeated(asked.ends, KEPT), drawn[order[:KEPT]], DRAWN
-        now, stride = problem.observed(phi, few), np.ones(KEPT)
-        descent, costs = now.descent, now.costs
-        rank = np.where(costs.feasible, costs.cost, INFEASIBLE + costs.cost)
+        now = beginning(problem, phi, few)
         while time.perf_counter() - began < seconds:
-            tried = phi + stride[:, None] * descent
-            now, curves = problem.observed(tried, few), curves + KEPT
-            new = np.where(now.costs.feasible, now.costs.cost, INFEASIBLE + now.costs.cost)
-            better = new < rank
-            phi = np.where(better[:, None], tried, phi)
-            descent = np.where(better[:, None], now.descent, descent)
-            rank = np.where(better, new, rank)
-            stride = np.where(better, np.minimum(GROWN * stride, LONGEST), CUT * stride)
-        best = np.argsort(rank)[: int((rank < INFEASIBLE).sum())]
+            now, curves = stepped(problem, now, few), curves + KEPT
+        best = np.argsort(now.rank)[: int((now.rank < INFEASIBLE).sum())]
         others = order[: int(first.feasible.sum())]
-        yield Offer(np.concatenate([phi[best], drawn[others]]), curves)
+        yield Offer(np.concatenate([now.phi[best], drawn[others]]), curves)
 
     return offers
 
@@ -273,11 +270,16 @@ def run_policies(task: PolicyTask) -> pd.DataFrame:
     problem = policy_problem(params, task.chart, scene, manifold, past)
     policies = {own: MeanPolicy.load(task.policies, own) for own in settings.seeds}
     compared, rows, phi = Compared(policies, settings), list[dict[str, Any]](), list[Phi]()
-    with BaselineBuilder(params, task.root)((PLANNER,), scene, task.name, manifold) as built:
-        planner = built[0][PLANNER]
-        queries = _queries(params, scene, manifold, task.name, planner)
+    build = partial(BaselineBuilder(params, task.root), PEERS)
+    with build(scene, task.name, manifold) as (peers, _):
+        queries = _queries(params, scene, manifold, task.name, peers[PLANNER])
         for query in queries:
-            found, answers = _query_rows(query, problem, compared, params, planner)
+            with ExitStack() as opened:
+                own = peers
+                if query.obstacle is not None:  # planners know the scene that they were made in
+                    made = build(query.in_scene(scene), task.name, manifold)
+                    own, _ = opened.enter_context(made)
+                found, answers = _query_rows(query, problem, compared, params, own)
             rows += found
             phi.append(np.array([answer.phi for answer in answers]))
     table = pd.DataFrame(rows).assign(optimum_rad=np.nan)
@@ -318,9 +320,13 @@ def _queries(
 
 
 def _query_rows(
-    query: Query, problem: LearnedProblem, compared: Compared, params: Params, planner: PathPlanner
+    query: Query,
+    problem: LearnedProblem,
+    compared: Compared,
+    params: Params,
+    peers: Mapping[str, PathPlanner],
 ) -> tuple[list[dict[str, Any]], list[Answer]]:
-    """One query's rows, and the answers that they are of."""
+    """One query's rows, and the answers that are curves of the family."""
     scene = query.in_scene(Scene.from_params(params))
     manifold, ends = problem.manifold, problem.ends(query.start[None], query.goal[None])
     with Certifier(scene, judge_limits(params.judge)) as certifier, scene.world() as world:
@@ -329,19 +335,35 @@ def _query_rows(
         answered(asked, straight(asked, 0.0))  # what is loaded late is no method's
         answers = query_answers(asked, compared)
         known = PlanningProblem(query.start, query.goal, manifold, world.is_free, clearance)
-        path = shortest_of({PLANNER: planner}, known, certifier)
-    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    lengths = [float(steps.sum()) if len(path) > 1 else np.nan]
-    best = float(np.fmin.reduce([*lengths, *(answer.length for _, _, answer in answers)]))
+        planned = [
+            (name, seed, _planned(asked, known, planner, seed))
+            for name, planner in peers.items()
+            for seed in (range(CONTROLS) if name in LEARNERS else (0,))
+        ]
+    every = [*answers, *planned]
+    best = float(np.fmin.reduce([answer.length for _, _, answer in every]))
     about = {"constraint": query.constraint, "scene": query.scene, "query": query.number}
     rows = [
         about
         | {"method": name, "seed": seed, "solved": answer.solved, "length_rad": answer.length}
         | {"best_rad": best, "curves": answer.curves, "checked": answer.checked}
         | {"search_ms": 1e3 * answer.search_s, "time_ms": 1e3 * (answer.search_s + answer.check_s)}
-        for name, seed, answer in answers
+        for name, seed, answer in every
     ]
     return rows, [answer for _, _, answer in answers]
+
+
+def _planned(asked: Asked, problem: PlanningProblem, planner: PathPlanner, seed: int) -> Answer:
+    """Another planner's answer, certified as all are; its path is no curve of the family."""
+    began = time.perf_counter()
+    joints = planner.plan(problem, seed).joints
+    found, length = time.perf_counter(), np.nan
+    if len(joints) > 1:
+        constraint = problem.manifold.constraint
+        certificate = asked.certifier.certify(joints, constraint, problem.start, problem.goal)
+        length = certificate.length_rad if certificate.valid else np.nan
+    nothing = np.zeros(asked.problem.curve.coefficients)
+    return Answer(nothing, length, found - began, time.perf_counter() - found, 0, 1)
 
 
 SHARES = ("solved", "ratio_median", "ratio_p95", "optimum_median", "optimum_p95", "time_ms")

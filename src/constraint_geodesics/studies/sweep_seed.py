@@ -160,7 +160,8 @@ _KEPT: dict[str, ProblemSet] = {}
 def _training(params: Params, layout: Layout) -> ProblemSet:
     """What policies train on; the same for configurations that differ in nothing it depends on."""
     own = params.policies
-    key = str((layout.root, params.geodesics.degree, own.chart, own.length_degree, own.obstacles))
+    degrees = params.geodesics.degree, own.training_length_degree
+    key = str((layout.root, degrees, own.chart, own.obstacles))
     if key not in _KEPT:
         scene = Scene.from_params(params)
         # one chart for all: members of a set share it
