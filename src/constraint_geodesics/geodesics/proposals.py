@@ -140,7 +140,7 @@ def _many_looked_at(
     at most: where few are, the way has to be looked for.
     """
     met = list(known)
-    for _ in range(MOST_LOOKS):
+    for _ in range(MOST_LOOKS if number else 0):
         met.append(_looked_at(problem, ends, _drawn(problem, ends, number, rng)))
         if sum(int(part.feasible.sum()) for part in met) >= wanted:
             break

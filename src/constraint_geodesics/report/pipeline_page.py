@@ -88,6 +88,9 @@ def page_content(params: Params, layout: Layout, table: pd.DataFrame) -> dict[st
         ],
         "executed": [study_report.execution_block(params, layout)],
         "proposals": study_report.policy_blocks(params, layout) if "policies" in studies else [],
+        "learning_adds": (
+            study_report.what_learning_adds(params, layout) if "policies" in studies else {}
+        ),
         "arms": arm_tables(layout) if "arms" in studies else [],
         "results": pipeline_tables.result_tables(params, layout, table),
         "ablations": (

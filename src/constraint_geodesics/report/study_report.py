@@ -13,7 +13,15 @@ from constraint_geodesics.pipeline.layout import Layout, in_checkout
 from constraint_geodesics.report.cells import fixed, markdown_table, share, short
 from constraint_geodesics.report.page import Links, Recorded, Table, runs_link
 from constraint_geodesics.report.results import read_metrics
-from constraint_geodesics.studies.proposals import DESCENT, OWN, POLICY, RANDOM, STRAIGHT
+from constraint_geodesics.studies.proposals import (
+    DESCENT,
+    OWN,
+    PEERS,
+    PLANNER,
+    POLICY,
+    RANDOM,
+    STRAIGHT,
+)
 
 POLICY_COLUMNS = (
     *("one cubic, not refined", "certified, of what anything solves", "95 % interval"),
@@ -24,8 +32,8 @@ EXECUTION_COLUMNS = (
     *("path", "executed", "spheres kept, mean", "worst", "largest tilt [°]", "collisions"),
     *("tracking error [rad]", "duration [s]"),
 )
-METHODS = (POLICY, OWN, RANDOM, DESCENT, STRAIGHT)
-"""The order of the proposals."""
+METHODS = (POLICY, OWN, RANDOM, DESCENT, STRAIGHT, *PEERS[1:], PLANNER)
+"""The order of the proposals; the last ones return whole paths."""
 SCENES = {"table": "", "keep_out": ", one sphere on the way"}
 """What a block's title says of each scene."""
 
@@ -100,8 +108,71 @@ def execution_markdown(params: Params, layout: Layout) -> str:
 
 
 def policies_markdown(params: Params, layout: Layout) -> str:
-    """The policies' first table, as Markdown."""
-    return _markdown(policy_blocks(params, layout)[0]) + "\n"
+    """What learning adds, and all tables of it, as Markdown."""
+    added = what_learning_adds(params, layout)
+    said = "\n".join(f"- **{footing}.** {sentence}" for footing, sentence in added.items())
+    blocks = "\n\n".join(map(_markdown, policy_blocks(params, layout)))
+    return f"{said}\n\n{blocks}\n"
+
+
+def what_learning_adds(params: Params, layout: Layout) -> dict[str, str]:
+    """What is to be said of each footing (one curve, unseen constraints, an obstacle, refined
+    paths), and of the training.
+    """
+    found = read_metrics(layout.report("benchmark_policies", "policies"))
+    studied = params.studies.constraint
+    unseen = ", ".join(
+        f"{name} {share(found[name]['table'][POLICY]['solved_iqm'])}"
+        for name in params.unseen
+        if POLICY in found.get(name, {}).get("table", {})
+    )
+    said = {
+        "One curve": f"{_against_controls(found[studied]['table'], studied)} "
+        f"{_against_controls(found['trained on']['table'], 'All constraints together')}",
+        "Constraints never trained on": f"The policy solves {unseen}. "
+        + _against_controls(found["never seen"]["table"], "Together"),
+    }
+    beset = found["trained on"].get("keep_out")
+    if beset:
+        said["A sphere on the way"] = _against_controls(beset, "All constraints together")
+    refined = found["trained on"]["table"].get(PLANNER)
+    if refined:
+        policy = found["trained on"]["table"][POLICY]
+        said["Refined paths"] = (
+            f"The planner, in which nothing is learned, solves "
+            f"{share(refined['solved_iqm'])} of the same queries in "
+            f"{short(refined['time_ms_iqm'])} ms, with a 95th percentile of "
+            f"{fixed(refined['ratio_p95_iqm'], 3)} times the shortest known, the policy "
+            f"{fixed(policy['ratio_p95_iqm'], 3)}: there learning adds nothing."
+        )
+    trained = _trained_for(params, layout)
+    return said | ({"Training, of one core": trained} if trained else {})
+
+
+def _against_controls(rows: Mapping[str, Mapping[str, Any]], where: str) -> str:
+    """What a policy solves and how long its curves are, and those of its controls."""
+    family = rows[POLICY]["optimum_p95_iqm"] is not None
+    column = "optimum_p95_iqm" if family else "ratio_p95_iqm"
+    over = "the family's shortest curve" if family else "the shortest path known"
+    told = [
+        f"{name} {share(row['solved_iqm'], 1)} and {fixed(row[column], 3)}"
+        for name, row in _ordered(rows, (POLICY, RANDOM, DESCENT)).items()
+        if name in (POLICY, RANDOM, DESCENT)
+    ]
+    return f"{where}: solved, and 95th percentile of the length over {over}, {'; '.join(told)}."
+
+
+def _trained_for(params: Params, layout: Layout) -> str:
+    """How long each learner is trained, where its stage said so."""
+    chart = params.policies.chart
+    stages = (("a seed of the policy", "train_policies", chart, "seconds_mean"),)
+    stages += (("path diffusion", "train_path_diffusion", "paths", "seconds"),)
+    told = [
+        f"{what} {read_metrics(layout.report(stage, item))[key]:.0f} s"
+        for what, stage, item, key in stages
+        if layout.report(stage, item).is_file()
+    ]
+    return f"{', '.join(told)}." if told else ""
 
 
 def _ordered(

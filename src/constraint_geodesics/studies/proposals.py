@@ -291,7 +291,8 @@ def run_policies(task: PolicyTask) -> pd.DataFrame:
         problem, problem.ends(starts, goals), np.array([phi[k] for k in alone]), OptimumSettings()
     )
     free = table["scene"] == TABLE
-    met = table[free].groupby("query")["length_rad"].min()
+    curves = table[free & ~table["method"].isin(PEERS)]
+    met = curves.groupby("query")["length_rad"].min()
     known = pd.Series(np.fmin(met.to_numpy(), shortest.length), index=met.index)
     table.loc[free, "optimum_rad"] = table.loc[free, "query"].map(known)
     return table
