@@ -34,6 +34,7 @@ def policy_rows(params: Params) -> pd.DataFrame:
                 "optimum_rad": 2.0
                 if (constraint, scene) == (params.studies.constraint, "table")
                 else np.nan,
+                "refined_rad": length - 0.01,
                 "curves": 5,
                 "checked": 1,
                 "search_ms": 3.0,

@@ -25,9 +25,11 @@ def test_policies_are_compared_over_what_anything_solves(reported):
     blocks = policy_blocks(*reported)
     first = blocks[0]
     rows = {row[0]: row[1:] for row in first.rows}
-    cells = ["100.0%", "100.0% to 100.0%", "1.0150", "1.0195", "5", "4", "", ""]
+    cells = ["2 × 1", "100.0%", "", "1.0150", "1.0195", "1.0200", "5", "4", "", ""]
+    cells += ["100.0%", "1.0145"]
     assert rows["policy"] == cells
-    cells = ["50.0%", "50.0% to 50.0%", "1.1000", "1.1000", "5", "4", "100%", "100%"]
+    cells = ["2 × 1", "50.0%", "", "1.1000", "1.1000", "∞", "5", "4", "100%", "100%"]
+    cells += ["50.0%", "1.0950"]
     assert rows["random curves, same time"] == cells
     assert "2 queries, 2 of which anything solves" in first.note
     assert "the family's shortest curve" in first.note
@@ -59,7 +61,9 @@ def test_markdown_holds_every_row(reported):
 def test_what_learning_adds_is_said_of_every_footing(reported):
     params, _ = reported
     said = what_learning_adds(*reported)
-    assert list(said) == ["One curve", "Constraints never trained on", "A sphere on the way"]
+    footings = ["One curve", "Constraints never trained on", "A sphere on the way"]
+    assert list(said) == [*footings, "Refined paths"]
+    assert "policy 100.0% and 1.0150; random curves, same time 50.0%" in said["Refined paths"]
     assert said["One curve"].startswith(
         f"{params.studies.constraint}: solved, and 95th percentile of the length over the family's "
         "shortest curve, policy 100.0% and 1.020; random curves, same time 50.0% and 1.100."

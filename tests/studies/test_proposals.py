@@ -66,7 +66,7 @@ def test_every_answer_is_a_certified_curve_of_the_family(asked, answers) -> None
 def test_all_methods_answer_and_the_straight_line_is_among_them(answers, compared) -> None:
     names = [(name, seed) for name, seed, _ in answers[0]]
     assert names[0] == (bench.POLICY, 0)
-    assert len(names) == 2 * len(compared.policies) + 1 + 2 * bench.CONTROLS
+    assert len(names) == 5 * len(compared.policies) + 1, "as many controls as policies"
     for found in answers:
         straight = next(a for name, _, a in found if name == bench.STRAIGHT)
         if straight.solved:
@@ -97,6 +97,7 @@ def rows(*answers: tuple[str, int, int, float]) -> pd.DataFrame:
     table["solved"] = table["length_rad"].notna()
     table["best_rad"] = table["query"].map({0: 1.0, 1: 2.0, 2: np.nan})
     table["optimum_rad"] = table["query"].map({0: 1.1, 1: 2.0, 2: np.nan})
+    table["refined_rad"] = table["length_rad"] - 0.01
     return table.assign(curves=5, checked=1, search_ms=2.0, time_ms=3.0)
 
 
@@ -122,6 +123,9 @@ def test_figures_are_of_what_anything_solves_and_of_the_seeds() -> None:
     assert mine["optimum_median_mean"] == pytest.approx(((1.0 + 1.1) / 2 + 1.3 / 1.1) / 2)
     assert theirs["beaten_in_solved"] == pytest.approx(0.75), "one seed solves more, one as many"
     assert theirs["beaten_in_ratio_p95"] == 1.0
+    assert mine["refined_mean"] == pytest.approx(0.75)
+    assert mine["ratio_p95_all_mean"] is None, "one seed of two has a failure, which is infinite"
+    assert theirs["solved_low"] is None, "one run has no interval"
     nothing = bench.policy_figures(rows((bench.POLICY, 0, 0, np.nan)))[bench.POLICY]
     assert nothing["solved_mean"] == 0.0
     assert nothing["ratio_median_mean"] is None

@@ -100,7 +100,7 @@ def test_what_is_kept_is_read_again_and_counts_as_done(layout) -> None:
 
 
 def test_a_sweep_without_data_names_the_file_and_what_makes_it(tmp_path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"manifolds/planner: .*`make repro` makes it"):
+    with pytest.raises(FileNotFoundError, match=r"joints.parquet: .*`make repro` makes it"):
         configuration(load_params(ROOT / "params.yaml"), Layout(tmp_path), {})
 
 

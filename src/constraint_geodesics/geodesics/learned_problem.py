@@ -45,8 +45,6 @@ that were looked at.
 """
 NEEDED_SHARE = 0.3
 """Share of the margin that a feasible curve keeps at every point looked at."""
-SPARED_SHARE = 0.5
-"""Share of the margin below which a missing clearance costs."""
 JUMP_WEIGHT = 2.0
 """Cost of a radian of a jump, beyond its length: a jump must never pay for a shorter curve."""
 CLOSE_WEIGHT = 20.0

@@ -15,7 +15,7 @@ import joblib
 import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -68,7 +68,6 @@ class Actor(nn.Module):
         self.body = nn.Sequential(*layers)
         self.mean = nn.Linear(width, actions)
         self.log_std = nn.Parameter(torch.zeros(actions))
-        self.sizes = {"observation": observation, "hidden": list(hidden), "actions": actions}
 
     def forward(self, observation: Float[Tensor, "B o"]) -> Float[Tensor, "B p"]:
         """Mean actions."""
@@ -219,18 +218,9 @@ def _shortest(found: Sequence[Geodesic]) -> Geodesic:
 
 
 def save_policy(policy: TrainedPolicy, folder: Path, seed: int) -> None:
-    """Weights (safetensors) and layer sizes (JSON) of one seed."""
+    """Weights (safetensors) of one seed; `MeanPolicy.load` reads them."""
     folder.mkdir(parents=True, exist_ok=True)
     save_file(policy.actor.state_dict(), folder / f"policy-{seed}.safetensors")
-    sizes = json.dumps(policy.actor.sizes, sort_keys=True)
-    (folder / f"policy-{seed}.json").write_text(sizes + "\n")
-
-
-def load_policy(folder: Path, seed: int) -> Actor:
-    """Read what `save_policy` wrote."""
-    actor = Actor(**json.loads((folder / f"policy-{seed}.json").read_text()))
-    actor.load_state_dict(load_file(folder / f"policy-{seed}.safetensors"))
-    return actor.eval().requires_grad_(False)
 
 
 def actor_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -73,7 +73,8 @@ class Met:
     """n curves met for one query.
 
     rollout: which of the kept ones met each, −1 for the others of the first look.  last: whether
-    the last step met it, so that another one might shorten it further.
+    the last step met it, so that another one might shorten it further.  looks: curves measured for
+    it, some of them twice.
     """
 
     phi: Float[np.ndarray, "n p"]
@@ -82,6 +83,7 @@ class Met:
     feasible: Bool[np.ndarray, "n"]
     rollout: Int[np.ndarray, "n"]
     last: Bool[np.ndarray, "n"]
+    looks: int = 0
 
     @cached_property
     def best_of_each(self) -> Int[np.ndarray, "k"]:
@@ -171,8 +173,9 @@ def _followed(
     kept = np.lexsort((looked.cost, ~looked.feasible))[: params.kept]
     rollout = np.arange(len(kept))
     looked.rollout[kept] = rollout
-    # the straight line comes first, then the heads' moves in their order
-    begun = replace(straight[np.zeros(len(kept), dtype=int)], head=(kept - 1) % params.heads)
+    # the straight line comes first, then the heads' moves, then random curves, shared out
+    head = np.maximum(kept - 1, 0) % params.heads
+    begun = replace(straight[np.zeros(len(kept), dtype=int)], head=head)
     states, visited = placed(problem, begun, looked.phi[kept]), [looked]
     for step in range(1, params.episode_steps):
         states = moved(problem, params, states, policy.act(observe(params, states)))
@@ -183,6 +186,7 @@ def _followed(
             states, rollout = states[better], rollout[better]
     visited[-1].last[:] = True
     met = _joined(visited)
+    met = replace(met, looks=len(met.phi) + len(kept))
     if not straight.descent.shape[1]:
         return met
     rows = met.best_of_each[:SETTLED]
@@ -190,7 +194,8 @@ def _followed(
     rest = descended(problem, beginning(problem, met.phi[rows], few), few, SETTLING)
     settled = _met(rest.phi, rest.now.costs, met.rollout[rows])
     settled.last[:] = True
-    return _joined([met, settled])
+    looks = met.looks + len(rows) * (1 + SETTLING)
+    return replace(_joined([met, settled]), looks=looks)
 
 
 def _looked_at(problem: GeodesicProblem, ends: Ends, phi: Phi) -> Met:
@@ -205,8 +210,11 @@ def _met(phi: Phi, costs: Costs | CurveStates, rollout: int | Int[np.ndarray, "n
 
 def _joined(parts: Sequence[Met]) -> Met:
     """What was met, one after another."""
-    return Met(*(np.concatenate(values) for values in zip(*map(_fields, parts), strict=True)))
-
-
-def _fields(met: Met) -> tuple[np.ndarray, ...]:
-    return met.phi, met.length, met.cost, met.feasible, met.rollout, met.last
+    return Met(
+        np.concatenate([part.phi for part in parts]),
+        np.concatenate([part.length for part in parts]),
+        np.concatenate([part.cost for part in parts]),
+        np.concatenate([part.feasible for part in parts]),
+        np.concatenate([part.rollout for part in parts]),
+        np.concatenate([part.last for part in parts]),
+    )

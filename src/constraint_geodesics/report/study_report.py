@@ -20,20 +20,25 @@ from constraint_geodesics.studies.proposals import (
     PLANNER,
     POLICY,
     RANDOM,
+    STILL,
     STRAIGHT,
 )
 
 POLICY_COLUMNS = (
-    *("one cubic, not refined", "certified, of what anything solves", "95 % interval"),
-    *("length / shortest, median", "p95", "curves looked at"),
-    *("time with its check [ms]", "chance that the policy solves more", "is shorter"),
+    *("one cubic, not refined", "queries × seeds", "certified, of what anything solves"),
+    *("95 % interval", "length / shortest, median", "p95", "p95, failures ∞"),
+    *("curves looked at", "time with its check [ms]", "chance that the policy solves more"),
+    *("is shorter", "refined: certified", "p95"),
 )
 EXECUTION_COLUMNS = (
     *("path", "executed", "spheres kept, mean", "worst", "largest tilt [°]", "collisions"),
     *("tracking error [rad]", "duration [s]"),
 )
-METHODS = (POLICY, OWN, RANDOM, DESCENT, STRAIGHT, *PEERS[1:], PLANNER)
+METHODS = (POLICY, STILL, RANDOM, DESCENT, OWN, STRAIGHT, *PEERS[1:], PLANNER)
 """The order of the proposals; the last ones return whole paths."""
+COMPARED = (POLICY, STILL, RANDOM, DESCENT)
+"""What a sentence compares."""
+DIFFUSION = "train_path_diffusion"
 SCENES = {"table": "", "keep_out": ", one sphere on the way"}
 """What a block's title says of each scene."""
 
@@ -135,18 +140,18 @@ def what_learning_adds(params: Params, layout: Layout) -> dict[str, str]:
     beset = found["trained on"].get("keep_out")
     if beset:
         said["A sphere on the way"] = _against_controls(beset, "All constraints together")
-    refined = found["trained on"]["table"].get(PLANNER)
-    if refined:
-        policy = found["trained on"]["table"][POLICY]
-        said["Refined paths"] = (
-            f"The planner, in which nothing is learned, solves "
-            f"{share(refined['solved_iqm'])} of the same queries in "
-            f"{short(refined['time_ms_iqm'])} ms, with a 95th percentile of "
-            f"{fixed(refined['ratio_p95_iqm'], 3)} times the shortest known, the policy "
-            f"{fixed(policy['ratio_p95_iqm'], 3)}: there learning adds nothing."
-        )
+    rows = found["trained on"]["table"]
+    told = [
+        f"{name} {share(own['refined_iqm'], 1)} and {fixed(own['refined_p95_iqm'], 4)}"
+        for name, own in _ordered(rows, (*COMPARED, PLANNER)).items()
+        if name in (*COMPARED, PLANNER)
+    ]
+    said["Refined paths"] = (
+        "The answers relaxed by the planner's band, all constraints together: certified, and 95th "
+        f"percentile of the length over the shortest path known, {'; '.join(told)}."
+    )
     trained = _trained_for(params, layout)
-    return said | ({"Training, of one core": trained} if trained else {})
+    return said | ({"Training": trained} if trained else {})
 
 
 def _against_controls(rows: Mapping[str, Mapping[str, Any]], where: str) -> str:
@@ -156,22 +161,27 @@ def _against_controls(rows: Mapping[str, Mapping[str, Any]], where: str) -> str:
     over = "the family's shortest curve" if family else "the shortest path known"
     told = [
         f"{name} {share(row['solved_iqm'], 1)} and {fixed(row[column], 3)}"
-        for name, row in _ordered(rows, (POLICY, RANDOM, DESCENT)).items()
-        if name in (POLICY, RANDOM, DESCENT)
+        for name, row in _ordered(rows, COMPARED).items()
+        if name in COMPARED
     ]
     return f"{where}: solved, and 95th percentile of the length over {over}, {'; '.join(told)}."
 
 
 def _trained_for(params: Params, layout: Layout) -> str:
-    """How long each learner is trained, where its stage said so."""
-    chart = params.policies.chart
-    stages = (("a seed of the policy", "train_policies", chart, "seconds_mean"),)
-    stages += (("path diffusion", "train_path_diffusion", "paths", "seconds"),)
-    told = [
-        f"{what} {read_metrics(layout.report(stage, item))[key]:.0f} s"
-        for what, stage, item, key in stages
-        if layout.report(stage, item).is_file()
-    ]
+    """How long the learners were trained, where their stages said so."""
+    told = []
+    policies = layout.report("train_policies", params.policies.chart)
+    if policies.is_file():
+        told.append(
+            f"a seed of the policy, on one core, {read_metrics(policies)['seconds_mean']:.0f} s"
+        )
+    times = layout.stage_times
+    if times.is_file():
+        seconds = pd.read_csv(times).set_index("stage")["seconds"]
+        if DIFFUSION in seconds:
+            told.append(
+                f"path diffusion, the paths it learns from planned, {seconds[DIFFUSION]:.0f} s"
+            )
     return f"{', '.join(told)}." if told else ""
 
 
@@ -192,21 +202,30 @@ def _policy_block(title: str, rows: Mapping[str, Mapping[str, Any]], link: Links
     over = "optimum" if family else "ratio"
     note = (
         f"{first['queries']} queries, {first['solvable']} of which anything solves; interquartile "
-        f"means over {first['seeds']} seeds of the policy; lengths over "
+        f"means and their bootstrap intervals over the seeds, the queries being what they are; "
+        f"lengths over "
         + ("the family's shortest curve" if family else "the shortest certified path known")
+        + ", p95 of what was solved; with failures infinite, and refined by the planner's band, "
+        "over the shortest certified path known"
     )
     cells = [
         [
             method,
+            f"{row['asked']} × {row['seeds']}",
             share(row["solved_iqm"], 1),
-            f"{share(row['solved_low'], 1)} to {share(row['solved_high'], 1)}",
+            ""
+            if row["solved_low"] is None
+            else f"{share(row['solved_low'], 1)} to {share(row['solved_high'], 1)}",
             *(fixed(row[f"{over}_{what}_iqm"], 4) for what in ("median", "p95")),
-            short(row["curves"]),
+            "∞" if row["ratio_p95_all_iqm"] is None else fixed(row["ratio_p95_all_iqm"], 4),
+            short(row["curves"]) if row["curves"] else "",
             short(row["time_ms_iqm"]),
             *(
                 share(row[f"beaten_in_{what}"]) if f"beaten_in_{what}" in row else ""
                 for what in ("solved", "ratio_p95")
             ),
+            share(row["refined_iqm"], 1),
+            fixed(row["refined_p95_iqm"], 4),
         ]
         for method, row in rows.items()
     ]

@@ -104,7 +104,7 @@ def _search_rows(task: ChartTask) -> list[dict[str, Any]]:
                 answered(asked, methods[POLICY](asked, spent))  # what is loaded late is no query's
             for name, method in methods.items():
                 answer = answered(asked, method(asked, spent))
-                spent = spent or answer.search_s
+                spent = spent or answer.search_s + answer.check_s
                 rows.append(_row(name, query, "length_rad", answer.length))
                 rows.append(_row(name, query, "ms", 1e3 * (answer.search_s + answer.check_s)))
     return rows

@@ -23,7 +23,7 @@ from constraint_geodesics.benchmark.judge import judge_limits
 from constraint_geodesics.benchmark.queries import TABLE, Query, draw_benchmark, shortest_of
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import ConstraintManifold, constraint_manifold
-from constraint_geodesics.geodesics.descent import INFEASIBLE, beginning, stepped
+from constraint_geodesics.geodesics.descent import INFEASIBLE, beginning, ranks, stepped
 from constraint_geodesics.geodesics.learned_method import LatentCurve, sampled
 from constraint_geodesics.geodesics.learned_problem import LearnedProblem
 from constraint_geodesics.geodesics.problem import Costs, Ends, Phi, repeated
@@ -35,7 +35,7 @@ from constraint_geodesics.peers.registry import BaselineBuilder
 from constraint_geodesics.problem import PathPlanner, PlanningProblem
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.search.candidates import ROW_SAFETY, Task, rows_of
+from constraint_geodesics.search.candidates import ROW_SAFETY, Candidate, Task, refined, rows_of
 from constraint_geodesics.studies.geodesic_search import policy_problem
 from constraint_geodesics.studies.optimum import OptimumSettings, family_optimum
 from constraint_geodesics.studies.statistics import (
@@ -45,22 +45,24 @@ from constraint_geodesics.studies.statistics import (
 )
 
 STRAIGHT, POLICY, OWN = "straight line", "policy", "policy, its own branches alone"
+STILL = "the same search, no policy"
 RANDOM, DESCENT = "random curves, same time", "random curves and descent, same time"
 CONTROLS = 5
 """Seeds of the methods that use chance but no policy."""
 MOST_CHECKED = 12
 """Curves of one offer that are checked at most: those behind them are mostly alike."""
-DRAWN, KEPT = 32, 4
+DRAWN, KEPT = 32, 8
 """Curves that the controls draw at once, and how many of them go down the descent together."""
+DRAWING = 0.5
+"""Share of its time in which the descent looks for so many curves that are feasible."""
+PEER_QUERIES, PEER_SEEDS = 40, 2
+"""Queries of each constraint and scene that slow planners are asked, and how often."""
 PAST_ROWS = 1000
 """Configurations of the constraint that random curves are bent past."""
 PLANNER = "planner"
 """Of the benchmark: it solves all that any other of its planners solves."""
-LEARNERS = ("path diffusion",)
-PEERS = (PLANNER, *LEARNERS, "receding horizon")
-"""Planners of the benchmark that are asked besides; those in which chance plays a part as often as
-the controls.
-"""
+PEERS = (PLANNER, "path diffusion", "receding horizon")
+"""Planners of the benchmark that are asked besides, all but the first of them PEER_QUERIES."""
 
 
 class Offer(NamedTuple):
@@ -74,7 +76,9 @@ class Offer(NamedTuple):
 
 Offers = Iterator[Offer]
 Method = Callable[["Asked", float], Offers]
-"""Offers for a query; the time [s] is what the controls may spend on their search."""
+"""Offers for a query; the time [s] is what the controls may spend on their search: all that the
+policy of the same number took, its checks too.
+"""
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,16 @@ class Asked:
 
     def certified_length(self, phi: Float[np.ndarray, "p"]) -> float | None:
         """Length of a curve's path [rad]; None unless it is certified."""
-        candidate = sampled(self.task, LatentCurve(self.problem, self.ends, phi))
+        return self._certified(sampled(self.task, LatentCurve(self.problem, self.ends, phi)))
+
+    def refined_length(self, phi: Float[np.ndarray, "p"]) -> float | None:
+        """The same of what the planner's elastic band makes of the curve."""
+        task = self.task
+        t = np.linspace(0.0, 1.0, task.settings.segments + 1)
+        curve = LatentCurve(self.problem, self.ends, phi)
+        return self._certified(refined(task, "policy", curve.decoded(t)))
+
+    def _certified(self, candidate: Candidate | None) -> float | None:
         if candidate is None:
             return None
         joints = rows_of(candidate, ROW_SAFETY * self.certifier.limits.violation_tolerance)
@@ -147,7 +160,7 @@ def by_policy(policy: MeanPolicy, settings: GeodesicParams, seed: int) -> Method
     def offers(asked: Asked, _: float) -> Offers:
         rng = np.random.default_rng((seed, asked.number))
         for met in rounds(asked.problem, policy, settings, asked.ends, rng):
-            yield Offer(met.phi[met.usable], len(met.phi))
+            yield Offer(met.phi[met.usable], met.looks)
 
     return offers
 
@@ -172,30 +185,47 @@ def at_random(seed: int) -> Method:
         phi = np.concatenate([drawn for drawn, _ in met])
         cost = np.concatenate([np.where(c.feasible, c.cost, np.inf) for _, c in met])
         order = np.argsort(cost, kind="stable")[: int(np.isfinite(cost).sum())]
-        yield Offer(phi[order], len(phi))
+        yield from _in_turn(phi[order], len(phi))
 
     return offers
 
 
+def _in_turn(phi: Phi, curves: int) -> Offers:
+    """All curves, as many at a time as are checked of one offer: a policy's rounds offer as many in
+    all, so that no control ends for want of checks.
+    """
+    yield Offer(phi[:MOST_CHECKED], curves)
+    for begin in range(MOST_CHECKED, len(phi), MOST_CHECKED):
+        yield Offer(phi[begin : begin + MOST_CHECKED], 0)
+
+
 def by_descent(seed: int) -> Method:
-    """The cheapest of a batch of random curves, and the straight line among those, down the
-    problem's own descent until the time is over.
+    """The cheapest of random curves, and the straight line among those, down the problem's own
+    descent until the time is over; random curves are drawn until KEPT of them are feasible or
+    DRAWING of the time is over.
     """
 
     def offers(asked: Asked, seconds: float) -> Offers:
         problem, many = asked.problem, repeated(asked.ends, DRAWN)
         began, rng = time.perf_counter(), np.random.default_rng((seed, asked.number))
-        drawn = problem.sample_curves(many, rng)
-        drawn[0] = 0.0
-        first = problem.evaluate(drawn, many)
-        order = np.lexsort((first.cost, ~first.feasible))
-        few, phi, curves = repeated(asked.ends, KEPT), drawn[order[:KEPT]], DRAWN
-        now = beginning(problem, phi, few)
+        met: list[tuple[Phi, Costs]] = []
+        while not met or (
+            sum(int(own.feasible.sum()) for _, own in met) < KEPT
+            and time.perf_counter() - began < DRAWING * seconds
+        ):
+            drawn = problem.sample_curves(many, rng)
+            drawn[0] *= bool(met)
+            met.append((drawn, problem.evaluate(drawn, many)))
+        phi = np.concatenate([drawn for drawn, _ in met])
+        first = np.concatenate([ranks(costs) for _, costs in met])
+        order = np.argsort(first, kind="stable")
+        few, curves = repeated(asked.ends, KEPT), len(phi) + KEPT
+        now = beginning(problem, phi[order[:KEPT]], few)
         while time.perf_counter() - began < seconds:
             now, curves = stepped(problem, now, few), curves + KEPT
         best = np.argsort(now.rank)[: int((now.rank < INFEASIBLE).sum())]
-        others = order[: int(first.feasible.sum())]
-        yield Offer(np.concatenate([now.phi[best], drawn[others]]), curves)
+        others = order[: int((first < INFEASIBLE).sum())]
+        yield from _in_turn(np.concatenate([now.phi[best], phi[others]]), curves)
 
     return offers
 
@@ -208,20 +238,27 @@ class Compared:
     settings: GeodesicParams
 
     def methods(self) -> list[tuple[str, int, Method]]:
-        """Name, seed and offers of each; the first policy comes first, for its time is what the
-        controls get.
+        """Name, seed and offers of each.  The policies come first: the time of each is what the
+        controls of its number get.
         """
         own = own_branches(self.settings)
         found: list[tuple[str, int, Method]] = [
             (POLICY, seed, by_policy(policy, self.settings, seed))
             for seed, policy in self.policies.items()
         ]
-        found += [
-            (OWN, seed, by_policy(policy, own, seed)) for seed, policy in self.policies.items()
-        ]
-        found.append((STRAIGHT, 0, straight))
-        found += [(RANDOM, seed, at_random(seed)) for seed in range(CONTROLS)]
-        return found + [(DESCENT, seed, by_descent(seed)) for seed in range(CONTROLS)]
+        controls = list(self.policies)[:CONTROLS]
+        found += [(OWN, seed, by_policy(self.policies[seed], own, seed)) for seed in controls]
+        still = without_actions(next(iter(self.policies.values())))
+        found += [(STILL, seed, by_policy(still, self.settings, seed)) for seed in controls]
+        found.append((STRAIGHT, controls[0], straight))
+        found += [(RANDOM, seed, at_random(seed)) for seed in controls]
+        return found + [(DESCENT, seed, by_descent(seed)) for seed in controls]
+
+
+def without_actions(policy: MeanPolicy) -> MeanPolicy:
+    """A policy that never acts: what the search around it does alone."""
+    seen = policy.layers[0][0].shape[1]
+    return MeanPolicy(((np.zeros((policy.actions, seen)), np.zeros(policy.actions)),))
 
 
 def own_branches(settings: GeodesicParams) -> GeodesicParams:
@@ -233,11 +270,10 @@ def own_branches(settings: GeodesicParams) -> GeodesicParams:
 def query_answers(asked: Asked, compared: Compared) -> list[tuple[str, int, Answer]]:
     """Name, seed and answer of every method."""
     answers: list[tuple[str, int, Answer]] = []
-    spent = 0.0
+    spent: dict[int, float] = {}
     for name, seed, method in compared.methods():
-        found = answered(asked, method(asked, spent))
-        if not answers:
-            spent = found.search_s
+        found = answered(asked, method(asked, spent.get(seed, 0.0)))
+        spent.setdefault(seed, found.search_s + found.check_s)
         answers.append((name, seed, found))
     return answers
 
@@ -259,7 +295,8 @@ def run_policies(task: PolicyTask) -> pd.DataFrame:
     Columns: constraint, scene, query, method, seed, solved, length_rad (nan where not solved),
     best_rad (of the shortest certified path that is known, the planner's or an answer's; nan where
     there is none), optimum_rad (of the family's shortest curve that is known; under the studied
-    constraint, without a sphere), curves (looked at), checked, search_ms and time_ms (with the
+    constraint, without a sphere), refined_rad (of what the planner's band makes of the answer; nan
+    where that is not certified), curves (looked at), checked, search_ms and time_ms (with the
     check).
     """
     params, settings = task.params, task.params.policy_settings()
@@ -339,19 +376,30 @@ def _query_rows(
         planned = [
             (name, seed, _planned(asked, known, planner, seed))
             for name, planner in peers.items()
-            for seed in (range(CONTROLS) if name in LEARNERS else (0,))
+            if name == PLANNER or query.number < PEER_QUERIES
+            for seed in (range(PEER_SEEDS) if name != PLANNER else (0,))
         ]
+        band = [_or_nan(asked.refined_length, answer) for _, _, answer in answers]
     every = [*answers, *planned]
-    best = float(np.fmin.reduce([answer.length for _, _, answer in every]))
+    best = float(np.fmin.reduce([*(answer.length for _, _, answer in every), *band]))
     about = {"constraint": query.constraint, "scene": query.scene, "query": query.number}
     rows = [
         about
         | {"method": name, "seed": seed, "solved": answer.solved, "length_rad": answer.length}
         | {"best_rad": best, "curves": answer.curves, "checked": answer.checked}
         | {"search_ms": 1e3 * answer.search_s, "time_ms": 1e3 * (answer.search_s + answer.check_s)}
-        for name, seed, answer in every
+        | {"refined_rad": refined_rad}
+        for (name, seed, answer), refined_rad in zip(
+            every, [*band, *(answer.length for _, _, answer in planned)], strict=True
+        )
     ]
     return rows, [answer for _, _, answer in answers]
+
+
+def _or_nan(length: Callable[[np.ndarray], float | None], answer: Answer) -> float:
+    """A length of an answer's curve, nan where there is none."""
+    found = length(answer.phi) if answer.solved else None
+    return np.nan if found is None else found
 
 
 def _planned(asked: Asked, problem: PlanningProblem, planner: PathPlanner, seed: int) -> Answer:
@@ -367,9 +415,13 @@ def _planned(asked: Asked, problem: PlanningProblem, planner: PathPlanner, seed:
     return Answer(nothing, length, found - began, time.perf_counter() - found, 0, 1)
 
 
-SHARES = ("solved", "ratio_median", "ratio_p95", "optimum_median", "optimum_p95", "time_ms")
-"""Figures of one seed: solved share of what anything solves, length over the best known path and
-over the family's shortest curve, over the seed's own answers, and median time [ms].
+SHARES = (
+    *("solved", "ratio_median", "ratio_p95", "ratio_p95_all", "optimum_median", "optimum_p95"),
+    *("refined", "refined_p95", "time_ms"),
+)
+"""Figures of one seed: solved share of what anything solves; length over the best known path, of
+the seed's own answers and (`_all`) with failures infinite, and over the family's shortest curve;
+the same of refined answers; median time [ms].
 """
 
 
@@ -379,13 +431,21 @@ def seed_figures(rows: pd.DataFrame) -> pd.DataFrame:
     # of some queries alone it would be no figure of all
     optimum = able["optimum_rad"] if able["optimum_rad"].notna().all() else np.nan
     able = able.assign(
-        ratio=able["length_rad"] / able["best_rad"], over_optimum=able["length_rad"] / optimum
+        ratio=able["length_rad"] / able["best_rad"],
+        over_optimum=able["length_rad"] / optimum,
+        refined_ratio=able["refined_rad"] / able["best_rad"],
+    )
+    able = able.assign(
+        ratio_all=able["ratio"].fillna(np.inf), is_refined=able["refined_ratio"].notna()
     )
     groups = able.groupby(["method", "seed"], sort=False)
     return groups.agg(
         solved=("solved", "mean"),
         ratio_median=("ratio", "median"),
         ratio_p95=("ratio", _p95),
+        ratio_p95_all=("ratio_all", _p95_all),
+        refined=("is_refined", "mean"),
+        refined_p95=("refined_ratio", _p95),
         optimum_median=("over_optimum", "median"),
         optimum_p95=("over_optimum", _p95),
         time_ms=("time_ms", "median"),
@@ -408,10 +468,14 @@ def policy_figures(rows: pd.DataFrame) -> dict[str, Any]:
         "solvable": int(able.groupby(["constraint", "query"]).ngroups),
     }
     for name, own in scores.items():
-        found: dict[str, Any] = counts | {"seeds": len(own), "curves": float(own["curves"].mean())}
+        asked = able[able["method"] == name].groupby(["constraint", "query"]).ngroups
+        found: dict[str, Any] = counts | {"seeds": len(own), "asked": asked}
+        found["curves"] = float(own["curves"].mean())
         for column in SHARES:
             values = own[column].to_numpy(float)
-            low, high = bootstrap_interval(values, interquartile_mean)
+            low = high = np.nan
+            if len(values) > 1 and np.isfinite(values).all():  # of one run there is no spread
+                low, high = bootstrap_interval(values, interquartile_mean)
             found |= {f"{column}_mean": float(values.mean()), f"{column}_low": low}
             found |= {f"{column}_iqm": interquartile_mean(values), f"{column}_high": high}
         if name != POLICY:
@@ -441,6 +505,11 @@ def _p95(values: pd.Series) -> float:
     return float(values.quantile(0.95))
 
 
+def _p95_all(values: pd.Series) -> float:
+    """Without interpolation: between a number and infinity there is none."""
+    return float(np.quantile(values, 0.95, method="higher"))
+
+
 def _json(value: Any) -> Any:
-    """Not a number is nothing in JSON."""
-    return None if isinstance(value, float) and np.isnan(value) else value
+    """Neither infinity nor not a number is there in JSON."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value

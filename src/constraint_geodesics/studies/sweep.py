@@ -121,10 +121,11 @@ def configurations_of(space: SearchSpace, layout: Layout) -> list[Configuration]
 
 def configuration(params: Params, layout: Layout, changes: Changes) -> Configuration:
     """A configuration that params describe, with what it changes in params.yaml."""
-    trained = params.policy_settings().of_training("length_degree")
-    del trained["seeds"]  # another seed changes nothing of those that are done
-    del trained["steps"]  # a sweep has its own
+    # another seed changes nothing of those that are done, and a sweep has steps of its own
+    trained = params.policies.model_dump(mode="json", exclude={"seeds", "steps"})
+    trained["degree"] = params.geodesics.degree
     judged = params.sweep.model_dump(include={"steps", "queries", "query_seed"})
+    judged |= params.judge.model_dump(mode="json")
     return Configuration(changes, params, fingerprint(trained, judged, _shared(params, layout)))
 
 
@@ -265,8 +266,7 @@ def _family(params: Params, layout: Layout, constraint: str) -> str:
 def _shared(params: Params, layout: Layout) -> list[Any]:
     """What all configurations depend on: robot, scene, constraints, data, code."""
     described = params.model_dump(mode="json", include={"robot", "workcell", "constraints"})
-    retract = params.manifolds[params.geodesics.searched[0]].retract
-    return [described, retract, _contents(tuple(_inputs(params, layout)))]
+    return [described, _contents(tuple(_inputs(params, layout)))]
 
 
 @cache
@@ -278,8 +278,9 @@ def _contents(inputs: tuple[Path, ...]) -> str:
 
 
 def _inputs(params: Params, layout: Layout) -> list[Path]:
-    manifold = layout.manifold(params.geodesics.searched[0])
-    files = [manifold, *(layout.joints(name) for name in params.constraints)]
+    chart = params.policies.chart
+    manifold = [layout.manifold(chart)] if chart in params.manifolds else []
+    files = [*manifold, *(layout.joints(name) for name in params.constraints)]
     for file in files:
         if not file.exists():
             raise FileNotFoundError(f"{file}: policies are trained on it; `make repro` makes it")
@@ -288,7 +289,7 @@ def _inputs(params: Params, layout: Layout) -> list[Path]:
 
 def _work(own: Configuration, layout: Layout) -> Work:
     params, settings = own.params, own.params.policy_settings()
-    known = subject_of(params, manifold=params.geodesics.searched[0], reward=settings.reward)
+    known = subject_of(params, manifold=params.policies.chart, reward=settings.reward)
     about = Subject({**known.tags, "configuration": own.name}, known.params)
     trained = settings.of_training("length_degree") | params.sweep.model_dump(mode="json")
     item = f"{own.label} ({own.key[:10]})"

@@ -160,8 +160,11 @@ _KEPT: dict[str, ProblemSet] = {}
 def _training(params: Params, layout: Layout) -> ProblemSet:
     """What policies train on; the same for configurations that differ in nothing it depends on."""
     own = params.policies
-    degrees = params.geodesics.degree, own.training_length_degree
-    key = str((layout.root, degrees, own.chart, own.obstacles))
+    trained = own.model_dump(exclude={"reward", "ppo", "seeds", "steps"})
+    described = params.model_dump(include={"robot", "workcell", "constraints"})
+    files = [layout.joints(name).stat() for name in params.constraints]
+    data = [(file.st_mtime_ns, file.st_size) for file in files]
+    key = str((layout.root, params.geodesics.degree, trained, described, data))
     if key not in _KEPT:
         scene = Scene.from_params(params)
         # one chart for all: members of a set share it
