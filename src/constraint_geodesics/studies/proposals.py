@@ -55,7 +55,11 @@ DRAWN, KEPT = 32, 8
 """Curves that the controls draw at once, and how many of them go down the descent together."""
 DRAWING = 0.5
 """Share of its time in which the descent looks for so many curves that are feasible."""
-PEER_QUERIES, PEER_SEEDS = 40, 2
+MOST_OFFERS = 5
+"""Offers of a control that are checked, as many as a policy has rounds."""
+SPHERES = 60
+"""Queries of each constraint with a sphere on the way."""
+PEER_QUERIES, PEER_SEEDS = 20, 2
 """Queries of each constraint and scene that slow planners are asked, and how often."""
 PAST_ROWS = 1000
 """Configurations of the constraint that random curves are bent past."""
@@ -191,11 +195,9 @@ def at_random(seed: int) -> Method:
 
 
 def _in_turn(phi: Phi, curves: int) -> Offers:
-    """All curves, as many at a time as are checked of one offer: a policy's rounds offer as many in
-    all, so that no control ends for want of checks.
-    """
+    """As many curves at a time as are checked of one offer, and as many offers as the policy has."""
     yield Offer(phi[:MOST_CHECKED], curves)
-    for begin in range(MOST_CHECKED, len(phi), MOST_CHECKED):
+    for begin in range(MOST_CHECKED, min(len(phi), MOST_OFFERS * MOST_CHECKED), MOST_CHECKED):
         yield Offer(phi[begin : begin + MOST_CHECKED], 0)
 
 
@@ -309,7 +311,8 @@ def run_policies(task: PolicyTask) -> pd.DataFrame:
     compared, rows, phi = Compared(policies, settings), list[dict[str, Any]](), list[Phi]()
     build = partial(BaselineBuilder(params, task.root), PEERS)
     with build(scene, task.name, manifold) as (peers, _):
-        queries = _queries(params, scene, manifold, task.name, peers[PLANNER])
+        drawn = _queries(params, scene, manifold, task.name, peers[PLANNER])
+        queries = [query for query in drawn if query.scene == TABLE or query.number < SPHERES]
         for query in queries:
             with ExitStack() as opened:
                 own = peers
