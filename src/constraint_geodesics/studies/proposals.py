@@ -195,7 +195,7 @@ def at_random(seed: int) -> Method:
 
 
 def _in_turn(phi: Phi, curves: int) -> Offers:
-    """As many curves at a time as are checked of one offer, and as many offers as the policy has."""
+    """As many curves at a time as are checked of one offer, in as many offers as a policy has."""
     yield Offer(phi[:MOST_CHECKED], curves)
     for begin in range(MOST_CHECKED, min(len(phi), MOST_OFFERS * MOST_CHECKED), MOST_CHECKED):
         yield Offer(phi[begin : begin + MOST_CHECKED], 0)
