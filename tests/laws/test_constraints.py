@@ -22,6 +22,7 @@ from constraint_geodesics.constraints.constraint import (
 )
 from constraint_geodesics.constraints.functions import FunctionsConstraint, RowBound, made_by
 from constraint_geodesics.constraints.kernels import curvature, linearise, new_look
+from constraint_geodesics.constraints.polynomial import PolynomialConstraint, Relation
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.params import FunctionsConstraintParams
 from constraint_geodesics.scene.scene import Scene
@@ -115,7 +116,10 @@ def test_a_tilt_is_measured_as_its_angle(xarm, tilt: float, heading: float) -> N
 
 
 SPHERE = "constraint_geodesics.constraints.functions:tip_on_sphere"
-KINDS = ["held axes", "cone", "two tolerances", "sphere", "thick sphere", "coupling"]
+KINDS = [
+    *("held axes", "cone", "two tolerances", "sphere", "thick sphere", "coupling"),
+    *("relations", "loose relations"),
+]
 
 
 def coupled(q, out) -> None:
@@ -140,6 +144,20 @@ def sphere(robot, tolerance: float = 0.0) -> FunctionsConstraint:
     return made_by(SPHERE, arguments, robot)
 
 
+def relations(tolerance: float = 0.0) -> PolynomialConstraint:
+    """The tip on a quadric, the tool's z axis towards a point of it, its y axis level."""
+    full, towards, level = np.zeros((12, 12)), np.zeros(12), np.zeros(12)
+    full[:3, :3], full[0, 9], full[9, 0] = np.diag([2.0, 3.0, 4.0]), 0.1, 0.1
+    towards[0], towards[9], level[8] = 1.0, 0.25, 1.0
+    return PolynomialConstraint(
+        (
+            Relation("quadric", "m", -0.25, np.linspace(-0.2, 0.2, 12), full, tolerance),
+            Relation("towards", "m", -0.35, towards, None, tolerance),
+            Relation("level", "rad", 0.0, level, None, tolerance),
+        )
+    )
+
+
 def of_kind(name: str, robot) -> Constraint:
     return {
         "held axes": Constraint((0, 0, 1, 1, 1, 0), reference=REFERENCE),
@@ -148,6 +166,8 @@ def of_kind(name: str, robot) -> Constraint:
         "sphere": sphere(robot),
         "thick sphere": sphere(robot, 0.05),
         "coupling": COUPLED,
+        "relations": relations(),
+        "loose relations": relations(0.05),
     }[name]
 
 
@@ -391,6 +411,7 @@ def test_params_name_a_factory(kuka) -> None:
 FILES = {
     "Pose": {"params.py", "constraints/constraint.py", "constraints/pose.py"},
     "Functions": {"params.py", "constraints/functions.py", "kernel_jobs.py"},
+    "Polynomial": {"constraints/polynomial.py"},
 }
 """Where the class of a kind, its arrays and its record may be named; the warm-up compiles what
 calls functions.

@@ -1,0 +1,285 @@
+"""Polynomial relations of the tool's pose: what demonstrations show, as rows of a residual.
+
+With y = (p, R e_x, R e_y, R e_z) (12,), the tool's position [m] and the axes of its frame in the
+base frame, one row is r = c + wᵀy + ½ yᵀA y.  Planes, spheres, cylinders, arcs and quadrics of the
+position, and axes that are level or point at something, are of this form.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+from jaxtyping import Float
+from numba import carray, njit
+
+from constraint_geodesics.compiled import COMPILE, LEAF
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintError, Series
+from constraint_geodesics.constraints.kernels import (
+    LINEARISE_WORDS,
+    ConstraintArrays,
+    Rows,
+    c_function,
+    chain_at,
+    floats,
+)
+from constraint_geodesics.robot.kernels import (
+    LANES,
+    Lanes,
+    geometric_jacobian,
+    poses_of,
+    posture_in,
+)
+from constraint_geodesics.robot.kinematics import SerialRobot
+
+FEATURES = 12
+"""Numbers of y: position, then the columns of the rotation."""
+_ROW = 1 + FEATURES + FEATURES * FEATURES
+"""Numbers of the data that are one row's: c, w, A."""
+_DRAWN = {"m": ("mm", 1e3), "rad": ("deg", 180.0 / math.pi)}
+
+
+@dataclass(frozen=True, eq=False)
+class Relation:
+    """One row |c + wᵀy + ½ yᵀA y| ≤ tolerance, in metres or radians.
+
+    name: what it is, in words.  unit: "m" or "rad", of the residual to first order.
+    Raises ConstraintError for numbers that are not finite, shapes that do not fit, or no name.
+    """
+
+    name: str
+    unit: str
+    constant: float
+    linear: Float[np.ndarray, "12"]
+    quadratic: Float[np.ndarray, "12 12"] | None = None
+    tolerance: float = 0.0
+
+    def __post_init__(self) -> None:
+        linear = np.array(self.linear, np.float64)
+        full = np.zeros((FEATURES, FEATURES)) if self.quadratic is None else self.quadratic
+        full = np.array(full, np.float64)
+        if linear.shape != (FEATURES,) or full.shape != (FEATURES, FEATURES):
+            raise ConstraintError(
+                f"relation {self.name!r}: linear has shape {linear.shape} and quadratic "
+                f"{full.shape}: must be (12,) and (12, 12)"
+            )
+        numbers = np.concatenate([[self.constant, self.tolerance], linear, full.ravel()])
+        if not np.isfinite(numbers).all() or self.tolerance < 0.0:
+            raise ConstraintError(
+                f"relation {self.name!r}: its numbers must be finite, its tolerance not negative"
+            )
+        if not self.name or self.unit not in _DRAWN:
+            raise ConstraintError(f"relation {self.name!r}: a name and m or rad are needed")
+        object.__setattr__(self, "linear", linear)
+        object.__setattr__(self, "quadratic", 0.5 * (full + full.T))
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "12 12"]:
+        """A, zero where there is none."""
+        assert self.quadratic is not None
+        return self.quadratic
+
+    @property
+    def numbers(self) -> Float[np.ndarray, "n"]:
+        """c, w and A, one after another."""
+        return np.concatenate([[self.constant], self.linear, self.matrix.ravel()])
+
+    def values(self, y: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "n"]:
+        """The residual of features."""
+        return self.constant + y @ self.linear + 0.5 * ((y @ self.matrix) * y).sum(axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class PolynomialConstraint(Constraint):
+    """Relations that all hold.  left_out: what each is off by on demonstrations that it was not
+    found on, in its unit; () where it was not found but given.
+    """
+
+    kind: ClassVar[str] = "polynomial"
+    relations: tuple[Relation, ...]
+    left_out: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.relations:
+            raise ConstraintError("relations = (): one is needed at least")
+        if self.left_out and len(self.left_out) != len(self.relations):
+            raise ConstraintError(
+                f"left_out has {len(self.left_out)} entries, there are {len(self.relations)} "
+                f"relations"
+            )
+
+    @property
+    def rows(self) -> Rows:
+        """Every row is held, each by itself."""
+        count = len(self.relations)
+        tolerance = np.array([own.tolerance for own in self.relations])
+        return Rows(np.ones(count, bool), tolerance, np.zeros(count, bool))
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Those of the relations."""
+        return tuple(own.unit for own in self.relations)
+
+    def arrays(self, robot: SerialRobot) -> ConstraintArrays:
+        """For the kernels."""
+        data = np.concatenate([own.numbers for own in self.relations])
+        return ConstraintArrays(self.rows, data, _compiled().address, 0, _room(robot.dof))
+
+    def compile(self) -> None:
+        """What all of this kind share, once."""
+        _compiled()
+
+    def loosened(self, least: Mapping[str, float]) -> "PolynomialConstraint":
+        """The same with every tolerance at least that of its row's unit."""
+        wider = (
+            replace(own, tolerance=max(own.tolerance, least[own.unit])) for own in self.relations
+        )
+        return replace(self, relations=tuple(wider))
+
+    @property
+    def label(self) -> str:
+        """Its relations, those of one name once."""
+        names = "; ".join(dict.fromkeys(own.name for own in self.relations))
+        return f"the constraint on the tool's pose ({names})"
+
+    @property
+    def key(self) -> tuple:
+        """All numbers, to the bit."""
+        own = tuple((r.unit, r.tolerance, r.numbers.tobytes()) for r in self.relations)
+        return (self.kind, own)
+
+    def series(self, residual: Float[np.ndarray, "n m"]) -> list[Series]:
+        """Each row by itself, in mm or degrees."""
+        found = []
+        for own, values in zip(self.relations, residual.T, strict=True):
+            unit, scale = _DRAWN[own.unit]
+            found.append(Series(own.name, unit, scale * abs(values), scale * own.tolerance))
+        return found
+
+    def to_json(self) -> dict[str, Any]:
+        """All numbers."""
+        relations = [
+            {
+                "name": own.name,
+                "unit": own.unit,
+                "constant": own.constant,
+                "linear": own.linear.tolist(),
+                "quadratic": own.matrix.tolist() if own.matrix.any() else None,
+                "tolerance": own.tolerance,
+            }
+            for own in self.relations
+        ]
+        return {"kind": self.kind, "relations": relations, "left_out": list(self.left_out)}
+
+    @classmethod
+    def from_json(
+        cls, about: Mapping[str, Any], robot: SerialRobot | None
+    ) -> "PolynomialConstraint":
+        """What `to_json` wrote."""
+        relations = tuple(
+            Relation(
+                str(own["name"]),
+                str(own["unit"]),
+                float(own["constant"]),
+                np.array(own["linear"], float),
+                None if own["quadratic"] is None else np.array(own["quadratic"], float),
+                float(own["tolerance"]),
+            )
+            for own in about["relations"]
+        )
+        return cls(relations, tuple(float(x) for x in about["left_out"]))
+
+
+KIND = PolynomialConstraint
+
+
+def features(
+    positions: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"]
+) -> Float[np.ndarray, "n 12"]:
+    """The features y of tool poses."""
+    columns = rotations.transpose(0, 2, 1).reshape(len(rotations), 9)
+    return np.concatenate([positions, columns], axis=1)
+
+
+_WORDS = 12 * LANES
+"""Numbers of the room that are the tools' frames."""
+
+
+def _room(dof: int) -> int:
+    """Numbers for the lanes, y and its gradient, and a Jacobian (6, D)."""
+    return _WORDS + 8 * LANES * dof + 2 * FEATURES + 6 * dof
+
+
+@njit(inline="always", **COMPILE)
+def _lanes_at(room, dof):
+    origins = room + 8 * _WORDS
+    axes, sines = origins + 24 * LANES * dof, origins + 48 * LANES * dof
+    return Lanes(
+        carray(floats(room), (3, 4, LANES)),
+        carray(floats(origins), (dof, 3, LANES)),
+        carray(floats(axes), (dof, 3, LANES)),
+        carray(floats(sines), (dof, LANES)),
+        carray(floats(sines + 8 * LANES * dof), (dof, LANES)),
+    )
+
+
+@njit(**LEAF)
+def _value_and_gradient(row, y, gradient):
+    """R of one row's numbers, and ∂r/∂y = w + A y into gradient (12,)."""
+    value = row[0]
+    for i in range(FEATURES):
+        slope = 0.0
+        for j in range(FEATURES):
+            slope += row[1 + FEATURES + FEATURES * i + j] * y[j]
+        value += (row[1 + i] + 0.5 * slope) * y[i]
+        gradient[i] = row[1 + i] + slope
+    return value
+
+
+@njit(**LEAF)
+def _into_joints(gradient, y, geometric, out):
+    """∂r/∂q (D,) = (∂r/∂p) J_v + (Σ_k u_k × ∂r/∂u_k) J_ω, with the geometric Jacobian (6, D)."""
+    t0, t1, t2 = 0.0, 0.0, 0.0
+    for k in range(3):
+        at = 3 + 3 * k
+        t0 += y[at + 1] * gradient[at + 2] - y[at + 2] * gradient[at + 1]
+        t1 += y[at + 2] * gradient[at] - y[at] * gradient[at + 2]
+        t2 += y[at] * gradient[at + 1] - y[at + 1] * gradient[at]
+    for d in range(out.shape[0]):
+        value = t0 * geometric[3, d] + t1 * geometric[4, d] + t2 * geometric[5, d]
+        for i in range(3):
+            value += gradient[i] * geometric[i, d]
+        out[d] = value
+
+
+def _write(
+    origins, axes, prismatic, base, tool, data, q, room, residuals, jacobians, dof, rows, count
+):
+    chain, lanes = chain_at(origins, axes, prismatic, base, tool, dof), _lanes_at(room, dof)
+    rest = room + 8 * (_WORDS + 8 * LANES * dof)
+    y, gradient = carray(floats(rest), (FEATURES,)), carray(floats(rest + 96), (FEATURES,))
+    geometric = carray(floats(rest + 192), (6, dof))
+    values = carray(floats(residuals), (count, rows))
+    poses_of(chain, carray(floats(q), (count, dof)), lanes)
+    for n in range(count):
+        posture = posture_in(lanes, n)
+        for i in range(3):
+            y[i] = posture.position[i]
+            for k in range(3):
+                y[3 + 3 * k + i] = posture.rotation[i, k]
+        if jacobians != 0:
+            geometric_jacobian(chain.prismatic, posture, geometric)
+        for m in range(rows):
+            row = carray(floats(data + 8 * _ROW * m), (_ROW,))
+            values[n, m] = _value_and_gradient(row, y, gradient)
+            if jacobians != 0:
+                slopes = carray(floats(jacobians + 8 * dof * (rows * n + m)), (dof,))
+                _into_joints(gradient, y, geometric, slopes)
+    return 0
+
+
+@cache
+def _compiled() -> Any:
+    return c_function(_write, LINEARISE_WORDS)
