@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from constraint_geodesics import cli_planning, completion
+from constraint_geodesics import cli_identify, cli_planning, completion
 from constraint_geodesics.errors import ParamsError
 from constraint_geodesics.extras import MissingExtraError, require
 from constraint_geodesics.pipeline.layout import Layout
@@ -42,6 +42,7 @@ app.command("plan", context_settings={"allow_extra_args": False})(cli_planning.p
 app.command("check")(cli_planning.check)
 app.command("robot")(cli_planning.show_robot)
 app.command("ik")(cli_planning.inverse_kinematics)
+app.command("identify")(cli_identify.identify_constraint)
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
 
 if TYPE_CHECKING:
     from constraint_geodesics.certification.certifier import Certificate
-    from constraint_geodesics.constraints.constraint import Pose
+    from constraint_geodesics.constraints.constraint import Constraint, Pose
     from constraint_geodesics.planner import Planner
 
 NO_PATH = 3
@@ -93,8 +93,8 @@ def plan(
     constraint: Annotated[
         str,
         typer.Option(
-            help="A name that `geodesics constraints` lists; with --urdf free, or level: the tilt "
-            "that the tool has at the start.",
+            help="A name that `geodesics constraints` lists, or a file that `geodesics identify` "
+            "wrote; with --urdf free, or level: the tilt that the tool has at the start.",
             shell_complete=completion.planned_constraints,
         ),
     ],
@@ -155,6 +155,7 @@ def plan(
     why.
     """
     from constraint_geodesics.bundle import BundleError
+    from constraint_geodesics.constraints.constraint import ConstraintError
     from constraint_geodesics.planner import PlannerError
     from constraint_geodesics.robot.kinematics import RobotError
 
@@ -168,14 +169,14 @@ def plan(
             path = loaded.plan(
                 first,
                 wanted,
-                constraint,
+                _constraint(constraint),
                 budget_s=budget,
                 snap=snap,
                 velocity_scale=velocity_scale,
                 acceleration_scale=acceleration_scale,
             )
             source = loaded.source
-    except (BundleError, PlannerError, RobotError) as error:
+    except (BundleError, ConstraintError, PlannerError, RobotError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
     print(f"planner: {source}", file=sys.stderr)
     about: dict[str, Any] = path.summary()
@@ -361,6 +362,15 @@ def _goal(joints: str | None, pose: str | None, free: str | None, tolerance: str
         return wanted
     widths = _joints(tolerance, "--goal-tolerance") if tolerance else (0.0,) * 6
     return GoalRegion(wanted, (free or "").replace(",", " ").split(), widths)
+
+
+def _constraint(name: str) -> "str | Constraint":
+    """A constraint's file, or the name of one."""
+    if Path(name).suffix not in (".yaml", ".yml"):
+        return name
+    from constraint_geodesics.identification.files import load_constraint
+
+    return load_constraint(Path(name))
 
 
 def _pose(text: str, option: str) -> "Pose":

@@ -156,7 +156,7 @@ class PolicySolver:
         return _first_accepted(problem, ends, asked, accept, began)
 
     def search_at_random(self, problem: GeodesicProblem, ends: Ends, accept: Accept) -> Geodesic:
-        """The control of `search`: as many curves as its first round meets, none by a policy,
+        """A control of `search`: no fewer curves than its first round measures, none by a policy,
         chosen by the same rule.
         """
         began, params = time.perf_counter(), self.params

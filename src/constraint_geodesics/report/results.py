@@ -281,7 +281,7 @@ def _found_on(
         _shortest_under(rows),
         f"The decoder reproduces unseen poses to {short(held_out['joint_error_mean_deg'])}° a "
         f"joint (mean) and {short(held_out['tool_error_median_mm'])} mm at the tool (median).",
-        "Without a policy, as many random curves as the search meets, chosen by the same rule, "
+        "Without a policy, no fewer random curves than a first round, chosen by the same rule, "
         f"give {_share(random, 'success')}.",
         "No connection in the sampled graph, and so no search: "
         f"{_share(learned, 'not_connected')} of the queries.",

@@ -1,0 +1,78 @@
+"""The command of `geodesics` that finds a constraint in demonstrations."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from constraint_geodesics.cli_planning import NO_PATH, Arm, AsJson, Hold, Srdf, ToolLink, Urdf
+from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
+
+
+def identify_constraint(
+    demonstrations: Annotated[
+        Path,
+        typer.Argument(
+            help="CSV with a joint a column in rad, and before them the demonstration's number if "
+            "there are several; or parquet as LeRobot writes it."
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Write the constraint here, as YAML for `plan --constraint`."),
+    ] = None,
+    loosely: Annotated[
+        float,
+        typer.Option(
+            help="Tolerance of each relation, in multiples of what it is missed by on left-out "
+            "demonstrations; 0 holds exactly."
+        ),
+    ] = 0.0,
+    urdf: Urdf = None,
+    tool_link: ToolLink = None,
+    tool_pose: Annotated[str | None, typer.Option(help="As for `plan`.")] = None,
+    hold: Hold = None,
+    srdf: Srdf = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say what demonstrations keep to, and write it as a constraint.  Exit code 0: identified; 2:
+    wrong usage; 3: nothing is identified, and the line says why.
+    """
+    from dataclasses import replace
+
+    from constraint_geodesics.bundle import BundleError
+    from constraint_geodesics.constraints.constraint import ConstraintError
+    from constraint_geodesics.identification.demonstrations import DemonstrationError
+    from constraint_geodesics.identification.files import save_constraint
+    from constraint_geodesics.identification.identify import identify, with_tolerance
+    from constraint_geodesics.planner import PlannerError
+    from constraint_geodesics.robot.kinematics import RobotError
+
+    try:
+        if not (loosely >= 0.0):
+            raise PlannerError(f"--loosely {loosely}: must be 0 or more")
+        with Arm(None, urdf, tool_link, tool_pose, hold, srdf).open() as planner:
+            found = identify(demonstrations, planner.robot)
+        if found.constraint is not None and loosely > 0.0:
+            found = replace(found, constraint=with_tolerance(found.constraint, loosely))
+        if out is not None and found.constraint is not None:
+            save_constraint(found, out)
+    except (BundleError, ConstraintError, DemonstrationError, PlannerError, RobotError) as error:
+        raise SystemExit(complain(error, WRONG_USAGE)) from None
+    about: dict[str, Any] = {
+        "identified": found.constraint is not None,
+        "relations": list(found.relations),
+        "missing": found.missing,
+        "codim": found.codim,
+        "noise_rad": None if found.constraint is None else found.noise_rad,
+        "left_out_error": found.left_out_error,
+        "rows": found.rows,
+        "demonstrations": found.demonstrations,
+        "dropped": found.dropped,
+    }
+    print(json.dumps(about) if as_json else found.explanation)
+    if out is not None and found.constraint is not None:
+        print(f"written: {out}", file=sys.stderr)
+    raise SystemExit(0 if found.constraint is not None else NO_PATH)

@@ -1,0 +1,62 @@
+"""Identified constraints as files: YAML that `geodesics plan --constraint FILE` takes."""
+
+from pathlib import Path
+from typing import Any
+
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintError,
+    constraint_from_json,
+)
+from constraint_geodesics.identification.identify import Identified
+from constraint_geodesics.params import ParamsError, read_yaml
+
+FORMAT = 1
+SUFFIXES = (".yaml", ".yml")
+
+
+def save_constraint(identified: Identified, file: Path) -> None:
+    """Write what was identified, with what it stands on.
+
+    Raises ConstraintError where nothing was, or the file's name has another suffix.
+    """
+    from ruamel.yaml import YAML
+
+    if identified.constraint is None:
+        raise ConstraintError(f"there is no constraint to save: {identified.explanation}")
+    if file.suffix not in SUFFIXES:
+        raise ConstraintError(f"{file}: the name must end in {' or '.join(SUFFIXES)}")
+    about = {
+        "format": FORMAT,
+        "explanation": identified.explanation,
+        "found_in": {
+            "rows": identified.rows,
+            "demonstrations": identified.demonstrations,
+            "noise_rad": identified.noise_rad,
+        },
+        "constraint": identified.constraint.to_json(),
+    }
+    file.parent.mkdir(parents=True, exist_ok=True)
+    writer = YAML(typ="safe", pure=True)
+    writer.width = 1000
+    with file.open("w", encoding="utf-8") as stream:
+        writer.dump(about, stream)
+
+
+def load_constraint(file: Path) -> Constraint:
+    """The constraint that `save_constraint` wrote.
+
+    Raises ConstraintError, one line, if the file is missing or is none.
+    """
+    try:
+        about: Any = read_yaml(file)
+    except (ParamsError, UnicodeDecodeError) as error:
+        raise ConstraintError(str(error)) from None
+    if not isinstance(about, dict) or about.get("format") != FORMAT:
+        raise ConstraintError(f"{file}: not a constraint's file of format {FORMAT}")
+    try:
+        return constraint_from_json(about["constraint"])
+    except ConstraintError as error:
+        raise ConstraintError(f"{file}: {error}") from None
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ConstraintError(f"{file}: not a constraint: {type(error).__name__} {error}") from None

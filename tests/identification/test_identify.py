@@ -1,0 +1,193 @@
+"""Demonstrations of hidden tasks: what is identified keeps to the hidden formula."""
+
+import json
+
+import numpy as np
+import pytest
+from tests.identification.hidden import HIDDEN, demonstrations, drawn, manifold_of
+
+from constraint_geodesics.constraints.constraint import ConstraintError, ConstraintManifold
+from constraint_geodesics.constraints.projection import retract
+from constraint_geodesics.identification import (
+    DemonstrationError,
+    identify,
+    load_constraint,
+    save_constraint,
+)
+from constraint_geodesics.identification.identify import with_tolerance
+from constraint_geodesics.planner import Planner
+
+
+def missed(task, found, robot) -> dict[str, float]:
+    """The 95th percentile of the hidden residuals, by unit, on the identified set."""
+    own = retract(ConstraintManifold(robot, found.constraint), drawn(task, robot, 300, seed=8))
+    assert own.converged.mean() > 0.95
+    hidden = manifold_of(task, robot)
+    off = np.quantile(np.abs(hidden.residual(own.joints[own.converged])), 0.95, axis=0)
+    worst = dict.fromkeys(hidden.constraint.units, 0.0)
+    for unit, value in zip(hidden.constraint.units, off, strict=True):
+        worst[unit] = max(worst[unit], float(value))
+    return worst
+
+
+@pytest.mark.parametrize("task", HIDDEN)
+def test_clean_demonstrations_give_the_formula_itself(task, xarm) -> None:
+    found = identify(demonstrations(task, xarm, 10), xarm)
+    assert found.codim == len(HIDDEN[task]), found.explanation
+    assert max(missed(task, found, xarm).values()) < 1e-6
+    assert found.missing == ""
+    assert max(found.left_out) < 1e-6
+
+
+@pytest.mark.parametrize("task", HIDDEN)
+def test_a_persons_error_is_averaged_out(task, xarm) -> None:
+    found = identify(demonstrations(task, xarm, 20, error_deg=0.3), xarm)
+    assert found.codim == len(HIDDEN[task]), found.explanation
+    off = missed(task, found, xarm)
+    assert off.get("rad", 0.0) < np.radians(0.35)
+    assert off.get("m", 0.0) < 2e-3
+    assert found.noise_rad == pytest.approx(np.radians(0.3), rel=0.25)
+
+
+@pytest.mark.parametrize("task", HIDDEN)
+def test_noise_of_independent_rows(task, xarm) -> None:
+    rows = drawn(task, xarm, 2000)
+    noise = np.random.default_rng(1).normal(size=rows.shape)
+    found = identify(rows + np.radians(0.5) * noise, xarm)
+    assert found.codim == len(HIDDEN[task]), found.explanation
+    off = missed(task, found, xarm)
+    assert off.get("rad", 0.0) < np.radians(0.15)
+    assert off.get("m", 0.0) < 0.8e-3
+    assert found.noise_rad == pytest.approx(np.radians(0.5), rel=0.1)
+
+
+def test_words_tell_the_numbers(xarm) -> None:
+    text = identify(demonstrations("towards a centre", xarm, 10), xarm).explanation
+    assert "a sphere, r = 250.0 mm about (420.0, 0.0, -50.0) mm" in text
+    assert "z axis points at its centre" in text
+    text = identify(demonstrations("door", xarm, 10), xarm).explanation
+    assert "y axis keeps the direction (0, 0, 1)" in text
+    assert "circle, r = 350.0 mm about the line through (550.0, 350.0, 0.0) mm" in text
+
+
+def test_free_motion_identifies_nothing(xarm, kuka) -> None:
+    for robot in (xarm, kuka):
+        found = identify(robot.sample(2000, np.random.default_rng(0)), robot)
+        assert found.constraint is None
+        assert "free" in found.explanation
+        assert found.codim == 0
+
+
+def test_too_few_demonstrations_ask_for_more(xarm) -> None:
+    one = identify(demonstrations("cup", xarm, 1), xarm)
+    assert one.constraint is None
+    assert "there are no others: show more demonstrations" in one.missing
+    for task in HIDDEN:
+        for count in (2, 3):
+            found = identify(demonstrations(task, xarm, count), xarm)
+            assert found.codim <= len(HIDDEN[task]), found.explanation
+            if found.codim < len(HIDDEN[task]):
+                assert "show more demonstrations" in found.missing
+
+
+def test_wrong_rows_are_left_out(xarm) -> None:
+    rows = drawn("cup", xarm, 1000)
+    wrong = np.random.default_rng(4).choice(1000, 50, replace=False)
+    rows[wrong] = xarm.sample(50, np.random.default_rng(5))
+    found = identify(rows, xarm)
+    assert found.codim == 2
+    assert 45 <= found.dropped <= 60
+    assert missed("cup", found, xarm)["rad"] < np.radians(0.02)
+
+
+def broken() -> dict:
+    return {
+        "one row": (lambda q: q[:1], "at least 12"),
+        "nan": (lambda q: np.where(np.arange(len(q))[:, None] == 7, np.nan, q), "row 7"),
+        "joints": (lambda q: q[:, :5], r"must be \(T, 6\)"),
+        "degrees": (np.degrees, "degrees"),
+        "another robot": (lambda q: q + 3.0, "another robot"),
+        "still": (lambda q: np.repeat(q[:1], 50, axis=0), "moving"),
+    }
+
+
+@pytest.mark.parametrize("name", broken())
+def test_what_nothing_can_be_learned_from_is_one_line(name, xarm) -> None:
+    change, words = broken()[name]
+    with pytest.raises(DemonstrationError, match=words) as caught:
+        identify(change(drawn("cup", xarm, 50)), xarm)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_are_read_as_arrays_are(xarm, tmp_path) -> None:
+    import pandas as pd
+
+    shown = demonstrations("cup", xarm, 4)
+    numbers = np.repeat(np.arange(4.0), 60)[:, None]
+    rows = np.concatenate(shown)
+    np.savetxt(tmp_path / "demos.csv", np.hstack([numbers, rows]), delimiter=",")
+    pd.DataFrame(
+        {"episode_index": numbers[:, 0].astype(int), "observation.state": list(rows)}
+    ).to_parquet(tmp_path / "demos.parquet")
+    expected = identify(shown, xarm)
+    for name in ("demos.csv", "demos.parquet"):
+        found = identify(tmp_path / name, xarm)
+        assert found.demonstrations == 4
+        assert found.explanation == expected.explanation
+    with pytest.raises(DemonstrationError, match="no such file"):
+        identify(tmp_path / "none.csv", xarm)
+    (tmp_path / "text.csv").write_text("a,b\nc,d\n")
+    with pytest.raises(DemonstrationError, match="not a table of numbers"):
+        identify(tmp_path / "text.csv", xarm)
+
+
+def test_a_saved_constraint_is_planned_with_and_certified(xarm, tmp_path) -> None:
+    found = identify(demonstrations("cup", xarm, 10), xarm)
+    save_constraint(found, tmp_path / "cup.yaml")
+    loaded = load_constraint(tmp_path / "cup.yaml")
+    assert loaded.key == found.constraint.key
+    start, goal = demonstrations("cup", xarm, 11)[-1][[0, -1]]
+    with Planner.load() as planner:
+        path = planner.plan(start, goal, loaded)
+        assert path.status in ("solved", "in_collision"), path.explanation
+        if path.status == "solved":
+            hidden = manifold_of("cup", xarm)
+            assert np.abs(hidden.residual(path.joints)).max() < 2e-4
+    loose = with_tolerance(found.constraint, 3.0)
+    assert [own.tolerance for own in loose.relations] == pytest.approx(
+        [3 * x for x in found.left_out]
+    )
+    (tmp_path / "other.yaml").write_text("format: 1\nconstraint: {kind: polynomial}\n")
+    with pytest.raises(ConstraintError, match="other.yaml: not a constraint: KeyError"):
+        load_constraint(tmp_path / "other.yaml")
+    nothing = identify(xarm.sample(500, np.random.default_rng(0)), xarm)
+    with pytest.raises(ConstraintError, match="no constraint to save"):
+        save_constraint(nothing, tmp_path / "free.yaml")
+
+
+def test_from_a_csv_to_a_path_by_the_shell(xarm, tmp_path, capsys) -> None:
+    from typer.testing import CliRunner
+
+    from constraint_geodesics.cli import app
+
+    shown = demonstrations("cup", xarm, 10)
+    numbers = np.repeat(np.arange(10.0), 60)[:, None]
+    csv, yaml = tmp_path / "demos.csv", tmp_path / "wipe.yaml"
+    np.savetxt(csv, np.hstack([numbers, np.concatenate(shown)]), delimiter=",")
+    run = CliRunner()
+    answer = run.invoke(app, ["identify", str(csv), "--out", str(yaml), "--json"])
+    assert answer.exit_code == 0, answer.output
+    about = json.loads(answer.stdout)
+    assert about["identified"]
+    assert about["codim"] == 2
+    assert yaml.is_file()
+    ends = [" ".join(f"{x:.9f}" for x in shown[0][k]) for k in (0, -1)]
+    ask = ["plan", "--constraint", str(yaml), "--start", ends[0], "--goal", ends[1], "--json"]
+    path = run.invoke(app, ask)
+    assert path.exit_code in (0, 3), path.output
+    assert json.loads(path.stdout)["status"] in ("solved", "in_collision")
+    np.savetxt(csv, xarm.sample(300, np.random.default_rng(0)), delimiter=",")
+    assert run.invoke(app, ["identify", str(csv)]).exit_code == 3
+    missing = run.invoke(app, ["identify", str(tmp_path / "none.csv")])
+    assert missing.exit_code == 2
+    assert run.invoke(app, [*ask[:2], str(tmp_path / "none.yaml"), *ask[3:]]).exit_code == 2
