@@ -11,9 +11,11 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from constraint_geodesics import bundle
+from tests.identification.hidden import demonstrations
 from tests.planner_fixtures import packaged_planner
 from tests.test_cli_plan import called
 from tests.test_docs import ROOT, words_of
@@ -38,6 +40,7 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "geodesics doctor": HERE,
     "geodesics robot": HERE,
     "geodesics ik": HERE,
+    "geodesics identify": HERE,
     "geodesics package": ("tests/test_bundle.py", "package"),
     "geodesics results": HERE,
     "geodesics results --experiments": (
@@ -123,6 +126,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = packaged_planner().plan(start, goal, "level_cup")
     path.save(folder / "path.csv")
     path.record(folder / "first_path" / "path.rrd")
+    shown = demonstrations("cup", packaged_planner().robot, 10)
+    numbers = np.repeat(np.arange(10.0), 60)[:, None]
+    rows = np.hstack([numbers, np.concatenate(shown)])
+    np.savetxt(folder / "demos.csv", rows, delimiter=",")
     return folder
 
 
@@ -147,7 +154,7 @@ def test_a_command_of_ours_does_what_its_page_says(words, folder, monkeypatch, c
     assert code == 0, err
     for option in ("--out", "--record", "--picture"):
         if option in given:
-            assert (folder / given[given.index(option) + 1]).stat().st_size > 1000
+            assert (folder / given[given.index(option) + 1]).stat().st_size > 500
     expected = {
         "warmup": "compiled",
         "constraints": "level_cup",
@@ -156,6 +163,7 @@ def test_a_command_of_ours_does_what_its_page_says(words, folder, monkeypatch, c
         "params": "ok",
         "robot": "carried by 7 joints",
         "ik": ".",
+        "identify": "keeps the direction (0, 0, 1)",
         "results": "planner",
         "replay": "path.rrd",
     }

@@ -143,7 +143,7 @@ def test_files_are_read_as_arrays_are(xarm, tmp_path) -> None:
 
 def test_a_saved_constraint_is_planned_with_and_certified(xarm, tmp_path) -> None:
     found = identify(demonstrations("cup", xarm, 10), xarm)
-    save_constraint(found, tmp_path / "cup.yaml")
+    found.save(tmp_path / "cup.yaml")
     loaded = load_constraint(tmp_path / "cup.yaml")
     assert loaded.key == found.constraint.key
     start, goal = demonstrations("cup", xarm, 11)[-1][[0, -1]]

@@ -15,13 +15,14 @@ FORMAT = 1
 SUFFIXES = (".yaml", ".yml")
 
 
-def save_constraint(identified: Identified, file: Path) -> None:
+def save_constraint(identified: Identified, file: str | Path) -> None:
     """Write what was identified, with what it stands on.
 
     Raises ConstraintError where nothing was, or the file's name has another suffix.
     """
     from ruamel.yaml import YAML
 
+    file = Path(file)
     if identified.constraint is None:
         raise ConstraintError(f"there is no constraint to save: {identified.explanation}")
     if file.suffix not in SUFFIXES:
@@ -43,13 +44,13 @@ def save_constraint(identified: Identified, file: Path) -> None:
         writer.dump(about, stream)
 
 
-def load_constraint(file: Path) -> Constraint:
+def load_constraint(file: str | Path) -> Constraint:
     """The constraint that `save_constraint` wrote.
 
     Raises ConstraintError, one line, if the file is missing or is none.
     """
     try:
-        about: Any = read_yaml(file)
+        about: Any = read_yaml(Path(file))
     except (ParamsError, UnicodeDecodeError) as error:
         raise ConstraintError(str(error)) from None
     if not isinstance(about, dict) or about.get("format") != FORMAT:

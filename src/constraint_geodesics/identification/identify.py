@@ -9,6 +9,7 @@ form has a name (forms.py) it stands in place of the combination that was found.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,12 @@ class Identified:
             for unit, value in zip(self.constraint.units, self.left_out, strict=True):
                 found[unit] = max(found.get(unit, 0.0), value)
         return found
+
+    def save(self, file: str | Path) -> None:
+        """Write the constraint as YAML (`files.save_constraint`)."""
+        from constraint_geodesics.identification.files import save_constraint
+
+        save_constraint(self, file)
 
     @property
     def explanation(self) -> str:
