@@ -1,13 +1,24 @@
 """The command of `geodesics` that finds a constraint in demonstrations."""
 
 import json
+import math
 import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from constraint_geodesics.cli_planning import NO_PATH, Arm, AsJson, Hold, Srdf, ToolLink, Urdf
+from constraint_geodesics.cli_planning import (
+    NO_PATH,
+    Arm,
+    AsJson,
+    Hold,
+    Source,
+    Srdf,
+    ToolLink,
+    Urdf,
+    loading,
+)
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
 
 
@@ -16,7 +27,7 @@ def identify_constraint(
         Path,
         typer.Argument(
             help="CSV with a joint a column in rad, and before them the demonstration's number if "
-            "there are several; or parquet as LeRobot writes it."
+            "there are several, or with the joints' names above; or parquet as LeRobot writes it."
         ),
     ],
     out: Annotated[
@@ -30,6 +41,7 @@ def identify_constraint(
             "demonstrations; 0 holds exactly."
         ),
     ] = 0.0,
+    planner: Source = None,
     urdf: Urdf = None,
     tool_link: ToolLink = None,
     tool_pose: Annotated[str | None, typer.Option(help="As for `plan`.")] = None,
@@ -51,10 +63,10 @@ def identify_constraint(
     from constraint_geodesics.robot.kinematics import RobotError
 
     try:
-        if not (loosely >= 0.0):
-            raise PlannerError(f"--loosely {loosely}: must be 0 or more")
-        with Arm(None, urdf, tool_link, tool_pose, hold, srdf).open() as planner:
-            found = identify(demonstrations, planner.robot)
+        if not 0.0 <= loosely < math.inf:
+            raise PlannerError(f"--loosely {loosely}: must be 0 or more, and finite")
+        with loading(), Arm(planner, urdf, tool_link, tool_pose, hold, srdf).open() as loaded:
+            found = identify(demonstrations, loaded.robot)
         if found.constraint is not None and loosely > 0.0:
             found = replace(found, constraint=with_tolerance(found.constraint, loosely))
         if out is not None and found.constraint is not None:

@@ -165,11 +165,11 @@ def plan(
     try:
         first = _joints(start, "--start")
         wanted = _goal(goal, goal_pose, goal_free, goal_tolerance)
-        with _loading(), arm.open(method) as loaded:
+        with loading(), arm.open(method) as loaded:
             path = loaded.plan(
                 first,
                 wanted,
-                _constraint(constraint),
+                _constraint(constraint, loaded),
                 budget_s=budget,
                 snap=snap,
                 velocity_scale=velocity_scale,
@@ -215,7 +215,7 @@ def inverse_kinematics(
     arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf)
     try:
         wanted = _pose(pose, "--pose")
-        with _loading(), arm.open() as loaded:
+        with loading(), arm.open() as loaded:
             found, names = loaded.ik(wanted), loaded.robot.joint_names
     except (BundleError, PlannerError, RobotError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
@@ -251,14 +251,16 @@ def check(
     what it breaks.
     """
     from constraint_geodesics.bundle import BundleError
+    from constraint_geodesics.constraints.constraint import ConstraintError
     from constraint_geodesics.planner import PlannerError
     from constraint_geodesics.robot.kinematics import RobotError
 
     arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf)
     try:
-        with _loading(), arm.open() as loaded:
-            certificate = loaded.check(file, constraint)
-    except (BundleError, PlannerError, RobotError) as error:
+        with loading(), arm.open() as loaded:
+            own = None if constraint is None else _constraint(constraint, loaded)
+            certificate = loaded.check(file, own)
+    except (BundleError, ConstraintError, PlannerError, RobotError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
     broken = certificate.violation
     untimed = (
@@ -333,7 +335,7 @@ def show_robot(
 
 
 @contextmanager
-def _loading() -> Iterator[None]:
+def loading() -> Iterator[None]:
     """Say what a planner's user waits for: the compiler where it was not asked before."""
     from constraint_geodesics import warmup
 
@@ -364,13 +366,13 @@ def _goal(joints: str | None, pose: str | None, free: str | None, tolerance: str
     return GoalRegion(wanted, (free or "").replace(",", " ").split(), widths)
 
 
-def _constraint(name: str) -> "str | Constraint":
+def _constraint(name: str, planner: "Planner") -> "str | Constraint":
     """A constraint's file, or the name of one."""
     if Path(name).suffix not in (".yaml", ".yml"):
         return name
     from constraint_geodesics.identification.files import load_constraint
 
-    return load_constraint(Path(name))
+    return load_constraint(Path(name), planner.robot)
 
 
 def _pose(text: str, option: str) -> "Pose":

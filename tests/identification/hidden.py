@@ -41,7 +41,23 @@ HIDDEN = {
     ),
     "door": (*LEVEL, row("m", -HEIGHT, p2=1.0), about(HINGE, REACH, flat=True)),
     "sphere": (about(CENTRE, 0.3, flat=False),),
+    "sphere up there": (about(np.array([0.5, 0.1, 0.3]), 0.3, flat=False), *LEVEL),
+    "cylinder": (about(HINGE, REACH, flat=True),),
+    "line": (row("m", -0.35, p0=1.0), row("m", -0.3, p2=1.0)),
+    "point": tuple(row("m", -x, **{f"p{k}": 1.0}) for k, x in enumerate((0.4, 0.1, 0.3))),
+    "angle": (row("rad", -0.5, u33=1.0),),
+    "orientation": tuple(
+        Relation("hidden", "rad", 0.0, linear)
+        for linear in np.array(
+            [
+                0.5 * (np.eye(12)[3 + 3 * j + k] - np.eye(12)[3 + 3 * k + j])
+                for k, j in ((2, 1), (0, 2), (1, 0))
+            ]
+        )
+    ),
 }
+UPRIGHT = [task for task, rows in HIDDEN.items() if set(LEVEL) <= set(rows)]
+"""Tasks whose tool's y axis points up, not down."""
 
 
 def manifold_of(task: str, robot: SerialRobot) -> ConstraintManifold:
@@ -55,8 +71,11 @@ def drawn(task: str, robot: SerialRobot, count: int, seed: int = 0) -> np.ndarra
     while sum(map(len, found)) < count:
         q = retract(manifold_of(task, robot), robot.sample(4000, rng))
         kept = q.joints[q.converged & (robot.limit_distance(q.joints) > 0.0)]
-        if task in ("cup", "plane", "door"):
-            kept = kept[robot.forward(kept)[1][:, 2, 1] > 0.0]
+        turned = robot.forward(kept)[1]
+        if task in UPRIGHT:
+            kept = kept[turned[:, 2, 1] > 0.0]
+        if task == "orientation":  # half turns are zeros of the formula, too
+            kept = kept[np.trace(turned, axis1=1, axis2=2) > 1.0]
         found.append(kept)
     return np.concatenate(found)[:count]
 

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from tests.identification.hidden import HIDDEN, demonstrations, drawn, manifold_of
+from tests.identification.hidden import HIDDEN, UPRIGHT, demonstrations, drawn, manifold_of
 
 from constraint_geodesics.constraints.constraint import ConstraintError, ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
@@ -19,15 +19,39 @@ from constraint_geodesics.planner import Planner
 
 
 def missed(task, found, robot) -> dict[str, float]:
-    """The 95th percentile of the hidden residuals, by unit, on the identified set."""
-    own = retract(ConstraintManifold(robot, found.constraint), drawn(task, robot, 300, seed=8))
-    assert own.converged.mean() > 0.95
+    """The 95th percentile of the hidden residuals, by unit, on all of the identified set near the
+    task: also where the hidden formula is not kept.
+    """
+    near = drawn(task, robot, 300, seed=8)
+    moved = near + np.random.default_rng(2).normal(scale=0.15, size=near.shape)
+    own = retract(ConstraintManifold(robot, found.constraint), moved)
+    assert own.converged.mean() > 0.9
     hidden = manifold_of(task, robot)
     off = np.quantile(np.abs(hidden.residual(own.joints[own.converged])), 0.95, axis=0)
     worst = dict.fromkeys(hidden.constraint.units, 0.0)
     for unit, value in zip(hidden.constraint.units, off, strict=True):
         worst[unit] = max(worst[unit], float(value))
     return worst
+
+
+@pytest.mark.parametrize("task", [*UPRIGHT, "orientation"])
+def test_what_is_upside_down_is_no_demonstration_of_it(task, xarm) -> None:
+    """A level axis has the same formula the other way up, an orientation turned by half."""
+    found = identify(demonstrations(task, xarm, 10), xarm)
+    anywhere = xarm.sample(4000, np.random.default_rng(1))
+    own = retract(ConstraintManifold(xarm, found.constraint), anywhere)
+    turned = xarm.forward(own.joints[own.converged])[1]
+    assert len(turned) > 100
+    if task == "orientation":
+        assert (np.trace(turned, axis1=1, axis2=2) > 1.0).all()
+    else:
+        assert (turned[:, 2, 1] > 0.0).all()
+        assert "direction (0, 0, 1)" in found.explanation
+    down = drawn(task, xarm, 20)
+    down[:, 5] += np.where(down[:, 5] > 0.0, -np.pi, np.pi)  # the tool turned by half
+    manifold = ConstraintManifold(xarm, found.constraint)
+    if task == "cup":
+        assert manifold.violation(down).min() > 0.5
 
 
 @pytest.mark.parametrize("task", HIDDEN)
@@ -79,9 +103,10 @@ def test_free_motion_identifies_nothing(xarm, kuka) -> None:
 
 
 def test_too_few_demonstrations_ask_for_more(xarm) -> None:
-    one = identify(demonstrations("cup", xarm, 1), xarm)
-    assert one.constraint is None
-    assert "there are no others: show more demonstrations" in one.missing
+    shown = demonstrations("cup", xarm, 1)
+    for one in (identify(shown, xarm), identify(shown[0], xarm)):
+        assert one.constraint is None
+        assert "there are no others: show more demonstrations" in one.missing
     for task in HIDDEN:
         for count in (2, 3):
             found = identify(demonstrations(task, xarm, count), xarm)
@@ -108,6 +133,9 @@ def broken() -> dict:
         "degrees": (np.degrees, "degrees"),
         "another robot": (lambda q: q + 3.0, "another robot"),
         "still": (lambda q: np.repeat(q[:1], 50, axis=0), "moving"),
+        "nothing": (lambda _: None, "must be rows"),
+        "ragged": (lambda q: [q[:20], q[0].tolist()], "demonstration 1: shape"),
+        "empty": (lambda q: [q, q[:0]], "demonstration 1: shape"),
     }
 
 
@@ -136,12 +164,23 @@ def test_files_are_read_as_arrays_are(xarm, tmp_path) -> None:
         assert found.explanation == expected.explanation
     with pytest.raises(DemonstrationError, match="no such file"):
         identify(tmp_path / "none.csv", xarm)
+    names = ",".join(xarm.joint_names)
+    timed = np.hstack([np.arange(60.0)[:, None], shown[0]])
+    np.savetxt(tmp_path / "timed.csv", timed, delimiter=",", header=f"time_s,{names}", comments="")
+    assert identify(tmp_path / "timed.csv", xarm).constraint is None, "one motion"
+    timed[:, 0] *= 0.1
+    np.savetxt(tmp_path / "unnamed.csv", timed, delimiter=",")
+    with pytest.raises(DemonstrationError, match="must be the demonstration's number"):
+        identify(tmp_path / "unnamed.csv", xarm)
+    (tmp_path / "empty.csv").write_text(f"{names}\n")
+    with pytest.raises(DemonstrationError, match="no rows of numbers"):
+        identify(tmp_path / "empty.csv", xarm)
     (tmp_path / "text.csv").write_text("a,b\nc,d\n")
     with pytest.raises(DemonstrationError, match="not a table of numbers"):
         identify(tmp_path / "text.csv", xarm)
 
 
-def test_a_saved_constraint_is_planned_with_and_certified(xarm, tmp_path) -> None:
+def test_a_saved_constraint_is_planned_with_and_certified(xarm, kuka, tmp_path) -> None:
     found = identify(demonstrations("cup", xarm, 10), xarm)
     found.save(tmp_path / "cup.yaml")
     loaded = load_constraint(tmp_path / "cup.yaml")
@@ -154,12 +193,13 @@ def test_a_saved_constraint_is_planned_with_and_certified(xarm, tmp_path) -> Non
             hidden = manifold_of("cup", xarm)
             assert np.abs(hidden.residual(path.joints)).max() < 2e-4
     loose = with_tolerance(found.constraint, 3.0)
-    assert [own.tolerance for own in loose.relations] == pytest.approx(
-        [3 * x for x in found.left_out]
-    )
+    tolerances = [own.tolerance for own in loose.relations]
+    assert tolerances[:2] == pytest.approx([3 * x for x in found.left_out[:2]])
     (tmp_path / "other.yaml").write_text("format: 1\nconstraint: {kind: polynomial}\n")
     with pytest.raises(ConstraintError, match="other.yaml: not a constraint: KeyError"):
         load_constraint(tmp_path / "other.yaml")
+    with pytest.raises(ConstraintError, match="found for xarm6 with the tool link6, not"):
+        load_constraint(tmp_path / "cup.yaml", kuka)
     nothing = identify(xarm.sample(500, np.random.default_rng(0)), xarm)
     with pytest.raises(ConstraintError, match="no constraint to save"):
         save_constraint(nothing, tmp_path / "free.yaml")

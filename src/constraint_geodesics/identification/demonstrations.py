@@ -1,5 +1,6 @@
 """Demonstrations as they come: arrays or files of joint configurations, checked."""
 
+import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,12 @@ OUTSIDE = 0.02
 """Rows beyond the joint limits by more are of another robot, or in degrees [rad or m]."""
 TURNS = 4.0 * np.pi
 """Larger numbers than two turns look like degrees [rad]."""
+IN_A_ROW = 0.3
+"""Rows whose steps are shorter than this share of their distances are a motion, not draws."""
 STATE, EPISODE = "observation.state", "episode_index"
 """Columns of a LeRobot data set."""
+NUMBERS = ("demonstration", "demo", "episode", EPISODE)
+"""Names of a column that tells demonstrations apart."""
 Demonstrations = Sequence[Float[np.ndarray, "T D"]]
 
 
@@ -30,34 +35,51 @@ def demonstrations_from(
     given: Any, robot: SerialRobot
 ) -> tuple[list[Float[np.ndarray, "T D"]], bool]:
     """Demonstrations (T, D) [rad], and whether they are motions: an array (n, D) is a set of
-    independent rows.
+    independent rows, unless its rows follow each other.
 
     given: an array (n, D) or (demonstrations, T, D), a list of arrays (T, D), or a file: CSV, or
     parquet as LeRobot writes it.  Raises DemonstrationError, one line.
     """
     if isinstance(given, (str, Path)):
-        given = _read(Path(given), robot.dof)
-    if isinstance(given, np.ndarray) and given.ndim == 2:
-        found, apart = [given], False
-    else:
-        found, apart = list(given), True
-    shown = [_checked(np.asarray(rows, float), k, robot, apart) for k, rows in enumerate(found)]
-    rows = sum(len(own) for own in shown)
+        given = _read(Path(given), robot)
+    shown, motions = _arrays(given)
+    found = [_checked(rows, k, robot, motions) for k, rows in enumerate(shown)]
+    rows = sum(len(own) for own in found)
     if rows < FEWEST_ROWS:
         raise DemonstrationError(
             f"{rows} rows in all: at least {FEWEST_ROWS} are needed; show more of the motion"
         )
-    every = np.concatenate(shown)
+    every = np.concatenate(found)
     if (np.ptp(every, axis=0) < SPREAD_RAD).all():
         raise DemonstrationError("all rows are the same configuration: show the arm moving")
-    return shown, apart
+    return found, motions or _is_a_motion(every)
+
+
+def _arrays(given: Any) -> tuple[list[np.ndarray], bool]:
+    try:
+        if hasattr(given, "to_numpy"):  # a table of pandas
+            given = given.to_numpy()
+        whole = isinstance(given, np.ndarray) and given.ndim == 2
+        return [np.asarray(rows, float) for rows in ([given] if whole else given)], not whole
+    except (TypeError, ValueError) as error:
+        raise DemonstrationError(
+            f"demonstrations must be rows (n, D), (demonstrations, T, D), a list of (T, D) or a "
+            f"file: {error}"
+        ) from None
+
+
+def _is_a_motion(rows: Float[np.ndarray, "n D"]) -> bool:
+    """Whether rows follow each other: then they are one demonstration."""
+    steps = np.median(np.linalg.norm(np.diff(rows, axis=0), axis=1))
+    mixed = np.random.default_rng(0).permutation(rows)
+    return bool(steps < IN_A_ROW * np.median(np.linalg.norm(np.diff(mixed, axis=0), axis=1)))
 
 
 def _checked(
-    rows: Float[np.ndarray, "T D"], number: int, robot: SerialRobot, apart: bool
+    rows: Float[np.ndarray, "T D"], number: int, robot: SerialRobot, motions: bool
 ) -> Float[np.ndarray, "T D"]:
-    where = f"demonstration {number}" if apart else "the rows"
-    if rows.ndim != 2 or rows.shape[1] != robot.dof:
+    where = f"demonstration {number}" if motions else "the rows"
+    if rows.ndim != 2 or rows.shape[1] != robot.dof or not len(rows):
         raise DemonstrationError(
             f"{where}: shape {rows.shape}, must be (T, {robot.dof}): one joint a column, "
             f"{', '.join(robot.joint_names)}"
@@ -78,22 +100,43 @@ def _checked(
     return rows
 
 
-def _read(file: Path, dof: int) -> Any:
+def _read(file: Path, robot: SerialRobot) -> Any:
     if not file.is_file():
         raise DemonstrationError(f"{file}: there is no such file")
     if file.suffix == ".parquet":
         return _read_lerobot(file)
     try:
-        with file.open(encoding="utf-8") as lines:
-            first = next(lines, "").strip().split(",")
-            named = not _is_number(first[0])
-        table = np.loadtxt(file, delimiter=",", skiprows=int(named), ndmin=2)
-    except (OSError, ValueError, UnicodeDecodeError) as error:
+        with file.open(encoding="utf-8-sig", newline="") as stream:
+            lines = [line for line in csv.reader(stream) if any(line) and line[0][:1] != "#"]
+        names = lines.pop(0) if lines and not _is_number(lines[0][0]) else []
+        table = np.array(lines, float)
+    except (OSError, ValueError) as error:
         raise DemonstrationError(f"{file}: not a table of numbers: {error}") from None
-    if table.shape[1] == dof + 1:  # a demonstration's number, then the joints
-        order = table[:, 0]
-        return [table[order == k, 1:] for k in dict.fromkeys(order.tolist())]
-    return table
+    if table.ndim != 2 or not table.size:
+        raise DemonstrationError(f"{file}: no rows of numbers")
+    return _told_apart(file, [name.strip() for name in names], table, robot)
+
+
+def _told_apart(file: Path, names: list[str], table: np.ndarray, robot: SerialRobot) -> Any:
+    """Rows, or demonstrations where a column tells them apart: one of NUMBERS, or without names
+    the first of one more than there are joints, if its numbers are whole.
+    """
+    if set(robot.joint_names) <= set(names):
+        joints = table[:, [names.index(name) for name in robot.joint_names]]
+        column = next((names.index(name) for name in NUMBERS if name in names), None)
+        numbers = None if column is None else table[:, column]
+    elif table.shape[1] == robot.dof + 1 and not names:
+        joints, numbers = table[:, 1:], table[:, 0]
+        if not (np.isfinite(numbers).all() and (numbers == np.round(numbers)).all()):
+            raise DemonstrationError(
+                f"{file}: the first of {table.shape[1]} columns must be the demonstration's "
+                f"number, or name the columns: time_s, {', '.join(robot.joint_names)}"
+            )
+    else:
+        return table
+    if numbers is None:
+        return joints
+    return [joints[numbers == k] for k in dict.fromkeys(numbers.tolist())]
 
 
 def _read_lerobot(file: Path) -> Any:
@@ -105,12 +148,13 @@ def _read_lerobot(file: Path) -> Any:
         ) from None
     try:
         table = pd.read_parquet(file)
-    except (OSError, ValueError) as error:
-        raise DemonstrationError(f"{file}: not a parquet file: {error}") from None
-    if STATE not in table:
-        raise DemonstrationError(f"{file}: there is no column {STATE!r}, as LeRobot writes it")
-    groups = table.groupby(EPISODE) if EPISODE in table else [(0, table)]
-    return [np.array(own[STATE].tolist(), float) for _, own in groups]
+        if STATE not in table:
+            raise DemonstrationError(f"{file}: there is no column {STATE!r}, as LeRobot writes it")
+        groups = table.groupby(EPISODE) if EPISODE in table else [(0, table)]
+        return [np.array(own[STATE].tolist(), float) for _, own in groups]
+    except (OSError, TypeError, ValueError) as error:
+        told = str(error) if isinstance(error, DemonstrationError) else f"{file}: {error}"
+        raise DemonstrationError(" ".join(told.split())[:300]) from None
 
 
 def _is_number(text: str) -> bool:

@@ -10,6 +10,7 @@ from constraint_geodesics.constraints.constraint import (
 )
 from constraint_geodesics.identification.identify import Identified
 from constraint_geodesics.params import ParamsError, read_yaml
+from constraint_geodesics.robot.kinematics import SerialRobot
 
 FORMAT = 1
 SUFFIXES = (".yaml", ".yml")
@@ -30,6 +31,7 @@ def save_constraint(identified: Identified, file: str | Path) -> None:
     about = {
         "format": FORMAT,
         "explanation": identified.explanation,
+        "robot": {"name": identified.robot[0], "tool_link": identified.robot[1]},
         "found_in": {
             "rows": identified.rows,
             "demonstrations": identified.demonstrations,
@@ -44,10 +46,11 @@ def save_constraint(identified: Identified, file: str | Path) -> None:
         writer.dump(about, stream)
 
 
-def load_constraint(file: str | Path) -> Constraint:
+def load_constraint(file: str | Path, robot: SerialRobot | None = None) -> Constraint:
     """The constraint that `save_constraint` wrote.
 
-    Raises ConstraintError, one line, if the file is missing or is none.
+    robot: who it is for; relations of one tool say nothing of another's.  Raises ConstraintError,
+    one line, if the file is missing or is none, or of another robot or tool.
     """
     try:
         about: Any = read_yaml(Path(file))
@@ -56,6 +59,12 @@ def load_constraint(file: str | Path) -> Constraint:
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise ConstraintError(f"{file}: not a constraint's file of format {FORMAT}")
     try:
+        own = about["robot"]["name"], about["robot"]["tool_link"]
+        if robot is not None and own != (robot.name, robot.tool_link):
+            raise ConstraintError(
+                f"found for {own[0]} with the tool {own[1]}, not {robot.name} with "
+                f"{robot.tool_link}"
+            )
         return constraint_from_json(about["constraint"])
     except ConstraintError as error:
         raise ConstraintError(f"{file}: {error}") from None

@@ -8,6 +8,7 @@ bias it.
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -27,26 +28,28 @@ Numbers = Float[np.ndarray, "p"]
 
 class Form(NamedTuple):
     """start: its numbers in closed form, from rows.  relations: the rows of the residual that they
-    make, in words.
+    make, in words.  facing: the numbers of which the rows are on the right side, where opposite
+    ones have the same zeros.  sides: relations with a tolerance that leave that side alone.
     """
 
     start: Callable[[Sample], Numbers]
     relations: Callable[[Numbers], tuple[Relation, ...]]
+    facing: Callable[[Sample, Numbers], Numbers] = lambda _, x: x
+    sides: Callable[[Numbers], tuple[Relation, ...]] = lambda _: ()
 
     def roughly(self, sample: Sample) -> tuple[Relation, ...]:
         """As read off in closed form."""
-        return self.relations(self.start(sample))
+        return self.relations(self.facing(sample, self.start(sample)))
 
-    def fitted(self, sample: Sample) -> tuple[Relation, ...]:
-        """With the least distances in joint space."""
-        some = sample[np.arange(0, len(sample), max(1, len(sample) // CAREFULLY))]
-        start = self.start(sample)
+    def fitted(self, sample: Sample) -> Numbers:
+        """The numbers with the least distances in joint space."""
+        some = sample[np.arange(0, len(sample), -(-len(sample) // CAREFULLY))]
 
         def off(x: Numbers) -> np.ndarray:
             return some.whitened(self.relations(x)).ravel()
 
-        found = least_squares(off, start, x_scale="jac", max_nfev=20)
-        return self.relations(found.x)
+        found = least_squares(off, self.start(sample), max_nfev=20)
+        return self.facing(sample, found.x)
 
 
 def _plane(count: int) -> Form:
@@ -55,15 +58,19 @@ def _plane(count: int) -> Form:
 
     def start(sample: Sample) -> Numbers:
         mean = sample.position.mean(axis=0)
+        if count == 3:
+            return mean
         _, directions = np.linalg.eigh(np.cov((sample.position - mean).T))
         normals = np.stack([_upright(directions[:, k]) for k in range(count)])
         return np.concatenate([normals.ravel(), normals @ mean])
 
     def relations(x: Numbers) -> tuple[Relation, ...]:
-        normals = x[: 3 * count].reshape(count, 3)
-        sizes = np.linalg.norm(normals, axis=1)
-        normals, offsets = normals / sizes[:, None], x[3 * count :] / sizes
-        point = np.linalg.lstsq(normals, offsets, rcond=None)[0]
+        normals, offsets = AXES, x
+        if count < 3:
+            # kept orthonormal: two that lean on each other would hold less than they say
+            left, _, right = np.linalg.svd(x[: 3 * count].reshape(count, 3), full_matrices=False)
+            normals, offsets = left @ right, x[3 * count :]
+        point = offsets @ normals
         if count == 1:
             told = f"{what}, normal {_vector(normals[0])}, {_mm(offsets[0])} from the base"
         elif count == 2:
@@ -92,6 +99,21 @@ def _axis_relations(x: Numbers) -> tuple[Relation, ...]:
     return tuple(_relation(words, "rad", 0.0, turned=(e, own)) for e in across(direction))
 
 
+def _axis_facing(sample: Sample, x: Numbers) -> Numbers:
+    """The direction that the axis points to, not the opposite one."""
+    own, direction = _unit(x[:3]), _unit(x[3:])
+    if _along(sample, direction, own).mean() < 0.0:
+        direction = -direction
+    return np.concatenate(_oriented(own, direction))
+
+
+def _axis_sides(x: Numbers) -> tuple[Relation, ...]:
+    """1 − nᵀR a ≤ 1: within 90°, for R a = −n has the same zeros."""
+    (words, *_), own, direction = (r.name for r in _axis_relations(x)), _unit(x[:3]), _unit(x[3:])
+    side = _relation(words, "rad", 1.0, turned=(-direction, own))
+    return (replace(side, tolerance=1.0),)
+
+
 def _orientation_start(sample: Sample) -> Numbers:
     left, _, right = np.linalg.svd(sample.rotation.mean(axis=0))
     return (left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right).ravel()
@@ -107,6 +129,15 @@ def _orientation_relations(x: Numbers) -> tuple[Relation, ...]:
         linear[3 + 3 * i : 6 + 3 * i] -= 0.5 * held[:, j]
         found.append(Relation("the tool keeps its whole orientation", "rad", 0.0, linear))
     return tuple(found)
+
+
+def _orientation_sides(x: Numbers) -> tuple[Relation, ...]:
+    """(3 − tr R₀ᵀR)/4 = (1 − cos θ)/2 ≤ 1/2: within 90°, for half turns have the same zeros."""
+    left, _, right = np.linalg.svd(x.reshape(3, 3))
+    linear = np.zeros(FEATURES)
+    linear[3:] = -0.25 * (left @ right).T.ravel()
+    words = _orientation_relations(x)[0].name
+    return (Relation(words, "rad", 0.75, linear, None, 0.5),)
 
 
 def _angle_start(sample: Sample) -> Numbers:
@@ -216,8 +247,8 @@ def circle(normal: Float[np.ndarray, "3"]) -> Form:
     )
 
 
-AXIS = Form(_axis_start, _axis_relations)
-ORIENTATION = Form(_orientation_start, _orientation_relations)
+AXIS = Form(_axis_start, _axis_relations, _axis_facing, _axis_sides)
+ORIENTATION = Form(_orientation_start, _orientation_relations, sides=_orientation_sides)
 ANGLE = Form(_angle_start, _angle_relations)
 CENTRE = Form(_centre_start, _centre_relations)
 SPHERE = Form(_sphere_start, _sphere_relations)

@@ -20,11 +20,9 @@ from constraint_geodesics.identification.demonstrations import demonstrations_fr
 from constraint_geodesics.identification.forms import POSE, POSITION, QUADRIC, TURNED, Form, named
 from constraint_geodesics.identification.vanishing import (
     AT_MOST_RAD,
-    FLOOR_RAD,
     METRES,
-    SURELY_RAD,
-    TIMES,
     Sample,
+    most_rad,
     rank,
     trimmed,
     vanishing,
@@ -52,25 +50,24 @@ class Identified:
     """What demonstrations keep to.
 
     constraint: None where nothing was identified.  relations: in words, each with the rms by which
-    it is missed on left-out demonstrations.  noise_rad: rms distance of the rows from the
-    constraint manifold, along each direction that is held; nan without a constraint.  left_out: rms
+    it is missed on left-out demonstrations.  codim: dimensions that they take.  noise_rad: rms
+    distance of the rows from the constraint manifold, along each direction that is held; nan
+    without a constraint.  left_out: rms
     of each row of the residual on left-out demonstrations, in its unit.  missing: what was seen but
-    not supported, or why there is nothing.  dropped: rows that were taken to be wrong.
+    not supported, or why there is nothing.  dropped: rows that were taken to be wrong.  robot: its
+    name and tool link, of whose tool all this is said.
     """
 
     constraint: PolynomialConstraint | None
     relations: tuple[str, ...]
+    codim: int
     noise_rad: float
     left_out: tuple[float, ...]
     missing: str
     rows: int
     demonstrations: int
     dropped: int
-
-    @property
-    def codim(self) -> int:
-        """Dimensions that the constraint takes."""
-        return 0 if self.constraint is None else self.constraint.codim
+    robot: tuple[str, str]
 
     @property
     def left_out_error(self) -> dict[str, float]:
@@ -115,8 +112,14 @@ def identify(demonstrations: Any, robot: SerialRobot) -> Identified:
         near = off <= max(WRONG * float(np.median(off[kept])), LEAST_WRONG_RAD)
         if (near == kept).all():
             break
+        if near.mean() < GOOD:  # that many are not wrong, they say something else
+            search.missing.append(
+                f"{1.0 - near.mean():.0%} of the rows are further off than the others: not all "
+                f"demonstrations are of one kind"
+            )
+            break
         kept, search = near, _searched(sample[near])
-    return _told(search, len(shown), int((~kept).sum()))
+    return _told(search, robot, len(shown), int((~kept).sum()))
 
 
 def _likely(sample: Sample) -> Bool[np.ndarray, "n"]:
@@ -136,6 +139,8 @@ class _Search:
     sample: Sample
     folds: Sequence[Bool[np.ndarray, "n"]]
     relations: tuple[Relation, ...] = ()
+    sides: tuple[Relation, ...] = ()
+    best_rad: float = 0.0
     found: list[Found] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
 
@@ -147,7 +152,10 @@ class _Search:
 
 def _searched(sample: Sample) -> _Search:
     search = _Search(sample, sample.folds())
-    for name in (*_COLUMNS, QUADRIC):
+    names = (*_COLUMNS, QUADRIC)
+    least = [vanishing(*_features(sample, name), []).found_rad for name in names]
+    search.best_rad = min((float(own[0]) for own in least if len(own)), default=np.inf)
+    for name in names:
         _look(search, name)
     return search
 
@@ -158,7 +166,7 @@ def _features(sample: Sample, name: str) -> tuple[np.ndarray, np.ndarray]:
     y, slopes = y / _SCALE, slopes / _SCALE[:, None]
     if name != QUADRIC:
         return y[:, _COLUMNS[name]], slopes[:, _COLUMNS[name]]
-    p, own = y[:, :3], slopes[:, :3]
+    p, own = y[:, :3] - y[:, :3].mean(axis=0), slopes[:, :3]
     steep = p[:, _FIRST, None] * own[:, _SECOND] + p[:, _SECOND, None] * own[:, _FIRST]
     return np.hstack([p, p[:, _FIRST] * p[:, _SECOND]]), np.concatenate([own, steep], axis=1)
 
@@ -170,19 +178,21 @@ def _look(search: _Search, name: str) -> None:
     if np.abs(free).max() < 1e-6:
         return
     found = vanishing(psi, free, search.folds)
-    seeming, held = found.seeming, found.held
+    seeming, held = found.seeming(search.best_rad), found.held(search.best_rad)
     for count in dict.fromkeys((seeming, held)):
         if not count:
             continue
         independent = rank(free, found.weights[:, :count])
-        off = _distance(search.sample, _generic(name, found.weights[:, :count], found.mean))
+        off = _distance(search.sample, _generic(name, found.weights[:, :count], search.sample))
         for form in named(name, independent, search.relations):
             if _distance(search.sample, form.roughly(search.sample)) > 4.0 * off + FINE_RAD:
                 continue
-            relations = form.fitted(search.sample)
+            numbers = form.fitted(search.sample)
+            relations = form.relations(numbers)
             good = _distance(search.sample, relations) <= WORSE * off + FINE_RAD
             if good and (count == held or _supported(form, search)):
-                search.keep(form.roughly, relations)
+                search.keep(partial(_fitted, form), relations)
+                search.sides += form.sides(numbers)
                 return
     if held < seeming and found.found_rad[held] < 0.5 * found.left_out_rad[held]:
         on_others = found.left_out_rad[held]
@@ -202,12 +212,18 @@ def _again(
     """The least varying combinations themselves, where they have no name."""
     psi, slopes = _features(sample, name)
     found = vanishing(psi, without(slopes, sample.slopes(known)), [])
-    return _generic(name, found.weights[:, :count], found.mean)
+    return _generic(name, found.weights[:, :count], sample)
 
 
-def _generic(name: str, weights: np.ndarray, mean: np.ndarray) -> tuple[Relation, ...]:
-    """Combinations as relations, in joint space's radians."""
-    relations = []
+def _fitted(form: Form, sample: Sample) -> tuple[Relation, ...]:
+    """A form's relations, fitted to other rows."""
+    return form.relations(form.fitted(sample))
+
+
+def _generic(name: str, weights: np.ndarray, sample: Sample) -> tuple[Relation, ...]:
+    """Combinations as relations, zero in the mean of the rows, in joint space's radians."""
+    relations, (y, _) = [], sample.pose
+    middle = np.concatenate([sample.position.mean(axis=0), np.zeros(9)])
     for w in weights.T:
         linear, full = np.zeros(FEATURES), np.zeros((FEATURES, FEATURES))
         if name == QUADRIC:
@@ -218,16 +234,17 @@ def _generic(name: str, weights: np.ndarray, mean: np.ndarray) -> tuple[Relation
         else:
             linear[_COLUMNS[name]] = w
         words = f"{weights.shape[1]} relations of the tool's {name} without a name"
-        relations.append(Relation(words, "rad", -float(w @ mean), linear / _SCALE, full))
+        own = Relation(words, "rad", 0.0, linear / _SCALE - full @ middle, full)
+        relations.append(replace(own, constant=-float(own.values(y).mean())))
     return tuple(relations)
 
 
 def _supported(form: Form, search: _Search) -> bool:
     """Whether a form holds on demonstrations that its numbers were not read off."""
-    within = _distance(search.sample, form.roughly(search.sample))
-    most = min(max(TIMES * max(within, FLOOR_RAD), SURELY_RAD), AT_MOST_RAD)
-    off = [_distance(search.sample[out], form.roughly(search.sample[~out])) for out in search.folds]
-    return bool(off) and float(np.sqrt(np.mean(np.square(off)))) <= most
+    off = [
+        _distance(search.sample[out], _fitted(form, search.sample[~out])) for out in search.folds
+    ]
+    return bool(off) and float(np.sqrt(np.mean(np.square(off)))) <= most_rad(search.best_rad)
 
 
 def _distance(sample: Sample, relations: Sequence[Relation]) -> float:
@@ -236,11 +253,12 @@ def _distance(sample: Sample, relations: Sequence[Relation]) -> float:
     return float(np.sqrt(np.mean(off[: max(1, int(GOOD * len(off)))] ** 2)))
 
 
-def _told(search: _Search, demonstrations: int, dropped: int) -> Identified:
-    missing, rows = "; ".join(search.missing), len(search.sample)
+def _told(search: _Search, robot: SerialRobot, demonstrations: int, dropped: int) -> Identified:
+    missing, counts = "; ".join(search.missing), (len(search.sample), demonstrations, dropped)
+    whose = robot.name, robot.tool_link
     if not search.relations:
         missing = missing or "the demonstrations keep to no relation, the motion is free"
-        return Identified(None, (), np.nan, (), missing, rows, demonstrations, dropped)
+        return Identified(None, (), 0, np.nan, (), missing, *counts, whose)
     left_out = _left_out(search)
     worst: dict[tuple[str, str], float] = {}
     for own, value in zip(search.relations, left_out.tolist(), strict=True):
@@ -249,9 +267,11 @@ def _told(search: _Search, demonstrations: int, dropped: int) -> Identified:
     told = tuple(f"{name} (± {_amount(unit, value)})" for (name, unit), value in worst.items())
     noise = search.sample.distances(search.relations)
     noise_rad = float(np.sqrt((noise**2).mean() / len(search.relations)))
-    constraint = PolynomialConstraint(search.relations, tuple(left_out.tolist()))
-    about = tuple(left_out.tolist())
-    return Identified(constraint, told, noise_rad, about, missing, rows, demonstrations, dropped)
+    # a side is no relation that is missed: it only tells two sets of the same zeros apart
+    about = (*left_out.tolist(), *(0.0 for _ in search.sides))
+    constraint = PolynomialConstraint((*search.relations, *search.sides), about)
+    codim = len(search.relations)
+    return Identified(constraint, told, codim, noise_rad, about, missing, *counts, whose)
 
 
 def _left_out(search: _Search) -> Float[np.ndarray, "m"]:
@@ -273,5 +293,7 @@ def with_tolerance(constraint: PolynomialConstraint, loosely: float) -> Polynomi
     demonstrations.
     """
     relations = zip(constraint.relations, constraint.left_out, strict=True)
-    wider = tuple(replace(own, tolerance=loosely * off) for own, off in relations)
+    wider = tuple(
+        replace(own, tolerance=max(own.tolerance, loosely * off)) for own, off in relations
+    )
     return replace(constraint, relations=wider)

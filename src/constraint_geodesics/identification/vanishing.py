@@ -18,7 +18,7 @@ from constraint_geodesics.robot.kinematics import SerialRobot
 
 METRES = 0.3
 """Unit of positions among the features: a reach, so that they are as large as a rotation's."""
-SEEN = 3e-3
+SEEN = 2e-4
 """Combinations whose squared gradient is smaller than this share of the largest hardly move with
 the joints: noise alone makes them vary.
 """
@@ -27,9 +27,9 @@ APART = 0.15
 share of the longest.
 """
 FLOOR_RAD = 1e-4
-SURELY_RAD, AT_MOST_RAD, TIMES = 2e-3, 0.03, 4.0
+SURELY_RAD, AT_MOST_RAD, TIMES = 2e-3, 0.02, 4.0
 """A relation holds on demonstrations that it was not found on if these are off by no more than
-TIMES the best relation's distance, or SURELY_RAD; and by AT_MOST_RAD in any case.
+TIMES the distance of the best relation of all, or SURELY_RAD; and by AT_MOST_RAD in any case.
 """
 RIDGE = 1e-9
 """Added to J Jᵀ, as a share of its trace: two relations may touch at a row."""
@@ -119,22 +119,22 @@ class Vanishing:
     found_rad: Float[np.ndarray, "k"]
     left_out_rad: Float[np.ndarray, "k"]
 
-    @property
-    def held(self) -> int:
-        """How many hold on what was left out."""
-        return _count(self.left_out_rad)
+    def held(self, best_rad: float) -> int:
+        """How many hold on what was left out; best_rad: what the best of all is off by."""
+        return _count(self.left_out_rad, best_rad)
 
-    @property
-    def seeming(self) -> int:
+    def seeming(self, best_rad: float) -> int:
         """How many hold on the rows that they were found on."""
-        return _count(self.found_rad)
+        return _count(self.found_rad, best_rad)
 
 
-def _count(distances: Float[np.ndarray, "k"]) -> int:
-    if not len(distances):
-        return 0
-    most = min(max(TIMES * max(distances[0], FLOOR_RAD), SURELY_RAD), AT_MOST_RAD)
-    beyond = np.flatnonzero(distances > most)
+def most_rad(best_rad: float) -> float:
+    """Distance up to which a relation holds, where the best of all is off by so much [rad]."""
+    return min(max(TIMES * max(best_rad, FLOOR_RAD), SURELY_RAD), AT_MOST_RAD)
+
+
+def _count(distances: Float[np.ndarray, "k"], best_rad: float) -> int:
+    beyond = np.flatnonzero(distances > most_rad(best_rad))
     return int(beyond[0]) if len(beyond) else len(distances)
 
 
@@ -174,6 +174,8 @@ def _least(
     steep = np.einsum("nad,nbd->ab", slopes, slopes, optimize=True) / len(psi)
     size, basis = np.linalg.eigh(steep)
     kept = size > SEEN * max(size[-1], 1e-300)
+    if not kept.any() or size[-1] <= 0.0:  # nothing of it moves with the joints
+        return mean, np.zeros((psi.shape[1], 0)), np.zeros(0)
     basis = basis[:, kept] / np.sqrt(size[kept])
     values, own = eigh(basis.T @ spread @ basis)
     return mean, basis @ own, np.sqrt(np.maximum(values, 0.0))
@@ -188,6 +190,8 @@ def trimmed(
     kept = np.ones(len(psi), dtype=bool)
     for _ in range(TRIMS):
         mean, own, found = _least(psi[kept], slopes[kept])
+        if not len(found):
+            return np.inf, np.zeros(len(psi))
         steep = np.linalg.norm(np.matmul(own[:, 0], slopes), axis=1)
         off = np.abs((psi - mean) @ own[:, 0]) / np.maximum(steep, LEAST_STEEP)
         kept = off <= np.quantile(off, share)
@@ -198,6 +202,8 @@ def rank(slopes: Float[np.ndarray, "n M D"], weights: Float[np.ndarray, "M k"]) 
     """How many of k combinations are independent: of the tool's axes two fix the third."""
     sizes = np.linalg.svd(np.matmul(weights.T, slopes), compute_uv=False)
     rms = np.sqrt((sizes**2).mean(axis=0))
+    if not len(rms):
+        return 0
     return int((rms > APART * rms[0]).sum())
 
 
