@@ -6,6 +6,7 @@ import sys
 
 import pandas as pd
 
+from constraint_geodesics.benchmark.queries import KEEP_OUT, TABLE
 from constraint_geodesics.learning.learned_manifold import chart_named
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
@@ -23,7 +24,8 @@ def main(params: Params, layout: Layout) -> None:
     name, folder = params.policies.chart, layout.policies(params.policies.chart)
     chart = chart_named(name, layout.manifold(name), robot_from(params.robot))
     tasks = [
-        PolicyTask(constraint, params, layout.root, chart, folder)
+        PolicyTask(constraint, scene, params, layout.root, chart, folder)
+        for scene in (KEEP_OUT, TABLE)
         for constraint in params.all_constraints
     ]
     with tracked_stage(
@@ -33,7 +35,7 @@ def main(params: Params, layout: Layout) -> None:
             run_policies, tasks, params.compute, description=f"policies' proposals {name}"
         )
         for task, rows in zip(tasks, tables, strict=True):
-            file = layout.report(STAGE, task.name, "csv.gz")
+            file = layout.report(STAGE, f"{task.name}-{task.scene}", "csv.gz")
             file.parent.mkdir(parents=True, exist_ok=True)
             rows.round(6).to_csv(file, index=False, compression={"method": "gzip", "mtime": 0})
         every = pd.concat(tables, ignore_index=True)

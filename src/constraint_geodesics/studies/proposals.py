@@ -282,9 +282,10 @@ def query_answers(asked: Asked, compared: Compared) -> list[tuple[str, int, Answ
 
 @dataclass(frozen=True)
 class PolicyTask:
-    """One constraint's queries; picklable.  policies: folder of the trained ones."""
+    """One constraint's queries in one scene; picklable.  policies: folder of the trained ones."""
 
     name: str
+    scene: str
     params: Params
     root: Path
     chart: LearnedManifold
@@ -292,7 +293,7 @@ class PolicyTask:
 
 
 def run_policies(task: PolicyTask) -> pd.DataFrame:
-    """One row a query, method and seed, in the workcell and with a sphere on the way.
+    """One row a query, method and seed, in the workcell or with a sphere on the way.
 
     Columns: constraint, scene, query, method, seed, solved, length_rad (nan where not solved),
     best_rad (of the shortest certified path that is known, the planner's or an answer's; nan where
@@ -312,30 +313,29 @@ def run_policies(task: PolicyTask) -> pd.DataFrame:
     build = partial(BaselineBuilder(params, task.root), PEERS)
     with build(scene, task.name, manifold) as (peers, _):
         drawn = _queries(params, scene, manifold, task.name, peers[PLANNER])
-        queries = [query for query in drawn if query.scene == TABLE or query.number < SPHERES]
-        for query in queries:
+        queries = [query for query in drawn if query.scene == task.scene]
+        queries = queries if task.scene == TABLE else queries[:SPHERES]
+        for place, query in enumerate(queries):
             with ExitStack() as opened:
                 own = peers
                 if query.obstacle is not None:  # planners know the scene that they were made in
                     made = build(query.in_scene(scene), task.name, manifold)
                     own, _ = opened.enter_context(made)
+                if place >= PEER_QUERIES:
+                    own = {PLANNER: own[PLANNER]}
                 found, answers = _query_rows(query, problem, compared, params, own)
             rows += found
             phi.append(np.array([answer.phi for answer in answers]))
     table = pd.DataFrame(rows).assign(optimum_rad=np.nan)
-    if task.name != params.studies.constraint:
+    if (task.name, task.scene) != (params.studies.constraint, TABLE):
         return table
-    alone = [k for k, query in enumerate(queries) if query.obstacle is None]
-    starts, goals = (np.array([getattr(queries[k], name) for k in alone]) for name in _ENDS)
-    shortest = family_optimum(
-        problem, problem.ends(starts, goals), np.array([phi[k] for k in alone]), OptimumSettings()
-    )
-    free = table["scene"] == TABLE
-    curves = table[free & ~table["method"].isin(PEERS)]
+    starts, goals = (np.array([getattr(query, name) for query in queries]) for name in _ENDS)
+    ends = problem.ends(starts, goals)
+    shortest = family_optimum(problem, ends, np.array(phi), OptimumSettings())
+    curves = table[~table["method"].isin(PEERS)]
     met = curves.groupby("query")["length_rad"].min()
     known = pd.Series(np.fmin(met.to_numpy(), shortest.length), index=met.index)
-    table.loc[free, "optimum_rad"] = table.loc[free, "query"].map(known)
-    return table
+    return table.assign(optimum_rad=table["query"].map(known))
 
 
 _ENDS = ("start", "goal")
@@ -379,7 +379,6 @@ def _query_rows(
         planned = [
             (name, seed, _planned(asked, known, planner, seed))
             for name, planner in peers.items()
-            if name == PLANNER or query.number < PEER_QUERIES
             for seed in (range(PEER_SEEDS) if name != PLANNER else (0,))
         ]
         band = [_or_nan(asked.refined_length, answer) for _, _, answer in answers]
