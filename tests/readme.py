@@ -37,7 +37,7 @@ QUOTED = re.compile(r"([\d.]+)([^\d<]{0,12})<!-- from (\S+) (\S+) ([\d.e-]+) (\d
 
 
 def with_planners(text: str) -> str:
-    """README's text with its table of planners, from the benchmark's overview."""
+    """README's text with its table of planners, from the benchmark's overview, and its numbers."""
     with (ROOT / "reports" / "benchmark" / "overview.csv").open() as file:
         found = {(row["planner"], row["scene"]): row for row in csv.DictReader(file)}
     columns = ("solved", "length, p95", "median [ms]")
@@ -46,7 +46,7 @@ def with_planners(text: str) -> str:
     for planner in SHOWN:
         cells = [cell for scene in ("table", "keep_out") for cell in _cells(found[planner, scene])]
         lines.append(f"| {' | '.join((planner, *cells))} |")
-    return replaced(text, "planners", "\n".join(lines))
+    return QUOTED.sub(_requoted, replaced(text, "planners", "\n".join(lines)))
 
 
 def _cells(row: dict[str, str]) -> tuple[str, str, str]:
