@@ -29,7 +29,7 @@ FAMILIES = {
         "this planner, its parts and policies",
         (
             *("planner", "planned", "learned", "without", "only", "nothing learned"),
-            *("trees + band", "band and trees", "graph", "policy", "policies", "separate policies"),
+            *("trees + band", "band and trees", "graph", "policy", "policies", "the same search"),
         ),
     ),
     "latent": Family(

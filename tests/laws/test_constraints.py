@@ -411,7 +411,10 @@ def test_params_name_a_factory(kuka) -> None:
 FILES = {
     "Pose": {"params.py", "constraints/constraint.py", "constraints/pose.py"},
     "Functions": {"params.py", "constraints/functions.py", "kernel_jobs.py"},
-    "Polynomial": {"constraints/polynomial.py"},
+    "Polynomial": {
+        "constraints/polynomial.py",
+        *(f"identification/{name}.py" for name in ("forms", "identify", "vanishing")),
+    },
 }
 """Where the class of a kind, its arrays and its record may be named; the warm-up compiles what
 calls functions.

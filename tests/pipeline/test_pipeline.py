@@ -35,6 +35,7 @@ for name, *items in (
     ("ablate_manifold", "paper"),
     ("ablate_manifold", "planner"),
     ("benchmark_geometry", "planner", "level_cup"),
+    ("train_path_diffusion",),
     ("benchmark_policies",),
     ("compare_charts",),
     ("report",),
