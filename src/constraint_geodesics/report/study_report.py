@@ -133,10 +133,13 @@ def what_learning_adds(params: Params, layout: Layout) -> dict[str, str]:
     )
     said = {
         "One curve": f"{_against_controls(found[studied]['table'], studied)} "
-        f"{_against_controls(found['trained on']['table'], 'All constraints together')}",
-        "Constraints never trained on": f"The policy solves {unseen}. "
-        + _against_controls(found["never seen"]["table"], "Together"),
+        f"{_against_controls(found['trained on']['table'], 'All constraints together')}"
     }
+    never = found["never seen"].get("table")
+    if never:
+        said["Constraints never trained on"] = f"The policy solves {unseen}. " + _against_controls(
+            never, "Together"
+        )
     beset = found["trained on"].get("keep_out")
     if beset:
         said["A sphere on the way"] = _against_controls(beset, "All constraints together")
