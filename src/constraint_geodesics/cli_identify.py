@@ -4,7 +4,7 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -73,18 +73,7 @@ def identify_constraint(
             save_constraint(found, out)
     except (BundleError, ConstraintError, DemonstrationError, PlannerError, RobotError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
-    about: dict[str, Any] = {
-        "identified": found.constraint is not None,
-        "relations": list(found.relations),
-        "missing": found.missing,
-        "codim": found.codim,
-        "noise_rad": None if found.constraint is None else found.noise_rad,
-        "left_out_error": found.left_out_error,
-        "rows": found.rows,
-        "demonstrations": found.demonstrations,
-        "dropped": found.dropped,
-    }
-    print(json.dumps(about) if as_json else found.explanation)
+    print(json.dumps(found.summary()) if as_json else found.explanation)
     if out is not None and found.constraint is not None:
         print(f"written: {out}", file=sys.stderr)
     raise SystemExit(0 if found.constraint is not None else NO_PATH)

@@ -108,8 +108,12 @@ def _read(file: Path, robot: SerialRobot) -> Any:
     try:
         with file.open(encoding="utf-8-sig", newline="") as stream:
             lines = [line for line in csv.reader(stream) if any(line) and line[0][:1] != "#"]
-        names = lines.pop(0) if lines and not _is_number(lines[0][0]) else []
-        table = np.array(lines, float)
+        names: list[str] = []
+        try:
+            table = np.array(lines, float)
+        except ValueError:  # a line of names stands above
+            names = lines.pop(0)
+            table = np.array(lines, float)
     except (OSError, ValueError) as error:
         raise DemonstrationError(f"{file}: not a table of numbers: {error}") from None
     if table.ndim != 2 or not table.size:
@@ -155,11 +159,3 @@ def _read_lerobot(file: Path) -> Any:
     except (OSError, TypeError, ValueError) as error:
         told = str(error) if isinstance(error, DemonstrationError) else f"{file}: {error}"
         raise DemonstrationError(" ".join(told.split())[:300]) from None
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

@@ -96,7 +96,7 @@ def _axis_relations(x: Numbers) -> tuple[Relation, ...]:
     """R a = n."""
     own, direction = _unit(x[:3]), _unit(x[3:])
     words = f"the tool's {_axis(own)} keeps the direction {_vector(direction)}"
-    return tuple(_relation(words, "rad", 0.0, turned=(e, own)) for e in across(direction))
+    return tuple(_relation(words, "rad", 0.0, turned=(e, own)) for e in _across(direction))
 
 
 def _axis_facing(sample: Sample, x: Numbers) -> Numbers:
@@ -109,8 +109,8 @@ def _axis_facing(sample: Sample, x: Numbers) -> Numbers:
 
 def _axis_sides(x: Numbers) -> tuple[Relation, ...]:
     """1 − nᵀR a ≤ 1: within 90°, for R a = −n has the same zeros."""
-    (words, *_), own, direction = (r.name for r in _axis_relations(x)), _unit(x[:3]), _unit(x[3:])
-    side = _relation(words, "rad", 1.0, turned=(-direction, own))
+    words = _axis_relations(x)[0].name
+    side = _relation(words, "rad", 1.0, turned=(-_unit(x[3:]), _unit(x[:3])))
     return (replace(side, tolerance=1.0),)
 
 
@@ -178,7 +178,7 @@ def _centre_start(sample: Sample) -> Numbers:
 
 
 def _centre_relations(x: Numbers) -> tuple[Relation, ...]:
-    """P + R b = c."""
+    """The rows of p + R b = c."""
     arm, centre = x[:3], x[3:]
     radius = float(np.linalg.norm(arm))
     words = (
@@ -191,9 +191,16 @@ def _centre_relations(x: Numbers) -> tuple[Relation, ...]:
 
 
 def _sphere_start(sample: Sample) -> Numbers:
-    p = sample.position
-    solved, *_ = np.linalg.lstsq(np.c_[2 * p, np.ones(len(p))], (p**2).sum(axis=1), rcond=None)
-    return np.append(solved[:3], np.sqrt(max(solved[3] + solved[:3] @ solved[:3], 1e-6)))
+    centre, radius = _round_through(sample.position)
+    return np.append(centre, radius)
+
+
+def _round_through(points: Float[np.ndarray, "n k"]) -> tuple[Float[np.ndarray, "k"], float]:
+    """Centre and radius of the sphere or circle through points, |p|² = 2 cᵀp + ρ² − |c|²."""
+    system = np.c_[2 * points, np.ones(len(points))]
+    solved, *_ = np.linalg.lstsq(system, (points**2).sum(axis=1), rcond=None)
+    centre = solved[:-1]
+    return centre, float(np.sqrt(max(solved[-1] + centre @ centre, 1e-6)))
 
 
 def _sphere_relations(x: Numbers) -> tuple[Relation, ...]:
@@ -216,11 +223,9 @@ def _off_cylinder(x: Numbers, sample: Sample) -> np.ndarray:
 
 def _around(sample: Sample, axis: Float[np.ndarray, "3"]) -> Numbers:
     """A circle about a direction: direction, centre, radius."""
-    flat = np.stack(across(axis))
-    p = sample.position @ flat.T
-    solved, *_ = np.linalg.lstsq(np.c_[2 * p, np.ones(len(p))], (p**2).sum(axis=1), rcond=None)
-    radius = np.sqrt(max(solved[2] + solved[:2] @ solved[:2], 1e-6))
-    return np.concatenate([axis, solved[:2] @ flat, [radius]])
+    flat = np.stack(_across(axis))
+    centre, radius = _round_through(sample.position @ flat.T)
+    return np.concatenate([axis, centre @ flat, [radius]])
 
 
 def _cylinder_relations(x: Numbers) -> tuple[Relation, ...]:
@@ -291,7 +296,7 @@ def _relation(
     position: Float[np.ndarray, "3"] | None = None,
     turned: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None,
 ) -> Relation:
-    """C + eᵀp + fᵀR a."""
+    """The row c + eᵀp + fᵀR a."""
     linear = np.zeros(FEATURES)
     if position is not None:
         linear[:3] = position
@@ -302,7 +307,7 @@ def _relation(
     return Relation(words, unit, constant, linear)
 
 
-def across(direction: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray]:
+def _across(direction: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray]:
     """Two unit vectors that complete a direction to a frame."""
     first = _unit(np.cross(direction, AXES[np.argmin(np.abs(direction))]))
     return first, np.cross(direction, first)

@@ -78,6 +78,21 @@ class Identified:
                 found[unit] = max(found.get(unit, 0.0), value)
         return found
 
+    def summary(self) -> dict[str, Any]:
+        """All but the numbers of the relations, as JSON takes it."""
+        identified = self.constraint is not None
+        return {
+            "identified": identified,
+            "relations": list(self.relations),
+            "missing": self.missing,
+            "codim": self.codim,
+            "noise_rad": self.noise_rad if identified else None,
+            "left_out_error": self.left_out_error,
+            "rows": self.rows,
+            "demonstrations": self.demonstrations,
+            "dropped": self.dropped,
+        }
+
     def save(self, file: str | Path) -> None:
         """Write the constraint as YAML (`files.save_constraint`)."""
         from constraint_geodesics.identification.files import save_constraint
@@ -108,8 +123,7 @@ def identify(demonstrations: Any, robot: SerialRobot) -> Identified:
     for _ in range(ROUNDS):
         if not search.relations:
             break
-        off = sample.distances(search.relations)
-        near = off <= max(WRONG * float(np.median(off[kept])), LEAST_WRONG_RAD)
+        near = _near(sample.distances(search.relations), kept)
         if (near == kept).all():
             break
         if near.mean() < GOOD:  # that many are not wrong, they say something else
@@ -124,12 +138,18 @@ def identify(demonstrations: Any, robot: SerialRobot) -> Identified:
 
 def _likely(sample: Sample) -> Bool[np.ndarray, "n"]:
     """Rows that keep to a relation that GOOD of them keep to; all if there is none."""
+    everything = np.ones(len(sample), dtype=bool)
     for name in (*_COLUMNS, QUADRIC):
         least, off = trimmed(*_features(sample, name), GOOD)
-        near = off <= max(WRONG * float(np.median(off)), LEAST_WRONG_RAD)
+        near = _near(off, everything)
         if least <= AT_MOST_RAD and near.mean() >= GOOD:
             return near
-    return np.ones(len(sample), dtype=bool)
+    return everything
+
+
+def _near(off: Float[np.ndarray, "n"], kept: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+    """Rows that are not further off than WRONG times the median of those that are kept."""
+    return off <= max(WRONG * float(np.median(off[kept])), LEAST_WRONG_RAD)
 
 
 @dataclass
@@ -233,7 +253,8 @@ def _generic(name: str, weights: np.ndarray, sample: Sample) -> tuple[Relation, 
                 full[j, i] += value
         else:
             linear[_COLUMNS[name]] = w
-        words = f"{weights.shape[1]} relations of the tool's {name} without a name"
+        count = "a relation" if weights.shape[1] == 1 else f"{weights.shape[1]} relations"
+        words = f"{count} of the tool's {name} without a name"
         own = Relation(words, "rad", 0.0, linear / _SCALE - full @ middle, full)
         relations.append(replace(own, constant=-float(own.values(y).mean())))
     return tuple(relations)
