@@ -7,7 +7,8 @@ import pytest
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.charts_page import METRICS, charts_markdown
 from constraint_geodesics.report.results import studies_at_hand
-from constraint_geodesics.studies.charts import CHART, DESCENT, HOLE, JOINTS, POLICY, TASK, WORKCELL
+from constraint_geodesics.studies.charts import CHART, HOLE, JOINTS, TASK, WORKCELL
+from constraint_geodesics.studies.proposals import DESCENT, POLICY
 
 
 def same(value: float | None) -> dict:

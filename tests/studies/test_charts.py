@@ -4,16 +4,15 @@ import pytest
 
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.studies.charts import (
-    DESCENT,
     HOLE,
     JOINTS,
-    POLICY,
     TASK,
     WORKCELL,
     summary,
     table_of,
     tasks_of,
 )
+from constraint_geodesics.studies.proposals import DESCENT, POLICY
 
 
 def rows(data: str, dim: int, seed: int, lengths: dict[str, list[float]]) -> list[dict]:

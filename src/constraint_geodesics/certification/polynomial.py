@@ -12,68 +12,35 @@ a.  So |r″| has a bound K, and |r(t)| ≤ max(|r₀|, |r₁|) + K/8, with piec
 K/8.
 """
 
-from typing import NamedTuple
-
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from constraint_geodesics.certification import kernels
 from constraint_geodesics.certification.chain import Chain
-from constraint_geodesics.certification.kept import Asked, Broken, Kept, nothing_exceeds, summed_up
+from constraint_geodesics.certification.kept import Asked, Kept
+from constraint_geodesics.certification.pieces import SHARE, cut, kept_on
 
-_SHARE = 0.05
-"""Share of what is allowed that the bound may add to the values at the pieces' ends."""
-_MOST_PIECES = 1024
 _BLOCKS = tuple(slice(3 * k, 3 * k + 3) for k in range(4))
-
-
-class _Pieces(NamedTuple):
-    """A path cut up: its stations (S, D), where the path's rows are among them, and the segment of
-    each piece.
-    """
-
-    stations: Float[np.ndarray, "S D"]
-    rows: Int[np.ndarray, "T"]
-    segments: Int[np.ndarray, "S-1"]
 
 
 def kept(asked: Asked) -> Kept:
     """How well the relations are kept at the rows and on the whole path."""
-    attained, bound = nothing_exceeds()
-    at_rows, between = [], []
-    relations, allowed = asked.constraint.relations, asked.limits.violation_tolerance
-    whole = _Pieces(asked.rows, np.arange(len(asked.rows)), np.arange(len(asked.rows) - 1))
-    _, added = _bounds(asked.chain, whole, relations)
-    pieces = _cut(asked.rows, added.max(axis=1), _SHARE * allowed)
-    values, added = _bounds(asked.chain, pieces, relations)
-    for own, value, more in zip(relations, values.T, added.T, strict=True):
-        size = np.abs(value)
-        size[np.isnan(size)] = np.inf
-        proven = np.maximum(size[1:], size[:-1]) + more + kernels.ROUNDING
-        limit, at = own.tolerance + allowed, size[pieces.rows]
-        if not at.max() <= limit:
-            row = int(np.argmax(at > limit))
-            excess = float(at[row]) - own.tolerance
-            at_rows.append(Broken(row, excess, own.name, own.unit, own.tolerance))
-        if not proven.max(initial=0.0) <= limit:
-            piece = int(np.argmax(proven > limit))
-            excess = float(proven[piece]) - own.tolerance
-            segment = int(pieces.segments[piece])
-            between.append(Broken(segment, excess, own.name, own.unit, own.tolerance))
-        attained[own.unit] = max(attained[own.unit], float(size.max()) - own.tolerance)
-        largest = float(max(proven.max(initial=0.0), size.max()))
-        bound[own.unit] = max(bound[own.unit], largest - own.tolerance)
-    return summed_up(attained, bound, at_rows, between, asked.limits)
+    relations = asked.constraint.relations
+    _, added = _bounds(asked.chain, asked.rows, relations)
+    wanted = SHARE * asked.limits.violation_tolerance
+    pieces = cut(asked.rows, added.max(axis=1), wanted)
+    values, added = _bounds(asked.chain, pieces.stations, relations)
+    return kept_on(pieces, relations, values, added, asked.limits)
 
 
 def _bounds(
-    chain: Chain, pieces: _Pieces, relations: tuple
+    chain: Chain, stations: Float[np.ndarray, "S D"], relations: tuple
 ) -> tuple[Float[np.ndarray, "S m"], Float[np.ndarray, "S-1 m"]]:
-    """Residuals at the stations, and K/8 of each piece."""
-    y = _features(chain, pieces.stations)
-    steps = np.abs(np.diff(pieces.stations, axis=0))
+    """Residuals at stations, and K/8 of the pieces between them."""
+    y = _features(chain, stations)
+    steps = np.abs(np.diff(stations, axis=0))
     turning = np.where(chain.prismatic, 0.0, steps).sum(axis=1)
-    first, second = _motions(chain, pieces.stations, steps)
+    first, second = _motions(chain, stations, steps)
     ones, twos = [first, *[turning] * 3], [second, *[turning**2] * 3]
     values, added = [], []
     for own in relations:
@@ -115,17 +82,3 @@ def _motions(
     second = reach[np.maximum(index[:, None], index)]
     second[chain.prismatic[np.minimum(index[:, None], index)]] = 0.0
     return steps @ reach, np.einsum("ti,ij,tj->t", steps, second, steps)
-
-
-def _cut(rows: Float[np.ndarray, "T D"], added: Float[np.ndarray, "T-1"], wanted: float) -> _Pieces:
-    """Pieces so many that what is added to each segment, which falls with their square, becomes
-    `wanted`; _MOST_PIECES at most.
-    """
-    needed = np.ceil(np.sqrt(added / max(wanted, 1e-12)))
-    counts = np.clip(np.nan_to_num(needed, nan=_MOST_PIECES), 1, _MOST_PIECES).astype(np.int64)
-    segments = np.repeat(np.arange(len(counts)), counts)
-    ends = np.concatenate([[0], np.cumsum(counts)])
-    share = ((np.arange(len(segments)) - ends[segments]) / counts[segments])[:, None]
-    steps = np.diff(rows, axis=0)
-    stations = np.concatenate([rows[segments] + share * steps[segments], rows[-1:]])
-    return _Pieces(stations, ends, segments)

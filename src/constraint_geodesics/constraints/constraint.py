@@ -6,11 +6,12 @@ waypoints stands in the file of the same name in certification/, and its entry o
 params.py.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -71,6 +72,43 @@ class Series(NamedTuple):
     unit: str
     values: Float[np.ndarray, "n"]
     limit: float
+
+
+class Bounded(Protocol):
+    """What is demanded of one row: |r| ≤ tolerance, in "m" or "rad"."""
+
+    @property
+    def name(self) -> str:
+        """In words."""
+        ...
+
+    @property
+    def unit(self) -> str:
+        """Of the residual."""
+        ...
+
+    @property
+    def tolerance(self) -> float:
+        """0 holds exactly."""
+        ...
+
+
+_DRAWN = {"m": ("mm", 1e3), "rad": ("deg", 180.0 / math.pi)}
+
+
+def each_held(bounds: Sequence[Bounded]) -> Rows:
+    """Rows that are all held, each by itself."""
+    tolerance = np.array([bound.tolerance for bound in bounds])
+    return Rows(np.ones(len(bounds), bool), tolerance, np.zeros(len(bounds), bool))
+
+
+def each_drawn(bounds: Sequence[Bounded], residual: Float[np.ndarray, "n m"]) -> list[Series]:
+    """Rows drawn each by itself, in mm or degrees."""
+    found = []
+    for bound, values in zip(bounds, residual.T, strict=True):
+        unit, scale = _DRAWN[bound.unit]
+        found.append(Series(bound.name, unit, scale * abs(values), scale * bound.tolerance))
+    return found
 
 
 class Constraint:

@@ -18,7 +18,13 @@ from jaxtyping import Float
 from numba import carray, njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
-from constraint_geodesics.constraints.constraint import Constraint, ConstraintError, Series
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintError,
+    Series,
+    each_drawn,
+    each_held,
+)
 from constraint_geodesics.constraints.kernels import (
     LINEARISE_WORDS,
     ConstraintArrays,
@@ -89,9 +95,7 @@ class FunctionsConstraint(Constraint):
     @property
     def rows(self) -> Rows:
         """Every row is held, each by itself."""
-        count = len(self.bounds)
-        tolerance = np.array([bound.tolerance for bound in self.bounds])
-        return Rows(np.ones(count, bool), tolerance, np.zeros(count, bool))
+        return each_held(self.bounds)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -137,12 +141,7 @@ class FunctionsConstraint(Constraint):
 
     def series(self, residual: Float[np.ndarray, "n m"]) -> list[Series]:
         """Each row by itself, in mm or degrees."""
-        drawn = {"m": ("mm", 1e3), "rad": ("deg", 180.0 / math.pi)}
-        found = []
-        for bound, values in zip(self.bounds, residual.T, strict=True):
-            unit, scale = drawn[bound.unit]
-            found.append(Series(bound.name, unit, scale * abs(values), scale * bound.tolerance))
-        return found
+        return each_drawn(self.bounds, residual)
 
     def to_json(self) -> dict[str, Any]:
         """Factory, arguments and tolerances; ConstraintError for functions without a factory."""

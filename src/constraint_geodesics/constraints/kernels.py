@@ -15,7 +15,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from constraint_geodesics.compiled import COMPILE, LEAF
-from constraint_geodesics.robot.kernels import LANES
+from constraint_geodesics.robot.kernels import LANES, Lanes
 from constraint_geodesics.robot.kinematics import ChainArrays
 
 
@@ -137,6 +137,26 @@ def chain_at(origins, axes, prismatic, base, tool, dof):
         carray(flags(prismatic), (dof,)),
         carray(floats(base), (4, 4)),
         carray(floats(tool), (4, 4)),
+    )
+
+
+TOOL_WORDS, JOINT_WORDS = 12 * LANES, 8 * LANES
+"""Numbers of the room that the tools' frames take in `lanes_at`, and each joint."""
+
+
+@njit(inline="always", **COMPILE)
+def lanes_at(room, dof):
+    """Where the arm is in up to LANES configurations, at the head of a kind's room: TOOL_WORDS +
+    JOINT_WORDS · D numbers.
+    """
+    origins = room + 8 * TOOL_WORDS
+    axes, sines = origins + 24 * LANES * dof, origins + 48 * LANES * dof
+    return Lanes(
+        carray(floats(room), (3, 4, LANES)),
+        carray(floats(origins), (dof, 3, LANES)),
+        carray(floats(axes), (dof, 3, LANES)),
+        carray(floats(sines), (dof, LANES)),
+        carray(floats(sines + 8 * LANES * dof), (dof, LANES)),
     )
 
 

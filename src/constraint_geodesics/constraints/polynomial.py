@@ -5,7 +5,6 @@ base frame, one row is r = c + wᵀy + ½ yᵀA y.  Planes, spheres, cylinders, 
 position, and axes that are level or point at something, are of this form.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -15,30 +14,32 @@ import numpy as np
 from jaxtyping import Float
 from numba import carray, njit
 
-from constraint_geodesics.compiled import COMPILE, LEAF
-from constraint_geodesics.constraints.constraint import Constraint, ConstraintError, Series
+from constraint_geodesics.compiled import LEAF
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintError,
+    Series,
+    each_drawn,
+    each_held,
+)
 from constraint_geodesics.constraints.kernels import (
+    JOINT_WORDS,
     LINEARISE_WORDS,
+    TOOL_WORDS,
     ConstraintArrays,
     Rows,
     c_function,
     chain_at,
     floats,
+    lanes_at,
 )
-from constraint_geodesics.robot.kernels import (
-    LANES,
-    Lanes,
-    geometric_jacobian,
-    poses_of,
-    posture_in,
-)
+from constraint_geodesics.robot.kernels import geometric_jacobian, poses_of, posture_in
 from constraint_geodesics.robot.kinematics import SerialRobot
 
 FEATURES = 12
 """Numbers of y: position, then the columns of the rotation."""
 _ROW = 1 + FEATURES + FEATURES * FEATURES
 """Numbers of the data that are one row's: c, w, A."""
-_DRAWN = {"m": ("mm", 1e3), "rad": ("deg", 180.0 / math.pi)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,7 @@ class Relation:
             raise ConstraintError(
                 f"relation {self.name!r}: its numbers must be finite, its tolerance not negative"
             )
-        if not self.name or self.unit not in _DRAWN:
+        if not self.name or self.unit not in ("m", "rad"):
             raise ConstraintError(f"relation {self.name!r}: a name and m or rad are needed")
         object.__setattr__(self, "linear", linear)
         object.__setattr__(self, "quadratic", 0.5 * (full + full.T))
@@ -113,9 +114,7 @@ class PolynomialConstraint(Constraint):
     @property
     def rows(self) -> Rows:
         """Every row is held, each by itself."""
-        count = len(self.relations)
-        tolerance = np.array([own.tolerance for own in self.relations])
-        return Rows(np.ones(count, bool), tolerance, np.zeros(count, bool))
+        return each_held(self.relations)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -152,11 +151,7 @@ class PolynomialConstraint(Constraint):
 
     def series(self, residual: Float[np.ndarray, "n m"]) -> list[Series]:
         """Each row by itself, in mm or degrees."""
-        found = []
-        for own, values in zip(self.relations, residual.T, strict=True):
-            unit, scale = _DRAWN[own.unit]
-            found.append(Series(own.name, unit, scale * abs(values), scale * own.tolerance))
-        return found
+        return each_drawn(self.relations, residual)
 
     def to_json(self) -> dict[str, Any]:
         """All numbers."""
@@ -203,31 +198,14 @@ def features(
     return np.concatenate([positions, columns], axis=1)
 
 
-_WORDS = 12 * LANES
-"""Numbers of the room that are the tools' frames."""
-
-
 def _room(dof: int) -> int:
     """Numbers for the lanes, y and its gradient, and a Jacobian (6, D)."""
-    return _WORDS + 8 * LANES * dof + 2 * FEATURES + 6 * dof
-
-
-@njit(inline="always", **COMPILE)
-def _lanes_at(room, dof):
-    origins = room + 8 * _WORDS
-    axes, sines = origins + 24 * LANES * dof, origins + 48 * LANES * dof
-    return Lanes(
-        carray(floats(room), (3, 4, LANES)),
-        carray(floats(origins), (dof, 3, LANES)),
-        carray(floats(axes), (dof, 3, LANES)),
-        carray(floats(sines), (dof, LANES)),
-        carray(floats(sines + 8 * LANES * dof), (dof, LANES)),
-    )
+    return TOOL_WORDS + JOINT_WORDS * dof + 2 * FEATURES + 6 * dof
 
 
 @njit(**LEAF)
 def _value_and_gradient(row, y, gradient):
-    """R of one row's numbers, and ∂r/∂y = w + A y into gradient (12,)."""
+    """The value r of one row's numbers, and ∂r/∂y = w + A y into gradient (12,)."""
     value = row[0]
     for i in range(FEATURES):
         slope = 0.0
@@ -257,8 +235,8 @@ def _into_joints(gradient, y, geometric, out):
 def _write(
     origins, axes, prismatic, base, tool, data, q, room, residuals, jacobians, dof, rows, count
 ):
-    chain, lanes = chain_at(origins, axes, prismatic, base, tool, dof), _lanes_at(room, dof)
-    rest = room + 8 * (_WORDS + 8 * LANES * dof)
+    chain, lanes = chain_at(origins, axes, prismatic, base, tool, dof), lanes_at(room, dof)
+    rest = room + 8 * (TOOL_WORDS + JOINT_WORDS * dof)
     y, gradient = carray(floats(rest), (FEATURES,)), carray(floats(rest + 96), (FEATURES,))
     geometric = carray(floats(rest + 192), (6, dof))
     values = carray(floats(residuals), (count, rows))

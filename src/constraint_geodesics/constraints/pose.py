@@ -28,21 +28,18 @@ from constraint_geodesics.constraints.constraint import (
 )
 from constraint_geodesics.constraints.kernels import (
     CURVATURE_WORDS,
+    JOINT_WORDS,
     LINEARISE_WORDS,
+    TOOL_WORDS,
     ConstraintArrays,
     Rows,
     c_function,
     chain_at,
     flags,
     floats,
+    lanes_at,
 )
-from constraint_geodesics.robot.kernels import (
-    LANES,
-    Lanes,
-    geometric_jacobian,
-    poses_of,
-    posture_in,
-)
+from constraint_geodesics.robot.kernels import geometric_jacobian, poses_of, posture_in
 from constraint_geodesics.robot.kinematics import SerialRobot
 
 SEEN_TOLERANCE = 0.2
@@ -401,34 +398,16 @@ def _about_at(data):
     )
 
 
-_WORDS = 12 * LANES
-"""Numbers of the room that are the tools' frames."""
-
-
-@njit(inline="always", **COMPILE)
-def _lanes_at(room, dof):
-    """Where the arm is, at the head of the room."""
-    origins = room + 8 * _WORDS
-    axes, sines = origins + 24 * LANES * dof, origins + 48 * LANES * dof
-    return Lanes(
-        carray(floats(room), (3, 4, LANES)),
-        carray(floats(origins), (dof, 3, LANES)),
-        carray(floats(axes), (dof, 3, LANES)),
-        carray(floats(sines), (dof, LANES)),
-        carray(floats(sines + 8 * LANES * dof), (dof, LANES)),
-    )
-
-
 def _room(dof: int) -> int:
     """Numbers for the lanes, for one orientation's derivative (3, 3) and a Jacobian (6, D)."""
-    return _WORDS + 8 * LANES * dof + 9 + 6 * dof
+    return TOOL_WORDS + JOINT_WORDS * dof + 9 + 6 * dof
 
 
 def _write(
     origins, axes, prismatic, base, tool, data, q, room, residuals, jacobians, dof, rows, count
 ):
     chain, about = chain_at(origins, axes, prismatic, base, tool, dof), _about_at(data)
-    lanes, rest = _lanes_at(room, dof), room + 8 * (_WORDS + 8 * LANES * dof)
+    lanes, rest = lanes_at(room, dof), room + 8 * (TOOL_WORDS + JOINT_WORDS * dof)
     linear, geometric = carray(floats(rest), (3, 3)), carray(floats(rest + 72), (6, dof))
     values = carray(floats(residuals), (count, 6))
     poses_of(chain, carray(floats(q), (count, dof)), lanes)
@@ -446,7 +425,7 @@ def _bend(prismatic, data, room, weights, full, dof, which):
     known = _curvature(
         carray(flags(prismatic), (dof,)),
         _about_at(data),
-        posture_in(_lanes_at(room, dof), which),
+        posture_in(lanes_at(room, dof), which),
         carray(floats(weights), (6,)),
         carray(floats(full), (dof, dof)),
     )

@@ -9,7 +9,8 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.cells import fixed, markdown_table, share
 from constraint_geodesics.report.results import read_metrics
-from constraint_geodesics.studies.charts import CHART, DESCENT, HOLE, JOINTS, POLICY, TASK, WORKCELL
+from constraint_geodesics.studies.charts import CHART, HOLE, JOINTS, TASK, WORKCELL
+from constraint_geodesics.studies.proposals import DESCENT, POLICY
 
 Figures = Mapping[str, Mapping[str, float | None]]
 """Mean, least and largest over seeds, by figure."""

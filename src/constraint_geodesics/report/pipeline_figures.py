@@ -32,7 +32,7 @@ from constraint_geodesics.report.results import (
     searched_items,
     studies_at_hand,
 )
-from constraint_geodesics.studies.charts import POLICY
+from constraint_geodesics.studies.proposals import POLICY
 
 DRAWN_QUERY = 0
 """The query whose geodesics Fig. 4c shows: the first, which is also recorded."""

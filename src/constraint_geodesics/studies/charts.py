@@ -25,13 +25,19 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.ablation import LearnedAblation
 from constraint_geodesics.studies.geodesic_search import policy_problem
-from constraint_geodesics.studies.proposals import Asked, answered, by_descent, by_policy
+from constraint_geodesics.studies.proposals import (
+    DESCENT,
+    POLICY,
+    Asked,
+    answered,
+    by_descent,
+    by_policy,
+)
 
 WORKCELL, TASK, JOINTS = "workcell", "task", "joint space"
 """What a chart is learned from: all free configurations, those that keep the constraint, nothing.
 """
 HOLE = "workcell with a hole"
-POLICY, DESCENT = "policy", "random curves and descent, same time"
 CHART = "chart"
 """In place of a method: figures of the chart itself."""
 

@@ -113,7 +113,11 @@ class Asked:
     def _certified(self, candidate: Candidate | None) -> float | None:
         if candidate is None:
             return None
-        joints = rows_of(candidate, ROW_SAFETY * self.certifier.limits.violation_tolerance)
+        allowed = ROW_SAFETY * self.certifier.limits.violation_tolerance
+        return self.length_of(rows_of(candidate, allowed))
+
+    def length_of(self, joints: Float[np.ndarray, "T D"]) -> float | None:
+        """The same of any path's waypoints."""
         constraint = self.problem.manifold.constraint
         start, goal = self.ends.q_start[0], self.ends.q_goal[0]
         found = self.certifier.certify(joints, constraint, start, goal)
@@ -408,13 +412,10 @@ def _planned(asked: Asked, problem: PlanningProblem, planner: PathPlanner, seed:
     """Another planner's answer, certified as all are; its path is no curve of the family."""
     began = time.perf_counter()
     joints = planner.plan(problem, seed).joints
-    found, length = time.perf_counter(), np.nan
-    if len(joints) > 1:
-        constraint = problem.manifold.constraint
-        certificate = asked.certifier.certify(joints, constraint, problem.start, problem.goal)
-        length = certificate.length_rad if certificate.valid else np.nan
-    nothing = np.zeros(asked.problem.curve.coefficients)
-    return Answer(nothing, length, found - began, time.perf_counter() - found, 0, 1)
+    found = time.perf_counter()
+    length = asked.length_of(joints) if len(joints) > 1 else None
+    checked_s, nothing = time.perf_counter() - found, np.zeros(asked.problem.curve.coefficients)
+    return Answer(nothing, np.nan if length is None else length, found - began, checked_s, 0, 1)
 
 
 SHARES = (
