@@ -50,8 +50,9 @@ def kept_on(
     added: Float[np.ndarray, "S-1 m"],
     limits: Limits,
 ) -> Kept:
-    """How well residuals with these values at the stations, and K/8 on the pieces, are kept; bounds:
-    of each its name, unit and tolerance.
+    """How well residuals with these values at the stations, and K/8 on the pieces, are kept.
+
+    bounds: of each residual its name, unit and tolerance.
     """
     attained, bound = nothing_exceeds()
     at_rows, between = [], []
