@@ -12,6 +12,7 @@ from numba import njit
 
 from constraint_geodesics.certification.certificate import Limits
 from constraint_geodesics.certification.certifier import Certifier
+from constraint_geodesics.constraints.both import Both
 from constraint_geodesics.constraints.constraint import (
     Constraint,
     ConstraintError,
@@ -24,6 +25,7 @@ from constraint_geodesics.constraints.functions import FunctionsConstraint, RowB
 from constraint_geodesics.constraints.kernels import curvature, linearise, new_look
 from constraint_geodesics.constraints.polynomial import PolynomialConstraint, Relation
 from constraint_geodesics.constraints.projection import Retraction, retract
+from constraint_geodesics.constraints.spline import Spline, SplineConstraint, SplineRelation, Term
 from constraint_geodesics.params import FunctionsConstraintParams
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search.band import PROJECTION
@@ -118,7 +120,7 @@ def test_a_tilt_is_measured_as_its_angle(xarm, tilt: float, heading: float) -> N
 SPHERE = "constraint_geodesics.constraints.functions:tip_on_sphere"
 KINDS = [
     *("held axes", "cone", "two tolerances", "sphere", "thick sphere", "coupling"),
-    *("relations", "loose relations"),
+    *("relations", "loose relations", "surface", "loose surface", "turning", "both"),
 ]
 
 
@@ -158,6 +160,32 @@ def relations(tolerance: float = 0.0) -> PolynomialConstraint:
     )
 
 
+def surface(tolerance: float = 0.0, normal: bool = True) -> SplineConstraint:
+    """The tip on a freeform surface, and a tool axis along its normal or loosely turned."""
+    rng = np.random.default_rng(4)
+    frame, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    lower, spacing = np.full(3, -2.0), np.full(3, 0.4)
+    # twice as coarse as the tests' steps would be needed to see every wave of it
+    height = Spline(
+        frame, np.zeros(3), lower, spacing, (5, 5, 0), 0.05 * rng.normal(size=(15, 15, 1))
+    )
+    turn = Spline(
+        np.eye(3), np.zeros(3), lower, spacing, (3, 3, 3), 0.2 * rng.normal(size=(13,) * 3)
+    )
+    up, nothing = np.concatenate([frame[2], np.zeros(9)]), np.zeros(12)
+    axis = [np.concatenate([np.zeros(9), row]) for row in frame]
+    rows = [SplineRelation("height", "m", -0.3, up, Term(height, -1, -1.0, nothing), tolerance)]
+    rows += [
+        SplineRelation("normal", "rad", 0.0, axis[k], Term(height, k, 0.0, axis[2]), tolerance)
+        for k in range(2)
+    ]
+    level = np.eye(12)[8]
+    rows.append(SplineRelation("turn", "rad", 0.0, level, Term(turn, -1, 1.0, nothing), 0.3))
+    rows.append(SplineRelation("side", "rad", 1.0, -axis[2], None, 2.1))
+    own = rows[:3] + rows[4:] if normal else [rows[0], rows[3]]
+    return SplineConstraint(tuple(own), (1e-3,) * len(own))
+
+
 def of_kind(name: str, robot) -> Constraint:
     return {
         "held axes": Constraint((0, 0, 1, 1, 1, 0), reference=REFERENCE),
@@ -168,6 +196,10 @@ def of_kind(name: str, robot) -> Constraint:
         "coupling": COUPLED,
         "relations": relations(),
         "loose relations": relations(0.05),
+        "surface": surface(),
+        "loose surface": surface(0.05),
+        "turning": surface(normal=False),
+        "both": Both(PolynomialConstraint(relations().relations[2:]), surface(0.0, normal=False)),
     }[name]
 
 
@@ -414,6 +446,10 @@ FILES = {
     "Polynomial": {
         "constraints/polynomial.py",
         *(f"identification/{name}.py" for name in ("forms", "identify", "vanishing")),
+    },
+    "Spline": {
+        "constraints/spline.py",
+        *(f"identification/{name}.py" for name in ("freeform", "identify", "kernels", "vanishing")),
     },
 }
 """Where the class of a kind, its arrays and its record may be named; the warm-up compiles what

@@ -37,10 +37,10 @@ def _bounds(
     chain: Chain, stations: Float[np.ndarray, "S D"], relations: tuple
 ) -> tuple[Float[np.ndarray, "S m"], Float[np.ndarray, "S-1 m"]]:
     """Residuals at stations, and K/8 of the pieces between them."""
-    y = _features(chain, stations)
+    y = features(chain, stations)
     steps = np.abs(np.diff(stations, axis=0))
     turning = np.where(chain.prismatic, 0.0, steps).sum(axis=1)
-    first, second = _motions(chain, stations, steps)
+    first, second = motions(chain, stations, steps)
     ones, twos = [first, *[turning] * 3], [second, *[turning**2] * 3]
     values, added = [], []
     for own in relations:
@@ -57,7 +57,7 @@ def _bounds(
     return np.stack(values, axis=1), np.stack(added, axis=1)
 
 
-def _features(chain: Chain, q: Float[np.ndarray, "S D"]) -> Float[np.ndarray, "S 12"]:
+def features(chain: Chain, q: Float[np.ndarray, "S D"]) -> Float[np.ndarray, "S 12"]:
     """Position and the axes of the tool's frame, by the certificate's own kinematics."""
     poses = np.empty((len(q), 7))
     kernels.poses(chain, np.ascontiguousarray(q), poses)
@@ -70,7 +70,7 @@ def _features(chain: Chain, q: Float[np.ndarray, "S D"]) -> Float[np.ndarray, "S
     return np.column_stack([poses[:, :3], *(entry for column in columns for entry in column)])
 
 
-def _motions(
+def motions(
     chain: Chain, q: Float[np.ndarray, "S D"], steps: Float[np.ndarray, "S-1 D"]
 ) -> tuple[Float[np.ndarray, "S-1"], Float[np.ndarray, "S-1"]]:
     """P and Q of each piece [m]."""

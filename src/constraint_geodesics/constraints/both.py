@@ -1,19 +1,17 @@
-"""Two constraints at once, for the search alone: where a goal's region and the path's constraint
-meet.
-
-No kind of its own: it has no name in params.yaml and nothing certifies it, since each of the two is
-certified by itself.
+"""Two constraints at once: relations of two kinds that demonstrations keep to, or where a goal's
+region and the path's constraint meet.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
+from jaxtyping import Float
 from numba import carray, int64
 
-from constraint_geodesics.constraints.constraint import Constraint
+from constraint_geodesics.constraints.constraint import Constraint, Series, constraint_from_json
 from constraint_geodesics.constraints.kernels import (
     LINEARISE_WORDS,
     ConstraintArrays,
@@ -50,6 +48,7 @@ class Both(Constraint):
     the box within the ball.
     """
 
+    kind: ClassVar[str] = "both"
     first: Constraint
     second: Constraint
 
@@ -103,7 +102,25 @@ class Both(Constraint):
     @property
     def key(self) -> tuple:
         """Those of both."""
-        return ("both", self.first.key, self.second.key)
+        return (self.kind, self.first.key, self.second.key)
+
+    def series(self, residual: Float[np.ndarray, "n m"]) -> list[Series]:
+        """Those of both."""
+        count = len(self.first.rows.held)
+        return self.first.series(residual[:, :count]) + self.second.series(residual[:, count:])
+
+    def to_json(self) -> dict[str, Any]:
+        """Both, each by itself."""
+        parts = {"first": self.first.to_json(), "second": self.second.to_json()}
+        return {"kind": self.kind, **parts}
+
+    @classmethod
+    def from_json(cls, about: Mapping[str, Any], robot: SerialRobot | None) -> "Both":
+        """What `to_json` wrote."""
+        return cls(*(constraint_from_json(about[part], robot) for part in ("first", "second")))
+
+
+KIND = Both
 
 
 def _write(

@@ -33,11 +33,10 @@ from constraint_geodesics.constraints.kernels import (
     floats,
     lanes_at,
 )
+from constraint_geodesics.constraints.tool_features import FEATURES, into_joints
 from constraint_geodesics.robot.kernels import geometric_jacobian, poses_of, posture_in
 from constraint_geodesics.robot.kinematics import SerialRobot
 
-FEATURES = 12
-"""Numbers of y: position, then the columns of the rotation."""
 _ROW = 1 + FEATURES + FEATURES * FEATURES
 """Numbers of the data that are one row's: c, w, A."""
 
@@ -90,6 +89,10 @@ class Relation:
     def values(self, y: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "n"]:
         """The residual of features."""
         return self.constant + y @ self.linear + 0.5 * ((y @ self.matrix) * y).sum(axis=1)
+
+    def gradients(self, y: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "n 12"]:
+        """∂r/∂y = w + A y."""
+        return self.linear + y @ self.matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,14 +193,6 @@ class PolynomialConstraint(Constraint):
 KIND = PolynomialConstraint
 
 
-def features(
-    positions: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"]
-) -> Float[np.ndarray, "n 12"]:
-    """The features y of tool poses."""
-    columns = rotations.transpose(0, 2, 1).reshape(len(rotations), 9)
-    return np.concatenate([positions, columns], axis=1)
-
-
 def _room(dof: int) -> int:
     """Numbers for the lanes, y and its gradient, and a Jacobian (6, D)."""
     return TOOL_WORDS + JOINT_WORDS * dof + 2 * FEATURES + 6 * dof
@@ -214,22 +209,6 @@ def _value_and_gradient(row, y, gradient):
         value += (row[1 + i] + 0.5 * slope) * y[i]
         gradient[i] = row[1 + i] + slope
     return value
-
-
-@njit(**LEAF)
-def _into_joints(gradient, y, geometric, out):
-    """∂r/∂q (D,) = (∂r/∂p) J_v + (Σ_k u_k × ∂r/∂u_k) J_ω, with the geometric Jacobian (6, D)."""
-    t0, t1, t2 = 0.0, 0.0, 0.0
-    for k in range(3):
-        at = 3 + 3 * k
-        t0 += y[at + 1] * gradient[at + 2] - y[at + 2] * gradient[at + 1]
-        t1 += y[at + 2] * gradient[at] - y[at] * gradient[at + 2]
-        t2 += y[at] * gradient[at + 1] - y[at + 1] * gradient[at]
-    for d in range(out.shape[0]):
-        value = t0 * geometric[3, d] + t1 * geometric[4, d] + t2 * geometric[5, d]
-        for i in range(3):
-            value += gradient[i] * geometric[i, d]
-        out[d] = value
 
 
 def _write(
@@ -254,7 +233,7 @@ def _write(
             values[n, m] = _value_and_gradient(row, y, gradient)
             if jacobians != 0:
                 slopes = carray(floats(jacobians + 8 * dof * (rows * n + m)), (dof,))
-                _into_joints(gradient, y, geometric, slopes)
+                into_joints(gradient, y, geometric, slopes)
     return 0
 
 

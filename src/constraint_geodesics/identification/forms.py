@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from constraint_geodesics.constraints.polynomial import FEATURES, Relation
-from constraint_geodesics.identification.vanishing import Sample
+from constraint_geodesics.constraints.polynomial import Relation
+from constraint_geodesics.constraints.tool_features import FEATURES
+from constraint_geodesics.identification.vanishing import AnyRelation, Sample
 
 AXES = np.eye(3)
 NAMES = ("x", "y", "z")
@@ -94,14 +95,14 @@ def _axis_start(sample: Sample) -> Numbers:
 
 def _axis_relations(x: Numbers) -> tuple[Relation, ...]:
     """R a = n."""
-    own, direction = _unit(x[:3]), _unit(x[3:])
-    words = f"the tool's {_axis(own)} keeps the direction {_vector(direction)}"
-    return tuple(_relation(words, "rad", 0.0, turned=(e, own)) for e in _across(direction))
+    own, direction = unit(x[:3]), unit(x[3:])
+    words = f"the tool's {axis_words(own)} keeps the direction {_vector(direction)}"
+    return tuple(_relation(words, "rad", 0.0, turned=(e, own)) for e in across(direction))
 
 
 def _axis_facing(sample: Sample, x: Numbers) -> Numbers:
     """The direction that the axis points to, not the opposite one."""
-    own, direction = _unit(x[:3]), _unit(x[3:])
+    own, direction = unit(x[:3]), unit(x[3:])
     if _along(sample, direction, own).mean() < 0.0:
         direction = -direction
     return np.concatenate(_oriented(own, direction))
@@ -110,7 +111,7 @@ def _axis_facing(sample: Sample, x: Numbers) -> Numbers:
 def _axis_sides(x: Numbers) -> tuple[Relation, ...]:
     """1 − nᵀR a ≤ 1: within 90°, for R a = −n has the same zeros."""
     words = _axis_relations(x)[0].name
-    side = _relation(words, "rad", 1.0, turned=(-_unit(x[3:]), _unit(x[:3])))
+    side = _relation(words, "rad", 1.0, turned=(-unit(x[3:]), unit(x[:3])))
     return (replace(side, tolerance=1.0),)
 
 
@@ -152,7 +153,7 @@ def _angle_start(sample: Sample) -> Numbers:
 
 
 def _off_angle(x: Numbers, sample: Sample) -> np.ndarray:
-    off: np.ndarray = _along(sample, _unit(x[:3]), _unit(x[3:6])) - x[6]
+    off: np.ndarray = _along(sample, unit(x[:3]), unit(x[3:6])) - x[6]
     return off
 
 
@@ -163,9 +164,11 @@ def _along(sample: Sample, n: np.ndarray, a: np.ndarray) -> Float[np.ndarray, "k
 
 def _angle_relations(x: Numbers) -> tuple[Relation, ...]:
     """nᵀ R a = cos θ, divided by sin θ."""
-    a, n = _oriented(_unit(x[3:6]), _unit(x[:3]))
+    a, n = _oriented(unit(x[3:6]), unit(x[:3]))
     level = float(np.clip(x[6], -1.0, 1.0))
-    words = f"the tool's {_axis(a)} stays at {np.degrees(np.arccos(level)):.2f}° to {_vector(n)}"
+    words = (
+        f"the tool's {axis_words(a)} stays at {np.degrees(np.arccos(level)):.2f}° to {_vector(n)}"
+    )
     scale = 1.0 / max(np.sqrt(1.0 - level**2), 0.1)
     return (_relation(words, "rad", -level * scale, turned=(n * scale, a)),)
 
@@ -183,7 +186,7 @@ def _centre_relations(x: Numbers) -> tuple[Relation, ...]:
     radius = float(np.linalg.norm(arm))
     words = (
         f"the tool's tip lies on a sphere, r = {1e3 * radius:.1f} mm about {_place(centre)}, and "
-        f"the tool's {_axis(arm / max(radius, 1e-12))} points at its centre"
+        f"the tool's {axis_words(arm / max(radius, 1e-12))} points at its centre"
     )
     return tuple(
         _relation(words, "m", -float(e @ centre), position=e, turned=(e, arm)) for e in AXES
@@ -215,7 +218,7 @@ def _cylinder_start(sample: Sample) -> Numbers:
 
 
 def _off_cylinder(x: Numbers, sample: Sample) -> np.ndarray:
-    axis, away = _unit(x[:3]), sample.position - x[3:6]
+    axis, away = unit(x[:3]), sample.position - x[3:6]
     away = away - (away @ axis)[:, None] * axis
     off: np.ndarray = np.linalg.norm(away, axis=1) - x[6]
     return off
@@ -223,13 +226,13 @@ def _off_cylinder(x: Numbers, sample: Sample) -> np.ndarray:
 
 def _around(sample: Sample, axis: Float[np.ndarray, "3"]) -> Numbers:
     """A circle about a direction: direction, centre, radius."""
-    flat = np.stack(_across(axis))
+    flat = np.stack(across(axis))
     centre, radius = _round_through(sample.position @ flat.T)
     return np.concatenate([axis, centre @ flat, [radius]])
 
 
 def _cylinder_relations(x: Numbers) -> tuple[Relation, ...]:
-    return _about_a_line("cylinder", _upright(_unit(x[:3])), x[3:6], float(abs(x[6])))
+    return _about_a_line("cylinder", _upright(unit(x[:3])), x[3:6], float(abs(x[6])))
 
 
 def _about_a_line(
@@ -261,7 +264,7 @@ CYLINDER = Form(_cylinder_start, _cylinder_relations)
 POSITION, TURNED, POSE, QUADRIC = "position", "orientation", "pose", "position's quadrics"
 
 
-def named(features: str, rank: int, known: tuple[Relation, ...]) -> Iterator[Form]:
+def named(features: str, rank: int, known: tuple[AnyRelation, ...]) -> Iterator[Form]:
     """Forms that as many independent relations of these features may be, the simplest first.
 
     known: what is held already.
@@ -297,23 +300,25 @@ def _relation(
     turned: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None,
 ) -> Relation:
     """The row c + eᵀp + fᵀR a."""
-    linear = np.zeros(FEATURES)
+    linear = np.zeros(FEATURES) if turned is None else of_axis(*turned)
     if position is not None:
         linear[:3] = position
-    if turned is not None:
-        e, own = turned
-        for k in range(3):
-            linear[3 + 3 * k : 6 + 3 * k] = own[k] * e
     return Relation(words, unit, constant, linear)
 
 
-def _across(direction: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray]:
+def of_axis(e: Float[np.ndarray, "3"], own: Float[np.ndarray, "3"]) -> Float[np.ndarray, "12"]:
+    """The linear form eᵀ R a of features."""
+    return np.concatenate([np.zeros(3), np.outer(own, e).ravel()])
+
+
+def across(direction: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray]:
     """Two unit vectors that complete a direction to a frame."""
-    first = _unit(np.cross(direction, AXES[np.argmin(np.abs(direction))]))
+    first = unit(np.cross(direction, AXES[np.argmin(np.abs(direction))]))
     return first, np.cross(direction, first)
 
 
-def _unit(v: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def unit(v: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """The unit vector along v."""
     return v / np.linalg.norm(v)
 
 
@@ -330,7 +335,8 @@ def _oriented(
     return sign * own, sign * direction
 
 
-def _axis(own: Float[np.ndarray, "3"]) -> str:
+def axis_words(own: Float[np.ndarray, "3"]) -> str:
+    """A tool axis in words: "-z axis", or its numbers where it is none of the three."""
     k = int(np.argmax(np.abs(own)))
     angle = np.degrees(np.arccos(min(abs(own[k]), 1.0)))
     return f"{'-' if own[k] < 0 else ''}{NAMES[k]} axis" if angle < 0.5 else f"axis {_vector(own)}"

@@ -8,20 +8,28 @@ form has a name (forms.py) it stands in place of the combination that was found.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from constraint_geodesics.constraints.polynomial import FEATURES, PolynomialConstraint, Relation
+from constraint_geodesics.constraints.both import Both
+from constraint_geodesics.constraints.constraint import Constraint
+from constraint_geodesics.constraints.polynomial import PolynomialConstraint, Relation
+from constraint_geodesics.constraints.spline import SplineConstraint, SplineRelation
+from constraint_geodesics.constraints.tool_features import FEATURES
+from constraint_geodesics.identification import freeform
 from constraint_geodesics.identification.demonstrations import demonstrations_from
 from constraint_geodesics.identification.forms import POSE, POSITION, QUADRIC, TURNED, Form, named
 from constraint_geodesics.identification.vanishing import (
     AT_MOST_RAD,
+    GOOD,
     METRES,
+    AnyRelation,
     Sample,
+    better_rms,
     most_rad,
     rank,
     trimmed,
@@ -30,18 +38,23 @@ from constraint_geodesics.identification.vanishing import (
 )
 from constraint_geodesics.robot.kinematics import SerialRobot
 
+SURELY_RAD = 6e-3
+"""Freeform relations hold where left-out demonstrations are no further off: there are gaps between
+demonstrations, and what has no formula is less sure there.
+"""
+WORTH = 0.8
+"""What is freeform takes a formula's place where left-out demonstrations are nearer by this."""
 WORSE, FINE_RAD = 1.25, 2e-5
 """A form may be off by so many times what the combination is that it stands for, and by so much."""
-WRONG, LEAST_WRONG_RAD = 5.0, 1e-6
+WRONG, LEAST_WRONG_RAD = 5.0, 1e-4
 """Rows that are further off than so many times the median are wrong, and left out."""
 ROUNDS = 4
-GOOD = 0.9
-"""Share of the rows that a distance is taken over: some may be wrong."""
 _COLUMNS = {POSITION: np.arange(3), TURNED: np.arange(3, 12), POSE: np.arange(12)}
 _SCALE = np.array([METRES] * 3 + [1.0] * 9)
 _FIRST, _SECOND = np.triu_indices(3)
+_ONES = np.ones((1, FEATURES))
 
-Found = Callable[[Sample], tuple[Relation, ...]]
+Found = Callable[[Sample], tuple[AnyRelation, ...]]
 """Relations as they are found on rows."""
 
 
@@ -58,7 +71,7 @@ class Identified:
     name and tool link, of whose tool all this is said.
     """
 
-    constraint: PolynomialConstraint | None
+    constraint: Constraint | None
     relations: tuple[str, ...]
     codim: int
     noise_rad: float
@@ -158,16 +171,40 @@ class _Search:
 
     sample: Sample
     folds: Sequence[Bool[np.ndarray, "n"]]
-    relations: tuple[Relation, ...] = ()
-    sides: tuple[Relation, ...] = ()
     best_rad: float = 0.0
-    found: list[Found] = field(default_factory=list)
+    steps: list[tuple[Found, tuple[AnyRelation, ...], tuple[AnyRelation, ...]]] = field(
+        default_factory=list
+    )
     missing: list[str] = field(default_factory=list)
 
-    def keep(self, found: Found, relations: tuple[Relation, ...]) -> None:
-        """Take relations in, and how they are found on other rows."""
-        self.found.append(found)
-        self.relations += relations
+    def keep(
+        self, found: Found, relations: tuple[AnyRelation, ...], sides: tuple[AnyRelation, ...] = ()
+    ) -> None:
+        """Take relations in, how they are found on other rows, and which of opposite sides of
+        theirs is shown.
+        """
+        self.steps.append((found, relations, sides))
+
+    @property
+    def relations(self) -> tuple[AnyRelation, ...]:
+        """All that are found."""
+        return tuple(own for _, relations, _ in self.steps for own in relations)
+
+    @property
+    def sides(self) -> tuple[AnyRelation, ...]:
+        """All of them."""
+        return tuple(own for *_, sides in self.steps for own in sides)
+
+    @cached_property
+    def on_others(self) -> list[tuple[Sample, tuple[AnyRelation, ...]]]:
+        """The rows of each fold, and the relations as they are found on all others."""
+        return [
+            (
+                self.sample[out],
+                tuple(own for step in self.steps for own in step[0](self.sample[~out])),
+            )
+            for out in self.folds
+        ]
 
 
 def _searched(sample: Sample) -> _Search:
@@ -177,7 +214,7 @@ def _searched(sample: Sample) -> _Search:
     search.best_rad = min((float(own[0]) for own in least if len(own)), default=np.inf)
     for name in names:
         _look(search, name)
-    return search
+    return _with_freeform(search) if search.folds else search
 
 
 def _features(sample: Sample, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -211,8 +248,7 @@ def _look(search: _Search, name: str) -> None:
             relations = form.relations(numbers)
             good = _distance(search.sample, relations) <= WORSE * off + FINE_RAD
             if good and (count == held or _supported(form, search)):
-                search.keep(partial(_fitted, form), relations)
-                search.sides += form.sides(numbers)
+                search.keep(partial(_fitted, form), relations, form.sides(numbers))
                 return
     if held < seeming and found.found_rad[held] < 0.5 * found.left_out_rad[held]:
         on_others = found.left_out_rad[held]
@@ -226,21 +262,125 @@ def _look(search: _Search, name: str) -> None:
         search.keep(again, again(search.sample))
 
 
+def _with_freeform(search: _Search) -> _Search:
+    """Freeform relations beside those that have a formula, or in place of some of them, where
+    these only come near what is shown.
+    """
+    flat = sum(map(_is_flat, search.relations))
+    tip = sum(map(_holds_the_tip, search.relations))
+    if tip == flat < 2:
+        found = _look_for_tip(search, np.inf)
+        _look_for_axes(search, found)
+        if found is not None or not flat:
+            return search
+    off = _tip_left_out_rad(search)
+    if off < FINE_RAD or flat > 1:
+        return search
+    other = _Search(search.sample, search.folds, best_rad=search.best_rad)
+    for again, relations, sides in search.steps:
+        # a plane stays, unless it is what is in question
+        kept = [not _holds_the_tip(own) or (tip > 1 and _is_flat(own)) for own in relations]
+        if all(kept):
+            other.keep(again, relations, sides)
+    found = _look_for_tip(other, off)
+    if found is None:
+        return search
+    _look_for_axes(other, found)
+    return other
+
+
+def _holds_the_tip(own: AnyRelation) -> bool:
+    return bool(np.any(own.gradients(_ONES)[:, :3]))
+
+
+def _is_flat(own: AnyRelation) -> bool:
+    """A plane."""
+    slopes = own.gradients(_ONES)
+    return isinstance(own, Relation) and not own.matrix.any() and not np.any(slopes[:, 3:])
+
+
+def _look_for_tip(search: _Search, off: float) -> freeform.Freeform | None:
+    """Add a freeform line or surface where nothing holds the tip but a plane, if left-out
+    demonstrations are nearer to it than `off` [rad].
+    """
+    sample = search.sample
+    flat = next((own.linear[:3] for own in search.relations if _is_flat(own)), None)
+    found = _better(search, None, freeform.line(sample, flat))
+    if found is None and flat is None:
+        found = _better(search, None, freeform.surface(sample))
+        if found is not None and found.left_out_rad < WORTH * off and not _turned(search):
+            found = _better(search, found, freeform.along_normal(sample, found))
+    if found is None or found.left_out_rad >= WORTH * off:
+        return None
+    search.keep(found.again, found.relations, found.sides)
+    return found
+
+
+def _look_for_axes(search: _Search, tip: freeform.Freeform | None) -> None:
+    """Add axes that turn with the place, over what holds the tip or a plane that does."""
+    sample, held = search.sample, _turned(search)
+    flat = next((own.linear[:3] for own in search.relations if _is_flat(own)), None)
+    if tip is not None:
+        place = tip.model.grid
+    elif flat is not None:
+        place = freeform.plane_grid(sample, flat)
+    else:
+        return
+    if held not in (0, 2):
+        return
+    off, axes = freeform.axes_of_place(sample, place, search.folds)
+    small = int((off < freeform.HOPELESS_RAD).sum())
+    models = []
+    if held == 2 and small == 3:
+        along = tip is not None and tip.model.axis is not None
+        known = tip.axis if tip is not None and along else freeform.least_moving(sample)
+        models.append(freeform.turning(sample, place, None, known))
+    elif held == 0 and small == 3:
+        models.append(freeform.turning(sample, place, axes[0], axes[0]))
+    if held == 0 and small:
+        models.append(freeform.turning(sample, place, axes[0], None))
+    found = next(filter(None, (_better(search, None, model) for model in models)), None)
+    if found is not None:
+        search.keep(found.again, found.relations)
+
+
+def _turned(search: _Search) -> int:
+    """How many relations hold the tool's orientation."""
+    slopes = [own.gradients(_ONES)[:, 3:] for own in search.relations]
+    return sum(bool(np.any(own)) for own in slopes)
+
+
+def _better(
+    search: _Search, found: freeform.Freeform | None, model: freeform.Model
+) -> freeform.Freeform | None:
+    """A richer model where left-out demonstrations support it, else what is found already."""
+    own = freeform.fitted(model, search.sample, search.folds)
+    enough = max(most_rad(min(search.best_rad, own.found_rad)), SURELY_RAD)
+    if own.left_out_rad <= enough:
+        return own
+    if own.found_rad <= 0.5 * min(own.left_out_rad, enough):
+        search.missing.append(
+            f"{own.relations[-1].name} to {own.found_rad:.2g} rad on the demonstrations that it "
+            f"was found on, to {own.left_out_rad:.2g} on others: show more demonstrations"
+        )
+    return found
+
+
 def _again(
-    name: str, count: int, known: tuple[Relation, ...], sample: Sample
-) -> tuple[Relation, ...]:
+    name: str, count: int, known: tuple[AnyRelation, ...], sample: Sample
+) -> tuple[AnyRelation, ...]:
     """The least varying combinations themselves, where they have no name."""
     psi, slopes = _features(sample, name)
     found = vanishing(psi, without(slopes, sample.slopes(known)), [])
     return _generic(name, found.weights[:, :count], sample)
 
 
-def _fitted(form: Form, sample: Sample) -> tuple[Relation, ...]:
+def _fitted(form: Form, sample: Sample) -> tuple[AnyRelation, ...]:
     """A form's relations, fitted to other rows."""
     return form.relations(form.fitted(sample))
 
 
-def _generic(name: str, weights: np.ndarray, sample: Sample) -> tuple[Relation, ...]:
+def _generic(name: str, weights: np.ndarray, sample: Sample) -> tuple[AnyRelation, ...]:
     """Combinations as relations, zero in the mean of the rows, in joint space's radians."""
     relations, (y, _) = [], sample.pose
     middle = np.concatenate([sample.position.mean(axis=0), np.zeros(9)])
@@ -268,10 +408,9 @@ def _supported(form: Form, search: _Search) -> bool:
     return bool(off) and float(np.sqrt(np.mean(np.square(off)))) <= most_rad(search.best_rad)
 
 
-def _distance(sample: Sample, relations: Sequence[Relation]) -> float:
+def _distance(sample: Sample, relations: Sequence[AnyRelation]) -> float:
     """The rms distance of the better GOOD of the rows from the relations' manifold [rad]."""
-    off = np.sort(sample.distances(relations))
-    return float(np.sqrt(np.mean(off[: max(1, int(GOOD * len(off)))] ** 2)))
+    return better_rms(sample.distances(relations))
 
 
 def _told(search: _Search, robot: SerialRobot, demonstrations: int, dropped: int) -> Identified:
@@ -290,31 +429,59 @@ def _told(search: _Search, robot: SerialRobot, demonstrations: int, dropped: int
     noise_rad = float(np.sqrt((noise**2).mean() / len(search.relations)))
     # a side is no relation that is missed: it only tells two sets of the same zeros apart
     about = (*left_out.tolist(), *(0.0 for _ in search.sides))
-    constraint = PolynomialConstraint((*search.relations, *search.sides), about)
+    constraint, about = _constraint((*search.relations, *search.sides), about)
     codim = len(search.relations)
     return Identified(constraint, told, codim, noise_rad, about, missing, *counts, whose)
 
 
+def _constraint(
+    relations: tuple[AnyRelation, ...], left_out: tuple[float, ...]
+) -> tuple[Constraint, tuple[float, ...]]:
+    """Relations as a constraint, those of a kind together, and what its rows are off by."""
+    pairs = list(zip(relations, left_out, strict=True))
+    rows = [(own, off) for own, off in pairs if isinstance(own, Relation)]
+    more = [(own, off) for own, off in pairs if isinstance(own, SplineRelation)]
+    parts: list[Constraint] = []
+    if rows:
+        parts.append(PolynomialConstraint(*map(tuple, zip(*rows, strict=True))))
+    if more:
+        parts.append(SplineConstraint(*map(tuple, zip(*more, strict=True))))
+    found = parts[0] if len(parts) == 1 else Both(*parts)
+    return found, tuple(off for _, off in (*rows, *more))
+
+
 def _left_out(search: _Search) -> Float[np.ndarray, "m"]:
     """The rms of each row on demonstrations that its relation was not found on."""
-    squares = []
-    for out in search.folds:
-        rest, own = search.sample[~out], search.sample[out]
-        relations = [one for found in search.found for one in found(rest)]
-        squares.append([float((one.values(own.pose[0]) ** 2).mean()) for one in relations])
+    squares = [
+        [float((own.values(sample.pose[0]) ** 2).mean()) for own in relations]
+        for sample, relations in search.on_others
+    ]
     return np.sqrt(np.mean(squares, axis=0))
+
+
+def _tip_left_out_rad(search: _Search) -> float:
+    """The rms distance of the better GOOD of the rows from what holds the tip, along each direction
+    that it holds, on demonstrations that it was not found on.
+    """
+    holds = [tuple(filter(_holds_the_tip, relations)) for _, relations in search.on_others]
+    off = [own.distances(tip) for (own, _), tip in zip(search.on_others, holds, strict=True)]
+    return better_rms(np.concatenate(off)) / float(np.sqrt(len(holds[0])))
 
 
 def _amount(unit: str, value: float) -> str:
     return f"{1e3 * value:.2g} mm" if unit == "m" else f"{np.degrees(value):.2g}°"
 
 
-def with_tolerance(constraint: PolynomialConstraint, loosely: float) -> PolynomialConstraint:
+def with_tolerance(constraint: Constraint, loosely: float) -> Constraint:
     """The same, each row as loose as so many times what it is missed by on left-out
     demonstrations.
     """
-    relations = zip(constraint.relations, constraint.left_out, strict=True)
+    if isinstance(constraint, Both):
+        parts = constraint.first, constraint.second
+        return Both(*(with_tolerance(own, loosely) for own in parts))
+    assert isinstance(constraint, (PolynomialConstraint, SplineConstraint))
+    relations: Any = zip(constraint.relations, constraint.left_out, strict=True)
     wider = tuple(
         replace(own, tolerance=max(own.tolerance, loosely * off)) for own, off in relations
     )
-    return replace(constraint, relations=wider)
+    return replace(constraint, relations=wider)  # type: ignore[arg-type]

@@ -13,7 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import eigh
 
-from constraint_geodesics.constraints.polynomial import Relation, features
+from constraint_geodesics.constraints.polynomial import Relation
+from constraint_geodesics.constraints.spline import SplineRelation
+from constraint_geodesics.constraints.tool_features import features
 from constraint_geodesics.robot.kinematics import SerialRobot
 
 METRES = 0.3
@@ -26,11 +28,14 @@ APART = 0.15
 """Of the normals of several relations, those directions count that are this long at least, as a
 share of the longest.
 """
+AnyRelation = Relation | SplineRelation
 FLOOR_RAD = 1e-4
 SURELY_RAD, AT_MOST_RAD, TIMES = 2e-3, 0.02, 4.0
 """A relation holds on demonstrations that it was not found on if these are off by no more than
 TIMES the distance of the best relation of all, or SURELY_RAD; and by AT_MOST_RAD in any case.
 """
+GOOD = 0.9
+"""Share of the rows that a distance is taken over: some may be wrong."""
 RIDGE = 1e-9
 """Added to J Jᵀ, as a share of its trace: two relations may touch at a row."""
 TRIMS = 8
@@ -85,13 +90,13 @@ class Sample:
         ]
         return features(self.position, self.rotation), np.concatenate([linear, *columns], axis=1)
 
-    def slopes(self, relations: Sequence[Relation]) -> Float[np.ndarray, "n k D"]:
+    def slopes(self, relations: Sequence[AnyRelation]) -> Float[np.ndarray, "n k D"]:
         """∂r/∂q of relations."""
         y, own = self.pose
-        found = [np.einsum("na,nad->nd", r.linear + y @ r.matrix, own) for r in relations]
+        found = [np.einsum("na,nad->nd", r.gradients(y), own) for r in relations]
         return np.stack(found, axis=1) if found else np.zeros((len(self), 0, own.shape[2]))
 
-    def whitened(self, relations: Sequence[Relation]) -> Float[np.ndarray, "n k"]:
+    def whitened(self, relations: Sequence[AnyRelation]) -> Float[np.ndarray, "n k"]:
         """Residuals r as L⁻¹ r with J Jᵀ = L Lᵀ: their length is the distance from the manifold of
         all relations, to first order [rad].
         """
@@ -103,7 +108,7 @@ class Sample:
         factor = np.linalg.cholesky(squares)
         return np.linalg.solve(factor, off[:, :, None])[:, :, 0]
 
-    def distances(self, relations: Sequence[Relation]) -> Float[np.ndarray, "n"]:
+    def distances(self, relations: Sequence[AnyRelation]) -> Float[np.ndarray, "n"]:
         """How far each row is from the manifold of all relations [rad]."""
         return np.linalg.norm(self.whitened(relations), axis=1)
 
@@ -126,6 +131,11 @@ class Vanishing:
     def seeming(self, best_rad: float) -> int:
         """How many hold on the rows that they were found on."""
         return _count(self.found_rad, best_rad)
+
+
+def better_rms(off: Float[np.ndarray, "n"]) -> float:
+    """Root of the mean square of the better GOOD of distances."""
+    return float(np.sqrt(np.mean(np.sort(off)[: max(1, int(GOOD * len(off)))] ** 2)))
 
 
 def most_rad(best_rad: float) -> float:
