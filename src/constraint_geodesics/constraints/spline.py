@@ -7,10 +7,13 @@ r = c + wᵀy + s(p) (c′ + w′ᵀy).  A surface is w = e₃, c′ = −1; a t
 r = tᵀe₁ + (∂s/∂u) tᵀe₃, and the same along v.
 """
 
+from base64 import b64decode, b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any, ClassVar, NamedTuple
+from zlib import compress, decompress
+from zlib import error as zlib_error
 
 import numpy as np
 from jaxtyping import Float
@@ -64,7 +67,7 @@ class Spline:
     frame (3, 3): F, a rotation.  origin (3,) [m].  lower (3,): where the domain begins [m].
     spacing (3,): of the knots [m].  degrees (3,): 3 or 5, or 0 for a coordinate that it does not
     depend on.  coefficients (n₁, n₂, n₃): degree + cells along each coordinate, 1 for degree 0.
-    Beyond the domain it is continued as a constant.  Raises ConstraintError where these do not fit.
+    Beyond the domain it is continued along its slopes at the border.  Raises ConstraintError where these do not fit.
     """
 
     frame: Float[np.ndarray, "3 3"]
@@ -136,15 +139,29 @@ class Spline:
         return out
 
     def to_json(self) -> dict[str, Any]:
-        """All numbers."""
+        """All numbers; the coefficients, which may be many, as the bytes of 64-bit numbers,
+        compressed, in base 64.
+        """
         return {
             "frame": self.frame.tolist(),
             "origin": self.origin.tolist(),
             "lower": self.lower.tolist(),
             "spacing": self.spacing.tolist(),
             "degrees": list(self.degrees),
-            "coefficients": self.coefficients.tolist(),
+            "shape": list(self.coefficients.shape),
+            "coefficients": b64encode(compress(self.coefficients.tobytes())).decode(),
         }
+
+    @classmethod
+    def from_json(cls, about: Mapping[str, Any]) -> "Spline":
+        """What `to_json` wrote."""
+        own = dict(about)
+        shape = own.pop("shape")
+        try:
+            numbers = np.frombuffer(decompress(b64decode(own["coefficients"])))
+            return cls(**{**own, "coefficients": numbers.reshape(shape)})
+        except (ValueError, zlib_error) as error:
+            raise ConstraintError(f"spline: coefficients: {error}") from None
 
 
 class Term(NamedTuple):
@@ -324,7 +341,7 @@ class SplineConstraint(Constraint):
     @classmethod
     def from_json(cls, about: Mapping[str, Any], robot: SerialRobot | None) -> "SplineConstraint":
         """What `to_json` wrote."""
-        splines = [Spline(**own) for own in about["splines"]]
+        splines = [Spline.from_json(own) for own in about["splines"]]
         relations = []
         for own in about["relations"]:
             which, term = int(own["spline"]), None
@@ -377,15 +394,14 @@ def basis_at(degree, at, count, scale, basis):
             left = (f + k - j) * basis[0, j - 1] if j > 0 else 0.0
             right = (j + 1 - f) * basis[0, j] if j < k else 0.0
             basis[0, j] = (left + right) / k
-    # derivatives are differences of basis functions of a lower degree; beyond the domain zero
-    own = scale if inside == at else 0.0
+    # derivatives are differences of basis functions of a lower degree
     for _ in range(2):
         for j in range(degree, -1, -1):
             before = basis[2, j - 1] if j > 0 else 0.0
-            basis[2, j] = (before - basis[2, j]) * own
+            basis[2, j] = (before - basis[2, j]) * scale
     for j in range(degree, -1, -1):
         before = basis[1, j - 1] if j > 0 else 0.0
-        basis[1, j] = (before - basis[1, j]) * own
+        basis[1, j] = (before - basis[1, j]) * scale
     return cell
 
 
@@ -393,12 +409,13 @@ def basis_at(degree, at, count, scale, basis):
 def _look(head, coefficients, p, basis, out):
     """Value, gradient and second derivatives of a spline at a position p (3,), into out (10,)."""
     x0, x1, x2 = p[0] - head[9], p[1] - head[10], p[2] - head[11]
-    first = 0
+    first, beyond = 0, False
     for k in range(3):
         x = head[3 * k] * x0 + head[3 * k + 1] * x1 + head[3 * k + 2] * x2
         at = (x - head[12 + k]) * head[15 + k]
         degree, count = int(head[18 + k]), int(head[21 + k])
         cell = basis_at(degree, at, count, head[15 + k], basis[k])
+        beyond = beyond or (degree > 0 and (at < 0.0 or at > count - degree))
         first = first * count + cell
     for i in range(_LOOK):
         out[i] = 0.0
@@ -426,6 +443,36 @@ def _look(head, coefficients, p, basis, out):
             out[7] += a0 * b2 * s0
             out[8] += a0 * b1 * s1
             out[9] += a0 * b0 * s2
+    if beyond:
+        _continue(head, x0, x1, x2, out)
+
+
+@njit(**LEAF)
+def _continue(head, x0, x1, x2, out):
+    """From the border of the domain on along its slopes there, first derivatives included."""
+    bent = out[4], out[5], out[6], out[7], out[8], out[9]
+    value, g0, g1, g2 = out[0], out[1], out[2], out[3]
+    for k in range(3):
+        if head[18 + k] == 0.0:
+            continue
+        x = head[3 * k] * x0 + head[3 * k + 1] * x1 + head[3 * k + 2] * x2 - head[12 + k]
+        far = x - min(max(x, 0.0), (head[21 + k] - head[18 + k]) / head[15 + k])
+        if far == 0.0:
+            continue
+        value += out[1 + k] * far
+        if k == 0:
+            g1 += bent[1] * far
+            g2 += bent[2] * far
+            out[4] = 0.0
+        elif k == 1:
+            g0 += bent[1] * far
+            g2 += bent[4] * far
+            out[7] = 0.0
+        else:
+            g0 += bent[2] * far
+            g1 += bent[4] * far
+            out[9] = 0.0
+    out[0], out[1], out[2], out[3] = value, g0, g1, g2
 
 
 @njit(**COMPILE)

@@ -149,7 +149,6 @@ def fitted(
     relations = model.relations(_splines(model, found), axis)
     each = np.sqrt(len(relations))
     found_rad = better_rms(_distances(relations, y, to_joints)) / each
-    on_others = better_rms(left_out) / each
     side = float(((sample.rotation @ axis) @ model.grid.frame[2]).mean())
     return Freeform(
         model, found, axis, float(smoothing), found_rad, better_rms(left_out) / each, side

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from constraint_geodesics.constraints.both import Both
+from constraint_geodesics.constraints.both import Both, both
 from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.constraints.polynomial import PolynomialConstraint, Relation
 from constraint_geodesics.constraints.spline import SplineConstraint, SplineRelation
@@ -23,6 +23,7 @@ from constraint_geodesics.constraints.tool_features import FEATURES
 from constraint_geodesics.identification import freeform
 from constraint_geodesics.identification.demonstrations import demonstrations_from
 from constraint_geodesics.identification.forms import POSE, POSITION, QUADRIC, TURNED, Form, named
+from constraint_geodesics.identification.support import Support, support_of
 from constraint_geodesics.identification.vanishing import (
     AT_MOST_RAD,
     GOOD,
@@ -68,7 +69,8 @@ class Identified:
     without a constraint.  left_out: rms
     of each row of the residual on left-out demonstrations, in its unit.  missing: what was seen but
     not supported, or why there is nothing.  dropped: rows that were taken to be wrong.  robot: its
-    name and tool link, of whose tool all this is said.
+    name and tool link, of whose tool all this is said.  support: the region where demonstrations
+    were; `supported` keeps a path in it.
     """
 
     constraint: Constraint | None
@@ -81,6 +83,15 @@ class Identified:
     demonstrations: int
     dropped: int
     robot: tuple[str, str]
+    support: Support | None = None
+
+    @property
+    def supported(self) -> Constraint | None:
+        """The constraint, and that the tip stays where it was shown."""
+        if self.constraint is None or self.support is None:
+            return self.constraint
+        region = SplineConstraint((self.support.relation,), (0.0,))
+        return both(self.constraint, region)
 
     @property
     def left_out_error(self) -> dict[str, float]:
@@ -429,9 +440,10 @@ def _told(search: _Search, robot: SerialRobot, demonstrations: int, dropped: int
     noise_rad = float(np.sqrt((noise**2).mean() / len(search.relations)))
     # a side is no relation that is missed: it only tells two sets of the same zeros apart
     about = (*left_out.tolist(), *(0.0 for _ in search.sides))
+    region = support_of(search.sample, search.relations, search.folds)
     constraint, about = _constraint((*search.relations, *search.sides), about)
     codim = len(search.relations)
-    return Identified(constraint, told, codim, noise_rad, about, missing, *counts, whose)
+    return Identified(constraint, told, codim, noise_rad, about, missing, *counts, whose, region)
 
 
 def _constraint(
