@@ -285,6 +285,16 @@ class CompareChartsParams(_Record):
     hole: HoleParams
 
 
+class DemonstrationsParams(_Record):
+    """Constraints from demonstrations whose formula is hidden.  pairs: queries of each cell, of
+    which peers that are no planners are asked the first `peer_pairs`.
+    """
+
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    pairs: Count
+    peer_pairs: Count
+
+
 class SubmanifoldParams(_Record):
     """How a constraint's sub-manifold is drawn or sampled in the latent space."""
 
@@ -608,6 +618,7 @@ class Params(_Record):
     unseen: dict[Name, ConstraintParams]
     compare_manifolds: CompareManifoldsParams
     compare_charts: CompareChartsParams
+    demonstrations: DemonstrationsParams
     studies: StudyParams
     sweep: SweepParams
     execution: ExecutionParams

@@ -120,7 +120,7 @@ def test_a_tilt_is_measured_as_its_angle(xarm, tilt: float, heading: float) -> N
 SPHERE = "constraint_geodesics.constraints.functions:tip_on_sphere"
 KINDS = [
     *("held axes", "cone", "two tolerances", "sphere", "thick sphere", "coupling"),
-    *("relations", "loose relations", "surface", "loose surface", "turning", "both"),
+    *("relations", "loose relations", "surface", "loose surface", "turning", "both", "elbow"),
 ]
 
 
@@ -158,6 +158,14 @@ def relations(tolerance: float = 0.0) -> PolynomialConstraint:
             Relation("level", "rad", 0.0, level, None, tolerance),
         )
     )
+
+
+def elbow() -> Relation:
+    """The origin of a joint on a sphere."""
+    full = np.zeros((12, 12))
+    full[:3, :3] = np.eye(3) / 0.4
+    linear = np.append(-np.array([0.1, 0.1, 0.5]) / 0.4, np.zeros(9))
+    return Relation("on a sphere", "m", 0.27 / 0.8 - 0.2, linear, full, 0.02)
 
 
 def surface(tolerance: float = 0.0, normal: bool = True) -> SplineConstraint:
@@ -198,6 +206,7 @@ def of_kind(name: str, robot) -> Constraint:
         "loose relations": relations(0.05),
         "surface": surface(),
         "loose surface": surface(0.05),
+        "elbow": PolynomialConstraint((elbow(),), joint=3),
         "turning": surface(normal=False),
         "both": Both(PolynomialConstraint(relations().relations[2:]), surface(0.0, normal=False)),
     }[name]

@@ -43,6 +43,7 @@ SMALL: dict[str, Any] = {
         "queries": 2,
         "hole": {"dims": [2], "pairs": 2},
     },
+    "demonstrations": {"seeds": [0], "pairs": 2, "peer_pairs": 1},
     "geometry": {"rounds": 1, "batch": 256, "checked": 32, "graph_points": 200, "pairs": 4},
     "policies": {
         "seeds": [0, 1],

@@ -25,19 +25,27 @@ _BLOCKS = tuple(slice(3 * k, 3 * k + 3) for k in range(4))
 
 def kept(asked: Asked) -> Kept:
     """How well the relations are kept at the rows and on the whole path."""
-    relations = asked.constraint.relations
-    _, added = _bounds(asked.chain, asked.rows, relations)
+    relations, joint = asked.constraint.relations, asked.constraint.joint
+    _, added = _bounds(asked.chain, asked.rows, relations, joint)
     wanted = SHARE * asked.limits.violation_tolerance
     pieces = cut(asked.rows, added.max(axis=1), wanted)
-    values, added = _bounds(asked.chain, pieces.stations, relations)
+    values, added = _bounds(asked.chain, pieces.stations, relations, joint)
     return kept_on(pieces, relations, values, added, asked.limits)
 
 
 def _bounds(
-    chain: Chain, stations: Float[np.ndarray, "S D"], relations: tuple
+    chain: Chain, stations: Float[np.ndarray, "S D"], relations: tuple, joint: int | None
 ) -> tuple[Float[np.ndarray, "S m"], Float[np.ndarray, "S-1 m"]]:
     """Residuals at stations, and K/8 of the pieces between them."""
+    if joint is not None:  # its origin is the tip of the chain before it
+        ends = slice(joint + 1)
+        chain = Chain(
+            chain.turns[ends], chain.offsets[ends], chain.prismatic[:joint], chain.lengths[ends]
+        )
+        stations = stations[:, :joint]
     y = features(chain, stations)
+    if joint is not None:
+        y[:, 3:] = 0.0
     steps = np.abs(np.diff(stations, axis=0))
     turning = np.where(chain.prismatic, 0.0, steps).sum(axis=1)
     first, second = motions(chain, stations, steps)

@@ -1,8 +1,10 @@
-"""Polynomial relations of the tool's pose: what demonstrations show, as rows of a residual.
+"""Polynomial relations of the tool's pose, or of a joint's place: what demonstrations show, as rows
+of a residual.
 
 With y = (p, R e_x, R e_y, R e_z) (12,), the tool's position [m] and the axes of its frame in the
 base frame, one row is r = c + wᵀy + ½ yᵀA y.  Planes, spheres, cylinders, arcs and quadrics of the
-position, and axes that are level or point at something, are of this form.
+position, and axes that are level or point at something, are of this form.  Of a joint y = (p, 0),
+with the place p of its origin.
 """
 
 from collections.abc import Mapping
@@ -12,7 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
-from numba import carray, njit
+from numba import carray, int64, njit
 
 from constraint_geodesics.compiled import LEAF
 from constraint_geodesics.constraints.constraint import (
@@ -33,7 +35,7 @@ from constraint_geodesics.constraints.kernels import (
     floats,
     lanes_at,
 )
-from constraint_geodesics.constraints.tool_features import FEATURES, into_joints
+from constraint_geodesics.constraints.tool_features import FEATURES, into_joints, jacobian_of_origin
 from constraint_geodesics.robot.kernels import geometric_jacobian, poses_of, posture_in
 from constraint_geodesics.robot.kinematics import SerialRobot
 
@@ -98,14 +100,18 @@ class Relation:
 @dataclass(frozen=True, eq=False)
 class PolynomialConstraint(Constraint):
     """Relations that all hold.  left_out: what each is off by on demonstrations that it was not
-    found on, in its unit; () where it was not found but given.
+    found on, in its unit; () where it was not found but given.  joint: the joint, counted from 0,
+    whose origin they are of, None for the tool.
     """
 
     kind: ClassVar[str] = "polynomial"
     relations: tuple[Relation, ...]
     left_out: tuple[float, ...] = ()
+    joint: int | None = None
 
     def __post_init__(self) -> None:
+        if self.joint is not None and self.joint < 0:
+            raise ConstraintError(f"joint = {self.joint}: must be 0 or more")
         if not self.relations:
             raise ConstraintError("relations = (): one is needed at least")
         if self.left_out and len(self.left_out) != len(self.relations):
@@ -126,7 +132,10 @@ class PolynomialConstraint(Constraint):
 
     def arrays(self, robot: SerialRobot) -> ConstraintArrays:
         """For the kernels."""
-        data = np.concatenate([own.numbers for own in self.relations])
+        if self.joint is not None and self.joint >= robot.dof:
+            raise ConstraintError(f"joint = {self.joint}: the arm has {robot.dof} joints")
+        which = -1.0 if self.joint is None else float(self.joint)
+        data = np.concatenate([[which], *(own.numbers for own in self.relations)])
         return ConstraintArrays(self.rows, data, _compiled().address, 0, _room(robot.dof))
 
     def compile(self) -> None:
@@ -144,13 +153,14 @@ class PolynomialConstraint(Constraint):
     def label(self) -> str:
         """Its relations, those of one name once."""
         names = "; ".join(dict.fromkeys(own.name for own in self.relations))
-        return f"the constraint on the tool's pose ({names})"
+        of = "the tool's pose" if self.joint is None else f"the place of joint {self.joint + 1}"
+        return f"the constraint on {of} ({names})"
 
     @property
     def key(self) -> tuple:
         """All numbers, to the bit."""
         own = tuple((r.unit, r.tolerance, r.numbers.tobytes()) for r in self.relations)
-        return (self.kind, own)
+        return (self.kind, self.joint, own)
 
     def series(self, residual: Float[np.ndarray, "n m"]) -> list[Series]:
         """Each row by itself, in mm or degrees."""
@@ -169,7 +179,12 @@ class PolynomialConstraint(Constraint):
             }
             for own in self.relations
         ]
-        return {"kind": self.kind, "relations": relations, "left_out": list(self.left_out)}
+        return {
+            "kind": self.kind,
+            "joint": self.joint,
+            "relations": relations,
+            "left_out": list(self.left_out),
+        }
 
     @classmethod
     def from_json(
@@ -187,7 +202,9 @@ class PolynomialConstraint(Constraint):
             )
             for own in about["relations"]
         )
-        return cls(relations, tuple(float(x) for x in about["left_out"]))
+        joint = about.get("joint")
+        joint = None if joint is None else int(joint)
+        return cls(relations, tuple(float(x) for x in about["left_out"]), joint)
 
 
 KIND = PolynomialConstraint
@@ -219,17 +236,20 @@ def _write(
     y, gradient = carray(floats(rest), (FEATURES,)), carray(floats(rest + 96), (FEATURES,))
     geometric = carray(floats(rest + 192), (6, dof))
     values = carray(floats(residuals), (count, rows))
+    joint = int64(carray(floats(data), (1,))[0])
     poses_of(chain, carray(floats(q), (count, dof)), lanes)
     for n in range(count):
         posture = posture_in(lanes, n)
         for i in range(3):
-            y[i] = posture.position[i]
+            y[i] = posture.position[i] if joint < 0 else posture.origins[joint, i]
             for k in range(3):
-                y[3 + 3 * k + i] = posture.rotation[i, k]
-        if jacobians != 0:
+                y[3 + 3 * k + i] = posture.rotation[i, k] if joint < 0 else 0.0
+        if jacobians != 0 and joint < 0:
             geometric_jacobian(chain.prismatic, posture, geometric)
+        elif jacobians != 0:
+            jacobian_of_origin(chain.prismatic, posture, joint, geometric)
         for m in range(rows):
-            row = carray(floats(data + 8 * _ROW * m), (_ROW,))
+            row = carray(floats(data + 8 * (1 + _ROW * m)), (_ROW,))
             values[n, m] = _value_and_gradient(row, y, gradient)
             if jacobians != 0:
                 slopes = carray(floats(jacobians + 8 * dof * (rows * n + m)), (dof,))

@@ -67,7 +67,8 @@ class Spline:
     frame (3, 3): F, a rotation.  origin (3,) [m].  lower (3,): where the domain begins [m].
     spacing (3,): of the knots [m].  degrees (3,): 3 or 5, or 0 for a coordinate that it does not
     depend on.  coefficients (n₁, n₂, n₃): degree + cells along each coordinate, 1 for degree 0.
-    Beyond the domain it is continued along its slopes at the border.  Raises ConstraintError where these do not fit.
+    Beyond the domain it is continued along its slopes at the border.  Raises ConstraintError where
+    these do not fit.
     """
 
     frame: Float[np.ndarray, "3 3"]

@@ -32,3 +32,26 @@ def into_joints(gradient, y, geometric, out):
         for i in range(3):
             value += gradient[i] * geometric[i, d]
         out[d] = value
+
+
+@njit(**LEAF)
+def jacobian_of_origin(prismatic, posture, joint, out):
+    """The geometric Jacobian (6, D) of a joint's origin, which only the joints before it move; its
+    angular rows are zero.
+    """
+    here = posture.origins[joint]
+    for d in range(out.shape[1]):
+        for i in range(6):
+            out[i, d] = 0.0
+        if d >= joint:
+            continue
+        a = posture.axes[d]
+        x = here[0] - posture.origins[d, 0]
+        y = here[1] - posture.origins[d, 1]
+        z = here[2] - posture.origins[d, 2]
+        if prismatic[d]:
+            out[0, d], out[1, d], out[2, d] = a[0], a[1], a[2]
+        else:
+            out[0, d] = a[1] * z - a[2] * y
+            out[1, d] = a[2] * x - a[0] * z
+            out[2, d] = a[0] * y - a[1] * x

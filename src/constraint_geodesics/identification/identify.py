@@ -50,6 +50,8 @@ WORSE, FINE_RAD = 1.25, 2e-5
 WRONG, LEAST_WRONG_RAD = 5.0, 1e-4
 """Rows that are further off than so many times the median are wrong, and left out."""
 ROUNDS = 4
+SAME_M = 1e-9
+"""Joints whose origins are no further apart have the same place."""
 _COLUMNS = {POSITION: np.arange(3), TURNED: np.arange(3, 12), POSE: np.arange(12)}
 _SCALE = np.array([METRES] * 3 + [1.0] * 9)
 _FIRST, _SECOND = np.triu_indices(3)
@@ -157,7 +159,9 @@ def identify(demonstrations: Any, robot: SerialRobot) -> Identified:
             )
             break
         kept, search = near, _searched(sample[near])
-    return _told(search, robot, len(shown), int((~kept).sum()))
+    if not search.relations and search.folds:
+        search = _of_joints(search, sample, robot, np.concatenate(shown))
+    return _told(search, robot, len(shown), len(sample) - len(search.sample))
 
 
 def _likely(sample: Sample) -> Bool[np.ndarray, "n"]:
@@ -178,7 +182,9 @@ def _near(off: Float[np.ndarray, "n"], kept: Bool[np.ndarray, "n"]) -> Bool[np.n
 
 @dataclass
 class _Search:
-    """What is found so far, how, and what was seen but not supported."""
+    """What is found so far, how, and what was seen but not supported.  joint: whose place it is
+    about, None for the tool.
+    """
 
     sample: Sample
     folds: Sequence[Bool[np.ndarray, "n"]]
@@ -187,6 +193,7 @@ class _Search:
         default_factory=list
     )
     missing: list[str] = field(default_factory=list)
+    joint: int | None = None
 
     def keep(
         self, found: Found, relations: tuple[AnyRelation, ...], sides: tuple[AnyRelation, ...] = ()
@@ -226,6 +233,28 @@ def _searched(sample: Sample) -> _Search:
     for name in names:
         _look(search, name)
     return _with_freeform(search) if search.folds else search
+
+
+def _of_joints(
+    search: _Search, sample: Sample, robot: SerialRobot, q: Float[np.ndarray, "n D"]
+) -> _Search:
+    """Where nothing of the tool is held: what the place of a joint keeps to, of the first joint
+    whose place no other has.
+    """
+    seen = [sample.position]
+    for joint in range(1, robot.dof):
+        own = sample.of_joint(robot, q, joint)
+        if any(np.abs(own.position - other).max() < SAME_M for other in seen):
+            continue
+        seen.append(own.position)
+        found = _Search(own, own.folds(), missing=list(search.missing), joint=joint)
+        least = [vanishing(*_features(own, name), []).found_rad for name in (POSITION, QUADRIC)]
+        found.best_rad = min((float(rad[0]) for rad in least if len(rad)), default=np.inf)
+        for name in (POSITION, QUADRIC):
+            _look(found, name)
+        if found.relations:
+            return found
+    return search
 
 
 def _features(sample: Sample, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -440,14 +469,19 @@ def _told(search: _Search, robot: SerialRobot, demonstrations: int, dropped: int
     noise_rad = float(np.sqrt((noise**2).mean() / len(search.relations)))
     # a side is no relation that is missed: it only tells two sets of the same zeros apart
     about = (*left_out.tolist(), *(0.0 for _ in search.sides))
-    region = support_of(search.sample, search.relations, search.folds)
-    constraint, about = _constraint((*search.relations, *search.sides), about)
+    region = None
+    if search.joint is None:
+        region = support_of(search.sample, search.relations, search.folds)
+    else:
+        origin = f"the origin of {robot.joint_names[search.joint]}"
+        told = tuple(words.replace("the tool's tip", origin) for words in told)
+    constraint, about = _constraint((*search.relations, *search.sides), about, search.joint)
     codim = len(search.relations)
     return Identified(constraint, told, codim, noise_rad, about, missing, *counts, whose, region)
 
 
 def _constraint(
-    relations: tuple[AnyRelation, ...], left_out: tuple[float, ...]
+    relations: tuple[AnyRelation, ...], left_out: tuple[float, ...], joint: int | None
 ) -> tuple[Constraint, tuple[float, ...]]:
     """Relations as a constraint, those of a kind together, and what its rows are off by."""
     pairs = list(zip(relations, left_out, strict=True))
@@ -455,9 +489,10 @@ def _constraint(
     more = [(own, off) for own, off in pairs if isinstance(own, SplineRelation)]
     parts: list[Constraint] = []
     if rows:
-        parts.append(PolynomialConstraint(*map(tuple, zip(*rows, strict=True))))
+        named, off = zip(*rows, strict=True)
+        parts.append(PolynomialConstraint(named, off, joint))
     if more:
-        parts.append(SplineConstraint(*map(tuple, zip(*more, strict=True))))
+        parts.append(SplineConstraint(*zip(*more, strict=True)))
     found = parts[0] if len(parts) == 1 else Both(*parts)
     return found, tuple(off for _, off in (*rows, *more))
 

@@ -5,6 +5,18 @@ from numba import njit
 
 from constraint_geodesics.compiled import COMPILE
 from constraint_geodesics.constraints.spline import HEAD, ORDER, basis_at
+from constraint_geodesics.constraints.tool_features import jacobian_of_origin
+from constraint_geodesics.robot.kernels import new_posture, pose_of
+
+
+@njit(**COMPILE)
+def joint_origins(chain, q, joint, places, jacobians):
+    """Places (n, 3) [m] of a joint's origin at q (n, D), and their Jacobians (n, 6, D)."""
+    posture = new_posture(q.shape[1])
+    for n in range(q.shape[0]):
+        pose_of(chain, q[n], posture)
+        places[n] = posture.origins[joint]
+        jacobian_of_origin(chain.prismatic, posture, joint, jacobians[n])
 
 
 @njit(**COMPILE)

@@ -16,6 +16,7 @@ from scipy.linalg import eigh
 from constraint_geodesics.constraints.polynomial import Relation
 from constraint_geodesics.constraints.spline import SplineRelation
 from constraint_geodesics.constraints.tool_features import features
+from constraint_geodesics.identification.kernels import joint_origins
 from constraint_geodesics.robot.kinematics import SerialRobot
 
 METRES = 0.3
@@ -67,6 +68,12 @@ class Sample:
         if not motions:
             of = np.random.default_rng(0).permutation(len(q)) % MOST_FOLDS
         return cls(*robot.forward(q), robot.jacobian(q), of)
+
+    def of_joint(self, robot: SerialRobot, q: Float[np.ndarray, "n D"], joint: int) -> "Sample":
+        """The same rows with the place of a joint's origin instead of the tool's pose."""
+        places, jacobian = np.empty((len(q), 3)), np.empty((len(q), 6, robot.dof))
+        joint_origins(robot.chain, np.ascontiguousarray(q), joint, places, jacobian)
+        return Sample(places, np.zeros((len(q), 3, 3)), jacobian, self.of)
 
     def __len__(self) -> int:
         return len(self.of)
