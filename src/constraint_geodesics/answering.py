@@ -248,6 +248,8 @@ class Answering:
             f"{certificate.length_rad:.3f} rad in {times[-1]:.2f} s from the {candidate.source} "
             f"proposal, at most {certificate.violation_bound:.1e} off {query.name}"
         )
+        if constraint.caveat:
+            line += f", {constraint.caveat}"
         about = self._asked(query), self._statistics(query, candidate.source)
         return Trajectory("solved", joints, times, line, *about, certificate)
 

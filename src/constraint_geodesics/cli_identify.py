@@ -41,6 +41,12 @@ def identify_constraint(
             "demonstrations; 0 holds exactly."
         ),
     ] = 0.0,
+    where_shown: Annotated[
+        bool,
+        typer.Option(
+            "--where-shown", help="Also keep the tip in the region where demonstrations were."
+        ),
+    ] = False,
     planner: Source = None,
     urdf: Urdf = None,
     tool_link: ToolLink = None,
@@ -70,7 +76,7 @@ def identify_constraint(
         if found.constraint is not None and loosely > 0.0:
             found = replace(found, constraint=with_tolerance(found.constraint, loosely))
         if out is not None and found.constraint is not None:
-            save_constraint(found, out)
+            save_constraint(found, out, where_shown)
     except (BundleError, ConstraintError, DemonstrationError, PlannerError, RobotError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
     print(json.dumps(found.summary()) if as_json else found.explanation)

@@ -269,6 +269,8 @@ def check(
         else ""
     )
     meant = constraint or f"the constraint that {file.name} names"
+    caveat = "" if own is None or isinstance(own, str) else own.caveat
+    meant = f"{meant}, {caveat}," if caveat else meant
     if as_json:
         print(json.dumps(certificate.summary()))
     elif broken is None:

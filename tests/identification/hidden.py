@@ -7,38 +7,21 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.polynomial import PolynomialConstraint, Relation
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.studies.hidden_tasks import (
+    BOWL,
+    CENTRE,
+    HEIGHT,
+    HINGE,
+    LEVEL,
+    REACH,
+    about,
+    row,
+)
 
-CENTRE, RADIUS = np.array([0.42, 0.0, -0.05]), 0.25
-HINGE, REACH, HEIGHT = np.array([0.55, 0.35, 0.0]), 0.35, 0.3
-
-
-def row(unit: str, constant: float, quadratic=None, **entries: float) -> Relation:
-    """One relation: entries p0 p1 p2, and u11 for the first entry of R e_x and so on."""
-    linear = np.zeros(12)
-    for name, value in entries.items():
-        at = int(name[1]) if name[0] == "p" else 3 * int(name[1]) + int(name[2]) - 1
-        linear[at] = value
-    return Relation("hidden", unit, constant, linear, quadratic)
-
-
-def about(centre: np.ndarray, radius: float, flat: bool) -> Relation:
-    """The tip at a distance from a point, or from the upright line through it."""
-    full, keep = np.zeros((12, 12)), np.diag([1.0, 1.0, 0.0 if flat else 1.0])
-    full[:3, :3] = keep / radius
-    linear = np.zeros(12)
-    linear[:3] = -keep @ centre / radius
-    constant = float((centre @ keep @ centre - radius**2) / (2 * radius))
-    return Relation("hidden", "m", constant, linear, full)
-
-
-LEVEL = (row("rad", 0.0, u21=1.0), row("rad", 0.0, u22=1.0))
-"""The tool's y axis upright."""
 HIDDEN = {
     "cup": LEVEL,
     "plane": (row("m", -0.2, p2=1.0), *LEVEL),
-    "towards a centre": tuple(
-        row("m", -float(CENTRE[k]), **{f"p{k}": 1.0, f"u3{k + 1}": RADIUS}) for k in range(3)
-    ),
+    "towards a centre": BOWL,
     "door": (*LEVEL, row("m", -HEIGHT, p2=1.0), about(HINGE, REACH, flat=True)),
     "sphere": (about(CENTRE, 0.3, flat=False),),
     "sphere up there": (about(np.array([0.5, 0.1, 0.3]), 0.3, flat=False), *LEVEL),

@@ -38,6 +38,7 @@ for name, *items in (
     ("train_path_diffusion",),
     ("benchmark_policies",),
     ("compare_charts",),
+    ("benchmark_demonstrations",),
     ("report",),
 ):
     importlib.import_module(name).main(load_params(), Layout(), *items)
@@ -283,6 +284,7 @@ def test_the_studies_of_make_bench_run_and_the_report_shows_them(finished: Path)
         "geometry.md",
         "policies.md",
         "charts.md",
+        "demonstrations.md",
         "figures/charts.png",
         "figures/ablation.png",
         "figures/length_rules.png",

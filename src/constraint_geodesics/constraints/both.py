@@ -100,6 +100,11 @@ class Both(Constraint):
         return f"{self.first.label} and {self.second.label}"
 
     @property
+    def caveat(self) -> str:
+        """Those of both."""
+        return " and ".join(filter(None, (self.first.caveat, self.second.caveat)))
+
+    @property
     def key(self) -> tuple:
         """Those of both."""
         return (self.kind, self.first.key, self.second.key)

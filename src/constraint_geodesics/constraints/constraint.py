@@ -111,6 +111,16 @@ def each_drawn(bounds: Sequence[Bounded], residual: Float[np.ndarray, "n m"]) ->
     return found
 
 
+def left_out_words(units: Sequence[str], left_out: Sequence[float]) -> str:
+    """The largest rms by which rows were missed on demonstrations left out; empty without any."""
+    most = {"m": 0.0, "rad": 0.0}
+    for unit, off in zip(units, left_out, strict=False):
+        most[unit] = max(most[unit], off)
+    parts = [f"{1e3 * most['m']:.2g} mm"] * (most["m"] > 0.0)
+    parts += [f"{np.degrees(most['rad']):.2g}°"] * (most["rad"] > 0.0)
+    return f"which demonstrations left out miss by {' and '.join(parts)}" if parts else ""
+
+
 class Constraint:
     """The base of all kinds.  `Constraint(axes=…, tolerance=…, reference=…)` builds the first of
     them, `constraints.pose.PoseConstraint`, which holds axes of the tool's pose.
@@ -176,6 +186,13 @@ class Constraint:
     def label(self) -> str:
         """A few words that describe it in a sentence."""
         raise NotImplementedError
+
+    @property
+    def caveat(self) -> str:
+        """What a certificate against it leaves open: how far demonstrations that were left out are
+        from it; empty where it was given.
+        """
+        return ""
 
     @property
     def context(self) -> Float[np.ndarray, "12"]:

@@ -23,6 +23,7 @@ from constraint_geodesics.constraints.constraint import (
     Series,
     each_drawn,
     each_held,
+    left_out_words,
 )
 from constraint_geodesics.constraints.kernels import (
     JOINT_WORDS,
@@ -155,6 +156,11 @@ class PolynomialConstraint(Constraint):
         names = "; ".join(dict.fromkeys(own.name for own in self.relations))
         of = "the tool's pose" if self.joint is None else f"the place of joint {self.joint + 1}"
         return f"the constraint on {of} ({names})"
+
+    @property
+    def caveat(self) -> str:
+        """By what is identified."""
+        return left_out_words(self.units, self.left_out)
 
     @property
     def key(self) -> tuple:

@@ -26,6 +26,7 @@ from constraint_geodesics.constraints.constraint import (
     Series,
     each_drawn,
     each_held,
+    left_out_words,
 )
 from constraint_geodesics.constraints.kernels import (
     JOINT_WORDS,
@@ -301,6 +302,11 @@ class SplineConstraint(Constraint):
         """Its relations, those of one name once."""
         names = "; ".join(dict.fromkeys(own.name for own in self.relations))
         return f"the constraint on the tool's pose ({names})"
+
+    @property
+    def caveat(self) -> str:
+        """By what is identified."""
+        return left_out_words(self.units, self.left_out)
 
     @property
     def key(self) -> tuple:

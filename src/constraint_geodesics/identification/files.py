@@ -16,16 +16,20 @@ FORMAT = 1
 SUFFIXES = (".yaml", ".yml")
 
 
-def save_constraint(identified: Identified, file: str | Path) -> None:
-    """Write what was identified, with what it stands on.
+def save_constraint(identified: Identified, file: str | Path, where_shown: bool = False) -> None:
+    """Write what was identified, with what it stands on.  where_shown: with the region where
+    demonstrations were, which a path then may not leave.
 
     Raises ConstraintError where nothing was, or the file's name has another suffix.
     """
     from ruamel.yaml import YAML
 
     file = Path(file)
-    if identified.constraint is None:
+    constraint = identified.supported if where_shown else identified.constraint
+    if constraint is None:
         raise ConstraintError(f"there is no constraint to save: {identified.explanation}")
+    if where_shown and identified.support is None:
+        raise ConstraintError("what was identified is not of the tool: it has no region")
     if file.suffix not in SUFFIXES:
         raise ConstraintError(f"{file}: the name must end in {' or '.join(SUFFIXES)}")
     about = {
@@ -37,7 +41,7 @@ def save_constraint(identified: Identified, file: str | Path) -> None:
             "demonstrations": identified.demonstrations,
             "noise_rad": identified.noise_rad,
         },
-        "constraint": identified.constraint.to_json(),
+        "constraint": constraint.to_json(),
     }
     file.parent.mkdir(parents=True, exist_ok=True)
     writer = YAML(typ="safe", pure=True)

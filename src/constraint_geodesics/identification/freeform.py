@@ -29,8 +29,8 @@ CELLS, COARSE = 16, 8
 """Of the grid along the longest side of where the rows are: of heights, and of axes that turn."""
 WRONG, LEAST_WRONG_RAD = 5.0, 1e-4
 """Rows that are further off than so many times the median are wrong: they don't count."""
-MARGIN = 0.25
-"""Of a cell, that the grid reaches beyond the rows."""
+MARGIN = 1.0
+"""Cells that the grid reaches beyond the rows."""
 DEGREE, PENALISED = 5, 3
 SMOOTHINGS = 10.0 ** np.arange(-11, 2, 2)
 """Weights of the penalty that are tried, as shares of what makes it weigh as much as the rows."""
@@ -211,12 +211,17 @@ def along_normal(sample: Sample, found: Freeform) -> Model:
 
 
 def turning(
-    sample: Sample, place: Spline, axis: np.ndarray | None, held: np.ndarray | None
+    sample: Sample,
+    place: Spline,
+    axis: np.ndarray | None,
+    held: np.ndarray | None,
+    only: int | None = None,
 ) -> Model:
     """Tool axes that are functions of the place.
 
     place: any spline over the same coordinates.  axis: one that turns with the place, or None.
     held: one, this or another that is held, about which the turn is told, too; or None.
+    only: of the rows, where another relation holds the rest.
     """
     grid, rows = _coarse(sample, place), []
     if axis is not None:
@@ -229,6 +234,7 @@ def turning(
         main = _mean_direction(sample, second)
         aside = np.cross(_mean_direction(sample, held), main)
         rows.append((words, second, main, aside / np.linalg.norm(aside)))
+    rows = rows if only is None else [rows[only]]
 
     def relations(splines: Sequence[Spline], _: np.ndarray) -> Relations:
         found = []

@@ -18,13 +18,14 @@ from jaxtyping import Bool, Float
 from constraint_geodesics.constraints.both import Both, both
 from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.constraints.polynomial import PolynomialConstraint, Relation
-from constraint_geodesics.constraints.spline import SplineConstraint, SplineRelation
+from constraint_geodesics.constraints.spline import Spline, SplineConstraint, SplineRelation
 from constraint_geodesics.constraints.tool_features import FEATURES
 from constraint_geodesics.identification import freeform
 from constraint_geodesics.identification.demonstrations import demonstrations_from
 from constraint_geodesics.identification.forms import POSE, POSITION, QUADRIC, TURNED, Form, named
 from constraint_geodesics.identification.support import Support, support_of
 from constraint_geodesics.identification.vanishing import (
+    APART,
     AT_MOST_RAD,
     GOOD,
     METRES,
@@ -114,16 +115,17 @@ class Identified:
             "codim": self.codim,
             "noise_rad": self.noise_rad if identified else None,
             "left_out_error": self.left_out_error,
+            "where_shown": None if self.support is None else self.support.words,
             "rows": self.rows,
             "demonstrations": self.demonstrations,
             "dropped": self.dropped,
         }
 
-    def save(self, file: str | Path) -> None:
+    def save(self, file: str | Path, where_shown: bool = False) -> None:
         """Write the constraint as YAML (`files.save_constraint`)."""
         from constraint_geodesics.identification.files import save_constraint
 
-        save_constraint(self, file)
+        save_constraint(self, file, where_shown)
 
     @property
     def explanation(self) -> str:
@@ -366,7 +368,7 @@ def _look_for_axes(search: _Search, tip: freeform.Freeform | None) -> None:
         place = freeform.plane_grid(sample, flat)
     else:
         return
-    if held not in (0, 2):
+    if held > 2:
         return
     off, axes = freeform.axes_of_place(sample, place, search.folds)
     small = int((off < freeform.HOPELESS_RAD).sum())
@@ -379,9 +381,35 @@ def _look_for_axes(search: _Search, tip: freeform.Freeform | None) -> None:
         models.append(freeform.turning(sample, place, axes[0], axes[0]))
     if held == 0 and small:
         models.append(freeform.turning(sample, place, axes[0], None))
+    if held == 1 and small:
+        # an angle is held, which is one of the two rows of an axis
+        both_rows = freeform.turning(sample, place, axes[0], None)
+        models.append(
+            both_rows if _independent(search, both_rows) == 2 else _rest(search, place, axes[0])
+        )
     found = next(filter(None, (_better(search, None, model) for model in models)), None)
     if found is not None:
         search.keep(found.again, found.relations)
+
+
+def _rest(search: _Search, place: Spline, axis: Float[np.ndarray, "3"]) -> freeform.Model:
+    """Of the two rows of an axis that which what is held leaves open."""
+    models = [freeform.turning(search.sample, place, axis, None, only) for only in range(2)]
+    return max(models, key=lambda own: float(np.square(_left_open(search, own)).sum()))
+
+
+def _independent(search: _Search, model: freeform.Model) -> int:
+    """How many rows of a model are independent of what is held, with flat splines."""
+    sizes = np.linalg.svd(_left_open(search, model), compute_uv=False)
+    rms = np.sqrt((sizes**2).mean(axis=0))
+    return int((rms > APART * rms[0]).sum())
+
+
+def _left_open(search: _Search, model: freeform.Model) -> Float[np.ndarray, "n k D"]:
+    """Slopes of a model's rows along what is held leaves free, with flat splines."""
+    flat = model.relations([model.grid] * model.splines, np.zeros(3))
+    slopes = search.sample.slopes(flat)
+    return without(slopes, search.sample.slopes(search.relations))
 
 
 def _turned(search: _Search) -> int:

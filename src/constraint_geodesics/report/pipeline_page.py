@@ -13,6 +13,7 @@ from constraint_geodesics.recording.png import save_png
 from constraint_geodesics.report import pipeline_tables, study_report
 from constraint_geodesics.report.arms_page import arm_tables, arms_markdown
 from constraint_geodesics.report.charts_page import charts_markdown
+from constraint_geodesics.report.demonstrations_page import demonstrations_markdown
 from constraint_geodesics.report.figures import PLANNERS
 from constraint_geodesics.report.manifolds_page import manifolds_markdown
 from constraint_geodesics.report.page import Picture, write_page
@@ -60,6 +61,8 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
         (reports / "manifolds.md").write_text(manifolds_markdown(params, layout))
     if "charts" in studies:
         (reports / "charts.md").write_text(charts_markdown(params, layout))
+    if "demonstrations" in studies:
+        (reports / "demonstrations.md").write_text(demonstrations_markdown(params, layout))
     pictures, described = ([save_figure(layout, one) for one in own] for own in (drawn, cards))
     ablated = [picture for picture in pictures if picture.name == ABLATION]
     others = [picture for picture in pictures if picture.name != ABLATION]

@@ -159,6 +159,7 @@ def studies_at_hand(params: Params, layout: Layout) -> frozenset[str]:
         "arms": [layout.root / "reports" / "arms.json"],
         "manifolds": [layout.root / "reports" / "compare_manifolds.json"],
         "charts": [layout.root / "reports" / "compare_charts.json"],
+        "demonstrations": [layout.root / "reports" / "demonstrations.json"],
     }
     return frozenset(n for n, own in files.items() if all(file.is_file() for file in own))
 

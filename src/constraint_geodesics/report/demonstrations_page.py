@@ -1,0 +1,157 @@
+"""Constraints from demonstrations whose formula is hidden: the tables of reports/demonstrations.md
+and what they say, from reports/demonstrations.json.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.report.cells import Cells, fixed, markdown_table, share, short
+from constraint_geodesics.report.results import read_metrics
+from constraint_geodesics.studies.demonstrations import (
+    FORMULA,
+    IDENTIFIED,
+    NEAREST,
+    PEERS,
+    TANGENTS,
+    WITHIN,
+)
+
+Figures = Mapping[str, Any]
+
+
+def demonstrations_markdown(params: Params, layout: Layout) -> str:
+    """Tables and sentences, as Markdown."""
+    found, own = (
+        read_metrics(layout.root / "reports" / "demonstrations.json"),
+        params.demonstrations,
+    )
+    given = (
+        f"Each task's formula is hidden from `identify`, which is given demonstrations of it: "
+        f"motions with a person's smooth error, or independent rows with noise of each joint, all "
+        f"free of collision by PyBullet. {own.pairs} pairs of configurations that keep to the "
+        f"formula, and that the formula's planner joins, are asked for in each of "
+        f"{len(own.seeds)} draws; peers, whose paths meet the workcell or not, are asked for "
+        f"{own.peer_pairs} of them. The worst violation of the formula along each path is taken: "
+        f"medians over the paths, 95th percentiles behind them. Length is over the path of the "
+        f"formula's planner. Times include the projection of the ends and the certificate, not the "
+        f"graph of a new constraint, which is drawn once."
+    )
+    peers = (
+        f"*{TANGENTS}* is told the rank, and takes the number of neighbours that is best on rows "
+        f"left out; *{NEAREST}* is the shortest way over a graph of the rows."
+    )
+    parts = [
+        "# Constraints from demonstrations",
+        " ".join(_sentences(found)),
+        given,
+        markdown_table(_identified_rows(found["cells"])),
+        peers,
+        markdown_table(_peer_rows(found["cells"])),
+        markdown_table(_hole_rows(found["cells"])),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _cells(cells: Figures) -> Iterator[tuple[str, str, Figures]]:
+    for task, cases in cells.items():
+        for case, methods in cases.items():
+            yield task, case, methods
+
+
+def _sentences(found: Figures) -> Iterator[str]:
+    ranks, free = found["ranks"], found["free_motion"]
+    yield (
+        f"Of {ranks['cells']} draws the rank is right in {share(ranks['right'], 1)}, right or less "
+        f"with a word on what is missing in {share(ranks['right_or_refused'], 1)}; more than the "
+        f"formula holds was found in {ranks['too_many']}."
+    )
+    nothing = sum(row["codim"] == 0 for row in free)
+    robots = len({row["robot"] for row in free})
+    yield f"In free motion of {robots} arms nothing is found in {nothing} of {len(free)} draws."
+    better, compared = 0, 0
+    for _, _, methods in _cells(found["cells"]):
+        own = methods.get(IDENTIFIED)
+        peers = [methods[name] for name in PEERS if methods.get(name, {}).get("solved")]
+        if own is None or not own["solved"]:
+            continue
+        for unit in ("deg", "mm"):
+            best = min((peer[unit] for peer in peers if unit in peer), default=None)
+            if best is not None and max(best, own.get(unit, 0.0)) > 1e-6:
+                compared += 1
+                better += own[unit] <= best
+    yield (
+        f"The identified constraint's median violation is at most that of the best peer in "
+        f"{better} of {compared} comparisons."
+    )
+
+
+def _identified_rows(cells: Figures) -> Cells:
+    rows: Cells = [
+        (
+            *("task", "shown", "violation [°]", "p95", "worst draw"),
+            *("violation [mm]", "p95", "worst draw"),
+            *(
+                "length",
+                "pairs joined",
+                "identify [s]",
+                "plan [ms]",
+                "p95",
+                "formula's [ms]",
+                "p95",
+            ),
+        )
+    ]
+    for task, case, methods in _cells(cells):
+        own, formula = methods.get(IDENTIFIED), methods[FORMULA]
+        if own is None:
+            rows.append((task, case, "nothing identified", *[""] * 10, *_times(formula)))
+            continue
+        found = [_off(own, f"{unit}{kind}") for unit in ("deg", "mm") for kind in KINDS]
+        ratio, joined = fixed(own["ratio_median"], 4), share(own["solved"], 1)
+        seconds = short(own["identify_s"])
+        rows.append((task, case, *found, ratio, joined, seconds, *_times(own), *_times(formula)))
+    return rows
+
+
+KINDS = ("", "_p95", "_worst_seed")
+
+
+def _off(own: Figures, name: str) -> str:
+    value = own.get(name)
+    return "–" if value is None else "0" if value < 5e-6 else f"{value:.2g}"
+
+
+def _times(own: Figures) -> tuple[str, str]:
+    return short(own["ms_median"]), short(own["ms_p95"])
+
+
+def _peer_rows(cells: Figures) -> Cells:
+    names = (IDENTIFIED, *PEERS)
+    header = [own for name in names for own in (f"{name} [° / mm]", "length", "joined")]
+    rows: Cells = [("task", "shown", *header)]
+    for task, case, methods in _cells(cells):
+        row = [task, case]
+        for name in names:
+            own = methods.get(name)
+            if own is None:
+                row += ["–", "–", "–"]
+                continue
+            off = f"{_off(own, 'deg')} / {_off(own, 'mm')}"
+            row += [off, fixed(own["ratio_median"], 3), share(own["solved"])]
+        rows.append(tuple(row))
+    return rows
+
+
+def _hole_rows(cells: Figures) -> Cells:
+    rows: Cells = [("into a hole of 40 mm", "depth [mm]", "p95", "violation [mm]", "joined", "ms")]
+    for _, _, methods in _cells({"hole": cells.get("hole", {})}):
+        for name in (FORMULA, IDENTIFIED, WITHIN, *PEERS):
+            own = methods.get(name)
+            if own is None or own.get("depth_mm") is None:
+                continue
+            depth = fixed(own["depth_mm"], 1), fixed(own["depth_mm_p95"], 1)
+            joined, ms = share(own["solved"]), short(own["ms_median"])
+            rows.append((name, *depth, _off(own, "mm"), joined, ms))
+    return rows
