@@ -12,8 +12,10 @@ from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.report.demonstrations_figure import demonstrations_figure
 from constraint_geodesics.studies.demonstrations import (
     cells_of,
+    example,
     free_arms,
     free_motion,
     measure,
@@ -26,7 +28,7 @@ STAGE = "benchmark_demonstrations"
 
 
 def main(params: Params, layout: Layout) -> None:
-    """Write reports/demonstrations.csv.gz and demonstrations.json."""
+    """Write reports/demonstrations.csv.gz, demonstrations.json and figures/demonstrations.png."""
     own, reports = params.demonstrations, layout.root / "reports"
     with tracked_stage(Work(STAGE, STAGE, own, []), params.tracking.experiment, layout.root) as run:
         cells = cells_of(params, layout)
@@ -44,6 +46,9 @@ def main(params: Params, layout: Layout) -> None:
             "free_motion": free_motion(free_arms(), own.seeds),
             "machine": machine(),
         }
+        picture = reports / "figures" / "demonstrations.png"
+        picture.parent.mkdir(exist_ok=True)
+        demonstrations_figure(example(params, layout)).savefig(picture, dpi=110)
         run.report(figures, reports / "demonstrations.json")
         for cell in cells:  # finished: the next run of this stage starts from nothing
             shutil.rmtree(cell.kept.parent, ignore_errors=True)

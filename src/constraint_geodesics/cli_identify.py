@@ -47,6 +47,10 @@ def identify_constraint(
             "--where-shown", help="Also keep the tip in the region where demonstrations were."
         ),
     ] = False,
+    record: Annotated[
+        Path | None,
+        typer.Option(help="Write a Rerun recording of demonstrations and identified set here."),
+    ] = None,
     planner: Source = None,
     urdf: Urdf = None,
     tool_link: ToolLink = None,
@@ -62,24 +66,40 @@ def identify_constraint(
 
     from constraint_geodesics.bundle import BundleError
     from constraint_geodesics.constraints.constraint import ConstraintError
-    from constraint_geodesics.identification.demonstrations import DemonstrationError
+    from constraint_geodesics.extras import require
+    from constraint_geodesics.identification.demonstrations import (
+        DemonstrationError,
+        demonstrations_from,
+    )
     from constraint_geodesics.identification.files import save_constraint
     from constraint_geodesics.identification.identify import identify, with_tolerance
     from constraint_geodesics.planner import PlannerError
     from constraint_geodesics.robot.kinematics import RobotError
 
+    if record is not None:
+        require("record")
     try:
+        if where_shown and out is None:
+            raise PlannerError("--where-shown is of the file that --out names: give it, too")
         if not 0.0 <= loosely < math.inf:
             raise PlannerError(f"--loosely {loosely}: must be 0 or more, and finite")
         with loading(), Arm(planner, urdf, tool_link, tool_pose, hold, srdf).open() as loaded:
             found = identify(demonstrations, loaded.robot)
+            robot, workcell = loaded.robot, loaded.scene.workcell
         if found.constraint is not None and loosely > 0.0:
             found = replace(found, constraint=with_tolerance(found.constraint, loosely))
         if out is not None and found.constraint is not None:
             save_constraint(found, out, where_shown)
+        if record is not None:
+            from constraint_geodesics.recording.demonstrations import record_demonstrations
+
+            shown, _ = demonstrations_from(demonstrations, robot)
+            record_demonstrations(record, shown, found, robot, workcell)
     except (BundleError, ConstraintError, DemonstrationError, PlannerError, RobotError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
     print(json.dumps(found.summary()) if as_json else found.explanation)
     if out is not None and found.constraint is not None:
         print(f"written: {out}", file=sys.stderr)
+    if record is not None:
+        print(f"written: {record}", file=sys.stderr)
     raise SystemExit(0 if found.constraint is not None else NO_PATH)

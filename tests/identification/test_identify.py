@@ -102,6 +102,27 @@ def test_free_motion_identifies_nothing(xarm, kuka) -> None:
         assert found.codim == 0
 
 
+def test_motions_that_hardly_differ_keep_to_nothing(xarm, kuka) -> None:
+    """Free motions from one place to another: what is the same in all is no relation."""
+    rng, t = np.random.default_rng(1), np.linspace(0.0, 1.0, 60)[:, None]
+    for robot in (xarm, kuka):
+        first, last = 0.4 * robot.sample(2, rng)
+        for scatter in (0.01, 0.03, 0.06):
+            for count in (3, 10):
+                noise = rng.normal(size=(2, count, 1, robot.dof))
+                shown = first + t * (last - first) + scatter * (noise[0] + np.sin(3 * t) * noise[1])
+                found = identify(shown, robot)
+                assert found.constraint is None, found.explanation
+                assert "show more demonstrations" in found.missing or "free" in found.missing
+
+
+def test_singular_configurations_are_no_error(kuka) -> None:
+    """Demonstrations that begin stretched out, where the Jacobian is singular."""
+    rng, t = np.random.default_rng(0), np.linspace(0.0, 1.0, 60)[:, None]
+    shown = [t * 0.7 * kuka.sample(1, rng)[0] for _ in range(8)]
+    assert isinstance(identify(shown, kuka).explanation, str)
+
+
 def test_too_few_demonstrations_ask_for_more(xarm) -> None:
     shown = demonstrations("cup", xarm, 1)
     for one in (identify(shown, xarm), identify(shown[0], xarm)):

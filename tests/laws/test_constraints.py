@@ -451,14 +451,23 @@ def test_params_name_a_factory(kuka) -> None:
 
 FILES = {
     "Pose": {"params.py", "constraints/constraint.py", "constraints/pose.py"},
-    "Functions": {"params.py", "constraints/functions.py", "kernel_jobs.py"},
+    "Functions": {
+        "params.py",
+        "constraints/functions.py",
+        "kernel_jobs.py",
+        "studies/hidden_tasks.py",
+    },
     "Polynomial": {
         "constraints/polynomial.py",
         *(f"identification/{name}.py" for name in ("forms", "identify", "vanishing")),
+        "studies/hidden_tasks.py",
     },
     "Spline": {
         "constraints/spline.py",
-        *(f"identification/{name}.py" for name in ("freeform", "identify", "kernels", "vanishing")),
+        *(f"identification/{name}.py" for name in ("freeform", "identify", "kernels")),
+        *(f"identification/{name}.py" for name in ("support", "vanishing")),
+        "studies/demonstrations.py",
+        "report/demonstrations_figure.py",
     },
 }
 """Where the class of a kind, its arrays and its record may be named; the warm-up compiles what

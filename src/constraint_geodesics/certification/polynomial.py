@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.certification import kernels
+from constraint_geodesics.certification.certificate import CertificationError
 from constraint_geodesics.certification.chain import Chain
 from constraint_geodesics.certification.kept import Asked, Kept
 from constraint_geodesics.certification.pieces import SHARE, cut, kept_on
@@ -38,6 +39,8 @@ def _bounds(
 ) -> tuple[Float[np.ndarray, "S m"], Float[np.ndarray, "S-1 m"]]:
     """Residuals at stations, and K/8 of the pieces between them."""
     if joint is not None:  # its origin is the tip of the chain before it
+        if joint >= len(chain.prismatic):
+            raise CertificationError(f"joint {joint} of the constraint: the arm has no such joint")
         ends = slice(joint + 1)
         chain = Chain(
             chain.turns[ends], chain.offsets[ends], chain.prismatic[:joint], chain.lengths[ends]

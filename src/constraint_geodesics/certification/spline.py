@@ -152,7 +152,8 @@ def _bounds(
             most = most + (bent * first**2 + steep * second) * (np.abs(rho[:-1]) + moved)
             most = most + 2.0 * steep * first * moved + size * twice
         values.append(value)
-        added.append(0.125 * most)
+        # beyond a domain: an infinite bound times a step of nothing is none
+        added.append(np.where(np.isnan(most), np.inf, 0.125 * most))
     return np.stack(values, axis=1), np.stack(added, axis=1)
 
 

@@ -210,6 +210,8 @@ class PolynomialConstraint(Constraint):
         )
         joint = about.get("joint")
         joint = None if joint is None else int(joint)
+        if joint is not None and robot is not None and joint >= robot.dof:
+            raise ConstraintError(f"joint = {joint}: the arm has {robot.dof} joints")
         return cls(relations, tuple(float(x) for x in about["left_out"]), joint)
 
 

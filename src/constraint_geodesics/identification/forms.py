@@ -262,6 +262,7 @@ CENTRE = Form(_centre_start, _centre_relations)
 SPHERE = Form(_sphere_start, _sphere_relations)
 CYLINDER = Form(_cylinder_start, _cylinder_relations)
 POSITION, TURNED, POSE, QUADRIC = "position", "orientation", "pose", "position's quadrics"
+PRODUCT = "position times its orientation"
 
 
 def named(features: str, rank: int, known: tuple[AnyRelation, ...]) -> Iterator[Form]:

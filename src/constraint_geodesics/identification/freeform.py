@@ -27,6 +27,8 @@ from constraint_geodesics.identification.vanishing import Sample, better_rms
 
 CELLS, COARSE = 16, 8
 """Of the grid along the longest side of where the rows are: of heights, and of axes that turn."""
+FACING = 0.995
+"""Share of the rows that must be on a side for it to be the one that is shown."""
 WRONG, LEAST_WRONG_RAD = 5.0, 1e-4
 """Rows that are further off than so many times the median are wrong: they don't count."""
 MARGIN = 1.0
@@ -34,7 +36,8 @@ MARGIN = 1.0
 DEGREE, PENALISED = 5, 3
 SMOOTHINGS = 10.0 ** np.arange(-11, 2, 2)
 """Weights of the penalty that are tried, as shares of what makes it weigh as much as the rows."""
-RIDGE = 1e-14
+RIDGE, FLAT = 1e-14, 1e-9
+"""Added to the normal equations, and to J Jᵀ, as shares of their traces."""
 CAREFULLY, SCREENED = 4000, 1000
 """Rows at most that a fit is done again on, and that axes are looked for among."""
 HOPELESS_RAD = 0.1
@@ -47,21 +50,23 @@ Relations = tuple[SplineRelation, ...]
 class Model(NamedTuple):
     """relations: the rows that splines (one for each of `splines`) and a tool axis make.
     axis: the tool axis to begin with, None where no row has one.  grid: a spline whose coefficients
-    don't matter.
+    don't matter.  faces: directions, and tool axes that are within 90° of them.
     """
 
     relations: Callable[[Sequence[Spline], np.ndarray], Relations]
     splines: int
     grid: Spline
     axis: Float[np.ndarray, "3"] | None
+    faces: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
 
 
 @dataclass(frozen=True)
 class Freeform:
     """A model fitted: its relations and what the fit needs to be done again on fewer rows.
 
-    found_rad, left_out_rad: the rms distance of the rows along each direction that is held, on
-    those that it was fitted to and on those that were left out.
+    found_rad, left_out_rad, worst_fold_rad: the rms distance of the rows along each direction that
+    is held, on those that it was fitted to, on those that were left out, and of the worst part of
+    these.  rotation: the rows' tool frames.
     """
 
     model: Model
@@ -70,16 +75,24 @@ class Freeform:
     smoothing: float
     found_rad: float
     left_out_rad: float
+    worst_fold_rad: float
     side: float
+    rotation: Float[np.ndarray, "n 3 3"]
 
     @property
     def sides(self) -> Relations:
-        """The side of the surface that the tool is on, for the opposite one has the same zeros."""
-        if self.model.axis is None:
-            return ()
-        main = np.sign(self.side) * self.model.grid.frame[2]
+        """The sides that the tool's axes are on, for the opposite ones have the same zeros: where
+        one side alone is shown.
+        """
+        own = self.model.faces
+        if self.model.axis is not None:
+            own = ((np.sign(self.side) * self.model.grid.frame[2], self.axis),)
         words = self.relations[0].name
-        return (SplineRelation(words, "rad", 1.0, -of_axis(main, self.axis), None, 1.0),)
+        return tuple(
+            SplineRelation(words, "rad", 1.0, -of_axis(main, body), None, 1.0)
+            for main, body in own
+            if ((self.rotation @ body) @ main > 0.0).mean() >= FACING
+        )
 
     @property
     def relations(self) -> Relations:
@@ -150,9 +163,10 @@ def fitted(
     each = np.sqrt(len(relations))
     found_rad = better_rms(_distances(relations, y, to_joints)) / each
     side = float(((sample.rotation @ axis) @ model.grid.frame[2]).mean())
-    return Freeform(
-        model, found, axis, float(smoothing), found_rad, better_rms(left_out) / each, side
-    )
+    on_others = better_rms(left_out) / each
+    worst = max((better_rms(left_out[out]) / each for out in folds), default=np.inf)
+    fit = model, found, axis, float(smoothing), found_rad, on_others, worst, side
+    return Freeform(*fit, sample.rotation)
 
 
 def _unknowns(
@@ -243,7 +257,8 @@ def turning(
             found.append(SplineRelation(words, "rad", 0.0, of_axis(out, body), term))
         return tuple(found)
 
-    return Model(relations, len(rows), grid, None)
+    faces = tuple((main, body) for _, body, main, _ in rows[::2])
+    return Model(relations, len(rows), grid, None, faces)
 
 
 def plane_grid(sample: Sample, normal: Float[np.ndarray, "3"]) -> Spline:
@@ -382,10 +397,16 @@ def _onto(
     there = y + np.einsum("nad,nd->na", to_joints, moved)
     off, slopes = _residuals(relations, there, to_joints)
     off = off - np.einsum("nkd,nd->nk", slopes, moved)
-    squares = slopes @ slopes.transpose(0, 2, 1)
-    weights = np.linalg.solve(squares, off[:, :, None])
+    weights = np.linalg.solve(_squares(slopes), off[:, :, None])
     found: np.ndarray = -(slopes.transpose(0, 2, 1) @ weights)[:, :, 0]
     return found
+
+
+def _squares(slopes: Float[np.ndarray, "n k D"]) -> Float[np.ndarray, "n k k"]:
+    """J Jᵀ, which may be singular at a row, and a little."""
+    found: np.ndarray = slopes @ slopes.transpose(0, 2, 1)
+    ridge = FLAT * np.trace(found, axis1=1, axis2=2) + 1e-300
+    return found + ridge[:, None, None] * np.eye(found.shape[1])
 
 
 def _distances(
@@ -427,7 +448,7 @@ def _system(
     splines = _splines(model, coefficients)
     relations = model.relations(splines, axis)
     values, slopes = _residuals(relations, there, to_joints)
-    factor = np.linalg.cholesky(slopes @ slopes.transpose(0, 2, 1))
+    factor = np.linalg.cholesky(_squares(slopes))
     count, rows = values.shape
     omega = np.zeros((count, rows, model.splines, 4))
     target = np.einsum("nkd,nd->nk", slopes, moved)

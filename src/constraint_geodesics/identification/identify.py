@@ -22,7 +22,15 @@ from constraint_geodesics.constraints.spline import Spline, SplineConstraint, Sp
 from constraint_geodesics.constraints.tool_features import FEATURES
 from constraint_geodesics.identification import freeform
 from constraint_geodesics.identification.demonstrations import demonstrations_from
-from constraint_geodesics.identification.forms import POSE, POSITION, QUADRIC, TURNED, Form, named
+from constraint_geodesics.identification.forms import (
+    POSE,
+    POSITION,
+    PRODUCT,
+    QUADRIC,
+    TURNED,
+    Form,
+    named,
+)
 from constraint_geodesics.identification.support import Support, support_of
 from constraint_geodesics.identification.vanishing import (
     APART,
@@ -44,6 +52,8 @@ SURELY_RAD = 6e-3
 """Freeform relations hold where left-out demonstrations are no further off: there are gaps between
 demonstrations, and what has no formula is less sure there.
 """
+WORST_FOLD_RAD = 0.05
+"""And not by more in any part of them."""
 WORTH = 0.8
 """What is freeform takes a formula's place where left-out demonstrations are nearer by this."""
 WORSE, FINE_RAD = 1.25, 2e-5
@@ -51,12 +61,18 @@ WORSE, FINE_RAD = 1.25, 2e-5
 WRONG, LEAST_WRONG_RAD = 5.0, 1e-4
 """Rows that are further off than so many times the median are wrong, and left out."""
 ROUNDS = 4
+VARIED, FAR, VARIED_RAD = 5.0, 25.0, 1e-3
+"""Demonstrations vary in every direction that is left free by so many times the rows' distance from
+the relations, in their farthest by so many times, and by so much [rad].
+"""
 SAME_M = 1e-9
 """Joints whose origins are no further apart have the same place."""
 _COLUMNS = {POSITION: np.arange(3), TURNED: np.arange(3, 12), POSE: np.arange(12)}
 _SCALE = np.array([METRES] * 3 + [1.0] * 9)
 _FIRST, _SECOND = np.triu_indices(3)
 _ONES = np.ones((1, FEATURES))
+TIP = "the tool's tip"
+"""Whose place relations are of, in words."""
 
 Found = Callable[[Sample], tuple[AnyRelation, ...]]
 """Relations as they are found on rows."""
@@ -163,6 +179,7 @@ def identify(demonstrations: Any, robot: SerialRobot) -> Identified:
         kept, search = near, _searched(sample[near])
     if not search.relations and search.folds:
         search = _of_joints(search, sample, robot, np.concatenate(shown))
+    search = _varied(search, np.concatenate(shown))
     return _told(search, robot, len(shown), len(sample) - len(search.sample))
 
 
@@ -234,7 +251,29 @@ def _searched(sample: Sample) -> _Search:
     search.best_rad = min((float(own[0]) for own in least if len(own)), default=np.inf)
     for name in names:
         _look(search, name)
-    return _with_freeform(search) if search.folds else search
+    search = _with_freeform(search) if search.folds else search
+    _look(search, PRODUCT)
+    return search
+
+
+def _varied(search: _Search, q: Float[np.ndarray, "n D"]) -> _Search:
+    """Nothing of what was found, where demonstrations hardly differ in what it leaves free: then
+    it is a lack of variation and no relation.
+    """
+    if not search.relations:
+        return search
+    count = len(search.relations)
+    noise = better_rms(search.sample.distances(search.relations)) / np.sqrt(count)
+    spreads = np.linalg.svd(q - np.median(q, axis=0), compute_uv=False) / np.sqrt(len(q))
+    free = max(q.shape[1] - count, 1)
+    least = spreads[min(free, len(spreads)) - 1]
+    if least >= max(VARIED * noise, VARIED_RAD) and spreads[0] >= FAR * noise:
+        return search
+    missing = (
+        f"what seems to be held varies by {noise:.2g} rad, and what seems to be free by only "
+        f"{least:.2g} to {spreads[0]:.2g}: show more demonstrations that differ from each other"
+    )
+    return _Search(search.sample, search.folds, missing=[missing])
 
 
 def _of_joints(
@@ -263,8 +302,15 @@ def _features(sample: Sample, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Features of order 1 and their gradients."""
     y, slopes = sample.pose
     y, slopes = y / _SCALE, slopes / _SCALE[:, None]
-    if name != QUADRIC:
+    if name in _COLUMNS:
         return y[:, _COLUMNS[name]], slopes[:, _COLUMNS[name]]
+    if name == PRODUCT:
+        p, turned = y[:, :3], y[:, 3:]
+        products = (p[:, :, None] * turned[:, None]).reshape(len(y), -1)
+        moved = p[:, :, None, None] * slopes[:, None, 3:]
+        moved = moved + turned[:, None, :, None] * slopes[:, :3, None]
+        moved = moved.reshape(len(y), -1, slopes.shape[2])
+        return np.hstack([y, products]), np.concatenate([slopes, moved], axis=1)
     p, own = y[:, :3] - y[:, :3].mean(axis=0), slopes[:, :3]
     steep = p[:, _FIRST, None] * own[:, _SECOND] + p[:, _SECOND, None] * own[:, _FIRST]
     return np.hstack([p, p[:, _FIRST] * p[:, _SECOND]]), np.concatenate([own, steep], axis=1)
@@ -424,7 +470,7 @@ def _better(
     """A richer model where left-out demonstrations support it, else what is found already."""
     own = freeform.fitted(model, search.sample, search.folds)
     enough = max(most_rad(min(search.best_rad, own.found_rad)), SURELY_RAD)
-    if own.left_out_rad <= enough:
+    if own.left_out_rad <= enough and own.worst_fold_rad <= WORST_FOLD_RAD:
         return own
     if own.found_rad <= 0.5 * min(own.left_out_rad, enough):
         search.missing.append(
@@ -459,11 +505,16 @@ def _generic(name: str, weights: np.ndarray, sample: Sample) -> tuple[AnyRelatio
             for i, j, value in zip(_FIRST, _SECOND, w[3:] / METRES**2, strict=True):
                 full[i, j] += value
                 full[j, i] += value
+        elif name == PRODUCT:
+            linear[:] = w[:12]
+            product = w[12:].reshape(3, 9) / METRES
+            full[:3, 3:], full[3:, :3] = product, product.T
         else:
             linear[_COLUMNS[name]] = w
         count = "a relation" if weights.shape[1] == 1 else f"{weights.shape[1]} relations"
         words = f"{count} of the tool's {name} without a name"
-        own = Relation(words, "rad", 0.0, linear / _SCALE - full @ middle, full)
+        centred = middle if name == QUADRIC else np.zeros(FEATURES)
+        own = Relation(words, "rad", 0.0, linear / _SCALE - full @ centred, full)
         relations.append(replace(own, constant=-float(own.values(y).mean())))
     return tuple(relations)
 
@@ -488,11 +539,14 @@ def _told(search: _Search, robot: SerialRobot, demonstrations: int, dropped: int
         missing = missing or "the demonstrations keep to no relation, the motion is free"
         return Identified(None, (), 0, np.nan, (), missing, *counts, whose)
     left_out = _left_out(search)
-    worst: dict[tuple[str, str], float] = {}
+    worst: dict[str, dict[str, float]] = {}
     for own, value in zip(search.relations, left_out.tolist(), strict=True):
-        key = own.name, own.unit
-        worst[key] = max(worst.get(key, 0.0), value)
-    told = tuple(f"{name} (± {_amount(unit, value)})" for (name, unit), value in worst.items())
+        by_unit = worst.setdefault(own.name, {})
+        by_unit[own.unit] = max(by_unit.get(own.unit, 0.0), value)
+    told = tuple(
+        f"{name} (± {', '.join(_amount(unit, value) for unit, value in by_unit.items())})"
+        for name, by_unit in worst.items()
+    )
     noise = search.sample.distances(search.relations)
     noise_rad = float(np.sqrt((noise**2).mean() / len(search.relations)))
     # a side is no relation that is missed: it only tells two sets of the same zeros apart
@@ -502,8 +556,11 @@ def _told(search: _Search, robot: SerialRobot, demonstrations: int, dropped: int
         region = support_of(search.sample, search.relations, search.folds)
     else:
         origin = f"the origin of {robot.joint_names[search.joint]}"
-        told = tuple(words.replace("the tool's tip", origin) for words in told)
-    constraint, about = _constraint((*search.relations, *search.sides), about, search.joint)
+        told = tuple(words.replace(TIP, origin) for words in told)
+    rows = (*search.relations, *search.sides)
+    if search.joint is not None:
+        rows = tuple(replace(own, name=own.name.replace(TIP, origin)) for own in rows)
+    constraint, about = _constraint(rows, about, search.joint)
     codim = len(search.relations)
     return Identified(constraint, told, codim, noise_rad, about, missing, *counts, whose, region)
 

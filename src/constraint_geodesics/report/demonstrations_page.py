@@ -31,7 +31,8 @@ def demonstrations_markdown(params: Params, layout: Layout) -> str:
         f"Each task's formula is hidden from `identify`, which is given demonstrations of it: "
         f"motions with a person's smooth error, or independent rows with noise of each joint, all "
         f"free of collision by PyBullet. {own.pairs} pairs of configurations that keep to the "
-        f"formula, and that the formula's planner joins, are asked for in each of "
+        f"formula, and that the formula's planner joins by a path in the region that is shown, or "
+        f"through the hole of that task, are asked for in each of "
         f"{len(own.seeds)} draws; peers, whose paths meet the workcell or not, are asked for "
         f"{own.peer_pairs} of them. The worst violation of the formula along each path is taken: "
         f"medians over the paths, 95th percentiles behind them. Length is over the path of the "
@@ -39,8 +40,10 @@ def demonstrations_markdown(params: Params, layout: Layout) -> str:
         f"graph of a new constraint, which is drawn once."
     )
     peers = (
-        f"*{TANGENTS}* is told the rank, and takes the number of neighbours that is best on rows "
-        f"left out; *{NEAREST}* is the shortest way over a graph of the rows."
+        f"*{TANGENTS}* are planes or quadrics through the nearest rows; they are told the rank, "
+        f"and take the number of neighbours and the degree that are best on demonstrations left "
+        f"out. *{NEAREST}* is the shortest way over a graph of the rows, in which each is joined "
+        f"to rows of other demonstrations, too."
     )
     parts = [
         "# Constraints from demonstrations",
@@ -74,13 +77,12 @@ def _sentences(found: Figures) -> Iterator[str]:
     for _, _, methods in _cells(found["cells"]):
         own = methods.get(IDENTIFIED)
         peers = [methods[name] for name in PEERS if methods.get(name, {}).get("solved")]
-        if own is None or not own["solved"]:
-            continue
         for unit in ("deg", "mm"):
             best = min((peer[unit] for peer in peers if unit in peer), default=None)
-            if best is not None and max(best, own.get(unit, 0.0)) > 1e-6:
+            mine = None if own is None else own.get(unit)
+            if best is not None and max(best, mine or 0.0) > 1e-6:
                 compared += 1
-                better += own[unit] <= best
+                better += mine is not None and mine <= best
     yield (
         f"The identified constraint's median violation is at most that of the best peer in "
         f"{better} of {compared} comparisons."
@@ -105,7 +107,7 @@ def _identified_rows(cells: Figures) -> Cells:
     ]
     for task, case, methods in _cells(cells):
         own, formula = methods.get(IDENTIFIED), methods[FORMULA]
-        if own is None:
+        if own is None or not own["solved"]:
             rows.append((task, case, "nothing identified", *[""] * 10, *_times(formula)))
             continue
         found = [_off(own, f"{unit}{kind}") for unit in ("deg", "mm") for kind in KINDS]

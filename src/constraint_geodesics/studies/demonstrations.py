@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from constraint_geodesics.constraints.spline import Spline, SplineConstraint
 from constraint_geodesics.identification import Identified, identify
 from constraint_geodesics.params import DemonstrationsParams, Params
 from constraint_geodesics.pipeline.layout import Layout
@@ -24,10 +25,11 @@ from constraint_geodesics.studies.hidden_tasks import HOLE, HOLE_M, TASKS, Hidde
 from constraint_geodesics.studies.local_models import NearestRows, PoseTangents
 
 FORMULA, IDENTIFIED, WITHIN = "formula", "identified", "identified, where shown"
-TANGENTS, NEAREST = "local PCA on poses", "nearest rows"
+TANGENTS, NEAREST = "local models of poses", "nearest rows"
 PEERS = (TANGENTS, NEAREST)
 APART_RAD = (0.4, 2.5)
 """How far apart the ends of a query are."""
+TRIES, SCATTER_RAD = 400, 0.05
 LEAST_MM = 15.0
 """How deep into the hole the formula's path goes, of the queries of that task."""
 Columns = dict[str, Any]
@@ -123,7 +125,7 @@ def _rows(cell: Cell) -> Iterator[Columns]:
     about = {
         "codim": found.codim,
         "hidden_codim": task.manifold(scene.robot).codim,
-        "missing": bool(found.missing),
+        "asked_for_more": "show more" in found.missing or "further off" in found.missing,
         "identify_s": seconds,
         "noise_rad": found.noise_rad,
     }
@@ -146,25 +148,41 @@ def _rows(cell: Cell) -> Iterator[Columns]:
 def _pairs(
     cell: Cell, task: HiddenTask, planner: Planner
 ) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """Queries that the formula's planner solves, and the lengths of its paths [rad]."""
+    """Queries that the formula's planner solves within the region that is shown, or through the
+    hole, and the lengths of its paths [rad].
+    """
     rng = np.random.default_rng(9000 + cell.seed)
-    ends = task.draw(planner.scene, 400, 9000 + cell.seed)
+    ends = task.draw(planner.scene, 1500, 9000 + cell.seed)
     own, found = task.manifold(planner.robot).constraint, []
-    for _ in range(40 * cell.settings.pairs):
+    for _ in range(TRIES * cell.settings.pairs):
         start = ends[rng.integers(len(ends))]
         away = np.linalg.norm(ends - start, axis=1)
         near = np.flatnonzero((away > APART_RAD[0]) & (away < APART_RAD[1]))
         if not len(near):
             continue
         goal = ends[near[rng.integers(len(near))]]
+        if cell.task == "hole" and not _across(planner.robot, start, goal):
+            continue
         path = planner.plan(start, goal, own)
         if path.status != "solved":
             continue
-        if cell.task != "hole" or _depth_mm(planner.robot, path.joints) > LEAST_MM:
+        if cell.task == "hole":
+            good = _depth_mm(planner.robot, path.joints) > LEAST_MM
+        else:  # demonstrations say nothing of where there were none
+            good = bool(task.shown(*planner.robot.forward(path.joints)).all())
+        if good:
             found.append((start, goal, _length(path.joints)))
         if len(found) == cell.settings.pairs:
             break
     return found
+
+
+def _across(robot: SerialRobot, start: np.ndarray, goal: np.ndarray) -> bool:
+    """Whether the hole lies between two places of the tip."""
+    first, last = robot.forward(np.stack([start, goal]))[0]
+    t = np.linspace(0.0, 1.0, 50)[:, None]
+    away = np.linalg.norm(first + t * (last - first) - HOLE, axis=1)
+    return bool(away.min() < HOLE_M - LEAST_MM / 1e3)
 
 
 def _depth_mm(robot: SerialRobot, path: np.ndarray) -> float:
@@ -182,15 +200,23 @@ def _methods(cell: Cell, found: Identified, shown: Any, planner: Planner) -> Map
     methods: dict[str, Answer] = {
         FORMULA: _planned(planner, TASKS[cell.task].manifold(planner.robot).constraint)
     }
+    methods[IDENTIFIED] = _nothing
     if found.constraint is not None:
         methods[IDENTIFIED] = _planned(planner, found.constraint)
         if cell.task == "hole" and found.supported is not None:
             methods[WITHIN] = _planned(planner, found.supported)
     rows = np.concatenate(shown) if isinstance(shown, list) else shown
     codim = TASKS[cell.task].manifold(planner.robot).codim
-    methods[TANGENTS] = PoseTangents(planner.robot, rows, codim).answer
-    methods[NEAREST] = NearestRows(rows).answer
+    lengths = [len(own) for own in shown] if isinstance(shown, list) else []
+    of = np.repeat(np.arange(len(lengths)), lengths) if lengths else np.arange(len(rows))
+    methods[TANGENTS] = PoseTangents(planner.robot, rows, of, codim).answer
+    methods[NEAREST] = NearestRows(rows, of).answer
     return methods
+
+
+def _nothing(start: np.ndarray, goal: np.ndarray) -> tuple[str, np.ndarray | None, float]:  # noqa: ARG001
+    """Where nothing was identified."""
+    return "not_identified", None, 0.0
 
 
 def _planned(planner: Planner, constraint: Any) -> Answer:
@@ -236,13 +262,32 @@ def free_arms() -> list[SerialRobot]:
 
 
 def free_motion(robots: Sequence[SerialRobot], seeds: Sequence[int]) -> list[Columns]:
-    """What is identified in motion that keeps to nothing."""
+    """What is identified in motion that keeps to nothing: in independent rows, in motions between
+    any ends, and in motions that are repeated with some scatter.
+    """
     rows = []
     for robot in robots:
         for seed in seeds:
-            found = identify(robot.sample(2000, np.random.default_rng(seed)), robot)
-            rows.append({"robot": robot.name, "seed": seed, "codim": found.codim})
+            rng = np.random.default_rng(seed)
+            ends = 0.5 * robot.sample(20, rng).reshape(10, 2, robot.dof)
+            again = ends[:1] + SCATTER_RAD * rng.normal(size=ends.shape)
+            shown = {
+                "rows": robot.sample(2000, rng),
+                "motions": [_swept(own[0], own[1], rng) for own in ends],
+                "repeated": [_swept(own[0], own[1], rng) for own in again],
+            }
+            for how, own in shown.items():
+                codim = identify(own, robot).codim
+                rows.append({"robot": robot.name, "seed": seed, "shown": how, "codim": codim})
     return rows
+
+
+def _swept(first: np.ndarray, last: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A motion between two configurations with smooth detours."""
+    t = np.linspace(0.0, 1.0, 60)[:, None]
+    waves = np.sin(np.pi * t * np.arange(1, 4)) @ rng.normal(size=(3, len(first)))
+    found: np.ndarray = first + t * (last - first) + SCATTER_RAD * waves
+    return found
 
 
 def summary(table: pd.DataFrame) -> dict[str, Any]:
@@ -278,7 +323,7 @@ def ranks(table: pd.DataFrame) -> dict[str, Any]:
     each = table.groupby(["task", "case", "seed"]).first().reset_index()
     made = each["task"].map(lambda name: TASKS[name].made_for)
     right = each["codim"] == each["hidden_codim"]
-    refused = (each["codim"] < each["hidden_codim"]) & each["missing"]
+    refused = (each["codim"] < each["hidden_codim"]) & each["asked_for_more"]
     wrong = each[~(right | refused)]
     return {
         "cells": len(each),
@@ -293,3 +338,46 @@ def ranks(table: pd.DataFrame) -> dict[str, Any]:
 def _quantile(values: pd.Series, share: float) -> float | None:
     own = values.dropna()
     return float(own.quantile(share)) if len(own) else None
+
+
+@dataclass(frozen=True)
+class Example:
+    """One draw of a surface to be looked at: demonstrated places [m], the identified surface, and a
+    path's places (T, 3) [m], tool axes (T, 3), and how far it is off the hidden formula.
+    """
+
+    title: str
+    shown: list[np.ndarray]
+    surface: Spline
+    path: Float[np.ndarray, "T 3"]
+    axes: Float[np.ndarray, "T 3"]
+    off_deg: Float[np.ndarray, "T"]
+    off_mm: Float[np.ndarray, "T"]
+
+
+def example(params: Params, layout: Layout) -> Example:
+    """The longest of some paths on the surface that forty demonstrations with a person's error keep
+    to.
+    """
+    name, case = "wavy surface", OF_SURFACES[-1]
+    task, scene = TASKS[name], Scene.from_params(params)
+    cell = Cell(params, layout, name, case, params.demonstrations.seeds[0])
+    shown = case.drawn(task, scene, 100 * cell.seed)
+    found = identify(shown, scene.robot)
+    constraint = found.constraint
+    if not isinstance(constraint, SplineConstraint):
+        raise ValueError(f"{name}, {case.name}: no surface was identified: {found.explanation}")
+    with Planner.load(layout.planner) as planner:
+        ask, paths = _planned(planner, constraint), []
+        for start, goal, _ in _pairs(cell, task, planner):
+            _, path, _ = ask(start, goal)
+            if path is not None and task.shown(*scene.robot.forward(path)).all():
+                paths.append(path)
+    path = max(paths, key=_length)
+    position, rotation = scene.robot.forward(path)
+    degrees, mm = task.missed(scene.robot, path)
+    title = (
+        f"{case.motions} demonstrations with an error of {case.noise_deg}° (grey), a planned path"
+    )
+    tips = [scene.robot.forward(rows)[0] for rows in shown]
+    return Example(title, tips, constraint.splines[0], position, rotation[:, :, 2], degrees, mm)

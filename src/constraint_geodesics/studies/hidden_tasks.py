@@ -189,8 +189,10 @@ def _by_position(*bounds: RowBound) -> Callable:
     return made
 
 
-STEEP = 30.0
-"""Bound of second derivatives that these tasks' reference stands on; generous [unit/rad²]."""
+STEEP = 100.0
+"""Bound of second derivatives of these tasks' residuals, generous, not proven: they are references
+alone, and paths are judged by the formula at their rows [unit/rad²].
+"""
 
 
 @_by_position(
@@ -222,6 +224,13 @@ def _looking_away(posture, out) -> None:  # type: ignore[no-untyped-def]
     out[0], out[1] = turned[0, 1], turned[1, 1]
     away = np.sqrt(p[0] * p[0] + p[1] * p[1]) + 1e-9
     out[2] = (p[0] * turned[1, 2] - p[1] * turned[0, 2]) / away
+
+
+@_by_position(RowBound("lean", "rad", STEEP))
+def _leaning(posture, out) -> None:  # type: ignore[no-untyped-def]
+    """The tool's z axis leans from straight down by an angle that grows with the tip's height."""
+    down = min(max(-posture.rotation[2, 2], -1.0), 1.0)
+    out[0] = np.arccos(down) - 0.6 - 1.5 * (posture.position[2] - 0.3)
 
 
 @_by_position(RowBound("hose", "m", STEEP))
@@ -276,6 +285,10 @@ def _above(p: np.ndarray, _: np.ndarray) -> np.ndarray:
     return np.asarray((p[:, 2] > TORUS_HEIGHT + 0.03) & (p[:, 0] > 0.0))
 
 
+def _between(p: np.ndarray, _: np.ndarray) -> np.ndarray:
+    return np.asarray((p[:, 2] > 0.05) & (p[:, 2] < 0.6))
+
+
 def _door(p: np.ndarray, turned: np.ndarray) -> np.ndarray:
     return _upright(p, turned) & (p[:, 1] < 0.30) & (p[:, 0] > 0.15)
 
@@ -297,7 +310,8 @@ TASKS = {
         HiddenTask("hole", _polynomial(*BOWL), _beside_hole, 1.3, off=_off_bowl),
         HiddenTask("hose at the elbow", _hose, _anywhere, 1.5),
         HiddenTask("torus", _torus, _above, 1.3, made_for=False),
-        HiddenTask("looking away", _looking_away, _upright, 1.3, made_for=False),
+        HiddenTask("looking away", _looking_away, _upright, 1.3),
+        HiddenTask("leaning with height", _leaning, _between, 1.3, made_for=False),
     )
 }
 """All tasks, by name."""

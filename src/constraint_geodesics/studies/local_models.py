@@ -1,11 +1,11 @@
-"""Baselines that keep rows of demonstrations instead of a constraint: tangent planes of the rows'
+"""Baselines that keep rows of demonstrations instead of a constraint: local models of the rows'
 tool poses, and a graph of the rows.
 """
 
 import time
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
@@ -16,31 +16,47 @@ from constraint_geodesics.robot.kinematics import SerialRobot
 
 METRES = 0.3
 """Unit of positions among the features."""
-NEIGHBOURS = (12, 25, 50, 100, 200)
-"""Rows of a tangent plane, of which the best on rows left out is taken."""
+NEIGHBOURS, LEAST_OF_A_QUADRIC = (12, 25, 50, 100, 200, 400, 1200), 50
+"""Rows of a local model that are tried, and of a quadric at least."""
 NODES, ROUNDS, SPACING_RAD = 33, 80, 0.02
 """Of the band between the ends, its shortening steps, and of the path's rows."""
-JOINED = 12
-"""Neighbours of a row in the graph."""
+JOINED, OTHERS, ASKED = 12, 4, 200
+"""Neighbours of a row in the graph, of these from other demonstrations, and how many are looked at
+for them.
+"""
 
 
 class PoseTangents:
-    """Local PCA on tool poses: the rows near a pose span a plane, and what is across it is held.
+    """Local models of tool poses: near a pose the rows span a plane, or a quadric over it, and what
+    is across is held.
 
-    The rank is told, that of the hidden formula: this is the baseline's strongest setting.
+    of (n,): the demonstration of each row.  The rank is told, that of the hidden formula, and the
+    number of neighbours and the degree are those that are best on demonstrations left out: the
+    baseline's strongest settings.
     """
 
-    def __init__(self, robot: SerialRobot, rows: Float[np.ndarray, "n D"], codim: int) -> None:
+    def __init__(
+        self,
+        robot: SerialRobot,
+        rows: Float[np.ndarray, "n D"],
+        of: Int[np.ndarray, "n"],
+        codim: int,
+    ) -> None:
         self._robot, self._codim = robot, codim
         y, _ = self._look(rows)
-        held_out = np.random.default_rng(0).permutation(len(rows))[: min(len(rows) // 5, 200)]
-        rest = np.setdiff1d(np.arange(len(rows)), held_out)
+        own = np.unique(of)
+        left = np.isin(of, own[::5])
+        held_out, rest = np.flatnonzero(left), np.flatnonzero(~left)
+        held_out = held_out[:: max(len(held_out) // 200, 1)]
         self._y, self._tree = y[rest], KDTree(y[rest])
-        off = []
-        for count in NEIGHBOURS:
-            self._count = min(count, len(rest))
-            off.append(np.median(np.linalg.norm(self._residual(rows[held_out])[0], axis=1)))
-        self._count = min(NEIGHBOURS[int(np.argmin(off))], len(rest))
+        tried: dict[tuple[int, int], float] = {}
+        for degree in (1, 2):
+            for count in NEIGHBOURS:
+                self._count, self._degree = min(count, len(rest)), degree
+                if degree == 1 or count >= LEAST_OF_A_QUADRIC:
+                    off = np.linalg.norm(self._residual(rows[held_out])[0], axis=1)
+                    tried[self._count, degree] = float(np.median(off))
+        self._count, self._degree = min(tried, key=lambda key: tried[key])
         self._y, self._tree = y, KDTree(y)
 
     def answer(self, start: np.ndarray, goal: np.ndarray) -> tuple[str, np.ndarray | None, float]:
@@ -81,8 +97,29 @@ class PoseTangents:
         basis = np.linalg.svd(slopes, full_matrices=False)[0][:, :, :6]
         flat = away @ basis
         _, directions = np.linalg.eigh(flat.transpose(0, 2, 1) @ flat)
-        across = (basis @ directions[:, :, : self._codim]).transpose(0, 2, 1)
-        return (across @ (y - mean)[:, :, None])[:, :, 0], across @ slopes
+        turned = (basis @ directions).transpose(0, 2, 1)
+        across, along = turned[:, : self._codim], turned[:, self._codim :]
+        off = (across @ (y - mean)[:, :, None])[:, :, 0]
+        if self._degree == 1 or not along.shape[1]:
+            return off, across @ slopes
+        t = away @ along.transpose(0, 2, 1)
+        first, second = np.triu_indices(along.shape[1])
+        ones = np.ones((*t.shape[:2], 1))
+        terms = np.concatenate([ones, t, t[:, :, first] * t[:, :, second]], axis=2)
+        squares = terms.transpose(0, 2, 1) @ terms
+        ridge = 1e-6 * np.trace(squares, axis1=1, axis2=2)[:, None, None] / terms.shape[2]
+        sums = terms.transpose(0, 2, 1) @ (away @ across.transpose(0, 2, 1))
+        fit = np.linalg.solve(squares + ridge * np.eye(terms.shape[2]), sums)
+        here, count = (along @ (y - mean)[:, :, None])[:, :, 0], along.shape[1]
+        own = np.concatenate([np.ones((len(y), 1)), here, here[:, first] * here[:, second]], axis=1)
+        off = off - np.einsum("nm,nmk->nk", own, fit)
+        steep = np.zeros((len(y), terms.shape[2], count))
+        steep[:, 1 : 1 + count] = np.eye(count)
+        for m, (i, j) in enumerate(zip(first, second, strict=True)):
+            steep[:, 1 + count + m, i] += here[:, j]
+            steep[:, 1 + count + m, j] += here[:, i]
+        bent = np.einsum("nmk,nmd->nkd", fit, steep)
+        return off, across @ slopes - bent @ (along @ slopes)
 
     def _projected(self, q: np.ndarray, steps: int) -> np.ndarray:
         q = q.copy()
@@ -97,12 +134,16 @@ class PoseTangents:
 class NearestRows:
     """The shortest way over a graph of the rows, each joined to its nearest ones."""
 
-    def __init__(self, rows: Float[np.ndarray, "n D"]) -> None:
+    def __init__(self, rows: Float[np.ndarray, "n D"], of: Int[np.ndarray, "n"]) -> None:
         self._rows, self._tree = rows, KDTree(rows)
-        count = min(JOINED + 1, len(rows))
+        count = min(ASKED, len(rows))
         lengths, nearest = (np.asarray(own) for own in self._tree.query(rows, count))
-        begins = np.repeat(np.arange(len(rows)), count - 1)
-        ends, values = nearest[:, 1:].ravel(), lengths[:, 1:].ravel()
+        others = of[nearest] != of[:, None]
+        others &= others.cumsum(axis=1) <= OTHERS
+        kept = others | (np.arange(count) <= JOINED)
+        kept[:, 0] = False
+        begins, column = np.nonzero(kept)
+        ends, values = nearest[begins, column], lengths[begins, column]
         self._graph = coo_matrix((values, (begins, ends)), shape=(len(rows),) * 2).tocsr()
 
     def answer(self, start: np.ndarray, goal: np.ndarray) -> tuple[str, np.ndarray | None, float]:
