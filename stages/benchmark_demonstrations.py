@@ -28,7 +28,7 @@ STAGE = "benchmark_demonstrations"
 
 
 def main(params: Params, layout: Layout) -> None:
-    """Write reports/demonstrations.csv.gz, demonstrations.json and figures/demonstrations.png."""
+    """Write reports/demonstrations.csv.gz, demonstrations.json and demonstrations.png."""
     own, reports = params.demonstrations, layout.root / "reports"
     with tracked_stage(Work(STAGE, STAGE, own, []), params.tracking.experiment, layout.root) as run:
         cells = cells_of(params, layout)
@@ -46,9 +46,8 @@ def main(params: Params, layout: Layout) -> None:
             "free_motion": free_motion(free_arms(), own.seeds),
             "machine": machine(),
         }
-        picture = reports / "figures" / "demonstrations.png"
-        picture.parent.mkdir(exist_ok=True)
-        demonstrations_figure(example(params, layout)).savefig(picture, dpi=110)
+        picture = demonstrations_figure(example(params, layout))
+        picture.savefig(reports / "demonstrations.png", dpi=110)
         run.report(figures, reports / "demonstrations.json")
         for cell in cells:  # finished: the next run of this stage starts from nothing
             shutil.rmtree(cell.kept.parent, ignore_errors=True)
