@@ -230,18 +230,25 @@ def test_from_a_csv_to_a_path_by_the_shell(xarm, tmp_path, capsys) -> None:
     from typer.testing import CliRunner
 
     from constraint_geodesics.cli import app
+    from constraint_geodesics.recording.recording import read_recording
 
     shown = demonstrations("cup", xarm, 10)
     numbers = np.repeat(np.arange(10.0), 60)[:, None]
     csv, yaml = tmp_path / "demos.csv", tmp_path / "wipe.yaml"
     np.savetxt(csv, np.hstack([numbers, np.concatenate(shown)]), delimiter=",")
     run = CliRunner()
-    answer = run.invoke(app, ["identify", str(csv), "--out", str(yaml), "--json"])
+    rrd = tmp_path / "demos.rrd"
+    ask = ["identify", str(csv), "--out", str(yaml), "--where-shown", "--record", str(rrd)]
+    answer = run.invoke(app, [*ask, "--json"])
     assert answer.exit_code == 0, answer.output
     about = json.loads(answer.stdout)
     assert about["identified"]
     assert about["codim"] == 2
-    assert yaml.is_file()
+    assert "region where it was shown" in about["where_shown"]
+    assert "region where it was shown" in load_constraint(yaml, xarm).label
+    entities = read_recording(rrd).entity_paths
+    assert {"/demonstrations", "/identified", "/tool/trace"} <= set(entities)
+    assert run.invoke(app, ["identify", str(csv), "--where-shown"]).exit_code == 2
     ends = [" ".join(f"{x:.9f}" for x in shown[0][k]) for k in (0, -1)]
     ask = ["plan", "--constraint", str(yaml), "--start", ends[0], "--goal", ends[1], "--json"]
     path = run.invoke(app, ask)
