@@ -10,7 +10,7 @@ are B-splines whose coefficients are differences of its own, and a B-spline lies
 and the largest of those that it is made of at a place.  Beyond the domain nothing is proven.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -21,7 +21,6 @@ from constraint_geodesics.certification.chain import Chain
 from constraint_geodesics.certification.kept import Asked, Kept
 from constraint_geodesics.certification.pieces import SHARE, cut, kept_on
 from constraint_geodesics.certification.polynomial import features, motions
-from constraint_geodesics.constraints.spline import Spline, SplineRelation
 
 AROUND = 1
 """Cells beyond its own that a piece may reach into for a bound of its neighbourhood."""
@@ -45,17 +44,17 @@ class _Bounded(NamedTuple):
     cell (4, cells…), and of all cells (4,).
     """
 
-    spline: Spline
+    spline: Any
     around: np.ndarray
     anywhere: Float[np.ndarray, "4"]
 
     @classmethod
-    def of(cls, spline: Spline) -> "_Bounded":
+    def of(cls, spline: Any) -> "_Bounded":
         """Sizes of tensors of derivatives, as the roots of their entries' squares summed up."""
         squares = []
         for order in range(4):
             total: np.ndarray = np.zeros(1)
-            for orders, times in _orders(spline.active, order):
+            for orders, times in _orders(_active(spline), order):
                 total = total + times * _largest(spline, orders) ** 2
             squares.append(np.sqrt(total))
         cells = np.stack([np.broadcast_to(own, squares[0].shape) for own in squares])
@@ -68,8 +67,8 @@ class _Bounded(NamedTuple):
         """What value and derivatives are at most within reach of positions [m]; infinite where
         that is beyond the domain.
         """
-        own, active = self.spline, list(self.spline.active)
-        x = own.coordinates(positions)
+        own, active = self.spline, list(_active(self.spline))
+        x = _coordinates(own, positions)
         cells = np.zeros((3, len(x)), dtype=np.int64)
         count = np.array(self.around.shape[1:])[:, None]
         found = np.floor((x - own.lower) / own.spacing).T
@@ -77,13 +76,14 @@ class _Bounded(NamedTuple):
         near = reach < AROUND * own.spacing[active].min()
         sizes = np.where(near, self.around[:, *cells], self.anywhere[:, None])
         low = (x - own.lower)[:, active].min(axis=1)
-        inside = np.minimum(low, (own.upper - x)[:, active].min(axis=1)) > reach
+        inside = np.minimum(low, (_upper(own) - x)[:, active].min(axis=1)) > reach
         return np.where(inside, sizes, np.inf)
 
     def values(self, positions: Float[np.ndarray, "S 3"], derivative: int) -> np.ndarray:
         """Value or a derivative, by another code than the search's."""
-        own, active = self.spline, self.spline.active
-        x = np.clip(own.coordinates(positions), own.lower, own.upper)[:, list(active)]
+        own, active = self.spline, _active(self.spline)
+        inside = np.clip(_coordinates(own, positions), own.lower, _upper(own))
+        x = inside[:, list(active)]
         if derivative >= 0 and derivative not in active:
             return np.zeros(len(x))
         shape = [own.coefficients.shape[k] for k in active]
@@ -98,6 +98,24 @@ class _Bounded(NamedTuple):
         return np.asarray(spline(x, nu=[int(k == derivative) for k in active]))
 
 
+def _active(spline: Any) -> tuple[int, ...]:
+    """The coordinates that a spline depends on."""
+    return tuple(k for k in range(3) if spline.degrees[k])
+
+
+def _coordinates(spline: Any, positions: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S 3"]:
+    """A spline's own of positions."""
+    found: np.ndarray = (positions - spline.origin) @ spline.frame.T
+    return found
+
+
+def _upper(spline: Any) -> Float[np.ndarray, "3"]:
+    """Where a spline's domain ends [m]."""
+    cells = np.array(spline.coefficients.shape) - np.array(spline.degrees)
+    found: np.ndarray = spline.lower + cells * spline.spacing
+    return found
+
+
 def _orders(active: tuple[int, ...], order: int) -> list[tuple[tuple[int, int, int], int]]:
     """Partial derivatives of an order, and how often each stands in the tensor of all."""
     counted: dict[tuple[int, int, int], int] = {}
@@ -110,7 +128,7 @@ def _orders(active: tuple[int, ...], order: int) -> list[tuple[tuple[int, int, i
     return list(counted.items())
 
 
-def _largest(spline: Spline, orders: tuple[int, int, int]) -> np.ndarray:
+def _largest(spline: Any, orders: tuple[int, int, int]) -> np.ndarray:
     """The largest size of a partial derivative's coefficients that count in each cell."""
     found = spline.coefficients
     for k, order in enumerate(orders):
@@ -126,10 +144,7 @@ def _largest(spline: Spline, orders: tuple[int, int, int]) -> np.ndarray:
 
 
 def _bounds(
-    chain: Chain,
-    stations: Float[np.ndarray, "S D"],
-    relations: tuple[SplineRelation, ...],
-    looks: dict[int, _Bounded],
+    chain: Chain, stations: Float[np.ndarray, "S D"], relations: tuple, looks: dict[int, _Bounded]
 ) -> tuple[Float[np.ndarray, "S m"], Float[np.ndarray, "S-1 m"]]:
     """Residuals at stations, and K/8 of the pieces between them."""
     y = features(chain, stations)
