@@ -40,7 +40,7 @@ def demonstrations_figure(example: Example) -> Figure:
         getattr(axes, f"{name}axis").set_tick_params(labelsize=7)
     axes.locator_params(nbins=5)
     axes.locator_params(axis="z", nbins=3)
-    axes.legend(loc="lower left", fontsize=8, frameon=False)
+    axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.93), fontsize=8, frameon=False)
     axes.set_title(example.title, fontsize=9)
     below: Any = figure.add_subplot(grid[0, 1])
     share = np.linspace(0.0, 100.0, len(path))
