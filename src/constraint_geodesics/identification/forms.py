@@ -44,7 +44,7 @@ class Form(NamedTuple):
 
     def fitted(self, sample: Sample) -> Numbers:
         """The numbers with the least distances in joint space."""
-        some = sample[np.arange(0, len(sample), -(-len(sample) // CAREFULLY))]
+        some = sample.thinned(CAREFULLY)
 
         def off(x: Numbers) -> np.ndarray:
             return some.whitened(self.relations(x)).ravel()

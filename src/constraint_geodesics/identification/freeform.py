@@ -23,21 +23,25 @@ from constraint_geodesics.constraints.spline import Spline, SplineRelation, Term
 from constraint_geodesics.constraints.tool_features import FEATURES
 from constraint_geodesics.identification.forms import across, axis_words, of_axis
 from constraint_geodesics.identification.kernels import add_up
-from constraint_geodesics.identification.vanishing import Sample, better_rms
+from constraint_geodesics.identification.vanishing import (
+    Sample,
+    better_rms,
+    near,
+    principal,
+    squares,
+)
 
 CELLS, COARSE = 16, 8
 """Of the grid along the longest side of where the rows are: of heights, and of axes that turn."""
 FACING = 0.995
 """Share of the rows that must be on a side for it to be the one that is shown."""
-WRONG, LEAST_WRONG_RAD = 5.0, 1e-4
-"""Rows that are further off than so many times the median are wrong: they don't count."""
 MARGIN = 1.0
 """Cells that the grid reaches beyond the rows."""
 DEGREE, PENALISED = 5, 3
 SMOOTHINGS = 10.0 ** np.arange(-11, 2, 2)
 """Weights of the penalty that are tried, as shares of what makes it weigh as much as the rows."""
-RIDGE, FLAT = 1e-14, 1e-9
-"""Added to the normal equations, and to J Jᵀ, as shares of their traces."""
+RIDGE = 1e-14
+"""Added to the normal equations, as a share of their trace."""
 CAREFULLY, SCREENED = 4000, 1000
 """Rows at most that a fit is done again on, and that axes are looked for among."""
 HOPELESS_RAD = 0.1
@@ -97,12 +101,11 @@ class Freeform:
     @property
     def relations(self) -> Relations:
         """The rows."""
-        return self.model.relations(_splines(self.model, self.coefficients), self.axis)
+        return self.model.relations(_splines(self.model.grid, self.coefficients), self.axis)
 
     def again(self, sample: Sample) -> Relations:
         """The same, fitted to other rows."""
-        some = sample[np.arange(0, len(sample), -(-len(sample) // CAREFULLY))]
-        return fitted(self.model, some, [], (self.smoothing,)).relations
+        return fitted(self.model, sample.thinned(CAREFULLY), [], (self.smoothing,)).relations
 
 
 def fitted(
@@ -123,10 +126,10 @@ def fitted(
     moved, right = np.zeros((len(y), to_joints.shape[2])), ~no_fold
     smoothing, left_out = smoothings[-1], np.full(len(y), np.inf)
     for step in range(ROUNDS):
-        relations = model.relations(_splines(model, found), axis)
+        relations = model.relations(_splines(model.grid, found), axis)
         if step > 0:
             off = _distances(relations, y, to_joints)
-            right = off <= max(WRONG * float(np.median(off)), LEAST_WRONG_RAD)
+            right = near(off, off)
         # the first two: as the rows are, since they would be moved onto what is not it yet
         if step > 1:
             moved = _onto(relations, y, to_joints, moved)
@@ -159,7 +162,7 @@ def fitted(
         numbers = _solved(whole, None, smoothing * penalty + ridge)
         _, axis = _unknowns(model, numbers, axis)
         found = numbers[:size].reshape(model.splines, count)
-    relations = model.relations(_splines(model, found), axis)
+    relations = model.relations(_splines(model.grid, found), axis)
     each = np.sqrt(len(relations))
     found_rad = better_rms(_distances(relations, y, to_joints)) / each
     side = float(((sample.rotation @ axis) @ model.grid.frame[2]).mean())
@@ -177,7 +180,7 @@ def _unknowns(
     if model.axis is not None:
         axis = axis + numbers[size:] @ _tangents(axis)
         axis = axis / np.linalg.norm(axis)
-    return _splines(model, numbers[:size].reshape(model.splines, -1)), axis
+    return _splines(model.grid, numbers[:size].reshape(model.splines, -1)), axis
 
 
 def surface(sample: Sample) -> Model:
@@ -313,8 +316,7 @@ def axes_of_place(
 def _values(
     grid: Spline, coefficients: Float[np.ndarray, "M k"], positions: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n k"]:
-    shape = grid.coefficients.shape
-    splines = [replace(grid, coefficients=own.reshape(shape)) for own in coefficients.T]
+    splines = _splines(grid, coefficients.T)
     return np.stack([own.look(positions)[:, 0] for own in splines], axis=1)
 
 
@@ -330,24 +332,16 @@ def least_moving(sample: Sample) -> Float[np.ndarray, "3"]:
     return np.linalg.eigh(np.einsum("nij,nik->jk", away, away))[1][:, 0]
 
 
-def _splines(model: Model, coefficients: Float[np.ndarray, "splines M"]) -> tuple[Spline, ...]:
-    shape = model.grid.coefficients.shape
-    return tuple(replace(model.grid, coefficients=own.reshape(shape)) for own in coefficients)
+def _splines(grid: Spline, coefficients: Float[np.ndarray, "splines M"]) -> tuple[Spline, ...]:
+    shape = grid.coefficients.shape
+    return tuple(replace(grid, coefficients=own.reshape(shape)) for own in coefficients)
 
 
 def _grid(sample: Sample, count: int, flat: Float[np.ndarray, "3"] | None = None) -> Spline:
     """Over as many directions as the positions spread most in, or two of a plane with this
     normal.
     """
-    mean = sample.position.mean(axis=0)
-    away = sample.position - mean
-    if flat is not None:
-        away = away - np.outer(away @ flat, flat)
-    _, directions = np.linalg.eigh(away.T @ away)
-    frame = directions.T[::-1]
-    if flat is not None:
-        frame[2] = flat
-    frame[2] = np.cross(frame[0], frame[1])
+    mean, frame = principal(sample.position, flat)
     return _cut(frame, mean, (sample.position - mean) @ frame.T, count, CELLS)
 
 
@@ -397,16 +391,9 @@ def _onto(
     there = y + np.einsum("nad,nd->na", to_joints, moved)
     off, slopes = _residuals(relations, there, to_joints)
     off = off - np.einsum("nkd,nd->nk", slopes, moved)
-    weights = np.linalg.solve(_squares(slopes), off[:, :, None])
+    weights = np.linalg.solve(squares(slopes), off[:, :, None])
     found: np.ndarray = -(slopes.transpose(0, 2, 1) @ weights)[:, :, 0]
     return found
-
-
-def _squares(slopes: Float[np.ndarray, "n k D"]) -> Float[np.ndarray, "n k k"]:
-    """J Jᵀ, which may be singular at a row, and a little."""
-    found: np.ndarray = slopes @ slopes.transpose(0, 2, 1)
-    ridge = FLAT * np.trace(found, axis1=1, axis2=2) + 1e-300
-    return found + ridge[:, None, None] * np.eye(found.shape[1])
 
 
 def _distances(
@@ -445,10 +432,10 @@ def _system(
     to_joints: Float[np.ndarray, "n 12 D"],
     moved: Float[np.ndarray, "n D"],
 ) -> _System:
-    splines = _splines(model, coefficients)
+    splines = _splines(model.grid, coefficients)
     relations = model.relations(splines, axis)
     values, slopes = _residuals(relations, there, to_joints)
-    factor = np.linalg.cholesky(_squares(slopes))
+    factor = np.linalg.cholesky(squares(slopes))
     count, rows = values.shape
     omega = np.zeros((count, rows, model.splines, 4))
     target = np.einsum("nkd,nd->nk", slopes, moved)

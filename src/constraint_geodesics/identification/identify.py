@@ -41,6 +41,7 @@ from constraint_geodesics.identification.vanishing import (
     Sample,
     better_rms,
     most_rad,
+    near,
     rank,
     trimmed,
     vanishing,
@@ -58,8 +59,6 @@ WORTH = 0.8
 """What is freeform takes a formula's place where left-out demonstrations are nearer by this."""
 WORSE, FINE_RAD = 1.25, 2e-5
 """A form may be off by so many times what the combination is that it stands for, and by so much."""
-WRONG, LEAST_WRONG_RAD = 5.0, 1e-4
-"""Rows that are further off than so many times the median are wrong, and left out."""
 ROUNDS = 4
 VARIED, FAR, VARIED_RAD = 5.0, 25.0, 1e-3
 """Demonstrations vary in every direction that is left free by so many times the rows' distance from
@@ -167,36 +166,32 @@ def identify(demonstrations: Any, robot: SerialRobot) -> Identified:
     for _ in range(ROUNDS):
         if not search.relations:
             break
-        near = _near(sample.distances(search.relations), kept)
-        if (near == kept).all():
+        off = sample.distances(search.relations)
+        right = near(off, off[kept])
+        if (right == kept).all():
             break
-        if near.mean() < GOOD:  # that many are not wrong, they say something else
+        if right.mean() < GOOD:  # that many are not wrong, they say something else
             search.missing.append(
-                f"{1.0 - near.mean():.0%} of the rows are further off than the others: not all "
+                f"{1.0 - right.mean():.0%} of the rows are further off than the others: not all "
                 f"demonstrations are of one kind"
             )
             break
-        kept, search = near, _searched(sample[near])
+        kept, search = right, _searched(sample[right])
+    q = np.concatenate(shown)
     if not search.relations and search.folds:
-        search = _of_joints(search, sample, robot, np.concatenate(shown))
-    search = _varied(search, np.concatenate(shown))
+        search = _of_joints(search, sample, robot, q)
+    search = _varied(search, q)
     return _told(search, robot, len(shown), len(sample) - len(search.sample))
 
 
 def _likely(sample: Sample) -> Bool[np.ndarray, "n"]:
     """Rows that keep to a relation that GOOD of them keep to; all if there is none."""
-    everything = np.ones(len(sample), dtype=bool)
     for name in (*_COLUMNS, QUADRIC):
         least, off = trimmed(*_features(sample, name), GOOD)
-        near = _near(off, everything)
-        if least <= AT_MOST_RAD and near.mean() >= GOOD:
-            return near
-    return everything
-
-
-def _near(off: Float[np.ndarray, "n"], kept: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-    """Rows that are not further off than WRONG times the median of those that are kept."""
-    return off <= max(WRONG * float(np.median(off[kept])), LEAST_WRONG_RAD)
+        right = near(off, off)
+        if least <= AT_MOST_RAD and right.mean() >= GOOD:
+            return right
+    return np.ones(len(sample), dtype=bool)
 
 
 @dataclass
@@ -392,7 +387,7 @@ def _look_for_tip(search: _Search, off: float) -> freeform.Freeform | None:
     demonstrations are nearer to it than `off` [rad].
     """
     sample = search.sample
-    flat = next((own.linear[:3] for own in search.relations if _is_flat(own)), None)
+    flat = _flat_normal(search)
     found = _better(search, None, freeform.line(sample, flat))
     if found is None and flat is None:
         found = _better(search, None, freeform.surface(sample))
@@ -407,7 +402,7 @@ def _look_for_tip(search: _Search, off: float) -> freeform.Freeform | None:
 def _look_for_axes(search: _Search, tip: freeform.Freeform | None) -> None:
     """Add axes that turn with the place, over what holds the tip or a plane that does."""
     sample, held = search.sample, _turned(search)
-    flat = next((own.linear[:3] for own in search.relations if _is_flat(own)), None)
+    flat = _flat_normal(search)
     if tip is not None:
         place = tip.model.grid
     elif flat is not None:
@@ -456,6 +451,11 @@ def _left_open(search: _Search, model: freeform.Model) -> Float[np.ndarray, "n k
     flat = model.relations([model.grid] * model.splines, np.zeros(3))
     slopes = search.sample.slopes(flat)
     return without(slopes, search.sample.slopes(search.relations))
+
+
+def _flat_normal(search: _Search) -> Float[np.ndarray, "3"] | None:
+    """The normal of a plane that holds the tip, if one does."""
+    return next((own.linear[:3] for own in search.relations if _is_flat(own)), None)
 
 
 def _turned(search: _Search) -> int:

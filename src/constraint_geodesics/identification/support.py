@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from constraint_geodesics.constraints.spline import Spline, SplineRelation, Term
 from constraint_geodesics.constraints.tool_features import FEATURES
-from constraint_geodesics.identification.vanishing import AnyRelation, Sample, without
+from constraint_geodesics.identification.vanishing import AnyRelation, Sample, principal, without
 
 SHARE = 0.95
 """Of the rows that are within the radius of other demonstrations' rows."""
@@ -61,12 +61,8 @@ def support_of(
     sample: Sample, relations: Sequence[AnyRelation], folds: Sequence[Bool[np.ndarray, "n"]]
 ) -> Support:
     """The region, from rows that keep to relations."""
-    mean = sample.position.mean(axis=0)
-    away = sample.position - mean
-    _, directions = np.linalg.eigh(away.T @ away)
-    frame = directions.T[::-1].copy()
-    frame[2] = np.cross(frame[0], frame[1])
-    x = away @ frame.T
+    mean, frame = principal(sample.position)
+    x = (sample.position - mean) @ frame.T
     count = _coordinates(sample, relations, x)
     radius = TIMES * max(_apart(x[:, :count], folds), LEAST_M)
     spline = _distances(frame, mean, x, count, radius)

@@ -37,6 +37,8 @@ TIMES the distance of the best relation of all, or SURELY_RAD; and by AT_MOST_RA
 """
 GOOD = 0.9
 """Share of the rows that a distance is taken over: some may be wrong."""
+WRONG, LEAST_WRONG_RAD = 5.0, 1e-4
+"""Rows that are further off than so many times the median, and than so much, are wrong."""
 RIDGE = 1e-9
 """Added to J Jᵀ, as a share of its trace: two relations may touch at a row."""
 TRIMS = 8
@@ -81,6 +83,10 @@ class Sample:
     def __getitem__(self, rows: np.ndarray) -> "Sample":
         return Sample(*(getattr(self, own.name)[rows] for own in fields(self)))
 
+    def thinned(self, most: int) -> "Sample":
+        """Every nth row, so that there are no more than `most`."""
+        return self[np.arange(0, len(self), -(-len(self) // most))]
+
     def folds(self) -> list[Bool[np.ndarray, "n"]]:
         """Which rows are left out, whole demonstrations each time; none for one demonstration."""
         names = np.unique(self.of)
@@ -109,10 +115,7 @@ class Sample:
         """
         off = np.stack([own.values(self.pose[0]) for own in relations], axis=1)
         slopes = self.slopes(relations)
-        squares = np.matmul(slopes, slopes.transpose(0, 2, 1))
-        ridge = RIDGE * np.trace(squares, axis1=1, axis2=2) + 1e-300
-        squares += ridge[:, None, None] * np.eye(len(relations))
-        factor = np.linalg.cholesky(squares)
+        factor = np.linalg.cholesky(squares(slopes))
         return np.linalg.solve(factor, off[:, :, None])[:, :, 0]
 
     def distances(self, relations: Sequence[AnyRelation]) -> Float[np.ndarray, "n"]:
@@ -138,6 +141,34 @@ class Vanishing:
     def seeming(self, best_rad: float) -> int:
         """How many hold on the rows that they were found on."""
         return _count(self.found_rad, best_rad)
+
+
+def squares(slopes: Float[np.ndarray, "n k D"]) -> Float[np.ndarray, "n k k"]:
+    """J Jᵀ of each row, which may be singular there, and a little."""
+    found: np.ndarray = np.matmul(slopes, slopes.transpose(0, 2, 1))
+    ridge = RIDGE * np.trace(found, axis1=1, axis2=2) + 1e-300
+    return found + ridge[:, None, None] * np.eye(found.shape[1])
+
+
+def near(off: Float[np.ndarray, "n"], among: Float[np.ndarray, "m"]) -> Bool[np.ndarray, "n"]:
+    """Which distances [rad] are no larger than WRONG times the median of those `among`."""
+    return off <= max(WRONG * float(np.median(among)), LEAST_WRONG_RAD)
+
+
+def principal(
+    positions: Float[np.ndarray, "n 3"], flat: Float[np.ndarray, "3"] | None = None
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """The mean of positions, and a frame whose rows are the directions that they spread most in,
+    the first two of them within the plane of a normal, if one is given.
+    """
+    mean = positions.mean(axis=0)
+    away = positions - mean
+    if flat is not None:
+        away = away - np.outer(away @ flat, flat)
+    _, directions = np.linalg.eigh(away.T @ away)
+    frame = directions.T[::-1].copy()
+    frame[2] = np.cross(frame[0], frame[1])
+    return mean, frame
 
 
 def better_rms(off: Float[np.ndarray, "n"]) -> float:
