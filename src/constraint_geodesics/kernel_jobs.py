@@ -15,11 +15,18 @@ from typing import NamedTuple
 import numpy as np
 
 from constraint_geodesics.certification.certifier import Certifier, Limits
-from constraint_geodesics.constraints.both import both
-from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
+from constraint_geodesics.constraints.both import Both, both
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    ConstraintManifold,
+    Pose,
+    constraint_from_json,
+)
 from constraint_geodesics.constraints.functions import values_batch
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.geometry.timing import time_parametrisation
+from constraint_geodesics.identification import identify
+from constraint_geodesics.identification.vanishing import Sample
 from constraint_geodesics.plugs import PULL, PULL_BOUNDS, plug
 from constraint_geodesics.robot.inverse_kinematics import solutions
 from constraint_geodesics.robot.kinematics import load_robot
@@ -138,6 +145,18 @@ def _learned() -> None:
     plug(PULL)(manifold.arrays, bounds, _TIMES, joints, np.empty_like(joints))
 
 
+def _demonstrations() -> None:
+    robot, rng = _scene().robot, np.random.default_rng(0)
+    shown = rng.uniform(-1.0, 1.0, (200, robot.dof))
+    identify(shown, robot)
+    Sample.of_joints(robot, [shown], False).of_joint(robot, shown, 1)
+    row = {"name": "x", "unit": "m", "constant": 0.0, "linear": [1.0, *[0.0] * 11]}
+    row |= {"tolerance": 0.0, "quadratic": None, "spline": -1}
+    rows = {"relations": [row], "left_out": [], "splines": []}
+    kinds = [constraint_from_json(rows | {"kind": kind}) for kind in ("polynomial", "spline")]
+    ConstraintManifold(robot, Both(*kinds)).linearise(_ROWS)
+
+
 class Job(NamedTuple):
     """after: jobs that compile what this one needs too, so that two processes do not both."""
 
@@ -157,6 +176,7 @@ JOBS = {
     "nearest configurations": Job(_nearest, ("roadmap",)),
     "inverse kinematics": Job(_inverse_kinematics, ("kinematics",)),
     "learned method": Job(_learned, ("constraints and times",)),
+    "demonstrations": Job(_demonstrations, ("kinematics",)),
 }
 """By their names, those that others wait for and the longest first."""
 

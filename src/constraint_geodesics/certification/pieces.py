@@ -4,19 +4,21 @@ A residual whose second derivative along a piece is at most K differs from its c
 there, so that |r(t)| ≤ max(|r₀|, |r₁|) + K/8; K falls with the square of a piece's length.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from constraint_geodesics.certification.certificate import Limits
-from constraint_geodesics.certification.kept import Broken, Kept, nothing_exceeds, summed_up
+from constraint_geodesics.certification.kept import Asked, Broken, Kept, nothing_exceeds, summed_up
 from constraint_geodesics.certification.kernels import ROUNDING
 
 SHARE = 0.05
 """Share of what is allowed that K/8 should be at most."""
 _MOST_PIECES = 2048
+Bounds = Callable[[Float[np.ndarray, "S D"]], tuple[np.ndarray, np.ndarray]]
+"""Residuals (S, m) at stations, and K/8 (S − 1, m) of the pieces between them."""
 
 
 class Pieces(NamedTuple):
@@ -41,6 +43,14 @@ def cut(rows: Float[np.ndarray, "T D"], added: Float[np.ndarray, "T-1"], wanted:
     steps = np.diff(rows, axis=0)
     stations = np.concatenate([rows[segments] + share * steps[segments], rows[-1:]])
     return Pieces(stations, ends, segments)
+
+
+def kept_by(asked: Asked, bounds: Bounds) -> Kept:
+    """How well the relations of a constraint are kept at the rows and on the whole path."""
+    _, added = bounds(asked.rows)
+    wanted = SHARE * asked.limits.violation_tolerance
+    pieces = cut(asked.rows, added.max(axis=1), wanted)
+    return kept_on(pieces, asked.constraint.relations, *bounds(pieces.stations), asked.limits)
 
 
 def kept_on(

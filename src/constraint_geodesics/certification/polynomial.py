@@ -19,7 +19,7 @@ from constraint_geodesics.certification import kernels
 from constraint_geodesics.certification.certificate import CertificationError
 from constraint_geodesics.certification.chain import Chain
 from constraint_geodesics.certification.kept import Asked, Kept
-from constraint_geodesics.certification.pieces import SHARE, cut, kept_on
+from constraint_geodesics.certification.pieces import kept_by
 
 _BLOCKS = tuple(slice(3 * k, 3 * k + 3) for k in range(4))
 
@@ -27,11 +27,7 @@ _BLOCKS = tuple(slice(3 * k, 3 * k + 3) for k in range(4))
 def kept(asked: Asked) -> Kept:
     """How well the relations are kept at the rows and on the whole path."""
     relations, joint = asked.constraint.relations, asked.constraint.joint
-    _, added = _bounds(asked.chain, asked.rows, relations, joint)
-    wanted = SHARE * asked.limits.violation_tolerance
-    pieces = cut(asked.rows, added.max(axis=1), wanted)
-    values, added = _bounds(asked.chain, pieces.stations, relations, joint)
-    return kept_on(pieces, relations, values, added, asked.limits)
+    return kept_by(asked, lambda stations: _bounds(asked.chain, stations, relations, joint))
 
 
 def _bounds(

@@ -19,7 +19,7 @@ from scipy.ndimage import maximum_filter
 
 from constraint_geodesics.certification.chain import Chain
 from constraint_geodesics.certification.kept import Asked, Kept
-from constraint_geodesics.certification.pieces import SHARE, cut, kept_on
+from constraint_geodesics.certification.pieces import kept_by
 from constraint_geodesics.certification.polynomial import features, motions
 
 AROUND = 1
@@ -30,11 +30,7 @@ def kept(asked: Asked) -> Kept:
     """How well the relations are kept at the rows and on the whole path."""
     relations = asked.constraint.relations
     looks = {id(own): _Bounded.of(own) for own in asked.constraint.splines}
-    _, added = _bounds(asked.chain, asked.rows, relations, looks)
-    wanted = SHARE * asked.limits.violation_tolerance
-    pieces = cut(asked.rows, added.max(axis=1), wanted)
-    values, added = _bounds(asked.chain, pieces.stations, relations, looks)
-    return kept_on(pieces, relations, values, added, asked.limits)
+    return kept_by(asked, lambda stations: _bounds(asked.chain, stations, relations, looks))
 
 
 class _Bounded(NamedTuple):

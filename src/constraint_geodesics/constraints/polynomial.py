@@ -8,7 +8,7 @@ with the place p of its origin.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar
 
@@ -17,25 +17,18 @@ from jaxtyping import Float
 from numba import carray, int64, njit
 
 from constraint_geodesics.compiled import LEAF
-from constraint_geodesics.constraints.constraint import (
-    Constraint,
-    ConstraintError,
-    Series,
-    each_drawn,
-    each_held,
-    left_out_words,
-)
+from constraint_geodesics.constraints.constraint import ConstraintError
 from constraint_geodesics.constraints.kernels import (
     JOINT_WORDS,
     LINEARISE_WORDS,
     TOOL_WORDS,
     ConstraintArrays,
-    Rows,
     c_function,
     chain_at,
     floats,
     lanes_at,
 )
+from constraint_geodesics.constraints.relations import RelationsConstraint
 from constraint_geodesics.constraints.tool_features import FEATURES, into_joints, jacobian_of_origin
 from constraint_geodesics.robot.kernels import geometric_jacobian, poses_of, posture_in
 from constraint_geodesics.robot.kinematics import SerialRobot
@@ -99,37 +92,18 @@ class Relation:
 
 
 @dataclass(frozen=True, eq=False)
-class PolynomialConstraint(Constraint):
-    """Relations that all hold.  left_out: what each is off by on demonstrations that it was not
-    found on, in its unit; () where it was not found but given.  joint: the joint, counted from 0,
-    whose origin they are of, None for the tool.
+class PolynomialConstraint(RelationsConstraint):
+    """Relations that all hold.  joint: the joint, counted from 0, whose origin they are of, None
+    for the tool.
     """
 
     kind: ClassVar[str] = "polynomial"
-    relations: tuple[Relation, ...]
-    left_out: tuple[float, ...] = ()
     joint: int | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.joint is not None and self.joint < 0:
             raise ConstraintError(f"joint = {self.joint}: must be 0 or more")
-        if not self.relations:
-            raise ConstraintError("relations = (): one is needed at least")
-        if self.left_out and len(self.left_out) != len(self.relations):
-            raise ConstraintError(
-                f"left_out has {len(self.left_out)} entries, there are {len(self.relations)} "
-                f"relations"
-            )
-
-    @property
-    def rows(self) -> Rows:
-        """Every row is held, each by itself."""
-        return each_held(self.relations)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """Those of the relations."""
-        return tuple(own.unit for own in self.relations)
 
     def arrays(self, robot: SerialRobot) -> ConstraintArrays:
         """For the kernels."""
@@ -143,34 +117,16 @@ class PolynomialConstraint(Constraint):
         """What all of this kind share, once."""
         _compiled()
 
-    def loosened(self, least: Mapping[str, float]) -> "PolynomialConstraint":
-        """The same with every tolerance at least that of its row's unit."""
-        wider = (
-            replace(own, tolerance=max(own.tolerance, least[own.unit])) for own in self.relations
-        )
-        return replace(self, relations=tuple(wider))
-
     @property
-    def label(self) -> str:
-        """Its relations, those of one name once."""
-        names = "; ".join(dict.fromkeys(own.name for own in self.relations))
-        of = "the tool's pose" if self.joint is None else f"the place of joint {self.joint + 1}"
-        return f"the constraint on {of} ({names})"
-
-    @property
-    def caveat(self) -> str:
-        """By what is identified."""
-        return left_out_words(self.units, self.left_out)
+    def whose(self) -> str:
+        """The tool, or a joint."""
+        return super().whose if self.joint is None else f"the place of joint {self.joint + 1}"
 
     @property
     def key(self) -> tuple:
         """All numbers, to the bit."""
         own = tuple((r.unit, r.tolerance, r.numbers.tobytes()) for r in self.relations)
         return (self.kind, self.joint, own)
-
-    def series(self, residual: Float[np.ndarray, "n m"]) -> list[Series]:
-        """Each row by itself, in mm or degrees."""
-        return each_drawn(self.relations, residual)
 
     def to_json(self) -> dict[str, Any]:
         """All numbers."""

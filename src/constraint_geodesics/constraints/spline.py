@@ -9,7 +9,7 @@ r = tᵀe₁ + (∂s/∂u) tᵀe₃, and the same along v.
 
 from base64 import b64decode, b64encode
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, ClassVar, NamedTuple
 from zlib import compress, decompress
@@ -20,25 +20,18 @@ from jaxtyping import Float
 from numba import carray, int64, njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
-from constraint_geodesics.constraints.constraint import (
-    Constraint,
-    ConstraintError,
-    Series,
-    each_drawn,
-    each_held,
-    left_out_words,
-)
+from constraint_geodesics.constraints.constraint import ConstraintError
 from constraint_geodesics.constraints.kernels import (
     JOINT_WORDS,
     LINEARISE_WORDS,
     TOOL_WORDS,
     ConstraintArrays,
-    Rows,
     c_function,
     chain_at,
     floats,
     lanes_at,
 )
+from constraint_geodesics.constraints.relations import RelationsConstraint
 from constraint_geodesics.constraints.tool_features import FEATURES, into_joints
 from constraint_geodesics.robot.kernels import geometric_jacobian, poses_of, posture_in
 from constraint_geodesics.robot.kinematics import SerialRobot
@@ -233,23 +226,10 @@ class SplineRelation:
 
 
 @dataclass(frozen=True, eq=False)
-class SplineConstraint(Constraint):
-    """Relations that all hold.  left_out: what each is off by on demonstrations that it was not
-    found on, in its unit; () where it was given.
-    """
+class SplineConstraint(RelationsConstraint):
+    """Relations that all hold."""
 
     kind: ClassVar[str] = "spline"
-    relations: tuple[SplineRelation, ...]
-    left_out: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not self.relations:
-            raise ConstraintError("relations = (): one is needed at least")
-        if self.left_out and len(self.left_out) != len(self.relations):
-            raise ConstraintError(
-                f"left_out has {len(self.left_out)} entries, there are {len(self.relations)} "
-                f"relations"
-            )
 
     @cached_property
     def splines(self) -> tuple[Spline, ...]:
@@ -261,16 +241,6 @@ class SplineConstraint(Constraint):
         """The number of a relation's spline, −1 if it has none."""
         own = None if relation.term is None else relation.term.spline
         return next((k for k, spline in enumerate(self.splines) if spline is own), -1)
-
-    @property
-    def rows(self) -> Rows:
-        """Every row is held, each by itself."""
-        return each_held(self.relations)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """Those of the relations."""
-        return tuple(own.unit for own in self.relations)
 
     def arrays(self, robot: SerialRobot) -> ConstraintArrays:
         """For the kernels."""
@@ -290,24 +260,6 @@ class SplineConstraint(Constraint):
         """What all of this kind share, once."""
         _compiled()
 
-    def loosened(self, least: Mapping[str, float]) -> "SplineConstraint":
-        """The same with every tolerance at least that of its row's unit."""
-        wider = (
-            replace(own, tolerance=max(own.tolerance, least[own.unit])) for own in self.relations
-        )
-        return replace(self, relations=tuple(wider))
-
-    @property
-    def label(self) -> str:
-        """Its relations, those of one name once."""
-        names = "; ".join(dict.fromkeys(own.name for own in self.relations))
-        return f"the constraint on the tool's pose ({names})"
-
-    @property
-    def caveat(self) -> str:
-        """By what is identified."""
-        return left_out_words(self.units, self.left_out)
-
     @property
     def key(self) -> tuple:
         """All numbers, to the bit."""
@@ -315,10 +267,6 @@ class SplineConstraint(Constraint):
             (r.unit, r.tolerance, self._which(r), r.numbers.tobytes()) for r in self.relations
         )
         return (self.kind, relations, tuple(own.numbers.tobytes() for own in self.splines))
-
-    def series(self, residual: Float[np.ndarray, "n m"]) -> list[Series]:
-        """Each row by itself, in mm or degrees."""
-        return each_drawn(self.relations, residual)
 
     def to_json(self) -> dict[str, Any]:
         """All numbers; relations name their splines by place."""
