@@ -47,6 +47,14 @@ def identify_constraint(
             "--where-shown", help="Also keep the tip in the region where demonstrations were."
         ),
     ] = False,
+    rounded: Annotated[
+        bool,
+        typer.Option(
+            "--rounded",
+            help="Take the axes and round numbers that the demonstrations are as near to, where "
+            "there are some.",
+        ),
+    ] = False,
     record: Annotated[
         Path | None,
         typer.Option(help="Write a Rerun recording of demonstrations and identified set here."),
@@ -63,6 +71,8 @@ def identify_constraint(
     wrong usage; 3: nothing is identified, and the line says why.
     """
     from dataclasses import replace
+
+    import numpy as np
 
     from constraint_geodesics.bundle import BundleError
     from constraint_geodesics.constraints.constraint import ConstraintError
@@ -84,8 +94,11 @@ def identify_constraint(
         if not 0.0 <= loosely < math.inf:
             raise PlannerError(f"--loosely {loosely}: must be 0 or more, and finite")
         with loading(), Arm(planner, urdf, tool_link, tool_pose, hold, srdf).open() as loaded:
-            found = identify(demonstrations, loaded.robot)
             robot, workcell = loaded.robot, loaded.scene.workcell
+            shown, motions = demonstrations_from(demonstrations, robot)
+            found = identify(shown if motions else np.concatenate(shown), robot)
+        if rounded:
+            found = found.rounded or found
         if found.constraint is not None and loosely > 0.0:
             found = replace(found, constraint=with_tolerance(found.constraint, loosely))
         if out is not None and found.constraint is not None:
@@ -93,7 +106,6 @@ def identify_constraint(
         if record is not None:
             from constraint_geodesics.recording.demonstrations import record_demonstrations
 
-            shown, _ = demonstrations_from(demonstrations, robot)
             record_demonstrations(record, shown, found, robot, workcell)
     except (BundleError, ConstraintError, DemonstrationError, PlannerError, RobotError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None

@@ -111,6 +111,10 @@ def plan(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the path here, as CSV.")] = None,
     record: Annotated[Path | None, typer.Option(help="Write a Rerun recording here.")] = None,
+    demonstrations: Annotated[
+        Path | None,
+        typer.Option(help="Draw what `identify` found the constraint in, in the recording."),
+    ] = None,
     picture: Annotated[Path | None, typer.Option(help="Draw the path here, as PNG.")] = None,
     trajectory: Annotated[
         bool,
@@ -156,6 +160,10 @@ def plan(
     """
     from constraint_geodesics.bundle import BundleError
     from constraint_geodesics.constraints.constraint import ConstraintError
+    from constraint_geodesics.identification.demonstrations import (
+        DemonstrationError,
+        demonstrations_from,
+    )
     from constraint_geodesics.planner import PlannerError
     from constraint_geodesics.robot.kinematics import RobotError
 
@@ -163,6 +171,8 @@ def plan(
         require("record")
     arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf)
     try:
+        if demonstrations is not None and record is None:
+            raise PlannerError("--demonstrations is drawn in what --record names: give it, too")
         first = _joints(start, "--start")
         wanted = _goal(goal, goal_pose, goal_free, goal_tolerance)
         with loading(), arm.open(method) as loaded:
@@ -175,8 +185,10 @@ def plan(
                 velocity_scale=velocity_scale,
                 acceleration_scale=acceleration_scale,
             )
-            source = loaded.source
-    except (BundleError, ConstraintError, PlannerError, RobotError) as error:
+            source, shown = loaded.source, None
+            if demonstrations is not None:
+                shown, _ = demonstrations_from(demonstrations, loaded.robot)
+    except (BundleError, ConstraintError, DemonstrationError, PlannerError, RobotError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
     print(f"planner: {source}", file=sys.stderr)
     about: dict[str, Any] = path.summary()
@@ -184,7 +196,7 @@ def plan(
         if out is not None:
             path.save(out)
         if record is not None:
-            path.record(record)
+            path.record(record, demonstrations=shown)
         if picture is not None:
             path.draw(picture)
         if trajectory:

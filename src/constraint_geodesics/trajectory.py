@@ -203,12 +203,14 @@ class Trajectory:
             ],
         }
 
-    def record(self, file: str | Path, frames: int = 100) -> None:
-        """Write a Rerun recording: the motion, and what of a goal's region and configurations was
-        looked at.  Raises PlannerError without a path, MissingExtraError without
-        the extra `record`.
+    def record(self, file: str | Path, frames: int = 100, demonstrations: Any = None) -> None:
+        """Write a Rerun recording: the motion, what of a goal's region and configurations was
+        looked at, and demonstrations, as `identify` takes them, with what of the constraint lies
+        near them.  Raises PlannerError without a path, MissingExtraError without the extra
+        `record`, DemonstrationError for demonstrations that can't be read.
         """
         require("record")
+        from constraint_geodesics.identification.demonstrations import demonstrations_from
         from constraint_geodesics.recording.goal import GoalView
         from constraint_geodesics.recording.recording import PathRecord, record_path
 
@@ -218,7 +220,12 @@ class Trajectory:
         if looked_at is not None and (regions or len(looked_at) > 1):
             goal = GoalView(looked_at, regions)
         name, text = self.constraint_name, self._markdown()
-        record = PathRecord("planner", name, 0, 0, self.joints, text, goal=goal)
+        shown: tuple[np.ndarray, ...] = ()
+        if demonstrations is not None:
+            shown = tuple(demonstrations_from(demonstrations, self.scene.robot)[0])
+        record = PathRecord(
+            "planner", name, 0, 0, self.joints, text, goal=goal, demonstrations=shown
+        )
         manifold = ConstraintManifold(self.scene.robot, self.constraint)
         record_path(Path(file), record, manifold, self.scene.workcell, frames=frames)
 

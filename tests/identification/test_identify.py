@@ -254,6 +254,12 @@ def test_from_a_csv_to_a_path_by_the_shell(xarm, tmp_path, capsys) -> None:
     path = run.invoke(app, ask)
     assert path.exit_code in (0, 3), path.output
     assert json.loads(path.stdout)["status"] in ("solved", "in_collision")
+    drawn_beside = ["--record", str(tmp_path / "path.rrd"), "--demonstrations", str(csv)]
+    if run.invoke(app, [*ask, *drawn_beside]).exit_code == 0:
+        entities = read_recording(tmp_path / "path.rrd").entity_paths
+        assert {"/demonstrations", "/identified", "/tool/trace"} <= set(entities)
+    assert run.invoke(app, [*ask, *drawn_beside[2:]]).exit_code == 2, "drawn in no recording"
+    assert run.invoke(app, ["identify", str(csv), "--rounded"]).exit_code == 0
     np.savetxt(csv, xarm.sample(300, np.random.default_rng(0)), delimiter=",")
     assert run.invoke(app, ["identify", str(csv)]).exit_code == 3
     missing = run.invoke(app, ["identify", str(tmp_path / "none.csv")])

@@ -39,7 +39,7 @@ def save_constraint(identified: Identified, file: str | Path, where_shown: bool 
         "found_in": {
             "rows": identified.rows,
             "demonstrations": identified.demonstrations,
-            "noise_rad": identified.noise_rad,
+            "noise_rad": identified.summary()["noise_rad"],
         },
         "constraint": constraint.to_json(),
     }

@@ -27,16 +27,48 @@ CAREFULLY = 4000
 Numbers = Float[np.ndarray, "p"]
 
 
+class Round(NamedTuple):
+    """What lengths and angles are rounded to multiples of."""
+
+    metres: float
+    degrees: float
+
+
+ROUND = (Round(0.05, 15.0), Round(0.01, 5.0), Round(0.005, 1.0), Round(0.001, 0.5))
+"""From the roundest on."""
+NEAR_AXIS = 0.06
+"""How far from an axis a direction may be that is rounded to it."""
+
+
 class Form(NamedTuple):
     """start: its numbers in closed form, from rows.  relations: the rows of the residual that they
     make, in words.  facing: the numbers of which the rows are on the right side, where opposite
     ones have the same zeros.  sides: relations with a tolerance that leave that side alone.
+    parts: what the numbers are, one letter each: d a direction (3 numbers), l a length [m], c a
+    cosine, - what has no round values.
     """
 
     start: Callable[[Sample], Numbers]
     relations: Callable[[Numbers], tuple[Relation, ...]]
     facing: Callable[[Sample, Numbers], Numbers] = lambda _, x: x
     sides: Callable[[Numbers], tuple[Relation, ...]] = lambda _: ()
+    parts: str = ""
+
+    def rounded(self, x: Numbers, digits: Round) -> Numbers:
+        """The numbers with directions along an axis, where they are near one, and with round
+        lengths and angles.
+        """
+        x, at = x.copy(), 0
+        for part in self.parts:
+            if part == "d":
+                x[at : at + 3] = _axis_near(unit(x[at : at + 3]))
+            elif part == "l":
+                x[at] = digits.metres * np.round(x[at] / digits.metres)
+            elif part == "c":
+                angle = np.degrees(np.arccos(np.clip(x[at], -1.0, 1.0)))
+                x[at] = np.cos(np.radians(digits.degrees * np.round(angle / digits.degrees)))
+            at += 3 if part == "d" else 1
+        return x
 
     def roughly(self, sample: Sample) -> tuple[Relation, ...]:
         """As read off in closed form."""
@@ -73,10 +105,10 @@ def _plane(count: int) -> Form:
             normals, offsets = left @ right, x[3 * count :]
         point = offsets @ normals
         if count == 1:
-            told = f"{what}, normal {_vector(normals[0])}, {_mm(offsets[0])} from the base"
+            told = f"{what}, normal {vector(normals[0])}, {_mm(offsets[0])} from the base"
         elif count == 2:
             along = _upright(np.cross(normals[0], normals[1]))
-            told = f"{what} through {_place(point)}, direction {_vector(along)}"
+            told = f"{what} through {_place(point)}, direction {vector(along)}"
         else:
             told = f"{what}, {_place(point)}"
         words = f"the tool's tip {told}"
@@ -85,7 +117,7 @@ def _plane(count: int) -> Form:
             for n, d in zip(normals, offsets, strict=True)
         )
 
-    return Form(start, relations)
+    return Form(start, relations, parts="lll" if count == 3 else "d" * count + "l" * count)
 
 
 def _axis_start(sample: Sample) -> Numbers:
@@ -96,7 +128,7 @@ def _axis_start(sample: Sample) -> Numbers:
 def _axis_relations(x: Numbers) -> tuple[Relation, ...]:
     """R a = n."""
     own, direction = unit(x[:3]), unit(x[3:])
-    words = f"the tool's {axis_words(own)} keeps the direction {_vector(direction)}"
+    words = f"the tool's {axis_words(own)} keeps the direction {vector(direction)}"
     return tuple(_relation(words, "rad", 0.0, turned=(e, own)) for e in across(direction))
 
 
@@ -167,7 +199,7 @@ def _angle_relations(x: Numbers) -> tuple[Relation, ...]:
     a, n = _oriented(unit(x[3:6]), unit(x[:3]))
     level = float(np.clip(x[6], -1.0, 1.0))
     words = (
-        f"the tool's {axis_words(a)} stays at {np.degrees(np.arccos(level)):.2f}° to {_vector(n)}"
+        f"the tool's {axis_words(a)} stays at {np.degrees(np.arccos(level)):.2f}° to {vector(n)}"
     )
     scale = 1.0 / max(np.sqrt(1.0 - level**2), 0.1)
     return (_relation(words, "rad", -level * scale, turned=(n * scale, a)),)
@@ -241,7 +273,7 @@ def _about_a_line(
     centre = centre - (centre @ axis) * axis
     words = (
         f"the tool's tip lies on a {what}, r = {1e3 * radius:.1f} mm about the line through "
-        f"{_place(centre)} along {_vector(axis)}"
+        f"{_place(centre)} along {vector(axis)}"
     )
     return (_round(words, AXES - np.outer(axis, axis), centre, radius),)
 
@@ -252,15 +284,16 @@ def circle(normal: Float[np.ndarray, "3"]) -> Form:
     return Form(
         lambda sample: _around(sample, axis)[3:],
         lambda x: _about_a_line("circle", axis, x[:3], float(abs(x[3]))),
+        parts="llll",
     )
 
 
-AXIS = Form(_axis_start, _axis_relations, _axis_facing, _axis_sides)
+AXIS = Form(_axis_start, _axis_relations, _axis_facing, _axis_sides, "dd")
 ORIENTATION = Form(_orientation_start, _orientation_relations, sides=_orientation_sides)
-ANGLE = Form(_angle_start, _angle_relations)
-CENTRE = Form(_centre_start, _centre_relations)
-SPHERE = Form(_sphere_start, _sphere_relations)
-CYLINDER = Form(_cylinder_start, _cylinder_relations)
+ANGLE = Form(_angle_start, _angle_relations, parts="ddc")
+CENTRE = Form(_centre_start, _centre_relations, parts="llllll")
+SPHERE = Form(_sphere_start, _sphere_relations, parts="llll")
+CYLINDER = Form(_cylinder_start, _cylinder_relations, parts="dllll")
 POSITION, TURNED, POSE, QUADRIC = "position", "orientation", "pose", "position's quadrics"
 PRODUCT = "position times its orientation"
 
@@ -323,6 +356,12 @@ def unit(v: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     return v / np.linalg.norm(v)
 
 
+def _axis_near(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """The axis that a direction is near, or the direction itself."""
+    axis = np.sign(direction) * (np.abs(direction) == np.abs(direction).max())
+    return axis if np.linalg.norm(direction - axis) < NEAR_AXIS else direction
+
+
 def _upright(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     """Of two opposite directions that with a positive largest entry."""
     return direction * np.sign(direction[np.argmax(np.abs(direction))])
@@ -340,10 +379,11 @@ def axis_words(own: Float[np.ndarray, "3"]) -> str:
     """A tool axis in words: "-z axis", or its numbers where it is none of the three."""
     k = int(np.argmax(np.abs(own)))
     angle = np.degrees(np.arccos(min(abs(own[k]), 1.0)))
-    return f"{'-' if own[k] < 0 else ''}{NAMES[k]} axis" if angle < 0.5 else f"axis {_vector(own)}"
+    return f"{'-' if own[k] < 0 else ''}{NAMES[k]} axis" if angle < 0.5 else f"axis {vector(own)}"
 
 
-def _vector(v: Float[np.ndarray, "3"]) -> str:
+def vector(v: Float[np.ndarray, "3"]) -> str:
+    """A direction in words."""
     return "(" + ", ".join(f"{x:g}" for x in np.round(v, 4) + 0.0) + ")"
 
 

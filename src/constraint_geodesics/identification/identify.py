@@ -1,9 +1,10 @@
 """Identification: from simple relations to rich ones, each kept only if it also holds on
 demonstrations that it was not found on.
 
-The order is positions, orientations, the whole pose, then quadrics of the position; what is held
-already is taken out of the gradients of what comes next, so that nothing is found twice.  Where a
-form has a name (forms.py) it stands in place of the combination that was found.
+The order is positions, orientations, the whole pose, then quadrics of the position, and last what
+is not held but bounded; what is held already is taken out of the gradients of what comes next, so
+that nothing is found twice.  Where a form has a name (forms.py) it stands in place of the
+combination that was found.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,15 +19,18 @@ from jaxtyping import Bool, Float
 from constraint_geodesics.constraints.both import Both, both
 from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.constraints.polynomial import PolynomialConstraint, Relation
+from constraint_geodesics.constraints.relations import RelationsConstraint
 from constraint_geodesics.constraints.spline import Spline, SplineConstraint, SplineRelation
 from constraint_geodesics.constraints.tool_features import FEATURES
 from constraint_geodesics.identification import freeform
+from constraint_geodesics.identification.bounds import Bound, bounds_of
 from constraint_geodesics.identification.demonstrations import demonstrations_from
 from constraint_geodesics.identification.forms import (
     POSE,
     POSITION,
     PRODUCT,
     QUADRIC,
+    ROUND,
     TURNED,
     Form,
     named,
@@ -59,11 +63,15 @@ WORTH = 0.8
 """What is freeform takes a formula's place where left-out demonstrations are nearer by this."""
 WORSE, FINE_RAD = 1.25, 2e-5
 """A form may be off by so many times what the combination is that it stands for, and by so much."""
+LOOSE_RAD = 0.008
+"""Relations that are held no better may be tolerances."""
 ROUNDS = 4
 VARIED, FAR, VARIED_RAD = 5.0, 25.0, 1e-3
 """Demonstrations vary in every direction that is left free by so many times the rows' distance from
 the relations, in their farthest by so many times, and by so much [rad].
 """
+SAME_RAD = 1e-7
+"""Relations from which all rows' distances differ by no more are the same."""
 SAME_M = 1e-9
 """Joints whose origins are no further apart have the same place."""
 _COLUMNS = {POSITION: np.arange(3), TURNED: np.arange(3, 12), POSE: np.arange(12)}
@@ -82,13 +90,15 @@ class Identified:
     """What demonstrations keep to.
 
     constraint: None where nothing was identified.  relations: in words, each with the rms by which
-    it is missed on left-out demonstrations.  codim: dimensions that they take.  noise_rad: rms
-    distance of the rows from the constraint manifold, along each direction that is held; nan
-    without a constraint.  left_out: rms
+    it is missed on left-out demonstrations, and bounds, with the rms by which these are beyond.
+    codim: dimensions that relations take.  noise_rad: rms distance of the rows from the constraint
+    manifold, along each direction that is held; nan without one.  left_out: rms
     of each row of the residual on left-out demonstrations, in its unit.  missing: what was seen but
     not supported, or why there is nothing.  dropped: rows that were taken to be wrong.  robot: its
     name and tool link, of whose tool all this is said.  support: the region where demonstrations
-    were; `supported` keeps a path in it.
+    were; `supported` keeps a path in it.  bounds: how many of the relations are tolerances.
+    rounded: the same with axes and round numbers that left-out demonstrations are no further from,
+    None if there are none.
     """
 
     constraint: Constraint | None
@@ -102,6 +112,8 @@ class Identified:
     dropped: int
     robot: tuple[str, str]
     support: Support | None = None
+    bounds: int = 0
+    rounded: "Identified | None" = None
 
     @property
     def supported(self) -> Constraint | None:
@@ -128,9 +140,11 @@ class Identified:
             "relations": list(self.relations),
             "missing": self.missing,
             "codim": self.codim,
-            "noise_rad": self.noise_rad if identified else None,
+            "bounds": self.bounds,
+            "noise_rad": self.noise_rad if self.codim else None,
             "left_out_error": self.left_out_error,
             "where_shown": None if self.support is None else self.support.words,
+            "rounded": None if self.rounded is None else list(self.rounded.relations),
             "rows": self.rows,
             "demonstrations": self.demonstrations,
             "dropped": self.dropped,
@@ -147,7 +161,11 @@ class Identified:
         """All of it in one line."""
         told = "; ".join(self.relations) or "nothing is identified"
         dropped = f"; {self.dropped} wrong rows left out" if self.dropped else ""
-        return f"{told}{dropped}{': ' if not self.relations else '. '}{self.missing}".rstrip(". ")
+        line = f"{told}{dropped}{': ' if not self.relations else '. '}{self.missing}".rstrip(". ")
+        if self.rounded is None:
+            return line
+        rounder = [own for own in self.rounded.relations if own not in self.relations]
+        return f"{line}. Within the noise: {'; '.join(rounder)}"
 
 
 def identify(demonstrations: Any, robot: SerialRobot) -> Identified:
@@ -181,7 +199,13 @@ def identify(demonstrations: Any, robot: SerialRobot) -> Identified:
     if not search.relations and search.folds:
         search = _of_joints(search, sample, robot, q)
     search = _varied(search, q)
-    return _told(search, robot, len(shown), len(sample) - len(search.sample))
+    if search.joint is None:
+        search = _bounded(search)
+    dropped = len(sample) - len(search.sample)
+    found, rounded = _told(search, robot, len(shown), dropped), _rounded(search)
+    if rounded is None:
+        return found
+    return replace(found, rounded=_told(rounded, robot, len(shown), dropped))
 
 
 def _likely(sample: Sample) -> Bool[np.ndarray, "n"]:
@@ -194,47 +218,48 @@ def _likely(sample: Sample) -> Bool[np.ndarray, "n"]:
     return np.ones(len(sample), dtype=bool)
 
 
+@dataclass(frozen=True)
+class _Step:
+    """Relations that were found together.  again: how they are found on other rows.  sides: which
+    of opposite sides of theirs is shown.  form: whose `numbers` they are of, if they have a name.
+    """
+
+    again: Found
+    relations: tuple[AnyRelation, ...]
+    sides: tuple[AnyRelation, ...] = ()
+    form: Form | None = None
+    numbers: Float[np.ndarray, "p"] | None = None
+
+
 @dataclass
 class _Search:
     """What is found so far, how, and what was seen but not supported.  joint: whose place it is
-    about, None for the tool.
+    about, None for the tool.  bounds: what is not held but bounded.
     """
 
     sample: Sample
     folds: Sequence[Bool[np.ndarray, "n"]]
     best_rad: float = 0.0
-    steps: list[tuple[Found, tuple[AnyRelation, ...], tuple[AnyRelation, ...]]] = field(
-        default_factory=list
-    )
+    steps: list[_Step] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     joint: int | None = None
-
-    def keep(
-        self, found: Found, relations: tuple[AnyRelation, ...], sides: tuple[AnyRelation, ...] = ()
-    ) -> None:
-        """Take relations in, how they are found on other rows, and which of opposite sides of
-        theirs is shown.
-        """
-        self.steps.append((found, relations, sides))
+    bounds: tuple[Bound, ...] = ()
 
     @property
     def relations(self) -> tuple[AnyRelation, ...]:
         """All that are found."""
-        return tuple(own for _, relations, _ in self.steps for own in relations)
+        return tuple(own for step in self.steps for own in step.relations)
 
     @property
     def sides(self) -> tuple[AnyRelation, ...]:
         """All of them."""
-        return tuple(own for *_, sides in self.steps for own in sides)
+        return tuple(own for step in self.steps for own in step.sides)
 
     @cached_property
-    def on_others(self) -> list[tuple[Sample, tuple[AnyRelation, ...]]]:
-        """The rows of each fold, and the relations as they are found on all others."""
+    def on_others(self) -> list[tuple[Sample, tuple[tuple[AnyRelation, ...], ...]]]:
+        """The rows of each fold, and the relations of each step as they are found on all others."""
         return [
-            (
-                self.sample[out],
-                tuple(own for step in self.steps for own in step[0](self.sample[~out])),
-            )
+            (self.sample[out], tuple(step.again(self.sample[~out]) for step in self.steps))
             for out in self.folds
         ]
 
@@ -249,6 +274,22 @@ def _searched(sample: Sample) -> _Search:
     search = _with_freeform(search) if search.folds else search
     _look(search, PRODUCT)
     return search
+
+
+def _bounded(search: _Search) -> _Search:
+    """The same with bounds on what is free, and in place of relations that are only nearly held and
+    whose residuals fill an interval or disc.
+    """
+    loose = [
+        _distance(search.sample, step.relations) > LOOSE_RAD * len(step.relations) ** 0.5
+        for step in search.steps
+    ]
+    held = [step for step, own in zip(search.steps, loose, strict=True) if not own]
+    rest = _Search(search.sample, search.folds, search.best_rad, held, search.missing)
+    for own in (rest, search) if any(loose) else (search,):
+        placed = any(map(_holds_the_tip, own.relations))
+        own.bounds = bounds_of(own.sample, _turned(own) > 0, placed, own.folds)
+    return rest if len(rest.bounds) > len(search.bounds) else search
 
 
 def _varied(search: _Search, q: Float[np.ndarray, "n D"]) -> _Search:
@@ -268,7 +309,7 @@ def _varied(search: _Search, q: Float[np.ndarray, "n D"]) -> _Search:
         f"what seems to be held varies by {noise:.2g} rad, and what seems to be free by only "
         f"{least:.2g} to {spreads[0]:.2g}: show more demonstrations that differ from each other"
     )
-    return _Search(search.sample, search.folds, missing=[missing])
+    return _Search(search.sample, [], missing=[missing])
 
 
 def _of_joints(
@@ -331,7 +372,8 @@ def _look(search: _Search, name: str) -> None:
             relations = form.relations(numbers)
             good = _distance(search.sample, relations) <= WORSE * off + FINE_RAD
             if good and (count == held or _supported(form, search)):
-                search.keep(partial(_fitted, form), relations, form.sides(numbers))
+                again, sides = partial(_fitted, form), form.sides(numbers)
+                search.steps.append(_Step(again, relations, sides, form, numbers))
                 return
     if held < seeming and found.found_rad[held] < 0.5 * found.left_out_rad[held]:
         on_others = found.left_out_rad[held]
@@ -342,7 +384,7 @@ def _look(search: _Search, name: str) -> None:
         )
     if held:
         again = partial(_again, name, rank(free, found.weights[:, :held]), search.relations)
-        search.keep(again, again(search.sample))
+        search.steps.append(_Step(again, again(search.sample)))
 
 
 def _with_freeform(search: _Search) -> _Search:
@@ -360,11 +402,11 @@ def _with_freeform(search: _Search) -> _Search:
     if off < FINE_RAD or flat > 1:
         return search
     other = _Search(search.sample, search.folds, best_rad=search.best_rad)
-    for again, relations, sides in search.steps:
+    for step in search.steps:
         # a plane stays, unless it is what is in question
-        kept = [not _holds_the_tip(own) or (tip > 1 and _is_flat(own)) for own in relations]
+        kept = [not _holds_the_tip(own) or (tip > 1 and _is_flat(own)) for own in step.relations]
         if all(kept):
-            other.keep(again, relations, sides)
+            other.steps.append(step)
     found = _look_for_tip(other, off)
     if found is None:
         return search
@@ -395,7 +437,7 @@ def _look_for_tip(search: _Search, off: float) -> freeform.Freeform | None:
             found = _better(search, found, freeform.along_normal(sample, found))
     if found is None or found.left_out_rad >= WORTH * off:
         return None
-    search.keep(found.again, found.relations, found.sides)
+    search.steps.append(_Step(found.again, found.relations, found.sides))
     return found
 
 
@@ -430,7 +472,7 @@ def _look_for_axes(search: _Search, tip: freeform.Freeform | None) -> None:
         )
     found = next(filter(None, (_better(search, None, model) for model in models)), None)
     if found is not None:
-        search.keep(found.again, found.relations)
+        search.steps.append(_Step(found.again, found.relations))
 
 
 def _rest(search: _Search, place: Spline, axis: Float[np.ndarray, "3"]) -> freeform.Model:
@@ -532,37 +574,80 @@ def _distance(sample: Sample, relations: Sequence[AnyRelation]) -> float:
     return better_rms(sample.distances(relations))
 
 
+def _rounded(search: _Search) -> _Search | None:
+    """The same with rounder numbers, where left-out demonstrations are no further from these than
+    from what was found without them; None where there are none.
+    """
+    steps = list(search.steps)
+    for k, step in enumerate(search.steps):
+        if step.form is None or step.numbers is None:
+            continue
+        off = sum(_distance(sample, found[k]) ** 2 for sample, found in search.on_others)
+        for digits in ROUND:
+            x = step.form.rounded(step.numbers, digits)
+            relations = step.form.relations(x)
+            moved = search.sample.distances(relations) - search.sample.distances(step.relations)
+            if np.abs(moved).max() < SAME_RAD:
+                break  # they are round already
+            if sum(_distance(own, relations) ** 2 for own, _ in search.on_others) <= off:
+                again = partial(_as_they_are, relations)
+                steps[k] = _Step(again, relations, step.form.sides(x), step.form, x)
+                break
+    if all(own is step for own, step in zip(steps, search.steps, strict=True)):
+        return None
+    return _Search(
+        search.sample,
+        search.folds,
+        search.best_rad,
+        steps,
+        search.missing,
+        search.joint,
+        search.bounds,
+    )
+
+
+def _as_they_are(relations: tuple[AnyRelation, ...], _: Sample) -> tuple[AnyRelation, ...]:
+    """Round numbers are not fitted."""
+    return relations
+
+
 def _told(search: _Search, robot: SerialRobot, demonstrations: int, dropped: int) -> Identified:
     missing, counts = "; ".join(search.missing), (len(search.sample), demonstrations, dropped)
     whose = robot.name, robot.tool_link
-    if not search.relations:
+    if not search.relations and not search.bounds:
         missing = missing or "the demonstrations keep to no relation, the motion is free"
         return Identified(None, (), 0, np.nan, (), missing, *counts, whose)
-    left_out = _left_out(search)
+    held = _left_out(search).tolist()
+    left_out = [*held, *(own.left_out for own in search.bounds)]
+    bounds = [own.relation for own in search.bounds]
     worst: dict[str, dict[str, float]] = {}
-    for own, value in zip(search.relations, left_out.tolist(), strict=True):
+    for own, value in zip((*search.relations, *bounds), left_out, strict=True):
         by_unit = worst.setdefault(own.name, {})
         by_unit[own.unit] = max(by_unit.get(own.unit, 0.0), value)
     told = tuple(
         f"{name} (± {', '.join(_amount(unit, value) for unit, value in by_unit.items())})"
         for name, by_unit in worst.items()
     )
-    noise = search.sample.distances(search.relations)
-    noise_rad = float(np.sqrt((noise**2).mean() / len(search.relations)))
+    noise_rad = np.nan
+    if search.relations:
+        noise = search.sample.distances(search.relations)
+        noise_rad = float(np.sqrt((noise**2).mean() / len(search.relations)))
     # a side is no relation that is missed: it only tells two sets of the same zeros apart
-    about = (*left_out.tolist(), *(0.0 for _ in search.sides))
+    about = (*left_out, *(0.0 for _ in search.sides))
     region = None
     if search.joint is None:
         region = support_of(search.sample, search.relations, search.folds)
     else:
         origin = f"the origin of {robot.joint_names[search.joint]}"
         told = tuple(words.replace(TIP, origin) for words in told)
-    rows = (*search.relations, *search.sides)
+    rows = (*search.relations, *bounds, *search.sides)
     if search.joint is not None:
         rows = tuple(replace(own, name=own.name.replace(TIP, origin)) for own in rows)
     constraint, about = _constraint(rows, about, search.joint)
     codim = len(search.relations)
-    return Identified(constraint, told, codim, noise_rad, about, missing, *counts, whose, region)
+    return Identified(
+        constraint, told, codim, noise_rad, about, missing, *counts, whose, region, len(bounds)
+    )
 
 
 def _constraint(
@@ -585,8 +670,8 @@ def _constraint(
 def _left_out(search: _Search) -> Float[np.ndarray, "m"]:
     """The rms of each row on demonstrations that its relation was not found on."""
     squares = [
-        [float((own.values(sample.pose[0]) ** 2).mean()) for own in relations]
-        for sample, relations in search.on_others
+        [float((own.values(sample.pose[0]) ** 2).mean()) for step in steps for own in step]
+        for sample, steps in search.on_others
     ]
     return np.sqrt(np.mean(squares, axis=0))
 
@@ -595,7 +680,7 @@ def _tip_left_out_rad(search: _Search) -> float:
     """The rms distance of the better GOOD of the rows from what holds the tip, along each direction
     that it holds, on demonstrations that it was not found on.
     """
-    holds = [tuple(filter(_holds_the_tip, relations)) for _, relations in search.on_others]
+    holds = [tuple(filter(_holds_the_tip, sum(steps, ()))) for _, steps in search.on_others]
     off = [own.distances(tip) for (own, _), tip in zip(search.on_others, holds, strict=True)]
     return better_rms(np.concatenate(off)) / float(np.sqrt(len(holds[0])))
 
@@ -611,9 +696,5 @@ def with_tolerance(constraint: Constraint, loosely: float) -> Constraint:
     if isinstance(constraint, Both):
         parts = constraint.first, constraint.second
         return Both(*(with_tolerance(own, loosely) for own in parts))
-    assert isinstance(constraint, (PolynomialConstraint, SplineConstraint))
-    relations: Any = zip(constraint.relations, constraint.left_out, strict=True)
-    wider = tuple(
-        replace(own, tolerance=max(own.tolerance, loosely * off)) for own, off in relations
-    )
-    return replace(constraint, relations=wider)  # type: ignore[arg-type]
+    assert isinstance(constraint, RelationsConstraint)
+    return constraint.widened([loosely * off for off in constraint.left_out])

@@ -29,6 +29,7 @@ from constraint_geodesics import palette
 from constraint_geodesics.certification.certifier import Limits
 from constraint_geodesics.constraints.constraint import ConstraintManifold, Series
 from constraint_geodesics.recording.goal import GoalView, goal_drawings
+from constraint_geodesics.recording.shown import ENTITIES, shown_drawings
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.urdf import urdf_name
@@ -102,6 +103,8 @@ class PathRecord:
     """What the judge grants a violation [rad or m]."""
     goal: GoalView | None = None
     """What was asked to reach, where it is more than the last configuration."""
+    demonstrations: Sequence[Float[np.ndarray, "T D"]] = ()
+    """What the constraint was found in [rad or m], if it was."""
     meshes: bool = True
     """Whether the file holds the meshes of robot and bodies, to be opened anywhere; without them it
     is a tenth as large and names the URDFs that `geodesics replay` adds them from.
@@ -179,6 +182,10 @@ def record_path(
         *scene_chunks(robot, workcell, sampled, meshes=path.meshes),
         *tool_chunks(sampled, rgb(palette.planner_colour(path.planner))),
         *(static(*drawing) for drawing in goal_drawings(robot, path.goal)),
+        *(
+            static(*drawing)
+            for drawing in shown_drawings(robot, path.demonstrations, manifold.constraint)
+        ),
         *_series_chunks(series, sampled),
         *joint_chunks(robot, sampled),
         *_latent_chunks(path.latent, sampled),
@@ -515,7 +522,7 @@ def _blueprint(path: PathRecord, sampled: Frames, series: Sequence[Series]) -> A
     shares = [2.5 if isinstance(panel, rrb.Spatial2DView) else 1.0 for panel in right]
     right.append(joint_panel())
     shares.append(1.8)  # its legend names every joint
-    more = () if path.goal is None else ("goal",)
+    more = ("goal",) * (path.goal is not None) + ENTITIES * bool(path.demonstrations)
     return arranged(
         scene_panel(sampled, *more), rrb.Vertical(*right, row_shares=shares), path_time()
     )

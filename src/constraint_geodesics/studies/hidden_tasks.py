@@ -3,7 +3,7 @@ collision by PyBullet.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -22,9 +22,13 @@ HINGE, REACH, HEIGHT = np.array([0.55, 0.35, 0.0]), 0.35, 0.3
 HOLE, HOLE_M = CENTRE + RADIUS * np.array([-0.09, 0.44, 0.893]), 0.04
 """A place on the bowl, and what is left out around it."""
 HOSE, HOSE_M, LINK = np.array([0.25, 0.25, 0.55]), 0.4, 3
+LEAN_RAD = float(np.radians(10.0))
+"""How far a cup may lean, of the task with a tolerance."""
 TORUS_M, TUBE_M, TORUS_HEIGHT = 0.38, 0.12, 0.3
 ROWS, STEP_RAD, APART_RAD = 60, 0.3, (0.4, 2.5)
 """Rows of a demonstration, their largest step, and how far apart its ends are."""
+KNOTS = 8
+"""Leanings that a demonstration goes through, where it may lean."""
 SMOOTH_ROWS = 5
 """Over which a person's error changes."""
 Rows = Float[np.ndarray, "n D"]
@@ -34,7 +38,8 @@ Rows = Float[np.ndarray, "n D"]
 class HiddenTask:
     """hidden: the formula.  shown: of configurations that keep to it, which a demonstration may
     hold.  branch_rad: how far from one configuration all are, where there are several branches.
-    made_for: whether a family of features was made for it.
+    made_for: whether a family of features was made for it.  loosely_rad: how far off LEVEL what is
+    shown may be, where that much is allowed.
     """
 
     name: str
@@ -42,6 +47,7 @@ class HiddenTask:
     shown: Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]], Bool[np.ndarray, "n"]]
     branch_rad: float = np.inf
     made_for: bool = True
+    loosely_rad: float = 0.0
     off: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
     _made: dict[str, ConstraintManifold] = field(default_factory=dict)
     _centres: dict[str, np.ndarray] = field(default_factory=dict)
@@ -59,6 +65,12 @@ class HiddenTask:
             near = np.linalg.norm(q[:, None] - q[None], axis=2) < self.branch_rad
             self._centres[robot.name] = q[np.argmax(near.sum(axis=1))]
         return self._centres[robot.name]
+
+    def around(self, robot: SerialRobot) -> ConstraintManifold:
+        """What configurations are drawn on or, where a tolerance is allowed, around."""
+        if not self.loosely_rad:
+            return self.manifold(robot)
+        return ConstraintManifold(robot, PolynomialConstraint(LEVEL))
 
     def missed(self, robot: SerialRobot, q: Rows) -> tuple[np.ndarray, np.ndarray]:
         """By how much configurations miss it, in degrees and mm."""
@@ -89,10 +101,20 @@ class HiddenTask:
         return np.concatenate(found)[:count]
 
     def _kept(self, robot: SerialRobot, drawn: Rows) -> Rows:
-        projected = retract(self.manifold(robot), drawn)
+        projected = retract(self.around(robot), drawn)
         q = projected.joints[projected.converged]
+        if self.loosely_rad:
+            q = self._leaning(robot, q, _in_disc(len(q), np.random.default_rng(len(q))))
         q = q[robot.limit_distance(q) > 0.0]
         return q[self.shown(*robot.forward(q))]
+
+    def _leaning(self, robot: SerialRobot, q: Rows, tilts: Float[np.ndarray, "n 2"]) -> Rows:
+        """Configurations that are off LEVEL by shares of what is allowed."""
+        for _ in range(2):
+            off, slopes = self.around(robot).linearise(q)
+            wanted = np.sin(self.loosely_rad) * tilts - off
+            q = q + (np.linalg.pinv(slopes) @ wanted[:, :, None])[:, :, 0]
+        return q
 
     def demonstrate(self, scene: Scene, count: int, error_deg: float, seed: int) -> list[Rows]:
         """Motions of ROWS rows between such configurations, with a person's smooth error."""
@@ -107,8 +129,10 @@ class HiddenTask:
                     continue
                 last = ends[near[rng.integers(len(near))]]
                 t = np.linspace(0.0, 1.0, ROWS)[:, None]
-                way = retract(self.manifold(robot), first + t * (last - first))
+                way = retract(self.around(robot), first + t * (last - first))
                 q = way.joints
+                if self.loosely_rad:
+                    q = self._leaning(robot, q, _wandering(rng))
                 steps = np.linalg.norm(np.diff(q, axis=0), axis=1)
                 if not way.converged.all() or steps.max() > STEP_RAD:
                     continue
@@ -119,6 +143,18 @@ class HiddenTask:
                 if not (labels.self_collision | labels.workcell_collision).any():
                     found.append(q)
         return [q + _error(q.shape, error_deg, rng) for q in found]
+
+
+def _in_disc(count: int, rng: np.random.Generator) -> Float[np.ndarray, "n 2"]:
+    """Random places of the unit disc."""
+    away, angle = np.sqrt(rng.random(count)), 2.0 * np.pi * rng.random(count)
+    return np.stack([away * np.cos(angle), away * np.sin(angle)], axis=1)
+
+
+def _wandering(rng: np.random.Generator) -> Float[np.ndarray, "T 2"]:
+    """ROWS places on a way through random ones of the unit disc."""
+    knots, at = _in_disc(KNOTS, rng), np.linspace(0.0, KNOTS - 1.0, ROWS)
+    return np.stack([np.interp(at, np.arange(KNOTS), own) for own in knots.T], axis=1)
 
 
 def _error(shape: tuple[int, ...], degrees: float, rng: np.random.Generator) -> np.ndarray:
@@ -149,6 +185,13 @@ LEVEL = (row("rad", 0.0, u21=1.0), row("rad", 0.0, u22=1.0))
 """The tool's y axis upright."""
 BOWL = tuple(row("m", -float(CENTRE[k]), **{f"p{k}": 1.0, f"u3{k + 1}": RADIUS}) for k in range(3))
 """The tip on a sphere, the tool's z axis towards its centre."""
+
+
+def _cone(angle: float) -> Relation:
+    """The tool's y axis within an angle of straight up."""
+    steep, level = np.sin(angle), np.cos(angle)
+    own = row("rad", float(-0.5 * (1.0 + level) / steep), u23=float(1.0 / steep))
+    return replace(own, tolerance=float(0.5 * (1.0 - level) / steep))
 
 
 def _polynomial(*relations: Relation) -> Callable[[SerialRobot], Constraint]:
@@ -253,6 +296,12 @@ def _on_top(p: np.ndarray, _: np.ndarray) -> np.ndarray:
     return np.asarray(p[:, 2] - CENTRE[2] > RADIUS * np.cos(np.radians(50.0)))
 
 
+def _off_cone(p: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the tool's y axis beyond what it may lean."""
+    lean = np.arccos(np.clip(turned[:, 2, 1], -1.0, 1.0))
+    return np.degrees(np.maximum(lean - LEAN_RAD, 0.0)), np.zeros(len(p))
+
+
 def _off_bowl(p: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of the tool's z axis from the direction to the centre, and of the tip from the sphere."""
     inward = CENTRE - p
@@ -289,6 +338,11 @@ def _between(p: np.ndarray, _: np.ndarray) -> np.ndarray:
     return np.asarray((p[:, 2] > 0.05) & (p[:, 2] < 0.6))
 
 
+def _little_tilted(_: np.ndarray, turned: np.ndarray) -> np.ndarray:
+    # paths turn at the edge
+    return np.asarray(turned[:, 2, 1] > np.cos(LEAN_RAD + 1e-3))
+
+
 def _door(p: np.ndarray, turned: np.ndarray) -> np.ndarray:
     return _upright(p, turned) & (p[:, 1] < 0.30) & (p[:, 0] > 0.15)
 
@@ -309,6 +363,13 @@ TASKS = {
         HiddenTask("wavy surface", _wavy, _patch, 1.3, off=_off_waves),
         HiddenTask("hole", _polynomial(*BOWL), _beside_hole, 1.3, off=_off_bowl),
         HiddenTask("hose at the elbow", _hose, _anywhere, 1.5),
+        HiddenTask(
+            "leaning cup",
+            _polynomial(_cone(LEAN_RAD)),
+            _little_tilted,
+            loosely_rad=LEAN_RAD,
+            off=_off_cone,
+        ),
         HiddenTask("torus", _torus, _above, 1.3, made_for=False),
         HiddenTask("looking away", _looking_away, _upright, 1.3),
         HiddenTask("leaning with height", _leaning, _between, 1.3, made_for=False),
