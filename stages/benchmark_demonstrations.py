@@ -14,6 +14,7 @@ from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.demonstrations_figure import demonstrations_figure
 from constraint_geodesics.studies.demonstrations import (
+    by_cell,
     cells_of,
     example,
     free_arms,
@@ -31,7 +32,7 @@ def main(params: Params, layout: Layout) -> None:
     """Write reports/demonstrations.csv.gz, demonstrations.json and demonstrations.png."""
     own, reports = params.demonstrations, layout.root / "reports"
     with tracked_stage(Work(STAGE, STAGE, own, []), params.tracking.experiment, layout.root) as run:
-        cells = cells_of(params, layout)
+        cells = cells_of(params, layout, STAGE)
         found = parallel_map(measure, cells, params.compute, description="demonstrations")
         table = pd.DataFrame([row for rows in found for row in rows])
         table.to_csv(
@@ -48,6 +49,7 @@ def main(params: Params, layout: Layout) -> None:
         }
         picture = demonstrations_figure(example(params, layout))
         picture.savefig(reports / "demonstrations.png", dpi=110)
+        run.cells(by_cell(figures["cells"]))
         run.report(figures, reports / "demonstrations.json")
         for cell in cells:  # finished: the next run of this stage starts from nothing
             shutil.rmtree(cell.kept.parent, ignore_errors=True)

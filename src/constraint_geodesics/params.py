@@ -285,14 +285,31 @@ class CompareChartsParams(_Record):
     hole: HoleParams
 
 
-class DemonstrationsParams(_Record):
-    """Constraints from demonstrations whose formula is hidden.  pairs: queries of each cell, of
-    which peers that are no planners are asked the first `peer_pairs`.
+class LearnedDemonstrationsParams(_Record):
+    """What is learned of demonstrations for comparison.  vae: the manifold whose networks it has;
+    batches: in an epoch.
     """
 
+    level_set_steps: Count
+    residual_steps: Count
+    vae: Name
+    beta: NonNegative
+    epochs: Count
+    batches: Count
+    policy_steps: Count
+
+
+class DemonstrationsParams(_Record):
+    """Constraints from demonstrations whose formula is hidden.  tasks: of
+    studies/hidden_tasks.py.  pairs: queries of each cell, of which peers that are no planners are
+    asked the first `peer_pairs`.
+    """
+
+    tasks: Annotated[tuple[str, ...], Field(min_length=1)]
     seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
     pairs: Count
     peer_pairs: Count
+    learned: LearnedDemonstrationsParams
 
 
 class SubmanifoldParams(_Record):
@@ -657,6 +674,7 @@ class Params(_Record):
         for study, name, taken in (
             ("compare_manifolds.vae", self.compare_manifolds.vae, self.manifolds),
             ("compare_charts.vae", charts.vae, self.manifolds),
+            ("demonstrations.learned.vae", self.demonstrations.learned.vae, self.manifolds),
             ("compare_charts.constraint", charts.constraint, self.constraints),
         ):
             if name not in taken:

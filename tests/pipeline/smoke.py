@@ -43,7 +43,13 @@ SMALL: dict[str, Any] = {
         "queries": 2,
         "hole": {"dims": [2], "pairs": 2},
     },
-    "demonstrations": {"seeds": [0], "pairs": 2, "peer_pairs": 1},
+    "demonstrations": {
+        "tasks": ["cup", "hole"],
+        "seeds": [0],
+        "pairs": 2,
+        "peer_pairs": 1,
+        "learned": {"level_set_steps": 40, "residual_steps": 40, "epochs": 2, "policy_steps": 2560},
+    },
     "geometry": {"rounds": 1, "batch": 256, "checked": 32, "graph_points": 200, "pairs": 4},
     "policies": {
         "seeds": [0, 1],

@@ -39,6 +39,7 @@ for name, *items in (
     ("benchmark_policies",),
     ("compare_charts",),
     ("benchmark_demonstrations",),
+    ("learn_demonstrations",),
     ("report",),
 ):
     importlib.import_module(name).main(load_params(), Layout(), *items)

@@ -8,9 +8,12 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.demonstrations_page import demonstrations_markdown
 from constraint_geodesics.report.results import studies_at_hand
 from constraint_geodesics.studies.demonstrations import (
+    DESCENT,
     FORMULA,
     IDENTIFIED,
+    LEVEL_SET,
     NEAREST,
+    ROUNDED,
     TANGENTS,
     WITHIN,
 )
@@ -38,7 +41,9 @@ def layout(tmp_path) -> Layout:
         WITHIN: method(0.0, 0.0, depth_mm=1.5, depth_mm_p95=2.5),
     }
     cells = {
-        "door": {"noisy": formula | {IDENTIFIED: method(0.1, 0.2)} | peers},
+        "door": {
+            "noisy": formula | {IDENTIFIED: method(0.1, 0.2), ROUNDED: method(0.03, 0.04)} | peers
+        },
         "leaning": {"noisy": formula | {IDENTIFIED: NOTHING} | peers},
         "hole": {"clean": hole},
     }
@@ -66,6 +71,22 @@ def test_there_is_a_row_for_each_cell(params, layout) -> None:
     (within,) = (line for line in lines if line.startswith(f"| {WITHIN}"))
     assert "1.5" in within
     assert not any("nan" in line for line in lines)
+
+
+def test_what_is_learned_stands_beside_it_where_it_was_run(params, layout) -> None:
+    learned = {LEVEL_SET: method(0.05, 0.9, trained_s=6.0), DESCENT: method(7.0, 0.9)}
+    file = layout.root / "reports" / "learned_demonstrations.json"
+    file.write_text(json.dumps({"cells": {"door": {"noisy": learned}}}))
+    text = demonstrations_markdown(params, layout)
+    lines = [line for line in text.splitlines() if "| door " in line]
+    assert len(lines) == 3
+    assert "0.03 / 0.04" in lines[0]
+    assert "0.05 / 0.9" in lines[2]
+    assert "7 / 0.9" in lines[2]
+    # a network is the best peer in degrees now: one comparison fewer is won, of as many
+    assert "at most that of the best peer in 0 of 4 comparisons" in text
+    (trained,) = (line for line in text.splitlines() if line.startswith(f"| {LEVEL_SET} "))
+    assert "6" in trained
 
 
 def test_the_report_writes_it_where_the_study_was_run(params, layout, tmp_path) -> None:

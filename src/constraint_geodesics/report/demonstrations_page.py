@@ -10,10 +10,17 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.cells import Cells, fixed, markdown_table, share, short
 from constraint_geodesics.report.results import read_metrics
 from constraint_geodesics.studies.demonstrations import (
+    DESCENT,
+    FLAT,
     FORMULA,
     IDENTIFIED,
+    LEARNED,
+    LEVEL_SET,
     NEAREST,
     PEERS,
+    POLICY,
+    RESIDUAL,
+    ROUNDED,
     TANGENTS,
     WITHIN,
 )
@@ -23,10 +30,12 @@ Figures = Mapping[str, Any]
 
 def demonstrations_markdown(params: Params, layout: Layout) -> str:
     """Tables and sentences, as Markdown."""
-    found, own = (
-        read_metrics(layout.root / "reports" / "demonstrations.json"),
-        params.demonstrations,
-    )
+    reports, own = layout.root / "reports", params.demonstrations
+    found = read_metrics(reports / "demonstrations.json")
+    learned = reports / "learned_demonstrations.json"
+    known = read_metrics(learned)["cells"] if learned.is_file() else {}
+    for task, case, methods in _cells(known):
+        found["cells"][task][case] |= methods
     given = (
         f"Each task's formula is hidden from `identify`, which is given demonstrations of it: "
         f"motions with a person's smooth error, or independent rows with noise of each joint, all "
@@ -34,7 +43,8 @@ def demonstrations_markdown(params: Params, layout: Layout) -> str:
         f"formula, and that the formula's planner joins by a path in the region that is shown, or "
         f"through the hole of that task, are asked for in each of "
         f"{len(own.seeds)} draws; peers, whose paths meet the workcell or not, are asked for "
-        f"{own.peer_pairs} of them. The worst violation of the formula along each path is taken: "
+        f"{own.peer_pairs} of them. Of a tolerance, straight joint lines between the ends "
+        f"leave it. The worst violation of the formula along each path is taken: "
         f"medians over the paths, 95th percentiles behind them. Length is over the path of the "
         f"formula's planner. Times include the projection of the ends and the certificate, not the "
         f"graph of a new constraint, which is drawn once."
@@ -45,16 +55,37 @@ def demonstrations_markdown(params: Params, layout: Layout) -> str:
         f"out. *{NEAREST}* is the shortest way over a graph of the rows, in which each is joined "
         f"to rows of other demonstrations, too."
     )
+    trained = (
+        f"*{LEVEL_SET}* learns a function that is zero at the rows and the distance from them "
+        f"beside them (ECoMaNN), in {own.learned.level_set_steps} steps, *{RESIDUAL}* the way back "
+        f"to the rows from beside them, in {own.learned.residual_steps}; both are told the rank, "
+        f"and see joints or tool poses, whichever is better on demonstrations left out; paths are "
+        f"bands on their zeros. *{DESCENT}* is the paper's way without a formula: a VAE of the "
+        f"rows with as many latent dimensions as the hidden set has ({own.learned.epochs} epochs "
+        f"of {own.learned.batches} batches), and cubic geodesics of its metric by descent; "
+        f"*{POLICY}* the same by a policy of {own.learned.policy_steps} PPO steps; ends are the "
+        f"query's own. All are trained on the same demonstrations of {len(own.seeds)} seeds."
+    )
     parts = [
         "# Constraints from demonstrations",
         " ".join(_sentences(found)),
         given,
         markdown_table(_identified_rows(found["cells"])),
         peers,
-        markdown_table(_peer_rows(found["cells"])),
-        markdown_table(_hole_rows(found["cells"])),
+        markdown_table(_peer_rows(found["cells"], PEERS)),
     ]
+    if known:
+        shown = (LEVEL_SET, RESIDUAL, DESCENT, POLICY)
+        parts += [trained, markdown_table(_peer_rows(found["cells"], shown))]
+        parts.append(markdown_table(_training_rows(found["cells"])))
+    parts += [HOLES, markdown_table(_hole_rows(found["cells"]))]
     return "\n\n".join(parts) + "\n"
+
+
+HOLES = (
+    "Where the examples have a hole, the learned metric's variance is the other way to keep out of "
+    "it. The formula and what is identified say nothing of it."
+)
 
 
 def _cells(cells: Figures) -> Iterator[tuple[str, str, Figures]]:
@@ -76,7 +107,8 @@ def _sentences(found: Figures) -> Iterator[str]:
     better, compared = 0, 0
     for _, _, methods in _cells(found["cells"]):
         own = methods.get(IDENTIFIED)
-        peers = [methods[name] for name in PEERS if methods.get(name, {}).get("solved")]
+        peers = [methods.get(name, {}) for name in (*PEERS, *LEARNED)]
+        peers = [peer for peer in peers if peer.get("solved")]
         for unit in ("deg", "mm"):
             best = min((peer[unit] for peer in peers if unit in peer), default=None)
             mine = None if own is None else own.get(unit)
@@ -93,7 +125,7 @@ def _identified_rows(cells: Figures) -> Cells:
     rows: Cells = [
         (
             *("task", "shown", "violation [°]", "p95", "worst draw"),
-            *("violation [mm]", "p95", "worst draw"),
+            *("violation [mm]", "p95", "worst draw", "rounded [° / mm]"),
             *(
                 "length",
                 "pairs joined",
@@ -108,9 +140,10 @@ def _identified_rows(cells: Figures) -> Cells:
     for task, case, methods in _cells(cells):
         own, formula = methods.get(IDENTIFIED), methods[FORMULA]
         if own is None or not own["solved"]:
-            rows.append((task, case, "nothing identified", *[""] * 10, *_times(formula)))
+            rows.append((task, case, "nothing identified", *[""] * 11, *_times(formula)))
             continue
         found = [_off(own, f"{unit}{kind}") for unit in ("deg", "mm") for kind in KINDS]
+        found.append(_both(methods.get(ROUNDED)))
         ratio, joined = fixed(own["ratio_median"], 4), share(own["solved"], 1)
         seconds = short(own["identify_s"])
         rows.append((task, case, *found, ratio, joined, seconds, *_times(own), *_times(formula)))
@@ -129,8 +162,12 @@ def _times(own: Figures) -> tuple[str, str]:
     return short(own["ms_median"]), short(own["ms_p95"])
 
 
-def _peer_rows(cells: Figures) -> Cells:
-    names = (IDENTIFIED, *PEERS)
+def _both(own: Figures | None) -> str:
+    return "" if own is None else f"{_off(own, 'deg')} / {_off(own, 'mm')}"
+
+
+def _peer_rows(cells: Figures, peers: tuple[str, ...]) -> Cells:
+    names = (IDENTIFIED, *peers)
     header = [own for name in names for own in (f"{name} [° / mm]", "length", "joined")]
     rows: Cells = [("task", "shown", *header)]
     for task, case, methods in _cells(cells):
@@ -140,20 +177,35 @@ def _peer_rows(cells: Figures) -> Cells:
             if own is None:
                 row += ["–", "–", "–"]
                 continue
-            off = f"{_off(own, 'deg')} / {_off(own, 'mm')}"
-            row += [off, fixed(own["ratio_median"], 3), share(own["solved"])]
+            row += [_both(own), fixed(own["ratio_median"], 3), share(own["solved"])]
         rows.append(tuple(row))
     return rows
 
 
+def _training_rows(cells: Figures) -> Cells:
+    """Seconds, over all tasks and cases."""
+    rows: Cells = [("trained on demonstrations", "training [s]", "a path [ms]")]
+    for name in LEARNED:
+        own = [methods[name] for _, _, methods in _cells(cells) if name in methods]
+        if own:
+            means = (sum(cell.get(key) or 0.0 for cell in own) / len(own) for key in TIMES)
+            rows.append((name, *map(short, means)))
+    return rows
+
+
+TIMES = "trained_s", "ms_median"
+
+
 def _hole_rows(cells: Figures) -> Cells:
-    rows: Cells = [("into a hole of 40 mm", "depth [mm]", "p95", "violation [mm]", "joined", "ms")]
+    rows: Cells = [
+        ("into a hole of 40 mm", "depth [mm]", "p95", "violation [° / mm]", "joined", "ms")
+    ]
     for _, _, methods in _cells({"hole": cells.get("hole", {})}):
-        for name in (FORMULA, IDENTIFIED, WITHIN, *PEERS):
+        for name in (FORMULA, IDENTIFIED, WITHIN, *PEERS, DESCENT, FLAT, POLICY):
             own = methods.get(name)
             if own is None or own.get("depth_mm") is None:
                 continue
             depth = fixed(own["depth_mm"], 1), fixed(own["depth_mm_p95"], 1)
             joined, ms = share(own["solved"]), short(own["ms_median"])
-            rows.append((name, *depth, _off(own, "mm"), joined, ms))
+            rows.append((name, *depth, _both(own), joined, ms))
     return rows

@@ -15,24 +15,34 @@ from jaxtyping import Float
 
 from constraint_geodesics.constraints.spline import Spline, SplineConstraint
 from constraint_geodesics.identification import Identified, identify
-from constraint_geodesics.params import DemonstrationsParams, Params
+from constraint_geodesics.params import DemonstrationsParams, Params, ParamsError
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.planner import Planner, PlannerError
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.arms import ARMS
-from constraint_geodesics.studies.hidden_tasks import HOLE, HOLE_M, TASKS, HiddenTask
-from constraint_geodesics.studies.local_models import NearestRows, PoseTangents
+from constraint_geodesics.studies.hidden_tasks import HOLE, HOLE_M, ROWS, TASKS, HiddenTask
+from constraint_geodesics.studies.local_models import Answer, LocalModels, NearestRows, poses_of
 
 FORMULA, IDENTIFIED, WITHIN = "formula", "identified", "identified, where shown"
+ROUNDED = "identified, rounded"
 TANGENTS, NEAREST = "local models of poses", "nearest rows"
 PEERS = (TANGENTS, NEAREST)
+LEVEL_SET, RESIDUAL = "level-set network", "residual network"
+DESCENT, FLAT, POLICY = "VAE, geodesic", "VAE, no variance", "VAE, policy"
+LEARNED = (LEVEL_SET, RESIDUAL, DESCENT, FLAT, POLICY)
+"""Those that studies/learned_demonstrations.py trains."""
 APART_RAD = (0.4, 2.5)
 """How far apart the ends of a query are."""
 TRIES, SCATTER_RAD = 400, 0.05
-LEAST_MM = 15.0
-"""How deep into the hole the formula's path goes, of the queries of that task."""
+LEAST_MM, LEAST_DEG = 15.0, 2.0
+"""How deep into the hole the formula's path goes, of the queries of that task; how far beyond a
+tolerance the straight joint line does.
+"""
 Columns = dict[str, Any]
+Query = tuple[np.ndarray, np.ndarray, float]
+"""Start, goal, and the length of the path of the formula's planner [rad]."""
+Answering = Callable[[np.ndarray, np.ndarray], Answer]
 
 
 @dataclass(frozen=True)
@@ -81,6 +91,7 @@ class Cell:
     task: str
     case: Case
     seed: int
+    stage: str
 
     @property
     def settings(self) -> DemonstrationsParams:
@@ -88,80 +99,114 @@ class Cell:
         return self.params.demonstrations
 
     @property
+    def hidden(self) -> HiddenTask:
+        """The task."""
+        return TASKS[self.task]
+
+    @property
+    def named(self) -> Columns:
+        """Columns that say which it is."""
+        return {"task": self.task, "case": self.case.name, "seed": self.seed}
+
+    def shown(self, scene: Scene) -> Any:
+        """Its demonstrations."""
+        return self.case.drawn(self.hidden, scene, 100 * self.seed)
+
+    @property
     def kept(self) -> Path:
         """Where its rows are until all cells are measured."""
         name = f"{self.task}-{self.case.name}-{self.seed}".replace(" ", "-").replace(",", "")
-        return self.layout.scratch("benchmark_demonstrations", name) / "rows.json"
+        return self.layout.scratch(self.stage, name) / "rows.json"
 
 
-def cells_of(params: Params, layout: Layout) -> list[Cell]:
-    """All of them."""
+def cells_of(params: Params, layout: Layout, stage: str) -> list[Cell]:
+    """All of them.  Raises ParamsError for a task that there is not."""
+    unknown = [name for name in params.demonstrations.tasks if name not in TASKS]
+    if unknown:
+        raise ParamsError(f"demonstrations.tasks: {unknown[0]!r} is none of {', '.join(TASKS)}")
     return [
-        Cell(params, layout, task, case, seed)
-        for task in TASKS
+        Cell(params, layout, task, case, seed, stage)
+        for task in params.demonstrations.tasks
         for case in cases_of(task)
         for seed in params.demonstrations.seeds
     ]
 
 
 def measure(cell: Cell) -> list[Columns]:
-    """Rows of one cell; those of an earlier run that was interrupted are taken as they are."""
+    """Rows of one cell, of what has no training; those of an earlier run that was interrupted are
+    taken as they are.
+    """
+    return kept_rows(cell, _rows)
+
+
+def kept_rows(cell: Cell, rows_of: Callable[[Cell], Iterator[Columns]]) -> list[Columns]:
+    """Rows of one cell, written down until all cells are measured."""
     if cell.kept.is_file():
         found: list[Columns] = json.loads(cell.kept.read_text())
         return found
-    rows = list(_rows(cell))
+    rows = list(rows_of(cell))
     cell.kept.parent.mkdir(parents=True, exist_ok=True)
     cell.kept.write_text(json.dumps(rows))
     return rows
 
 
 def _rows(cell: Cell) -> Iterator[Columns]:
-    task, scene = TASKS[cell.task], Scene.from_params(cell.params)
-    named = {"task": cell.task, "case": cell.case.name, "seed": cell.seed}
-    shown = cell.case.drawn(task, scene, 100 * cell.seed)
+    scene = Scene.from_params(cell.params)
+    shown = cell.shown(scene)
     began = time.perf_counter()
     found = identify(shown, scene.robot)
     seconds = time.perf_counter() - began
     about = {
         "codim": found.codim,
-        "hidden_codim": task.manifold(scene.robot).codim,
+        "hidden_codim": cell.hidden.manifold(scene.robot).codim,
+        "bounds": found.bounds,
+        "hidden_bounds": int(cell.hidden.loosely_rad > 0.0),
         "asked_for_more": "show more" in found.missing or "further off" in found.missing,
         "identify_s": seconds,
         "noise_rad": found.noise_rad,
     }
     with Planner.load(cell.layout.planner) as planner:
-        pairs = _pairs(cell, task, planner)
+        pairs = pairs_of(cell, planner, cell.settings.pairs)
         # the first plan draws the graph of a constraint, which no later one waits for
         for method, answer in _methods(cell, found, shown, planner).items():
-            peers = method in PEERS
-            asked = pairs[: cell.settings.peer_pairs] if peers else pairs
-            for number, (start, goal, length) in enumerate(asked):
-                own = answer(start, goal)
-                yield (
-                    named
-                    | about
-                    | {"method": method, "query": number}
-                    | _judged(task, scene.robot, own, length)
-                )
+            asked = pairs[: cell.settings.peer_pairs] if method in PEERS else pairs
+            for row in asked_all(cell, scene.robot, method, answer, asked):
+                yield row | about
 
 
-def _pairs(
-    cell: Cell, task: HiddenTask, planner: Planner
-) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """Queries that the formula's planner solves within the region that is shown, or through the
-    hole, and the lengths of its paths [rad].
+def asked_all(
+    cell: Cell, robot: SerialRobot, method: str, answer: Answering, pairs: Sequence[Query]
+) -> Iterator[Columns]:
+    """A method's answers to queries, one row each."""
+    for number, (start, goal, length) in enumerate(pairs):
+        judged = _judged(cell.hidden, robot, answer(start, goal), length)
+        yield cell.named | {"method": method, "query": number} | judged
+
+
+def flat_rows(shown: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (n, D) of demonstrations, and the demonstration (n,) of each; independent rows are one
+    each.
     """
-    rng = np.random.default_rng(9000 + cell.seed)
+    if not isinstance(shown, list):
+        return shown, np.arange(len(shown))
+    return np.concatenate(shown), np.repeat(np.arange(len(shown)), [len(own) for own in shown])
+
+
+def pairs_of(cell: Cell, planner: Planner, count: int) -> list[Query]:
+    """The first queries that the formula's planner solves within the region that is shown, or
+    through the hole.
+    """
+    task, rng = cell.hidden, np.random.default_rng(9000 + cell.seed)
     ends = task.draw(planner.scene, 1500, 9000 + cell.seed)
     own, found = task.manifold(planner.robot).constraint, []
-    for _ in range(TRIES * cell.settings.pairs):
+    for _ in range(TRIES * count):
         start = ends[rng.integers(len(ends))]
         away = np.linalg.norm(ends - start, axis=1)
         near = np.flatnonzero((away > APART_RAD[0]) & (away < APART_RAD[1]))
         if not len(near):
             continue
         goal = ends[near[rng.integers(len(near))]]
-        if cell.task == "hole" and not _across(planner.robot, start, goal):
+        if not _asks(cell, planner.robot, start, goal):
             continue
         path = planner.plan(start, goal, own)
         if path.status != "solved":
@@ -172,9 +217,21 @@ def _pairs(
             good = bool(task.shown(*planner.robot.forward(path.joints)).all())
         if good:
             found.append((start, goal, _length(path.joints)))
-        if len(found) == cell.settings.pairs:
+        if len(found) == count:
             break
     return found
+
+
+def _asks(cell: Cell, robot: SerialRobot, start: np.ndarray, goal: np.ndarray) -> bool:
+    """Whether a query tells a planner that knows of a hole, or of a tolerance, from one that does
+    not.
+    """
+    if cell.task == "hole":
+        return _across(robot, start, goal)
+    if not cell.hidden.loosely_rad:
+        return True
+    t = np.linspace(0.0, 1.0, 50)[:, None]
+    return bool(cell.hidden.missed(robot, start + t * (goal - start))[0].max() > LEAST_DEG)
 
 
 def _across(robot: SerialRobot, start: np.ndarray, goal: np.ndarray) -> bool:
@@ -191,38 +248,34 @@ def _depth_mm(robot: SerialRobot, path: np.ndarray) -> float:
     return float(1e3 * (HOLE_M - away).max())
 
 
-Answer = Callable[[np.ndarray, np.ndarray], tuple[str, np.ndarray | None, float]]
-"""Status, path (T, D) and milliseconds of a query."""
-
-
-def _methods(cell: Cell, found: Identified, shown: Any, planner: Planner) -> Mapping[str, Answer]:
+def _methods(
+    cell: Cell, found: Identified, shown: Any, planner: Planner
+) -> Mapping[str, Answering]:
     """Everything that is held against each other."""
-    methods: dict[str, Answer] = {
-        FORMULA: _planned(planner, TASKS[cell.task].manifold(planner.robot).constraint)
-    }
+    hidden = cell.hidden.manifold(planner.robot)
+    methods: dict[str, Answering] = {FORMULA: _planned(planner, hidden.constraint)}
     methods[IDENTIFIED] = _nothing
     if found.constraint is not None:
         methods[IDENTIFIED] = _planned(planner, found.constraint)
+        if found.rounded is not None:
+            methods[ROUNDED] = _planned(planner, found.rounded.constraint)
         if cell.task == "hole" and found.supported is not None:
             methods[WITHIN] = _planned(planner, found.supported)
-    rows = np.concatenate(shown) if isinstance(shown, list) else shown
-    codim = TASKS[cell.task].manifold(planner.robot).codim
-    lengths = [len(own) for own in shown] if isinstance(shown, list) else []
-    of = np.repeat(np.arange(len(lengths)), lengths) if lengths else np.arange(len(rows))
-    methods[TANGENTS] = PoseTangents(planner.robot, rows, of, codim).answer
+    rows, of = flat_rows(shown)
+    methods[TANGENTS] = LocalModels(poses_of(planner.robot), rows, of, hidden.codim).answer
     methods[NEAREST] = NearestRows(rows, of).answer
     return methods
 
 
-def _nothing(start: np.ndarray, goal: np.ndarray) -> tuple[str, np.ndarray | None, float]:  # noqa: ARG001
+def _nothing(start: np.ndarray, goal: np.ndarray) -> Answer:  # noqa: ARG001
     """Where nothing was identified."""
     return "not_identified", None, 0.0
 
 
-def _planned(planner: Planner, constraint: Any) -> Answer:
+def _planned(planner: Planner, constraint: Any) -> Answering:
     """By the planner; the ends are moved onto the constraint first, as its users do."""
 
-    def answer(start: np.ndarray, goal: np.ndarray) -> tuple[str, np.ndarray | None, float]:
+    def answer(start: np.ndarray, goal: np.ndarray) -> Answer:
         began = time.perf_counter()
         try:
             first, last = (planner.project(q, constraint).configuration for q in (start, goal))
@@ -236,9 +289,7 @@ def _planned(planner: Planner, constraint: Any) -> Answer:
     return answer
 
 
-def _judged(
-    task: HiddenTask, robot: SerialRobot, own: tuple[str, np.ndarray | None, float], length: float
-) -> Columns:
+def _judged(task: HiddenTask, robot: SerialRobot, own: Answer, length: float) -> Columns:
     """What the hidden formula says of a path: the worst violation, in degrees and mm."""
     status, path, ms = own
     row: Columns = {"status": status, "ms": ms, "deg": None, "mm": None, "ratio": None}
@@ -314,23 +365,43 @@ def summary(table: pd.DataFrame) -> dict[str, Any]:
         if method == IDENTIFIED:
             each = own.groupby("seed").first()
             cell["identify_s"] = float(each["identify_s"].median())
+        if "trained_s" in own:
+            cell["trained_s"] = float(own["trained_s"].median())
         figures.setdefault(task, {}).setdefault(case, {})[method] = cell
     return figures
+
+
+def by_cell(cells: Mapping[str, Any]) -> dict[str, tuple[Columns, Columns]]:
+    """Figures of each task and case, with what tells them apart."""
+    return {
+        f"{task}, {case.name}": (
+            {
+                "task": task,
+                "demonstrations": case.motions,
+                "rows": case.rows or case.motions * ROWS,
+                "noise_deg": case.noise_deg,
+            },
+            cells[task][case.name],
+        )
+        for task in cells
+        for case in cases_of(task)
+    }
 
 
 def ranks(table: pd.DataFrame) -> dict[str, Any]:
     """How often the rank is right, or less was said with a word on what is missing."""
     each = table.groupby(["task", "case", "seed"]).first().reset_index()
     made = each["task"].map(lambda name: TASKS[name].made_for)
-    right = each["codim"] == each["hidden_codim"]
-    refused = (each["codim"] < each["hidden_codim"]) & each["asked_for_more"]
+    less = (each["codim"] < each["hidden_codim"]) | (each["bounds"] < each["hidden_bounds"])
+    more = (each["codim"] > each["hidden_codim"]) | (each["bounds"] > each["hidden_bounds"])
+    right, refused = ~(less | more), less & ~more & each["asked_for_more"]
     wrong = each[~(right | refused)]
     return {
         "cells": len(each),
         "right": float(right.mean()),
         "right_or_refused": float((right | refused).mean()),
         "right_where_made_for": float(right[made].mean()),
-        "too_many": int((each["codim"] > each["hidden_codim"]).sum()),
+        "too_many": int(more.sum()),
         "wrong": [f"{r.task}, {r.case}, seed {r.seed}: {r.codim}" for r in wrong.itertuples()],
     }
 
@@ -359,17 +430,16 @@ def example(params: Params, layout: Layout) -> Example:
     """The longest of some paths on the surface that forty demonstrations with a person's error keep
     to.
     """
-    name, case = "wavy surface", OF_SURFACES[-1]
-    task, scene = TASKS[name], Scene.from_params(params)
-    cell = Cell(params, layout, name, case, params.demonstrations.seeds[0])
-    shown = case.drawn(task, scene, 100 * cell.seed)
+    name, case, scene = "wavy surface", OF_SURFACES[-1], Scene.from_params(params)
+    cell = Cell(params, layout, name, case, params.demonstrations.seeds[0], "")
+    task, shown = cell.hidden, cell.shown(scene)
     found = identify(shown, scene.robot)
     constraint = found.constraint
     if not isinstance(constraint, SplineConstraint):
         raise ValueError(f"{name}, {case.name}: no surface was identified: {found.explanation}")
     with Planner.load(layout.planner) as planner:
         ask, paths = _planned(planner, constraint), []
-        for start, goal, _ in _pairs(cell, task, planner):
+        for start, goal, _ in pairs_of(cell, planner, cell.settings.pairs):
             _, path, _ = ask(start, goal)
             if path is not None and task.shown(*scene.robot.forward(path)).all():
                 paths.append(path)

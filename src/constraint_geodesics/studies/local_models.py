@@ -3,6 +3,7 @@ tool poses, and a graph of the rows.
 """
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,15 +21,84 @@ NEIGHBOURS, LEAST_OF_A_QUADRIC = (12, 25, 50, 100, 200, 400, 1200), 50
 """Rows of a local model that are tried, and of a quadric at least."""
 NODES, ROUNDS, SPACING_RAD = 33, 80, 0.02
 """Of the band between the ends, its shortening steps, and of the path's rows."""
+LOOKED_AT, LONGEST_RAD = 200, 0.3
+"""Rows left out that settings are chosen on, and the longest step of a projection."""
 JOINED, OTHERS, ASKED = 12, 4, 200
 """Neighbours of a row in the graph, of these from other demonstrations, and how many are looked at
 for them.
 """
 
 
-class PoseTangents:
-    """Local models of tool poses: near a pose the rows span a plane, or a quadric over it, and what
-    is across is held.
+Answer = tuple[str, np.ndarray | None, float]
+"""Status, path (T, D) and milliseconds of a query."""
+Look = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""What configurations (n, D) are looked at by: numbers (n, k) of order 1, and their slopes
+(n, k, D).
+"""
+
+
+def poses_of(robot: SerialRobot) -> Look:
+    """By the tool's position and the axes of its frame."""
+    scale = np.array([METRES] * 3 + [1.0] * 9)
+
+    def look(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        position, rotation = robot.forward(q)
+        jacobian = robot.jacobian(q)
+        y, slopes = features(position, rotation), [jacobian[:, :3]]
+        for k in range(3):
+            turned = rotation[:, :, k][:, :, None]
+            slopes.append(np.cross(jacobian[:, 3:], turned, axisa=1, axisb=1, axisc=1))
+        return y / scale, np.concatenate(slopes, axis=1) / scale[:, None]
+
+    return look
+
+
+def joints_of(robot: SerialRobot) -> Look:
+    """By the joints themselves [rad]."""
+    return lambda q: (q, np.broadcast_to(np.eye(robot.dof), (len(q), robot.dof, robot.dof)))
+
+
+def halves(of: Int[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "l"], Int[np.ndarray, "r"]]:
+    """Rows of every fifth demonstration, some LOOKED_AT of them, and all rows of the others."""
+    left = np.isin(of, np.unique(of)[::5])
+    held_out, rest = np.flatnonzero(left), np.flatnonzero(~left)
+    return held_out[:: max(len(held_out) // LOOKED_AT, 1)], rest
+
+
+def band_between(
+    projected: Callable[[np.ndarray, int], np.ndarray], start: np.ndarray, goal: np.ndarray
+) -> Answer:
+    """A band between two configurations that `projected`, with so many steps, keeps where the rows
+    are.
+    """
+    began = time.perf_counter()
+    t = np.linspace(0.0, 1.0, NODES)[:, None]
+    nodes = projected(start + t * (goal - start), 6)
+    for _ in range(ROUNDS):
+        nodes[1:-1] = 0.5 * (nodes[:-2] + nodes[2:])
+        nodes = projected(nodes, 1)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
+    if not np.isfinite(way).all() or np.diff(way).min() < 1e-9:
+        return "not_found", None, 1e3 * (time.perf_counter() - began)
+    at = np.linspace(0.0, way[-1], max(int(way[-1] / SPACING_RAD), NODES))
+    path = projected(CubicSpline(way, nodes)(at), 5)
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    jumps = steps.max() > 3.0 * steps.mean() + 1e-3
+    ms = 1e3 * (time.perf_counter() - began)
+    return ("jumps", None, ms) if jumps else ("solved", path, ms)
+
+
+def moved(off: np.ndarray, slopes: np.ndarray) -> Float[np.ndarray, "n D"]:
+    """The shortest step of the joints that takes away what is off to first order, at most
+    LONGEST_RAD.
+    """
+    move = (np.linalg.pinv(slopes, rcond=1e-4) @ off[:, :, None])[:, :, 0]
+    size = np.linalg.norm(move, axis=1, keepdims=True)
+    return -move * np.minimum(1.0, LONGEST_RAD / np.maximum(size, 1e-12))
+
+
+class LocalModels:
+    """Near a row its neighbours span a plane, or a quadric over it, and what is across is held.
 
     of (n,): the demonstration of each row.  The rank is told, that of the hidden formula, and the
     number of neighbours and the degree are those that are best on demonstrations left out: the
@@ -36,18 +106,11 @@ class PoseTangents:
     """
 
     def __init__(
-        self,
-        robot: SerialRobot,
-        rows: Float[np.ndarray, "n D"],
-        of: Int[np.ndarray, "n"],
-        codim: int,
+        self, look: Look, rows: Float[np.ndarray, "n D"], of: Int[np.ndarray, "n"], codim: int
     ) -> None:
-        self._robot, self._codim = robot, codim
+        self._look, self._codim = look, codim
         y, _ = self._look(rows)
-        own = np.unique(of)
-        left = np.isin(of, own[::5])
-        held_out, rest = np.flatnonzero(left), np.flatnonzero(~left)
-        held_out = held_out[:: max(len(held_out) // 200, 1)]
+        held_out, rest = halves(of)
         self._y, self._tree = y[rest], KDTree(y[rest])
         tried: dict[tuple[int, int], float] = {}
         for degree in (1, 2):
@@ -59,37 +122,19 @@ class PoseTangents:
         self._count, self._degree = min(tried, key=lambda key: tried[key])
         self._y, self._tree = y, KDTree(y)
 
-    def answer(self, start: np.ndarray, goal: np.ndarray) -> tuple[str, np.ndarray | None, float]:
-        """A band on the tangent planes."""
-        began = time.perf_counter()
-        t = np.linspace(0.0, 1.0, NODES)[:, None]
-        nodes = self._projected(start + t * (goal - start), 6)
-        for _ in range(ROUNDS):
-            nodes[1:-1] = 0.5 * (nodes[:-2] + nodes[2:])
-            nodes = self._projected(nodes, 1)
-        way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
-        if not np.isfinite(way).all() or np.diff(way).min() < 1e-9:
-            return "not_found", None, 0.0
-        at = np.linspace(0.0, way[-1], max(int(way[-1] / SPACING_RAD), NODES))
-        path = self._projected(CubicSpline(way, nodes)(at), 5)
-        steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-        jumps = steps.max() > 3.0 * steps.mean() + 1e-3
-        ms = 1e3 * (time.perf_counter() - began)
-        return ("jumps", None, ms) if jumps else ("solved", path, ms)
+    def answer(self, start: np.ndarray, goal: np.ndarray) -> Answer:
+        """A band on the local models."""
+        return band_between(self._projected, start, goal)
 
-    def _look(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        position, rotation = self._robot.forward(q)
-        jacobian = self._robot.jacobian(q)
-        y, slopes = features(position, rotation), [jacobian[:, :3]]
-        for k in range(3):
-            turned = rotation[:, :, k][:, :, None]
-            slopes.append(np.cross(jacobian[:, 3:], turned, axisa=1, axisb=1, axisc=1))
-        scale = np.array([METRES] * 3 + [1.0] * 9)
-        return y / scale, np.concatenate(slopes, axis=1) / scale[:, None]
+    def frames(
+        self, y: Float[np.ndarray, "n k"], slopes: Float[np.ndarray, "n k D"]
+    ) -> tuple[Float[np.ndarray, "n c k"], Float[np.ndarray, "n d k"]]:
+        """Directions across the rows near each of some places, which are held, and along them."""
+        _, _, across, along = self._near(y, slopes)
+        return across, along
 
-    def _residual(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Across the tangent plane of the poses' own tangent space, and its slopes."""
-        y, slopes = self._look(q)
+    def _near(self, y: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Mean of the nearest rows, how far they are from it, and their directions."""
         near = self._y[np.asarray(self._tree.query(y, self._count)[1])]
         mean = near.mean(axis=1)
         away = near - mean[:, None]
@@ -98,7 +143,12 @@ class PoseTangents:
         flat = away @ basis
         _, directions = np.linalg.eigh(flat.transpose(0, 2, 1) @ flat)
         turned = (basis @ directions).transpose(0, 2, 1)
-        across, along = turned[:, : self._codim], turned[:, self._codim :]
+        return mean, away, turned[:, : self._codim], turned[:, self._codim :]
+
+    def _residual(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Across the tangent plane of the poses' own tangent space, and its slopes."""
+        y, slopes = self._look(q)
+        mean, away, across, along = self._near(y, slopes)
         off = (across @ (y - mean)[:, :, None])[:, :, 0]
         if self._degree == 1 or not along.shape[1]:
             return off, across @ slopes
@@ -124,10 +174,7 @@ class PoseTangents:
     def _projected(self, q: np.ndarray, steps: int) -> np.ndarray:
         q = q.copy()
         for _ in range(steps):
-            off, slopes = self._residual(q)
-            move = (np.linalg.pinv(slopes, rcond=1e-4) @ off[:, :, None])[:, :, 0]
-            size = np.linalg.norm(move, axis=1, keepdims=True)
-            q -= move * np.minimum(1.0, 0.3 / np.maximum(size, 1e-12))
+            q += moved(*self._residual(q))
         return q
 
 
@@ -146,7 +193,7 @@ class NearestRows:
         ends, values = nearest[begins, column], lengths[begins, column]
         self._graph = coo_matrix((values, (begins, ends)), shape=(len(rows),) * 2).tocsr()
 
-    def answer(self, start: np.ndarray, goal: np.ndarray) -> tuple[str, np.ndarray | None, float]:
+    def answer(self, start: np.ndarray, goal: np.ndarray) -> Answer:
         """From the row nearest to the start to that nearest to the goal."""
         began = time.perf_counter()
         first, last = (int(np.asarray(self._tree.query(q)[1])) for q in (start, goal))

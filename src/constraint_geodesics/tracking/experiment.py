@@ -159,9 +159,7 @@ class StageRun:
         text = json.dumps(plain, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False)
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text + "\n", "utf-8")
-        # MLflow takes no other characters in a metric's name
-        named = {re.sub(r"[^\w\-. :/]", "_", name): v for name, v in flat(plain, "/").items()}
-        self.metric_logger()(0, {n: v for n, v in named.items() if isinstance(v, int | float)})
+        self.metric_logger()(0, _numbers(plain))
         keep_copy(self.tracking_uri, self.run_id, file, "reports")
 
     def metric_logger(self) -> MetricLogger:
@@ -183,6 +181,12 @@ class StageRun:
             "mlflow.parentRunId": self.run_id,
         }
         return ChildRun(self.tracking_uri, self.experiment_id, tags, {**self.params, **params})
+
+    def cells(self, table: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]]) -> None:
+        """A child for each cell of a table: by its name, what sets it apart and its figures."""
+        for name, (params, figures) in table.items():
+            with self.child(name, params) as own:
+                own.log(0, _numbers(stable(figures)))
 
     def summarise(
         self,
@@ -405,6 +409,12 @@ def _status(error: BaseException | None) -> str:
     if error is None:
         return "FINISHED"
     return "KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED"
+
+
+def _numbers(plain: Mapping[str, Any]) -> dict[str, float]:
+    """Numbers among nested figures, under names that MLflow takes."""
+    named = {re.sub(r"[^\w\-. :/]", "_", name): v for name, v in flat(plain, "/").items()}
+    return {name: v for name, v in named.items() if isinstance(v, int | float)}
 
 
 def _spread(figures: Sequence[Mapping[str, float]]) -> dict[str, float]:

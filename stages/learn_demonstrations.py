@@ -1,0 +1,43 @@
+"""Stage: what networks, a VAE and policies learn of demonstrations whose formula is hidden; goes on
+where an earlier run of it stopped.
+"""
+
+import shutil
+import sys
+
+import pandas as pd
+
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import machine
+from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.studies.demonstrations import by_cell, cells_of, summary
+from constraint_geodesics.studies.learned_demonstrations import measure
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
+
+STAGE = "learn_demonstrations"
+
+
+def main(params: Params, layout: Layout) -> None:
+    """Write reports/learned_demonstrations.csv.gz and learned_demonstrations.json."""
+    own, reports = params.demonstrations, layout.root / "reports"
+    with tracked_stage(Work(STAGE, STAGE, own, []), params.tracking.experiment, layout.root) as run:
+        cells = cells_of(params, layout, STAGE)
+        found = parallel_map(measure, cells, params.compute, description="learned of rows")
+        table = pd.DataFrame([row for rows in found for row in rows])
+        table.to_csv(
+            reports / "learned_demonstrations.csv.gz",
+            index=False,
+            compression={"method": "gzip", "mtime": 0},
+            float_format="%.6g",
+        )
+        figures = {"cells": summary(table), "machine": machine()}
+        run.cells(by_cell(figures["cells"]))
+        run.report(figures, reports / "learned_demonstrations.json")
+        for cell in cells:  # finished: the next run of this stage starts from nothing
+            shutil.rmtree(cell.kept.parent, ignore_errors=True)
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])
