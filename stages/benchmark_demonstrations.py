@@ -4,6 +4,7 @@ against other methods; goes on where an earlier run of it stopped.
 
 import shutil
 import sys
+from typing import Any
 
 import pandas as pd
 
@@ -41,7 +42,7 @@ def main(params: Params, layout: Layout) -> None:
             compression={"method": "gzip", "mtime": 0},
             float_format="%.6g",
         )
-        figures = {
+        figures: dict[str, Any] = {
             "cells": summary(table),
             "ranks": ranks(table),
             "free_motion": free_motion(free_arms(), own.seeds),

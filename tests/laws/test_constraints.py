@@ -459,7 +459,7 @@ FILES = {
     },
     "Polynomial": {
         "constraints/polynomial.py",
-        *(f"identification/{name}.py" for name in ("forms", "identify", "vanishing")),
+        *(f"identification/{name}.py" for name in ("bounds", "forms", "identify", "vanishing")),
         "studies/hidden_tasks.py",
     },
     "Spline": {

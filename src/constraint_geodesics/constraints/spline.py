@@ -133,6 +133,22 @@ class Spline:
         _looks(self.numbers, np.ascontiguousarray(positions, np.float64), out)
         return out
 
+    def seen_at(self, y: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "n 10"]:
+        """The same at the positions of features, which several relations ask for one after another:
+        the last answer is kept, for as long as nothing writes to y.
+        """
+        if not self._seen or self._seen[0] is not y:
+            self._seen[:] = y, self.look(y[:, :3])
+        found: np.ndarray = self._seen[1]
+        return found
+
+    @cached_property
+    def _seen(self) -> list[np.ndarray]:
+        return []
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: own for name, own in vars(self).items() if name != "_seen"}
+
     def to_json(self) -> dict[str, Any]:
         """All numbers; the coefficients, which may be many, as the bytes of 64-bit numbers,
         compressed, in base 64.
@@ -210,7 +226,7 @@ class SplineRelation:
         found: np.ndarray = self.constant + y @ self.linear
         if self.term is not None:
             spline, a, constant, linear = self.term
-            found += spline.look(y[:, :3])[:, 1 + a] * (constant + y @ linear)
+            found += spline.seen_at(y)[:, 1 + a] * (constant + y @ linear)
         return found
 
     def gradients(self, y: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "n 12"]:
@@ -218,7 +234,7 @@ class SplineRelation:
         found = np.tile(self.linear, (len(y), 1))
         if self.term is not None:
             spline, a, constant, linear = self.term
-            look = spline.look(y[:, :3])
+            look = spline.seen_at(y)
             steep = look[:, 1:4] if a < 0 else look[:, 4 + _SECOND[a]]
             found += look[:, 1 + a, None] * linear
             found[:, :3] += (constant + y @ linear)[:, None] * (steep @ spline.frame)

@@ -42,8 +42,10 @@ SMOOTHINGS = 10.0 ** np.arange(-11, 2, 2)
 """Weights of the penalty that are tried, as shares of what makes it weigh as much as the rows."""
 RIDGE = 1e-14
 """Added to the normal equations, as a share of their trace."""
-CAREFULLY, SCREENED = 4000, 1000
-"""Rows at most that a fit is done again on, and that axes are looked for among."""
+AGAIN, STEPS_AGAIN, SCREENED = 2000, 2, 1000
+"""Rows at most that a fit is done again on, the steps that takes, and rows that axes are looked for
+among.
+"""
 HOPELESS_RAD = 0.1
 """Where rows that were left out are further off after the first step, there is no second."""
 ROUNDS, LOOKED = 6, (0, 1, 5)
@@ -105,7 +107,8 @@ class Freeform:
 
     def again(self, sample: Sample) -> Relations:
         """The same, fitted to other rows."""
-        return fitted(self.model, sample.thinned(CAREFULLY), [], (self.smoothing,)).relations
+        few = sample.thinned(AGAIN)
+        return fitted(self.model, few, [], (self.smoothing,), self).relations
 
 
 def fitted(
@@ -113,10 +116,12 @@ def fitted(
     sample: Sample,
     folds: Sequence[Bool[np.ndarray, "n"]],
     smoothings: Sequence[float] = tuple(SMOOTHINGS),
+    begin: Freeform | None = None,
 ) -> Freeform:
     """The coefficients and the axis with the least distances in joint space.
 
-    folds: which rows are left out when the smoothing is chosen.
+    folds: which rows are left out when the smoothing is chosen.  begin: what was fitted to nearly
+    the same rows, from where it takes fewer steps.
     """
     (y, to_joints), count = sample.pose, model.grid.coefficients.size
     size, no_fold = count * model.splines, np.zeros(len(y), dtype=bool)
@@ -125,7 +130,9 @@ def fitted(
     smooth = np.kron(np.eye(model.splines), _penalty(model.grid))
     moved, right = np.zeros((len(y), to_joints.shape[2])), ~no_fold
     smoothing, left_out = smoothings[-1], np.full(len(y), np.inf)
-    for step in range(ROUNDS):
+    if begin is not None:
+        found, axis = begin.coefficients, begin.axis
+    for step in range(0 if begin is None else ROUNDS - STEPS_AGAIN, ROUNDS):
         relations = model.relations(_splines(model.grid, found), axis)
         if step > 0:
             off = _distances(relations, y, to_joints)
