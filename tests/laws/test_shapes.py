@@ -25,8 +25,9 @@ from constraint_geodesics.scene.clearance import (
     near_contacts,
     new_contacts,
 )
+from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.pieces import Piece
-from constraint_geodesics.scene.shape import RoundedBox, Shape, add_body
+from constraint_geodesics.scene.shape import Placement, RoundedBox, Shape, add_body
 from constraint_geodesics.scene.shapes import AnyShape
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.scene.world import World
@@ -61,6 +62,11 @@ class Slab(Shape):
         size = {"shapeType": kind, "halfExtents": self.half_edges}
         return add_body(bullet, self.centre, turn, **size)
 
+    def placed(self, at: Placement) -> "Slab":
+        turn = Rotation.from_matrix(at.turn).as_rotvec()
+        x, y, z = turn.tolist()
+        return replace(self, centre=at.position_m, turn=(x, y, z))
+
     def drawn(self, rerun: Any, style: Mapping[str, Any]) -> Any:
         return None
 
@@ -72,6 +78,8 @@ SHAPES: dict[str, Shape] = {
     "capsule that points down": Capsule("post", (0.2, 0.1, 0.2), (0.2, 0.1, -0.3), 0.15),
     "tilted capsule": Capsule("pipe", (-0.3, 0.1, -0.2), (0.25, -0.2, 0.3), 0.1),
     "capsule of no length": Capsule("ball", (0.1, 0.2, 0.1), (0.1, 0.2, 0.1), 0.2),
+    "turned box": Box("box", (0.1, 0.0, -0.2), (0.5, 0.2, 0.3), rpy_rad=(0.4, -0.3, 1.1)),
+    "cylinder": Cylinder("cup", Placement((0.1, -0.1, 0.0), (0.5, 0.2, 0.0)), 0.4, 0.2),
     "own": Slab("own"),
 }
 POINTS = st.tuples(*[st.floats(-ROOM, ROOM, allow_subnormal=False)] * 3)
@@ -109,8 +117,14 @@ def closed_form(shape: Shape, point: np.ndarray) -> float:
         a, line = np.array(shape.from_m), np.subtract(shape.to_m, shape.from_m)
         share = np.clip((point - a) @ line / max(line @ line, 1e-12), 0.0, 1.0)
         return float(np.linalg.norm(point - a - share * line)) - shape.radius_m
+    if isinstance(shape, Cylinder):
+        local = (point - shape.pose.position_m) @ shape.pose.turn
+        out = np.array([np.linalg.norm(local[:2]) - shape.radius_m, np.abs(local[2])])
+        out[1] -= 0.5 * shape.length_m
+        return float(np.linalg.norm(np.maximum(out, 0.0)) + min(out.max(), 0.0))
     if isinstance(shape, Box):
-        local, half = point - shape.centre_m, 0.5 * np.array(shape.size_m)
+        local = (point - shape.centre_m) @ Placement((0.0, 0.0, 0.0), shape.rpy_rad).turn
+        half = 0.5 * np.array(shape.size_m)
     else:
         assert isinstance(shape, Slab)
         local = Rotation.from_rotvec(shape.turn).inv().apply(point - shape.centre)
@@ -125,6 +139,11 @@ def closed_form(shape: Shape, point: np.ndarray) -> float:
 def test_the_distance_is_that_of_the_formula(kind: str, point: tuple[float, ...]) -> None:
     """Outside; inside it is known how deep in some directions."""
     wanted, found = closed_form(SHAPES[kind], np.array(point)), distance(kind, point)
+    if isinstance(SHAPES[kind], Cylinder):  # what bounds it is a prism around it, with a margin
+        assert found <= wanted + 1e-6
+        if wanted > 0.0:
+            assert found > wanted - 0.0015
+        return
     if wanted > -inscribed(SHAPES[kind]):
         assert found == pytest.approx(wanted, abs=1e-6)
     else:
@@ -177,6 +196,20 @@ def test_its_sign_is_what_pybullet_says(kind: str) -> None:
 
 
 @kinds
+def test_a_shape_that_is_placed_elsewhere_is_the_same_there(kind: str) -> None:
+    shape, at = SHAPES[kind], Placement((0.1, 0.2, -0.1), (0.3, -0.2, 0.5))
+    there, back = shape.placed(at), shape.placed(Placement())
+    assert there.name == shape.name
+    own = np.random.default_rng(4).uniform(-0.5, 0.5, (100, 3))
+    first, second = (
+        clearance_model(room(), (one,)).clearance(room(), points)
+        for one, points in ((back, own), (there, own @ at.turn.T + at.position_m))
+    )
+    # inside it is known how deep in some directions
+    np.testing.assert_allclose(np.maximum(first, 0.0), np.maximum(second, 0.0), atol=1e-6)
+
+
+@kinds
 def test_links_that_may_touch_it_do_not_count(kind: str) -> None:
     touching = replace(SHAPES[kind], exempt_links=("tip",))  # type: ignore[type-var]
     q = np.random.default_rng(1).uniform(-ROOM, ROOM, (200, 3))
@@ -214,7 +247,7 @@ def test_a_kind_is_known_in_its_own_file_and_among_the_shapes() -> None:
     chosen |= {"geodesics/obstacles.py"}
     tried = {"studies/collision_proof.py"}
     others = {Sphere: chosen | tried, Box: tried | {"studies/thin_shapes.py"}}
-    for kind in (Box, Sphere, Capsule, Body):
+    for kind in (Box, Sphere, Capsule, Cylinder, Body):
         home = kind.__module__.split(".", 1)[1].replace(".", "/") + ".py"
         named = {
             file.relative_to(package).as_posix()

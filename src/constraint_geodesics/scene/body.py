@@ -1,6 +1,6 @@
 """A body read from a URDF."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,7 +9,7 @@ import numpy as np
 from constraint_geodesics.fields import Vector3
 from constraint_geodesics.robot.kinematics import rotation_from_rpy
 from constraint_geodesics.scene.pieces import Piece, read_pieces
-from constraint_geodesics.scene.shape import PlacedUrdf, Shape
+from constraint_geodesics.scene.shape import PlacedUrdf, Placement, Shape
 from constraint_geodesics.scene.urdf import find_urdf
 
 
@@ -23,6 +23,10 @@ class Body(Shape):
     rpy_rad: Vector3 = (0.0, 0.0, 0.0)
     exempt_links: tuple[str, ...] = ()
     kind: Literal["urdf"] = "urdf"
+
+    def placed(self, at: Placement) -> "Body":
+        """The URDF elsewhere."""
+        return replace(self, position_m=at.position_m, rpy_rad=at.rpy_rad)
 
     def urdf_model(self) -> PlacedUrdf:
         """The URDF at its pose."""

@@ -1,23 +1,30 @@
-"""A box along the axes of the base frame."""
+"""A box."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from constraint_geodesics.fields import Positive, Vector3
 from constraint_geodesics.scene.pieces import Piece
-from constraint_geodesics.scene.shape import RoundedBox, Shape, Triple, add_body
+from constraint_geodesics.scene.shape import Placement, RoundedBox, Shape, Triple, add_body
 
 
 @dataclass(frozen=True)
 class Box(Shape):
-    """A box: its centre and edge lengths [m]."""
+    """A box: its centre and edge lengths [m], and how its edges are turned from the base frame's
+    axes [rad].
+    """
 
     name: str
     centre_m: Vector3
     size_m: tuple[Positive, Positive, Positive]
     exempt_links: tuple[str, ...] = ()
     kind: Literal["box"] = "box"
+    rpy_rad: Vector3 = (0.0, 0.0, 0.0)
+
+    @property
+    def _at(self) -> Placement:
+        return Placement(self.centre_m, self.rpy_rad)
 
     @property
     def _half_edges(self) -> Triple:
@@ -26,13 +33,21 @@ class Box(Shape):
 
     def pieces(self) -> tuple[Piece, ...]:
         """It is one, without rounding."""
-        return (RoundedBox(self.centre_m, self._half_edges).piece(),)
+        turn = self._at.turn
+        return (RoundedBox(self.centre_m, self._half_edges, turn=turn).piece(),)
+
+    def placed(self, at: Placement) -> "Box":
+        """About another centre, and turned."""
+        return replace(self, centre_m=at.position_m, rpy_rad=at.rpy_rad)
 
     def add_to(self, bullet: Any) -> int:
         """A box of PyBullet."""
         kind = bullet.GEOM_BOX
-        return add_body(bullet, self.centre_m, shapeType=kind, halfExtents=self._half_edges)
+        turn, size = self._at.quaternion, self._half_edges
+        return add_body(bullet, self.centre_m, turn, shapeType=kind, halfExtents=size)
 
     def drawn(self, rerun: Any, style: Mapping[str, Any]) -> Any:
         """A box of Rerun."""
-        return rerun.Boxes3D(centers=[self.centre_m], sizes=[self.size_m], **style)
+        turn = rerun.Quaternion(xyzw=self._at.quaternion)
+        size = {"sizes": [self.size_m], "quaternions": [turn]}
+        return rerun.Boxes3D(centers=[self.centre_m], **size, **style)

@@ -1,7 +1,7 @@
 """A capsule: a cylinder in any direction with a half sphere on either end, as a pipe or a post."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.fields import Positive, Vector3
 from constraint_geodesics.scene.pieces import Piece
-from constraint_geodesics.scene.shape import RoundedBox, Shape, Triple, add_body
+from constraint_geodesics.scene.shape import Placement, RoundedBox, Shape, Triple, add_body
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,12 @@ class Capsule(Shape):
         """A box with one edge, along the line, rounded by the radius."""
         half_edges = (0.0, 0.0, 0.5 * self.length_m)
         return (RoundedBox(self._centre, half_edges, self.radius_m, self._turn()).piece(),)
+
+    def placed(self, at: Placement) -> "Capsule":
+        """With its middle elsewhere, and its line along the z axis there."""
+        middle, half = np.array(at.position_m), 0.5 * self.length_m * at.turn[:, 2]
+        first, last = (middle - half).tolist(), (middle + half).tolist()
+        return replace(self, from_m=tuple(first), to_m=tuple(last))
 
     def add_to(self, bullet: Any) -> int:
         """A capsule of PyBullet, which has it along its z axis."""

@@ -5,14 +5,17 @@ A new kind is one more file in this folder, and its name in shapes.py.
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
 from pydantic import ConfigDict
+from scipy.spatial.transform import Rotation
 
-from constraint_geodesics.robot.kinematics import RobotError
+from constraint_geodesics.fields import Vector3
+from constraint_geodesics.robot.kinematics import RobotError, rotation_from_rpy, rpy_of
 from constraint_geodesics.scene.pieces import Piece, box_corners
 
 Triple = tuple[float, float, float]
@@ -34,6 +37,42 @@ class RoundedBox(NamedTuple):
         box = np.array([*self.centre, *self.half_edges, *np.ravel(self.turn)])
         at = corners @ self.turn.T + np.array(self.centre)
         return Piece(at, self.rounding, box=box)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a shape's own frame is in the base frame: its position [m], and its roll, pitch and yaw
+    about the fixed axes [rad].
+    """
+
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    rpy_rad: Vector3 = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def of(cls, pose: Any) -> "Placement":
+        """From a Pose, or anything that has a `position` (3,) [m] and a `rotation` (3, 3)."""
+        if isinstance(pose, cls):
+            return pose
+        x, y, z = (float(value) for value in pose.position)
+        return cls((x, y, z), rpy_of(np.asarray(pose.rotation, float)))
+
+    @property
+    def turn(self) -> Float[np.ndarray, "3 3"]:
+        """Into the base frame."""
+        return rotation_from_rpy(np.array(self.rpy_rad))
+
+    @property
+    def quaternion(self) -> list[float]:
+        """The same as x, y, z, w."""
+        found: list[float] = Rotation.from_matrix(self.turn).as_quat().tolist()
+        return found
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "4 4"]:
+        """The pose of the frame."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.turn, self.position_m
+        return pose
 
 
 class PlacedUrdf(NamedTuple):
@@ -64,6 +103,10 @@ class Shape(ABC):
     def urdf_model(self) -> PlacedUrdf | None:
         """Its meshes, where it has some; they are drawn by Rerun itself."""
         return None
+
+    @abstractmethod
+    def placed(self, at: Placement) -> Self:
+        """The same shape with its own frame elsewhere: that about its middle, or of its file."""
 
     @abstractmethod
     def add_to(self, bullet: Any) -> int:

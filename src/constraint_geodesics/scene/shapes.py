@@ -7,6 +7,7 @@ from pydantic import Field
 from constraint_geodesics.scene.body import Body
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.capsule import Capsule
+from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.sphere import Sphere
 
-AnyShape = Annotated[Box | Sphere | Capsule | Body, Field(discriminator="kind")]
+AnyShape = Annotated[Box | Sphere | Capsule | Cylinder | Body, Field(discriminator="kind")]

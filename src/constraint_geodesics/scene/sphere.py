@@ -1,12 +1,12 @@
 """A sphere."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from constraint_geodesics.fields import Positive, Vector3
 from constraint_geodesics.scene.pieces import Piece
-from constraint_geodesics.scene.shape import RoundedBox, Shape, add_body
+from constraint_geodesics.scene.shape import Placement, RoundedBox, Shape, add_body
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,10 @@ class Sphere(Shape):
     def pieces(self) -> tuple[Piece, ...]:
         """A box without edges, rounded by the radius."""
         return (RoundedBox(self.centre_m, (0.0, 0.0, 0.0), self.radius_m).piece(),)
+
+    def placed(self, at: Placement) -> "Sphere":
+        """About another centre."""
+        return replace(self, centre_m=at.position_m)
 
     def add_to(self, bullet: Any) -> int:
         """A sphere of PyBullet."""
