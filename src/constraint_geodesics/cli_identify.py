@@ -37,8 +37,8 @@ def identify_constraint(
     loosely: Annotated[
         float,
         typer.Option(
-            help="Tolerance of each relation, in multiples of what it is missed by on left-out "
-            "demonstrations; 0 holds exactly."
+            help="By how much each relation is looser, in multiples of what it is missed by on "
+            "left-out demonstrations; 0 holds it exactly, a bound as it was found."
         ),
     ] = 0.0,
     where_shown: Annotated[
@@ -70,8 +70,6 @@ def identify_constraint(
     """Say what demonstrations keep to, and write it as a constraint.  Exit code 0: identified; 2:
     wrong usage; 3: nothing is identified, and the line says why.
     """
-    from dataclasses import replace
-
     import numpy as np
 
     from constraint_geodesics.bundle import BundleError
@@ -82,7 +80,7 @@ def identify_constraint(
         demonstrations_from,
     )
     from constraint_geodesics.identification.files import save_constraint
-    from constraint_geodesics.identification.identify import identify, with_tolerance
+    from constraint_geodesics.identification.identify import identify
     from constraint_geodesics.planner import PlannerError
     from constraint_geodesics.robot.kinematics import RobotError
 
@@ -99,8 +97,8 @@ def identify_constraint(
             found = identify(shown if motions else np.concatenate(shown), robot)
         if rounded:
             found = found.rounded or found
-        if found.constraint is not None and loosely > 0.0:
-            found = replace(found, constraint=with_tolerance(found.constraint, loosely))
+        if loosely > 0.0:
+            found = found.held_loosely(loosely)
         if out is not None and found.constraint is not None:
             save_constraint(found, out, where_shown)
         if record is not None:

@@ -176,6 +176,9 @@ def plan(
         first = _joints(start, "--start")
         wanted = _goal(goal, goal_pose, goal_free, goal_tolerance)
         with loading(), arm.open(method) as loaded:
+            shown = None
+            if demonstrations is not None:
+                shown, _ = demonstrations_from(demonstrations, loaded.robot)
             path = loaded.plan(
                 first,
                 wanted,
@@ -185,9 +188,7 @@ def plan(
                 velocity_scale=velocity_scale,
                 acceleration_scale=acceleration_scale,
             )
-            source, shown = loaded.source, None
-            if demonstrations is not None:
-                shown, _ = demonstrations_from(demonstrations, loaded.robot)
+            source = loaded.source
     except (BundleError, ConstraintError, DemonstrationError, PlannerError, RobotError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
     print(f"planner: {source}", file=sys.stderr)

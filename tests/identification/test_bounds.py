@@ -111,3 +111,64 @@ def test_what_is_not_round_is_not_rounded(xarm) -> None:
 def test_demonstrations_without_noise_are_not_rounded(xarm) -> None:
     """There is nothing to round: the numbers are what they are."""
     assert identify(demonstrations("plane", xarm, 10), xarm).rounded is None
+
+
+def tilted(scene, count: int, across_deg: float, seed: int) -> np.ndarray:
+    """Cups that lean by up to 10° the one way and by up to so much the other."""
+    robot = scene.robot
+    q = LEANING.draw(scene, 20 * count, seed)
+    axis = robot.forward(q)[1][:, :, 1]
+    return q[np.abs(axis[:, 0]) < np.sin(np.radians(across_deg))][:count]
+
+
+def test_leaning_that_was_shown_in_one_direction_alone_is_no_cone(scene) -> None:
+    found = identify(tilted(scene, 400, 2.0, 3), scene.robot)
+    assert found.bounds == 0
+
+
+def test_wrong_rows_are_beyond_a_bound(scene, xarm) -> None:
+    robot, rng = scene.robot, np.random.default_rng(6)
+    rows = leaning(scene, 1)
+    found = identify(np.concatenate([rows, robot.sample(90, rng)]), robot)
+    assert found.bounds == 1
+    assert "wrong rows left out" in found.explanation
+    assert 60 <= found.dropped <= 100
+    q = xarm.sample(60_000, np.random.default_rng(0))
+    plate = q[np.abs(xarm.forward(q)[0][:, 2] - 0.3) < 0.028][:2000]
+    found = identify(np.concatenate([plate, xarm.sample(60, rng)]), xarm)
+    assert found.bounds == 1
+    assert 30 <= found.dropped <= 70
+    (relation,) = found.constraint.relations
+    assert relation.tolerance == pytest.approx(0.028, abs=1e-3)
+
+
+def test_a_relation_beside_a_bound_stays(xarm) -> None:
+    """A plane that is kept with noise, an axis that leans by up to 2.5°: the one is held, the other
+    bounded.
+    """
+    rng = np.random.default_rng(2)
+    rows = drawn("plane", xarm, 1500)
+    manifold = ConstraintManifold(xarm, PolynomialConstraint(TASKS["plane"].hidden(xarm).relations))
+    away, angle = np.sqrt(rng.random(1500)), 2.0 * np.pi * rng.random(1500)
+    wanted = np.stack(
+        [
+            0.007 * rng.normal(size=1500),
+            *(np.sin(0.044) * away * turn(angle) for turn in (np.cos, np.sin)),
+        ],
+        axis=1,
+    )
+    for _ in range(3):
+        off, slopes = manifold.linearise(rows)
+        rows = rows + (np.linalg.pinv(slopes) @ (wanted - off)[:, :, None])[:, :, 0]
+    found = identify(rows, xarm)
+    assert (found.codim, found.bounds) == (1, 1), found.explanation
+    assert "lies in a plane" in found.explanation
+    assert "stays within 2." in found.explanation
+
+
+def test_a_bound_is_held_as_it_was_found_and_looser(scene) -> None:
+    found = identify(leaning(scene, 1), scene.robot)
+    looser = found.held_loosely(3.0)
+    (own,), (wider,) = found.constraint.relations, looser.constraint.relations
+    assert wider.tolerance == pytest.approx(own.tolerance + 3.0 * found.left_out[0])
+    assert "Held looser by 3 times" in looser.explanation

@@ -52,12 +52,17 @@ class RelationsConstraint(Constraint):
 
     def loosened(self, least: Mapping[str, float]) -> Self:
         """The same with every tolerance at least that of its row's unit."""
-        return self.widened([least[own.unit] for own in self.relations])
+        wider = (
+            replace(own, tolerance=max(own.tolerance, least[own.unit])) for own in self.relations
+        )
+        return replace(self, relations=tuple(wider))
 
-    def widened(self, least: Any) -> Self:
-        """The same with each relation's tolerance at least the entry (m,) of its own."""
-        pairs = zip(self.relations, least, strict=True)
-        wider = (replace(own, tolerance=max(own.tolerance, value)) for own, value in pairs)
+    def widened(self, times: float) -> Self:
+        """The same with each relation looser by so many times what it is missed by on left-out
+        demonstrations.
+        """
+        pairs = zip(self.relations, self.left_out, strict=True)
+        wider = (replace(own, tolerance=own.tolerance + times * off) for own, off in pairs)
         return replace(self, relations=tuple(wider))
 
     @property

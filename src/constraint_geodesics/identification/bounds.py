@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from constraint_geodesics.constraints.polynomial import Relation
 from constraint_geodesics.constraints.tool_features import FEATURES
-from constraint_geodesics.identification.forms import axis_words, of_axis, vector
+from constraint_geodesics.identification.forms import across, axis_words, of_axis, vector
 from constraint_geodesics.identification.vanishing import Sample
 
 WIDEST_RAD, WIDEST_M = 0.35, 0.03
@@ -29,6 +29,8 @@ FILLED = 1.9
 """A bound over the rms of what it bounds, at most: 1.4 where a disc is filled evenly, 1.7 for an
 interval, 2.2 and 2.6 where values fade out as a normal distribution's.
 """
+ROUND = 0.6
+"""The rms of leaning the one way over that the other way, at least."""
 FREER = 2.5
 """What is not bounded varies by so many times as much, at least."""
 BEYOND = 1.2
@@ -39,20 +41,22 @@ Offs = Float[np.ndarray, "n"]
 
 class Bound(NamedTuple):
     """relation: the row of the residual, with its tolerance.  left_out: the rms by which left-out
-    rows were beyond bounds that were found without them [rad or m].
+    rows were beyond bounds that were found without them [rad or m].  right (n,): rows that are not
+    taken to be wrong.
     """
 
     relation: Relation
     left_out: float
+    right: Bool[np.ndarray, "n"]
 
 
 class _Middle(NamedTuple):
     """What rows are near.  off: how far they are from it.  other: how much the least of what it
-    leaves free varies.  row: the relation of a half-width.
+    leaves free varies, of rows.  row: the relation of a half-width.
     """
 
-    off: Callable[[Sample], Offs]
-    other: float
+    off: Offs
+    other: Callable[[Sample], float]
     row: Callable[[float], Relation]
 
 
@@ -72,10 +76,10 @@ def bounds_of(
 def _bound(
     own: _Middle, widest: float, sample: Sample, folds: Sequence[Bool[np.ndarray, "n"]]
 ) -> Bound | None:
-    off = own.off(sample)
+    off = own.off
     right = off <= WRONG * np.quantile(off, INLIERS)
     rms, width = float(np.sqrt((off[right] ** 2).mean())), float(np.quantile(off[right], SHARE))
-    if not 0.0 < width <= min(widest, FILLED * rms) or own.other < FREER * rms:
+    if not 0.0 < width <= min(widest, FILLED * rms) or own.other(sample[right]) < FREER * rms:
         return None
     beyond = []
     for out in folds:
@@ -84,7 +88,7 @@ def _bound(
         if not len(left) or np.quantile(left, SHARE) > BEYOND * narrow:
             return None
         beyond.append(float((np.maximum(left - narrow, 0.0) ** 2).mean()))
-    return Bound(own.row(width), float(np.sqrt(np.mean(beyond))))
+    return Bound(own.row(width), float(np.sqrt(np.mean(beyond))), right)
 
 
 def _named(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"] | None:
@@ -97,15 +101,24 @@ def _named(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"] | None:
 
 def _cone(sample: Sample) -> _Middle | None:
     """About the direction that an axis keeps best, in the mean."""
-    left, sizes, right = np.linalg.svd(sample.rotation.mean(axis=0))
-    own, direction = _named(right[0]), _named(left[:, 0])
+    left, _, turned = np.linalg.svd(sample.rotation.mean(axis=0))
+    own, direction = _named(turned[0]), _named(left[:, 0])
     if own is None or direction is None:
         return None
     if direction.sum() < 0.0:
         own, direction = -own, -direction
 
-    def off(some: Sample) -> Offs:
-        return np.arccos(np.clip((some.rotation @ own) @ direction, -1.0, 1.0))
+    leaning = sample.rotation @ own
+    off = np.arccos(np.clip(leaning @ direction, -1.0, 1.0))
+    # in both directions alike: of a cone that is a line, most was never shown
+    right = leaning[off <= WRONG * np.quantile(off, INLIERS)] @ np.stack(across(direction)).T
+    least, most = np.linalg.eigvalsh(right.T @ right)
+    if least < ROUND**2 * most:
+        return None
+
+    def other(some: Sample) -> float:
+        sizes = np.linalg.svd(some.rotation.mean(axis=0), compute_uv=False)
+        return float(np.arccos(np.clip(sizes[1], -1.0, 1.0)))
 
     def row(width: float) -> Relation:
         """With s = nᵀR a: cos θ ≤ s ≤ 1 is |s − (1 + cos θ)/2| ≤ (1 − cos θ)/2, over sin θ."""
@@ -118,18 +131,24 @@ def _cone(sample: Sample) -> _Middle | None:
         middle, half = -0.5 * (1.0 + level) / steep, 0.5 * (1.0 - level) / steep
         return Relation(words, "rad", middle, linear, None, half)
 
-    return _Middle(off, float(np.arccos(np.clip(sizes[1], -1.0, 1.0))), row)
+    return _Middle(off, other, row)
 
 
 def _slab(sample: Sample) -> _Middle | None:
-    """Across the direction in which the tip moves least."""
-    spreads, directions = np.linalg.eigh(np.cov(sample.position.T))
-    normal = _named(directions[:, 0])
-    if normal is None:
+    """Across the axis along which most rows are nearest to each other."""
+    spans = [_shortest(sample.position[:, k], INLIERS) for k in range(3)]
+    k = int(np.argmin([high - low for low, high in spans]))
+    heights, (low, high) = sample.position[:, k], spans[k]
+    right = np.abs(heights - 0.5 * (low + high)) <= WRONG * 0.5 * (high - low)
+    low, high = _shortest(heights[right], SHARE)
+    middle, normal = 0.5 * (low + high), np.eye(3)[k]
+    _, directions = np.linalg.eigh(np.cov(sample.position[right].T))
+    if _named(directions[:, 0]) is None:
         return None
-    normal = np.abs(normal)
-    low, high = np.quantile(sample.position @ normal, (0.5 - 0.5 * SHARE, 0.5 + 0.5 * SHARE))
-    middle = 0.5 * float(low + high)
+
+    def other(some: Sample) -> float:
+        flat = np.delete(some.position, k, axis=1)
+        return float(np.sqrt(np.linalg.eigvalsh(np.cov(flat.T))[0]))
 
     def row(width: float) -> Relation:
         words = (
@@ -139,6 +158,13 @@ def _slab(sample: Sample) -> _Middle | None:
         linear = np.concatenate([normal, np.zeros(FEATURES - 3)])
         return Relation(words, "m", -middle, linear, None, width)
 
-    return _Middle(
-        lambda some: np.abs(some.position @ normal - middle), float(np.sqrt(spreads[1])), row
-    )
+    return _Middle(np.abs(heights - middle), other, row)
+
+
+def _shortest(values: Float[np.ndarray, "n"], share: float) -> tuple[float, float]:
+    """The shortest interval that holds a share of values."""
+    ordered = np.sort(values)
+    count = max(int(share * len(ordered)), 2)
+    widths = ordered[count - 1 :] - ordered[: len(ordered) - count + 1]
+    first = int(np.argmin(widths))
+    return float(ordered[first]), float(ordered[first + count - 1])

@@ -45,7 +45,7 @@ class Form(NamedTuple):
     make, in words.  facing: the numbers of which the rows are on the right side, where opposite
     ones have the same zeros.  sides: relations with a tolerance that leave that side alone.
     parts: what the numbers are, one letter each: d a direction (3 numbers), l a length [m], c a
-    cosine, - what has no round values.
+    cosine.  flat: whether it is of a plane that is known.
     """
 
     start: Callable[[Sample], Numbers]
@@ -53,6 +53,7 @@ class Form(NamedTuple):
     facing: Callable[[Sample, Numbers], Numbers] = lambda _, x: x
     sides: Callable[[Numbers], tuple[Relation, ...]] = lambda _: ()
     parts: str = ""
+    flat: bool = False
 
     def rounded(self, x: Numbers, digits: Round) -> Numbers:
         """The numbers with directions along an axis, where they are near one, and with round
@@ -285,6 +286,7 @@ def circle(normal: Float[np.ndarray, "3"]) -> Form:
         lambda sample: _around(sample, axis)[3:],
         lambda x: _about_a_line("circle", axis, x[:3], float(abs(x[3]))),
         parts="llll",
+        flat=True,
     )
 
 

@@ -33,6 +33,8 @@ from constraint_geodesics.identification.forms import (
     ROUND,
     TURNED,
     Form,
+    Round,
+    circle,
     named,
 )
 from constraint_geodesics.identification.support import Support, support_of
@@ -98,7 +100,8 @@ class Identified:
     name and tool link, of whose tool all this is said.  support: the region where demonstrations
     were; `supported` keeps a path in it.  bounds: how many of the relations are tolerances.
     rounded: the same with axes and round numbers that left-out demonstrations are no further from,
-    None if there are none.
+    None if there are none; is_rounded: whether these are taken.  loosely: by how many times what
+    relations are missed by the constraint is looser (`held_loosely`).
     """
 
     constraint: Constraint | None
@@ -114,6 +117,8 @@ class Identified:
     support: Support | None = None
     bounds: int = 0
     rounded: "Identified | None" = None
+    is_rounded: bool = False
+    loosely: float = 0.0
 
     @property
     def supported(self) -> Constraint | None:
@@ -144,11 +149,19 @@ class Identified:
             "noise_rad": self.noise_rad if self.codim else None,
             "left_out_error": self.left_out_error,
             "where_shown": None if self.support is None else self.support.words,
+            "is_rounded": self.is_rounded,
+            "loosely": self.loosely,
             "rounded": None if self.rounded is None else list(self.rounded.relations),
             "rows": self.rows,
             "demonstrations": self.demonstrations,
             "dropped": self.dropped,
         }
+
+    def held_loosely(self, times: float) -> "Identified":
+        """The same with a constraint that is looser (`with_tolerance`)."""
+        if self.constraint is None:
+            return self
+        return replace(self, constraint=with_tolerance(self.constraint, times), loosely=times)
 
     def save(self, file: str | Path, where_shown: bool = False) -> None:
         """Write the constraint as YAML (`files.save_constraint`)."""
@@ -162,6 +175,8 @@ class Identified:
         told = "; ".join(self.relations) or "nothing is identified"
         dropped = f"; {self.dropped} wrong rows left out" if self.dropped else ""
         line = f"{told}{dropped}{': ' if not self.relations else '. '}{self.missing}".rstrip(". ")
+        if self.loosely:
+            line += f". Held looser by {self.loosely:g} times what they are missed by"
         if self.rounded is None:
             return line
         rounder = [own for own in self.rounded.relations if own not in self.relations]
@@ -200,12 +215,13 @@ def identify(demonstrations: Any, robot: SerialRobot) -> Identified:
         search = _of_joints(search, sample, robot, q)
     search = _varied(search, q)
     if search.joint is None:
-        search = _bounded(search)
+        search = _bounded(search, sample)
     dropped = len(sample) - len(search.sample)
     found, rounded = _told(search, robot, len(shown), dropped), _rounded(search)
     if rounded is None:
         return found
-    return replace(found, rounded=_told(rounded, robot, len(shown), dropped))
+    taken = replace(_told(rounded, robot, len(shown), dropped), is_rounded=True)
+    return replace(found, rounded=taken)
 
 
 def _likely(sample: Sample) -> Bool[np.ndarray, "n"]:
@@ -218,10 +234,11 @@ def _likely(sample: Sample) -> Bool[np.ndarray, "n"]:
     return np.ones(len(sample), dtype=bool)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Step:
     """Relations that were found together.  again: how they are found on other rows.  sides: which
-    of opposite sides of theirs is shown.  form: whose `numbers` they are of, if they have a name.
+    of opposite sides of theirs is shown.  form: whose `numbers` they are of, if they have a name,
+    rounded to `digits`, if they are.
     """
 
     again: Found
@@ -229,6 +246,21 @@ class _Step:
     sides: tuple[AnyRelation, ...] = ()
     form: Form | None = None
     numbers: Float[np.ndarray, "p"] | None = None
+    digits: Round | None = None
+
+    @classmethod
+    def of_form(cls, form: Form, numbers: Float[np.ndarray, "p"], digits: Round | None) -> "_Step":
+        """What numbers of a form make."""
+        if digits is not None:
+            numbers = form.rounded(numbers, digits)
+        again, made = partial(_fitted, form), form.relations(numbers)
+        return cls(again, made, form.sides(numbers), form, numbers, digits)
+
+    def on(self, sample: Sample) -> "_Step":
+        """The same as it is found on other rows."""
+        if self.form is None:
+            return replace(self, relations=self.again(sample))
+        return self.of_form(self.form, self.form.fitted(sample), self.digits)
 
 
 @dataclass
@@ -256,10 +288,10 @@ class _Search:
         return tuple(own for step in self.steps for own in step.sides)
 
     @cached_property
-    def on_others(self) -> list[tuple[Sample, tuple[tuple[AnyRelation, ...], ...]]]:
-        """The rows of each fold, and the relations of each step as they are found on all others."""
+    def on_others(self) -> list[tuple[Sample, tuple["_Step", ...]]]:
+        """The rows of each fold, and each step as it is found on all others."""
         return [
-            (self.sample[out], tuple(step.again(self.sample[~out]) for step in self.steps))
+            (self.sample[out], tuple(step.on(self.sample[~out]) for step in self.steps))
             for out in self.folds
         ]
 
@@ -276,20 +308,38 @@ def _searched(sample: Sample) -> _Search:
     return search
 
 
-def _bounded(search: _Search) -> _Search:
+def _bounded(search: _Search, sample: Sample) -> _Search:
     """The same with bounds on what is free, and in place of relations that are only nearly held and
     whose residuals fill an interval or disc.
+
+    sample: all rows, of which those that were wrong for such relations may be right.
     """
-    loose = [
-        _distance(search.sample, step.relations) > LOOSE_RAD * len(step.relations) ** 0.5
-        for step in search.steps
-    ]
-    held = [step for step, own in zip(search.steps, loose, strict=True) if not own]
-    rest = _Search(search.sample, search.folds, search.best_rad, held, search.missing)
-    for own in (rest, search) if any(loose) else (search,):
-        placed = any(map(_holds_the_tip, own.relations))
-        own.bounds = bounds_of(own.sample, _turned(own) > 0, placed, own.folds)
-    return rest if len(rest.bounds) > len(search.bounds) else search
+    if not search.folds:
+        return search
+    held, loose = dict[str, list[_Step]](rad=[], m=[]), dict[str, list[_Step]](rad=[], m=[])
+    for step in search.steps:
+        near = _distance(search.sample, step.relations) <= LOOSE_RAD * len(step.relations) ** 0.5
+        turned = any(np.any(own.gradients(_ONES)[:, 3:]) for own in step.relations)
+        placed = any(map(_holds_the_tip, step.relations))
+        for unit, what in (("rad", turned), ("m", placed)):
+            if what:
+                (held if near or (turned and placed) else loose)[unit].append(step)
+
+    def look(rows: Sample) -> tuple[tuple[Bound, ...], list[_Step]]:
+        found = bounds_of(rows, bool(held["rad"]), bool(held["m"]), rows.folds())
+        instead = [step for own in found for step in loose[own.relation.unit]]
+        return found, [step for step in search.steps if step not in instead]
+
+    rows = search.sample if any(held.values()) else sample
+    found, steps = look(rows)
+    if steps and rows is not search.sample:  # what is wrong for a relation that stays, is wrong
+        rows = search.sample
+        found, steps = look(rows)
+    if not found:
+        return search
+    right = np.logical_and.reduce([own.right for own in found])
+    kept = rows[right]
+    return _Search(kept, kept.folds(), search.best_rad, steps, search.missing, None, found)
 
 
 def _varied(search: _Search, q: Float[np.ndarray, "n D"]) -> _Search:
@@ -372,8 +422,7 @@ def _look(search: _Search, name: str) -> None:
             relations = form.relations(numbers)
             good = _distance(search.sample, relations) <= WORSE * off + FINE_RAD
             if good and (count == held or _supported(form, search)):
-                again, sides = partial(_fitted, form), form.sides(numbers)
-                search.steps.append(_Step(again, relations, sides, form, numbers))
+                search.steps.append(_Step.of_form(form, numbers, None))
                 return
     if held < seeming and found.found_rad[held] < 0.5 * found.left_out_rad[held]:
         on_others = found.left_out_rad[held]
@@ -575,40 +624,36 @@ def _distance(sample: Sample, relations: Sequence[AnyRelation]) -> float:
 
 
 def _rounded(search: _Search) -> _Search | None:
-    """The same with rounder numbers, where left-out demonstrations are no further from these than
-    from what was found without them; None where there are none.
+    """The same with rounder numbers, where left-out demonstrations are no further from what is
+    found without them and rounded than from what is not; None where there are none.
     """
-    steps = list(search.steps)
+    steps: list[_Step] = []
     for k, step in enumerate(search.steps):
-        if step.form is None or step.numbers is None:
+        steps.append(step)
+        form, numbers = step.form, step.numbers
+        if form is None or numbers is None:
             continue
-        off = sum(_distance(sample, found[k]) ** 2 for sample, found in search.on_others)
+        others = [(own, found[k]) for own, found in search.on_others]
+        off = sum(_distance(own, found.relations) ** 2 for own, found in others)
+        known = [x for x in (found.numbers for _, found in others) if x is not None]
+        if form.flat and steps[:-1] != search.steps[:k]:  # about the normal of a plane that moved
+            form = circle(next(r.linear[:3] for s in steps for r in s.relations if _is_flat(r)))
+            numbers = form.fitted(search.sample)
+            steps[-1] = _Step.of_form(form, numbers, None)
+            known = [form.fitted(search.sample[~out]) for out in search.folds]
         for digits in ROUND:
-            x = step.form.rounded(step.numbers, digits)
-            relations = step.form.relations(x)
-            moved = search.sample.distances(relations) - search.sample.distances(step.relations)
-            if np.abs(moved).max() < SAME_RAD:
+            rounded = _Step.of_form(form, numbers, digits)
+            first, second = (search.sample.distances(own.relations) for own in (steps[-1], rounded))
+            if np.abs(first - second).max() < SAME_RAD:
                 break  # they are round already
-            if sum(_distance(own, relations) ** 2 for own, _ in search.on_others) <= off:
-                again = partial(_as_they_are, relations)
-                steps[k] = _Step(again, relations, step.form.sides(x), step.form, x)
+            fits = [_Step.of_form(form, x, digits) for x in known]
+            pairs = zip(others, fits, strict=True)
+            if sum(_distance(own, fit.relations) ** 2 for (own, _), fit in pairs) <= off:
+                steps[-1] = rounded
                 break
     if all(own is step for own, step in zip(steps, search.steps, strict=True)):
         return None
-    return _Search(
-        search.sample,
-        search.folds,
-        search.best_rad,
-        steps,
-        search.missing,
-        search.joint,
-        search.bounds,
-    )
-
-
-def _as_they_are(relations: tuple[AnyRelation, ...], _: Sample) -> tuple[AnyRelation, ...]:
-    """Round numbers are not fitted."""
-    return relations
+    return replace(search, steps=steps)
 
 
 def _told(search: _Search, robot: SerialRobot, demonstrations: int, dropped: int) -> Identified:
@@ -670,7 +715,7 @@ def _constraint(
 def _left_out(search: _Search) -> Float[np.ndarray, "m"]:
     """The rms of each row on demonstrations that its relation was not found on."""
     squares = [
-        [float((own.values(sample.pose[0]) ** 2).mean()) for step in steps for own in step]
+        [float((r.values(sample.pose[0]) ** 2).mean()) for step in steps for r in step.relations]
         for sample, steps in search.on_others
     ]
     return np.sqrt(np.mean(squares, axis=0))
@@ -680,7 +725,10 @@ def _tip_left_out_rad(search: _Search) -> float:
     """The rms distance of the better GOOD of the rows from what holds the tip, along each direction
     that it holds, on demonstrations that it was not found on.
     """
-    holds = [tuple(filter(_holds_the_tip, sum(steps, ()))) for _, steps in search.on_others]
+    holds = [
+        tuple(r for step in steps for r in step.relations if _holds_the_tip(r))
+        for _, steps in search.on_others
+    ]
     off = [own.distances(tip) for (own, _), tip in zip(search.on_others, holds, strict=True)]
     return better_rms(np.concatenate(off)) / float(np.sqrt(len(holds[0])))
 
@@ -690,11 +738,9 @@ def _amount(unit: str, value: float) -> str:
 
 
 def with_tolerance(constraint: Constraint, loosely: float) -> Constraint:
-    """The same, each row as loose as so many times what it is missed by on left-out
-    demonstrations.
-    """
+    """The same, each row looser by so many times what left-out demonstrations miss it by."""
     if isinstance(constraint, Both):
         parts = constraint.first, constraint.second
         return Both(*(with_tolerance(own, loosely) for own in parts))
     assert isinstance(constraint, RelationsConstraint)
-    return constraint.widened([loosely * off for off in constraint.left_out])
+    return constraint.widened(loosely)
