@@ -43,7 +43,7 @@ def main(params: Params, layout: Layout) -> None:
             float_format="%.6g",
         )
         figures: dict[str, Any] = {
-            "cells": summary(table),
+            "cells": summary(table, own.peer_pairs),
             "ranks": ranks(table),
             "free_motion": free_motion(free_arms(), own.seeds),
             "machine": machine(),
@@ -53,7 +53,7 @@ def main(params: Params, layout: Layout) -> None:
         run.cells(by_cell(figures["cells"]))
         run.report(figures, reports / "demonstrations.json")
         for cell in cells:  # finished: the next run of this stage starts from nothing
-            shutil.rmtree(cell.kept.parent, ignore_errors=True)
+            shutil.rmtree(cell.folder.parent, ignore_errors=True)
 
 
 if __name__ == "__main__":

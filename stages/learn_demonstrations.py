@@ -32,11 +32,11 @@ def main(params: Params, layout: Layout) -> None:
             compression={"method": "gzip", "mtime": 0},
             float_format="%.6g",
         )
-        figures = {"cells": summary(table), "machine": machine()}
+        figures = {"cells": summary(table, own.peer_pairs), "machine": machine()}
         run.cells(by_cell(figures["cells"]))
         run.report(figures, reports / "learned_demonstrations.json")
         for cell in cells:  # finished: the next run of this stage starts from nothing
-            shutil.rmtree(cell.kept.parent, ignore_errors=True)
+            shutil.rmtree(cell.folder.parent, ignore_errors=True)
 
 
 if __name__ == "__main__":

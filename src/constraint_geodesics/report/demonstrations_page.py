@@ -10,6 +10,7 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.cells import Cells, fixed, markdown_table, share, short
 from constraint_geodesics.report.results import read_metrics
 from constraint_geodesics.studies.demonstrations import (
+    COMPARED,
     DESCENT,
     FLAT,
     FORMULA,
@@ -101,12 +102,12 @@ def _sentences(found: Figures) -> Iterator[str]:
         f"with a word on what is missing in {share(ranks['right_or_refused'], 1)}; more than the "
         f"formula holds was found in {ranks['too_many']}."
     )
-    nothing = sum(row["codim"] == 0 for row in free)
+    nothing = sum(row["codim"] + row["bounds"] == 0 for row in free)
     robots = len({row["robot"] for row in free})
     yield f"In free motion of {robots} arms nothing is found in {nothing} of {len(free)} draws."
     better, compared = 0, 0
     for _, _, methods in _cells(found["cells"]):
-        own = methods.get(IDENTIFIED)
+        own = methods.get(COMPARED)
         peers = [methods.get(name, {}) for name in (*PEERS, *LEARNED)]
         peers = [peer for peer in peers if peer.get("solved")]
         for unit in ("deg", "mm"):
@@ -116,8 +117,9 @@ def _sentences(found: Figures) -> Iterator[str]:
                 compared += 1
                 better += mine is not None and mine <= best
     yield (
-        f"The identified constraint's median violation is at most that of the best peer in "
-        f"{better} of {compared} comparisons."
+        f"On the queries that peers are asked, the identified constraint's median violation is at "
+        f"most that of the best peer, whatever share of them that joins, in {better} of {compared} "
+        f"comparisons."
     )
 
 
@@ -167,8 +169,12 @@ def _both(own: Figures | None) -> str:
 
 
 def _peer_rows(cells: Figures, peers: tuple[str, ...]) -> Cells:
-    names = (IDENTIFIED, *peers)
-    header = [own for name in names for own in (f"{name} [° / mm]", "length", "joined")]
+    names = (COMPARED, *peers)
+    header = [
+        own
+        for name in names
+        for own in (f"{IDENTIFIED if name == COMPARED else name} [° / mm]", "length", "joined")
+    ]
     rows: Cells = [("task", "shown", *header)]
     for task, case, methods in _cells(cells):
         row = [task, case]

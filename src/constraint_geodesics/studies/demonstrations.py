@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from constraint_geodesics.studies.hidden_tasks import HOLE, HOLE_M, ROWS, TASKS,
 from constraint_geodesics.studies.local_models import Answer, LocalModels, NearestRows, poses_of
 
 FORMULA, IDENTIFIED, WITHIN = "formula", "identified", "identified, where shown"
-ROUNDED = "identified, rounded"
+ROUNDED, COMPARED = "identified, rounded", "identified, as asked of peers"
 TANGENTS, NEAREST = "local models of poses", "nearest rows"
 PEERS = (TANGENTS, NEAREST)
 LEVEL_SET, RESIDUAL = "level-set network", "residual network"
@@ -113,10 +114,15 @@ class Cell:
         return self.case.drawn(self.hidden, scene, 100 * self.seed)
 
     @property
-    def kept(self) -> Path:
-        """Where its rows are until all cells are measured."""
+    def folder(self) -> Path:
+        """Where its rows are until all cells are measured, those of these settings and this code
+        alone.
+        """
         name = f"{self.task}-{self.case.name}-{self.seed}".replace(" ", "-").replace(",", "")
-        return self.layout.scratch(self.stage, name) / "rows.json"
+        code = self.layout.root / "data" / "code" / f"{self.stage}.txt"
+        told = code.read_text() if code.is_file() else ""
+        key = sha256((self.settings.model_dump_json() + told).encode()).hexdigest()[:12]
+        return self.layout.scratch(self.stage, name) / key
 
 
 def cells_of(params: Params, layout: Layout, stage: str) -> list[Cell]:
@@ -136,17 +142,20 @@ def measure(cell: Cell) -> list[Columns]:
     """Rows of one cell, of what has no training; those of an earlier run that was interrupted are
     taken as they are.
     """
-    return kept_rows(cell, _rows)
+    return kept_rows(cell, "rows", _rows)
 
 
-def kept_rows(cell: Cell, rows_of: Callable[[Cell], Iterator[Columns]]) -> list[Columns]:
-    """Rows of one cell, written down until all cells are measured."""
-    if cell.kept.is_file():
-        found: list[Columns] = json.loads(cell.kept.read_text())
+def kept_rows(cell: Cell, name: str, rows_of: Callable[[Cell], Iterator[Columns]]) -> list[Columns]:
+    """Rows of one cell, written down under a name until all cells are measured."""
+    file = cell.folder / f"{name}.json"
+    if file.is_file():
+        found: list[Columns] = json.loads(file.read_text())
         return found
     rows = list(rows_of(cell))
-    cell.kept.parent.mkdir(parents=True, exist_ok=True)
-    cell.kept.write_text(json.dumps(rows))
+    cell.folder.mkdir(parents=True, exist_ok=True)
+    begun = file.with_suffix(".begun")
+    begun.write_text(json.dumps(rows))
+    begun.replace(file)
     return rows
 
 
@@ -328,8 +337,9 @@ def free_motion(robots: Sequence[SerialRobot], seeds: Sequence[int]) -> list[Col
                 "repeated": [_swept(own[0], own[1], rng) for own in again],
             }
             for how, own in shown.items():
-                codim = identify(own, robot).codim
-                rows.append({"robot": robot.name, "seed": seed, "shown": how, "codim": codim})
+                found = identify(own, robot)
+                held = {"codim": found.codim, "bounds": found.bounds}
+                rows.append({"robot": robot.name, "seed": seed, "shown": how} | held)
     return rows
 
 
@@ -341,11 +351,15 @@ def _swept(first: np.ndarray, last: np.ndarray, rng: np.random.Generator) -> np.
     return found
 
 
-def summary(table: pd.DataFrame) -> dict[str, Any]:
+def summary(table: pd.DataFrame, peer_pairs: int) -> dict[str, Any]:
     """Figures by task, case and method; medians and 95th percentiles over all paths of all seeds,
     and the largest over seeds of the seeds' medians.
+
+    COMPARED: what is identified, on the queries that peers are asked.
     """
     figures: dict[str, Any] = {}
+    asked = table[(table["method"] == IDENTIFIED) & (table["query"] < peer_pairs)]
+    table = pd.concat([table, asked.assign(method=COMPARED)])
     for named, own in table.groupby(["task", "case", "method"], sort=False):
         task, case, method = map(str, named)
         solved = own[own["status"] == "solved"]

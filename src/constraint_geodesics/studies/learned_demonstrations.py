@@ -5,7 +5,8 @@ by the hidden formula.
 
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 from constraint_geodesics.params import GeodesicParams, ManifoldParams
 from constraint_geodesics.planner import Planner
@@ -30,32 +31,47 @@ from constraint_geodesics.studies.row_networks import RowNetwork, level_set, res
 
 def measure(cell: Cell) -> list[Columns]:
     """Rows of one cell; those of an earlier run that was interrupted are taken as they are."""
-    return kept_rows(cell, _rows)
+    groups = {"networks": _networks, "latents": _latents}
+    return [
+        row
+        for name, trained in groups.items()
+        for row in kept_rows(cell, name, partial(_rows, trained))
+    ]
 
 
-def _rows(cell: Cell) -> Iterator[Columns]:
+Trained = Iterator[tuple[str, Answering, float]]
+"""Methods, each trained on a cell's demonstrations, and the seconds that it took."""
+
+
+def _rows(trained: Callable[[Cell, Scene], Trained], cell: Cell) -> Iterator[Columns]:
     scene = Scene.from_params(cell.params)
     with Planner.load(cell.layout.planner) as planner:
         pairs = pairs_of(cell, planner, cell.settings.peer_pairs)
-    for method, answer, seconds in _trained(cell, scene):
+    for method, answer, seconds in trained(cell, scene):
         if pairs:
             answer(*pairs[0][:2])  # what is loaded late is no query's
         for row in asked_all(cell, scene.robot, method, answer, pairs):
             yield row | {"trained_s": seconds}
 
 
-def _trained(cell: Cell, scene: Scene) -> Iterator[tuple[str, Answering, float]]:
-    """Each method, trained on the cell's demonstrations, and the seconds that it took."""
-    robot, own, scratch = scene.robot, cell.settings.learned, cell.kept.parent / "training"
-    codim = cell.hidden.manifold(robot).codim
+def _networks(cell: Cell, scene: Scene) -> Trained:
+    own, codim = cell.settings.learned, cell.hidden.manifold(scene.robot).codim
+    if not codim:  # they hold something or nothing, and no tolerance
+        return
     rows, of = flat_rows(cell.shown(scene))
     losses = {LEVEL_SET: (level_set, own.level_set_steps), RESIDUAL: (residual, own.residual_steps)}
-    for name, (loss, steps) in losses.items() if codim else ():  # they hold or leave free
+    for name, (loss, steps) in losses.items():
         began = time.perf_counter()
-        network = RowNetwork(robot, rows, of, codim, loss, steps, cell.seed)
+        network = RowNetwork(scene.robot, rows, of, codim, loss, steps, cell.seed)
         yield name, network.answer, time.perf_counter() - began
+
+
+def _latents(cell: Cell, scene: Scene) -> Trained:
+    robot, scratch = scene.robot, cell.folder / "training"
+    rows, _ = flat_rows(cell.shown(scene))
     began = time.perf_counter()
-    latents = RowLatents(robot, rows, _vae(cell, len(rows), robot.dof - codim), scratch)
+    dim = robot.dof - cell.hidden.manifold(robot).codim
+    latents = RowLatents(robot, rows, _vae(cell, len(rows), dim), scratch)
     seconds = time.perf_counter() - began
     yield DESCENT, latents.by_descent(), seconds
     yield FLAT, latents.without_variance(), seconds

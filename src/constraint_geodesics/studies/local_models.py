@@ -117,9 +117,10 @@ class LocalModels:
             for count in NEIGHBOURS:
                 self._count, self._degree = min(count, len(rest)), degree
                 if degree == 1 or count >= LEAST_OF_A_QUADRIC:
-                    off = np.linalg.norm(self._residual(rows[held_out])[0], axis=1)
-                    tried[self._count, degree] = float(np.median(off))
+                    away = np.linalg.norm(moved(*self._residual(rows[held_out])), axis=1)
+                    tried[self._count, degree] = float(np.median(away))
         self._count, self._degree = min(tried, key=lambda key: tried[key])
+        self.left_out_rad = tried[self._count, self._degree]
         self._y, self._tree = y, KDTree(y)
 
     def answer(self, start: np.ndarray, goal: np.ndarray) -> Answer:
@@ -129,12 +130,24 @@ class LocalModels:
     def frames(
         self, y: Float[np.ndarray, "n k"], slopes: Float[np.ndarray, "n k D"]
     ) -> tuple[Float[np.ndarray, "n c k"], Float[np.ndarray, "n d k"]]:
-        """Directions across the rows near each of some places, which are held, and along them."""
-        _, _, across, along = self._near(y, slopes)
-        return across, along
+        """Orthonormal directions across the model of each of some places, which are held, and along
+        it.
+        """
+        _, normals, every = self._model(y, slopes)
+        sides, _, _ = np.linalg.svd(every @ normals.transpose(0, 2, 1))
+        turned = sides.transpose(0, 2, 1) @ every
+        return turned[:, : self._codim], turned[:, self._codim :]
 
-    def _near(self, y: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Mean of the nearest rows, how far they are from it, and their directions."""
+    def _residual(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far configurations are off the models, and the slopes of that."""
+        y, slopes = self._look(q)
+        off, normals, _ = self._model(y, slopes)
+        return off, normals @ slopes
+
+    def _model(self, y: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, ...]:
+        """How far places are off the model of the rows near them (n, c), its normals there, and
+        directions that span all poses.
+        """
         near = self._y[np.asarray(self._tree.query(y, self._count)[1])]
         mean = near.mean(axis=1)
         away = near - mean[:, None]
@@ -142,16 +155,11 @@ class LocalModels:
         basis = np.linalg.svd(slopes, full_matrices=False)[0][:, :, :6]
         flat = away @ basis
         _, directions = np.linalg.eigh(flat.transpose(0, 2, 1) @ flat)
-        turned = (basis @ directions).transpose(0, 2, 1)
-        return mean, away, turned[:, : self._codim], turned[:, self._codim :]
-
-    def _residual(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Across the tangent plane of the poses' own tangent space, and its slopes."""
-        y, slopes = self._look(q)
-        mean, away, across, along = self._near(y, slopes)
+        every = (basis @ directions).transpose(0, 2, 1)
+        across, along = every[:, : self._codim], every[:, self._codim :]
         off = (across @ (y - mean)[:, :, None])[:, :, 0]
         if self._degree == 1 or not along.shape[1]:
-            return off, across @ slopes
+            return off, across, every
         t = away @ along.transpose(0, 2, 1)
         first, second = np.triu_indices(along.shape[1])
         ones = np.ones((*t.shape[:2], 1))
@@ -169,7 +177,7 @@ class LocalModels:
             steep[:, 1 + count + m, i] += here[:, j]
             steep[:, 1 + count + m, j] += here[:, i]
         bent = np.einsum("nmk,nmd->nkd", fit, steep)
-        return off, across @ slopes - bent @ (along @ slopes)
+        return off, across - bent @ along, every
 
     def _projected(self, q: np.ndarray, steps: int) -> np.ndarray:
         q = q.copy()

@@ -2,9 +2,9 @@
 network as in ECoMaNN (Sutanto et al., 2020) and a residual network.
 
 Both are trained on the rows and on places beside them, along the directions across the rows that
-local models give.  The rank is told.  Whether a network sees joints or the tool's pose is chosen on
-demonstrations left out, as the steps and the size were by hand on clean rows of a sphere: the
-baselines' strongest settings.
+local models give.  The rank is told.  A network sees joints or the tool's pose, by which local
+models are nearer to demonstrations left out; its size, its steps and how far beside the rows it is
+trained were chosen by hand on three of the tasks.
 """
 
 from collections.abc import Callable
@@ -19,9 +19,7 @@ from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.studies.local_models import (
     Answer,
     LocalModels,
-    Look,
     band_between,
-    halves,
     joints_of,
     moved,
     poses_of,
@@ -30,11 +28,8 @@ from constraint_geodesics.studies.local_models import (
 WIDTH, BATCH, RATE = 128, 256, 3e-3
 BESIDE = 0.2
 """How far beside the rows places are drawn, at most, in units of what is looked at."""
-FRAMED = 4000
-"""Rows that directions are computed at, at most."""
 CHUNK = 250
-SHORT = 0.25
-"""Of the steps, for the choice of what is looked at."""
+"""Rows whose directions are computed at once."""
 Loss = Callable[[nn.Module, "Beside"], Tensor]
 
 
@@ -52,9 +47,13 @@ def level_set(net: nn.Module, rows: Beside) -> Tensor:
     """Zero at the rows and the distance beside them; its slope one across the rows, none along
     them.
     """
-    at_rows, along = torch.func.jvp(net, (rows.y,), (rows.along,))[:2]
-    _, across = torch.func.jvp(net, (rows.y,), (rows.across,))[:2]
-    beside = net(rows.y + rows.away * rows.across)
+    count, still = len(rows.y), torch.zeros_like(rows.y)
+    places = torch.cat([rows.y, rows.y, rows.y + rows.away * rows.across])
+    values, slopes = torch.func.jvp(net, (places,), (torch.cat([rows.along, rows.across, still]),))[
+        :2
+    ]
+    at_rows, beside = values[:count], values[2 * count :]
+    along, across = slopes[:count], slopes[count : 2 * count]
     return (
         at_rows.square().sum(-1)
         + (beside.norm(dim=-1) - rows.away[:, 0].abs()).square()
@@ -82,31 +81,26 @@ class RowNetwork:
         steps: int,
         seed: int,
     ) -> None:
-        self._loss, self._codim, self._seed = loss, codim, seed
-        held_out, rest = halves(of)
-        tried: dict[Look, float] = {}
-        for look in (poses_of(robot), joints_of(robot)):
-            self._fit(look, rows[rest], of[rest], int(SHORT * steps))
-            off = np.linalg.norm(self._move(rows[held_out]), axis=1)
-            tried[look] = float(np.median(off))
-        self._fit(min(tried, key=lambda look: tried[look]), rows, of, steps)
+        looks = (poses_of(robot), joints_of(robot))
+        models = {look: LocalModels(look, rows, of, codim) for look in looks}
+        self._look = min(looks, key=lambda look: models[look].left_out_rad)
+        self._loss, self._seed = loss, seed
+        outputs = codim if loss is level_set else None
+        self._fit(models[self._look], rows, outputs, steps)
 
     def answer(self, start: np.ndarray, goal: np.ndarray) -> Answer:
         """A band on the network's zeros."""
         return band_between(self._projected, start, goal)
 
-    def _fit(self, look: Look, rows: np.ndarray, of: np.ndarray, steps: int) -> None:
-        rng = np.random.default_rng(self._seed)
-        models = LocalModels(look, rows, of, self._codim)
-        kept = rng.permutation(len(rows))[:FRAMED]
-        parts = np.array_split(rows[kept], max(len(kept) // CHUNK, 1))
-        seen = [look(part) for part in parts]
+    def _fit(self, models: LocalModels, rows: np.ndarray, outputs: int | None, steps: int) -> None:
+        seen = [self._look(part) for part in np.array_split(rows, max(len(rows) // CHUNK, 1))]
         across, along = (
             np.concatenate(own) for own in zip(*(models.frames(*own) for own in seen), strict=True)
         )
         y = np.concatenate([own for own, _ in seen])
-        self._look, self._middle, self._size = look, y.mean(axis=0), max(float(y.std()), 1e-3)
-        outputs = self._codim if self._loss is level_set else y.shape[1]
+        self._middle = y.mean(axis=0)
+        self._size = max(float((y - self._middle).std()), 1e-3)
+        outputs = outputs or y.shape[1]
         torch.manual_seed(self._seed)
         net = nn.Sequential(
             *(nn.Linear(y.shape[1], WIDTH), nn.Tanh(), nn.Linear(WIDTH, WIDTH), nn.Tanh()),
