@@ -147,12 +147,13 @@ def measure(cell: Cell) -> list[Columns]:
 
 def kept_rows(cell: Cell, name: str, rows_of: Callable[[Cell], Iterator[Columns]]) -> list[Columns]:
     """Rows of one cell, written down under a name until all cells are measured."""
-    file = cell.folder / f"{name}.json"
+    folder = cell.folder
+    file = folder / f"{name}.json"
     if file.is_file():
         found: list[Columns] = json.loads(file.read_text())
         return found
     rows = list(rows_of(cell))
-    cell.folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     begun = file.with_suffix(".begun")
     begun.write_text(json.dumps(rows))
     begun.replace(file)
