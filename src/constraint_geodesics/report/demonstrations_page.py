@@ -65,7 +65,9 @@ def demonstrations_markdown(params: Params, layout: Layout) -> str:
         f"rows with as many latent dimensions as the hidden set has ({own.learned.epochs} epochs "
         f"of {own.learned.batches} batches), and cubic geodesics of its metric by descent; "
         f"*{POLICY}* the same by a policy of {own.learned.policy_steps} PPO steps; ends are the "
-        f"query's own. All are trained on the same demonstrations of {len(own.seeds)} seeds."
+        f"query's own. All are trained on the same demonstrations, the networks of the first "
+        f"{_most(known, LEVEL_SET, 'queries') // own.peer_pairs} draws, the VAEs and policies of "
+        f"{_most(known, POLICY, 'queries') // own.peer_pairs}."
     )
     parts = [
         "# Constraints from demonstrations",
@@ -93,6 +95,11 @@ def _cells(cells: Figures) -> Iterator[tuple[str, str, Figures]]:
     for task, cases in cells.items():
         for case, methods in cases.items():
             yield task, case, methods
+
+
+def _most(cells: Figures, method: str, figure: str) -> int:
+    """The largest of a method's figure over all cells."""
+    return max((int(own[method][figure]) for *_, own in _cells(cells) if method in own), default=0)
 
 
 def _sentences(found: Figures) -> Iterator[str]:
