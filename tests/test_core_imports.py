@@ -15,9 +15,17 @@ ONLY_IN_EXTRAS = sorted({*EXTRAS["bench"], "yaml", "click", "networkx"} - {"pack
 """What comes with the extras' packages too; Matplotlib needs packaging."""
 HEAVY = {*ONLY_IN_EXTRAS, "matplotlib", "typer", "rich", "ruamel"}
 LAB = {"learning", "geodesics", "peers", "benchmark", "studies", "report", "tracking", "pipeline"}
-PLANS = """
-import json, sys
-sys.modules.update(dict.fromkeys({absent!r}))
+ABSENT = """
+import sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {absent!r}:
+            raise ModuleNotFoundError(name)
+sys.meta_path.insert(0, Absent())
+"""
+"""As if packages were not installed."""
+PLANS = f"""{ABSENT}
+import json
 from constraint_geodesics import Planner
 from constraint_geodesics.bundle import PACKAGED
 start, goal = json.loads(sys.stdin.read())
@@ -28,10 +36,8 @@ path.save("path.csv")
 path.draw("path.png")
 print(json.dumps([path.status, loaded]))
 """
-CHECKS = """
-import sys
-sys.modules.update(dict.fromkeys({absent!r}))
-sys.argv = ["geodesics", "check", "path.csv", "--planner", {planner!r}]
+CHECKS = f"""{ABSENT}
+sys.argv = ["geodesics", "check", "path.csv", "--planner", {{planner!r}}]
 from constraint_geodesics import cli
 cli.main()
 """
