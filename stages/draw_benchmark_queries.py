@@ -52,7 +52,7 @@ def draw(params: Params, layout: Layout, constraint: str) -> None:
         Certifier(scene, judge_limits(params.judge)) as certifier,
         scene.world() as world,
     ):
-        clearance = clearance_model(scene.robot, scene.workcell, certifier.collisions.apart)
+        clearance = clearance_model(scene, certifier.collisions.apart)
 
         def plan(
             start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]

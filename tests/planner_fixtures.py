@@ -110,7 +110,7 @@ def walled(robot: SerialRobot, is_free: Callable[[np.ndarray], bool]) -> Plannin
 def problems(world: World, name: str, count: int) -> list[PlanningProblem]:
     """Queries of one constraint in the packaged planner's workcell."""
     planner = packaged_planner()
-    clearance = clearance_model(planner.scene.robot, planner.scene.workcell)
+    clearance = clearance_model(planner.scene.now)
     manifold = manifold_of(planner, name)
     known = world.is_free, clearance, planner._certifier.collisions.is_clear
     return [PlanningProblem(a, b, manifold, *known) for a, b in pairs_of(name, count, 3)]

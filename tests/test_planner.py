@@ -61,7 +61,7 @@ def certifier(planner):
     """A judge of its own."""
     acceleration = packaged_bundle().planner.acceleration_rad_s2
     limits = Limits(acceleration_rad_s2=(acceleration,) * planner.scene.robot.dof)
-    with Certifier(planner.scene, limits) as judge:
+    with Certifier(planner.scene.now, limits) as judge:
         yield judge
 
 

@@ -75,7 +75,7 @@ with Planner.load(PACKAGED) as planner:
     retract(manifold, start[None] + 0.01), manifold.violation(start), manifold.inclusion(start)
     rows = path.joints.copy()
     rows.flags.writeable = False
-    with Certifier(planner.scene) as certifier:
+    with Certifier(planner.scene.now) as certifier:
         certifier.certify(rows, held_at_start)
     robot.forward(rows), robot.jacobian(rows), robot.skeleton(rows)
     planner.plan(start + 0.01, goal, "level_cup"), planner.plan(0.0 * start, goal, "free")

@@ -77,7 +77,7 @@ def test_a_path_is_planned_drawn_and_certified_round_an_obstacle(tmp_path) -> No
     assert answer["certificate"]["asked_pybullet"] == 0
     assert "no PyBullet" in answer["certificate"]["rests_on"]
     assert answer["certificate"]["largest_pose_difference"] is None
-    assert answer["inside"] == "the start touches the workcell"
+    assert answer["inside"].startswith("the start touches the workcell: ")
     assert (tmp_path / "path.png").stat().st_size > 10_000
 
     words = ["geodesics", "check", "path.csv", "--planner", "planner"]
@@ -117,7 +117,7 @@ def test_what_the_proof_leaves_open_is_refused(monkeypatch) -> None:
         assert violation is not None
         assert violation.kind == "clearance"
         assert not certifier.collisions.is_free(upright[0])
-        assert certifier.collisions.what_touches(upright[0]) == "the workcell"
+        assert certifier.collisions.what_touches(upright[0]).startswith("the workcell: ")
     with Certifier(under(touching + 2e-4)) as certifier:
         assert certifier.certify(upright, free).valid
 

@@ -31,7 +31,7 @@ from constraint_geodesics.plugs import PULL, PULL_BOUNDS, plug
 from constraint_geodesics.robot.inverse_kinematics import solutions
 from constraint_geodesics.robot.kinematics import load_robot
 from constraint_geodesics.scene import convex_kernels as convex
-from constraint_geodesics.scene.bodies import Body, NodeTable
+from constraint_geodesics.scene.bodies import block_of
 from constraint_geodesics.scene.clearance import clearance_model, path_stays_clear
 from constraint_geodesics.scene.pieces import Piece, prism
 from constraint_geodesics.scene.scene import Scene
@@ -63,16 +63,16 @@ def _level() -> Constraint:
 @cache
 def _space() -> Space:
     robot = _scene().robot
-    clearance = clearance_model(robot, _scene().workcell)
+    clearance = clearance_model(_scene())
     return space_of(ConstraintManifold(robot, _level()), clearance, 0.01)
 
 
 def _distances() -> None:
-    arrays = clearance_model(_scene().robot, _scene().workcell).arrays
+    arrays = clearance_model(_scene()).arrays
     frames, simplex = np.zeros((_scene().robot.dof + 1, 12)), np.empty(convex.SIMPLEX)
     convex.place_balls(arrays.nodes, frames)
     convex.distance(arrays[:3], frames, 0, (0.0, 0.0), simplex)
-    NodeTable([Body("round", 0, (Piece(prism(8, 0.1, 0.0, 0.1)),))])
+    block_of([Piece(prism(8, 0.1, 0.0, 0.1))], 3)
 
 
 def _kinematics() -> None:
@@ -86,7 +86,7 @@ def _kinematics() -> None:
 def _space_searched() -> None:
     own = _space()
     path_stays_clear(own.chain, own.clearance, _ROWS)
-    clearance_model(_scene().robot, _scene().workcell).clearance(_scene().robot, _ROWS)
+    clearance_model(_scene()).clearance(_scene().robot, _ROWS)
     project(own, _ROWS.copy())
 
 
@@ -110,7 +110,7 @@ def _constraints_and_times() -> None:
 
 
 def _band() -> None:
-    model = clearance_model(_scene().robot, _scene().workcell)
+    model = clearance_model(_scene())
     task = Task(ConstraintManifold(_scene().robot, _level()), model, lambda: None)
     found = refined(task, "straight", _ROWS)
     assert found is not None

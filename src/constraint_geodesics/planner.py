@@ -41,7 +41,9 @@ from constraint_geodesics.problem import end_refused
 from constraint_geodesics.robot.inverse_kinematics import Search, solutions, spread
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, rpy_of
 from constraint_geodesics.scene.arm import FOUND
+from constraint_geodesics.scene.planning_scene import PlanningScene
 from constraint_geodesics.scene.scene import Scene, robot_from, workcell_from
+from constraint_geodesics.scene.scene import SceneError as SceneError
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.search.candidates import ALL_PARTS, Parts
 from constraint_geodesics.search.nearest import Projection, projection
@@ -72,17 +74,19 @@ class Planner:
         warmup.ensure()
         self._closed = False
         self.source, self.bundle = source, bundle
-        self.scene = Scene(robot_from(bundle.robot), workcell_from(bundle.workcell))
+        scene = Scene(robot_from(bundle.robot), workcell_from(bundle.workcell))
         self.constraints = {
-            name: constraint_from(c, self.scene.robot) for name, c in bundle.constraints.items()
+            name: constraint_from(c, scene.robot) for name, c in bundle.constraints.items()
         }
         self.method: Method = method or SearchMethod()
         settings = bundle.planner
-        limits = limits_of(settings, bundle.judge, self.scene.robot)
-        self._certifier = Certifier(self.scene, limits)
+        limits = limits_of(settings, bundle.judge, scene.robot)
+        self._certifier = Certifier(scene, limits)
         self._answering = Answering(self.method, self._certifier)
         checks = self._certifier.collisions
-        self._preparation = Preparation(self.scene, checks, settings, self.method.draw)
+        self._preparation = Preparation(scene, checks, settings, self.method.draw)
+        bodies = checks.collider
+        self.scene = PlanningScene(scene, self._follow, bodies.links, bodies.link_pose)
         roadmaps = bundle.roadmaps if self.method.roadmaps is None else self.method.roadmaps
         self._preparation.supply(self.constraints, roadmaps)
         self.band = self._preparation.band
@@ -168,6 +172,11 @@ class Planner:
         if self._closed:
             raise PlannerError("this planner is closed: load another")
 
+    def _follow(self, scene: Scene) -> None:
+        self._require_open()
+        self._certifier.change(scene)
+        self._preparation.change(scene)
+
     def prepare(self, constraint: str | Constraint) -> None:
         """Make the constraint's roadmap now (about a second), and load the compiled code, so that
         no query waits.
@@ -240,6 +249,7 @@ class Planner:
         snap: bool = False,
         velocity_scale: float = 1.0,
         acceleration_scale: float = 1.0,
+        scene: Sequence[Shape] = (),
     ) -> Trajectory:
         """A short path from a start [rad] under a constraint: a name from params.yaml, or a
         Constraint, which without a reference holds its axes where the start has them.
@@ -254,9 +264,10 @@ class Planner:
         constraint or a limit is moved to the nearest configuration that keeps them, where that is
         at most SNAP_RAD away, and SNAP_M for prismatic joints, and nothing is touched on the way;
         else such a start is refused.  velocity_scale, acceleration_scale: the shares of the limits
-        that the motion uses, above 0 and at most 1.
+        that the motion uses, above 0 and at most 1.  scene: shapes for this query alone, beside
+        what is in `planner.scene`.
         Raises PlannerError if an end has the wrong shape or is not finite, the name is unknown, or
-        the budget or a scale is none.
+        the budget or a scale is none, SceneError for shapes that the scene can't take.
         """
         self._require_open()
         given, name = self._named(constraint)
@@ -270,11 +281,12 @@ class Planner:
                 raise PlannerError(f"{which}_scale = {scale!r}: must be above 0 and at most 1")
         dof = self.scene.robot.dof
         q_start, goals = checked_configuration(start, dof, "start"), as_goals(goal, dof)
-        task, moved = self._preparation.task(self._held_at(given, q_start)), 0.0
-        if snap:
-            q_start, moved = self._snapped(q_start, task.manifold)
-        query = Query(task, name, q_start, q_start, began, parts, scales, moved)
-        return self._answering.answer(query, goals, budget_s)
+        with self.scene.including(scene):
+            task, moved = self._preparation.task(self._held_at(given, q_start)), 0.0
+            if snap:
+                q_start, moved = self._snapped(q_start, task.manifold)
+            query = Query(task, name, q_start, q_start, began, parts, scales, moved)
+            return self._answering.answer(query, goals, budget_s)
 
     def plan_batch(
         self,

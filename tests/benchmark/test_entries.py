@@ -38,7 +38,7 @@ def with_planner(params: Params, **entry: object) -> Params:
 def build(params: Params, name: str, root: Path) -> None:
     planner = packaged_planner()
     with BaselineBuilder(params, root)(
-        [name], planner.scene, "level_cup", manifold_of(planner, "level_cup")
+        [name], planner.scene.now, "level_cup", manifold_of(planner, "level_cup")
     ):
         pass
 

@@ -72,7 +72,7 @@ def batch(tmp_path) -> QueryBatch:
     ball = Sphere("keep_out", (5.0, 5.0, 5.0), 0.1)
     queries = (*queries[:2], replace(queries[2], scene="keep_out", obstacle=ball))
     return QueryBatch(
-        scene=planner.scene,
+        scene=planner.scene.now,
         manifold=manifold_of(planner, "level_cup"),
         queries=queries,
         baselines=ASKED,
@@ -215,11 +215,11 @@ def test_spheres_stand_between_the_ends_and_not_on_the_ends() -> None:
         return planner.plan(start, goal, "level_cup").joints
 
     few = PARAMS.benchmark.model_copy(update={"queries": 3, "seed": 5})
-    queries = draw_benchmark(planner.scene, manifold, "level_cup", few, plan)
+    queries = draw_benchmark(planner.scene.now, manifold, "level_cup", few, plan)
     assert [query.scene for query in queries] == ["table"] * 3 + ["keep_out"] * 3
     assert [query.number for query in queries] == list(range(6))
     for query in queries[3:]:
-        with query.in_scene(planner.scene).world() as world:
+        with query.in_scene(planner.scene.now).world() as world:
             assert world.is_free(query.start)
             assert world.is_free(query.goal)
             assert world.first_collision(plan(query.start, query.goal)) is not None

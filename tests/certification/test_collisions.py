@@ -9,11 +9,12 @@ import pytest
 
 from constraint_geodesics.certification import collision_kernels as kernels
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.certification.collider import collider
+from constraint_geodesics.certification.collider import Collider
 from constraint_geodesics.certification.collisions import MARGIN_M
 from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.robot.kinematics import RobotError, load_robot
+from constraint_geodesics.scene import bodies
 from constraint_geodesics.scene import convex_kernels as convex
 from constraint_geodesics.scene.body import Body
 from constraint_geodesics.scene.box import Box
@@ -94,7 +95,7 @@ def test_distances_are_pybullets(any_scene: Scene) -> None:
     """
     below, seen = (2e-3 if any_scene.robot.name == "sliding" else 1e-4), 0
     with Certifier(any_scene) as certifier, any_scene.world() as world:
-        whole = collider(any_scene, certifier.collisions.collider.arrays.chain, np.inf, 0.0)
+        whole = Collider(any_scene, certifier.collisions.collider.arrays.chain, np.inf, 0.0)
         assert not whole.apart
         for q in any_scene.robot.sample(60, np.random.default_rng(0)):
             for p, (a, b) in enumerate(whole.moving):
@@ -104,7 +105,7 @@ def test_distances_are_pybullets(any_scene: Scene) -> None:
                 keep[0, 2:4] = (1, len(keep)) if last > first else (0, 0)
                 alone = whole.arrays._replace(pairs=keep, top=1)
                 own, _ = kernels.nearest_pair(alone, q, 0.3)
-                theirs = world.distance(q, whole.bodies[a].key, whole.bodies[b].key, 0.3)
+                theirs = world.distance(q, a, b, 0.3)
                 if own < 0.29 and theirs > 0.0:
                     seen += 1
                     assert -below < own - theirs < ABOVE_M
@@ -113,8 +114,7 @@ def test_distances_are_pybullets(any_scene: Scene) -> None:
 
 def test_pairs_that_are_left_out_never_meet(any_scene: Scene) -> None:
     with Certifier(any_scene) as certifier, any_scene.world() as world:
-        own = certifier.collisions.collider
-        named = [(own.bodies[a].key, own.bodies[b].key) for a, b in own.apart]
+        named = certifier.collisions.collider.apart
         for q in any_scene.robot.sample(300, np.random.default_rng(3)):
             assert all(world.distance(q, *keys, 0.0) == np.inf for keys in named)
     assert named
@@ -146,11 +146,21 @@ def furthest(arrays: kernels.Bodies, node: int, direction: np.ndarray) -> tuple[
     return min(convex.furthest(hulls, k, *direction)[1] for k in corners), true
 
 
+def nodes_of_pieces(own: Collider) -> Iterator[tuple[int, bodies.Body, Piece]]:
+    """Where each piece is among the nodes; a body of several has one of its own before them."""
+    first = 0
+    for body in own.bodies.values():
+        several = len(body.pieces) > 1
+        for k, piece in enumerate(body.pieces):
+            yield first + several + k, body, piece
+        first += several + len(body.pieces)
+
+
 def test_a_way_along_edges_leads_to_the_furthest_corner(any_scene: Scene) -> None:
     rng = np.random.default_rng(0)
     with Certifier(any_scene) as certifier:
         own = certifier.collisions.collider
-        for node in range(len(own.bodies), len(own.arrays.nodes)):
+        for node, *_ in nodes_of_pieces(own):
             for direction in rng.normal(size=(10, 3)):
                 np.testing.assert_allclose(*furthest(own.arrays, node, direction), atol=1e-12)
 
@@ -196,24 +206,19 @@ def test_bodies_move_no_further_than_the_bounds_say(any_scene: Scene) -> None:
         steps = np.stack([np.abs(step), np.abs(step), np.zeros(dof)])
         for frame, share in zip(frames, shares, strict=True):
             kernels.joint_frames(own.arrays.chain, start + share * step, frame)
-        node = len(own.bodies)
-        for body in own.bodies:
-            for piece in body.pieces:
-                for below in range(body.frame):
-                    nodes = own.arrays.nodes[[node, node]]
-                    nodes[0, convex.FRAME] = below
-                    motion, bend = kernels._bounds_of_motion(nodes, 0, 1, steps)
-                    seen = np.stack(
-                        [seen_from(frame, below, body.frame, piece) for frame in frames]
-                    )
-                    away = np.linalg.norm(seen - seen[0], axis=2).max()
-                    line = seen[0] + shares[:, None, None] * (seen[-1] - seen[0])
-                    off = np.linalg.norm(seen - line, axis=2).max()
-                    assert away <= motion + 1e-12
-                    assert off <= bend + 1e-12
-                    moved.append(away / motion)
-                    bent.append(off / bend)
-                node += 1
+        for node, body, piece in nodes_of_pieces(own):
+            for below in range(body.frame):
+                nodes = own.arrays.nodes[[node, node]]
+                nodes[0, convex.FRAME] = below
+                motion, bend = kernels._bounds_of_motion(nodes, 0, 1, steps)
+                seen = np.stack([seen_from(frame, below, body.frame, piece) for frame in frames])
+                away = np.linalg.norm(seen - seen[0], axis=2).max()
+                line = seen[0] + shares[:, None, None] * (seen[-1] - seen[0])
+                off = np.linalg.norm(seen - line, axis=2).max()
+                assert away <= motion + 1e-12
+                assert off <= bend + 1e-12
+                moved.append(away / motion)
+                bent.append(off / bend)
     assert max(moved) > 0.8
     assert max(bent) > 0.8
 

@@ -24,7 +24,7 @@ DEGREE = 16
 def problem(scene, params):
     manifold = constraint_manifold(scene.robot, params.constraints["level_cup"])
     joints = draw_free(ShardTask(scene, manifold, 600, (1,)))
-    clearance = clearance_model(scene.robot, scene.workcell)
+    clearance = clearance_model(scene)
     space = joint_space(scene.robot), manifold, PinnedPolynomial(6, 3), joints
     return LearnedProblem(*space, DEGREE, True, 0.0, clearance=clearance)
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
+from constraint_geodesics.robot.kinematics import SerialRobot, load_robot, rpy_of
 from constraint_geodesics.scene.body import Body
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.capsule import Capsule
@@ -27,6 +27,7 @@ from constraint_geodesics.scene.clearance import (
 )
 from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.pieces import Piece
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.shape import Placement, RoundedBox, Shape, add_body
 from constraint_geodesics.scene.shapes import AnyShape
 from constraint_geodesics.scene.sphere import Sphere
@@ -52,6 +53,10 @@ class Slab(Shape):
     centre: tuple[float, float, float] = (0.1, -0.05, 0.2)
     half_edges: tuple[float, float, float] = (0.3, 0.05, 0.12)
     turn: tuple[float, float, float] = (0.4, -0.3, 1.1)
+
+    @property
+    def at(self) -> Placement:
+        return Placement(self.centre, rpy_of(Rotation.from_rotvec(self.turn).as_matrix()))
 
     def pieces(self) -> tuple[Piece, ...]:
         turn = Rotation.from_rotvec(self.turn).as_matrix()
@@ -101,7 +106,7 @@ def room() -> SerialRobot:
 
 @cache
 def model_of(kind: str) -> ClearanceModel:
-    return clearance_model(room(), (SHAPES[kind],))
+    return clearance_model(Scene(room(), (SHAPES[kind],)))
 
 
 def distance(kind: str, points: Any) -> Any:
@@ -202,7 +207,7 @@ def test_a_shape_that_is_placed_elsewhere_is_the_same_there(kind: str) -> None:
     assert there.name == shape.name
     own = np.random.default_rng(4).uniform(-0.5, 0.5, (100, 3))
     first, second = (
-        clearance_model(room(), (one,)).clearance(room(), points)
+        clearance_model(Scene(room(), (one,))).clearance(room(), points)
         for one, points in ((back, own), (there, own @ at.turn.T + at.position_m))
     )
     # inside it is known how deep in some directions
@@ -213,7 +218,7 @@ def test_a_shape_that_is_placed_elsewhere_is_the_same_there(kind: str) -> None:
 def test_links_that_may_touch_it_do_not_count(kind: str) -> None:
     touching = replace(SHAPES[kind], exempt_links=("tip",))  # type: ignore[type-var]
     q = np.random.default_rng(1).uniform(-ROOM, ROOM, (200, 3))
-    assert (clearance_model(room(), (touching,)).clearance(room(), q) == np.inf).all()
+    assert (clearance_model(Scene(room(), (touching,))).clearance(room(), q) == np.inf).all()
     with World(room(), (touching,)) as world:
         assert world.free(q).all()
 
@@ -232,7 +237,8 @@ def test_either_end_of_a_capsule_may_come_first() -> None:
 
 def test_several_shapes_leave_the_smallest_distance() -> None:
     q = np.random.default_rng(3).uniform(-ROOM, ROOM, (500, 3))
-    model = clearance_model(room(), tuple(SHAPES.values()))
+    shapes = (replace(one, name=f"s{k}") for k, one in enumerate(SHAPES.values()))
+    model = clearance_model(Scene(room(), tuple(shapes)))
     smallest = np.min([distance(kind, q) for kind in SHAPES], axis=0)
     np.testing.assert_allclose(model.clearance(room(), q) + TIP, smallest, atol=1e-6)
 

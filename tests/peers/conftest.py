@@ -24,7 +24,7 @@ def chart() -> LearnedManifold:
 
 @pytest.fixture(scope="module")
 def certifier() -> Iterator[Certifier]:
-    with Certifier(packaged_planner().scene, Limits()) as loaded:
+    with Certifier(packaged_planner().scene.now, Limits()) as loaded:
         yield loaded
 
 

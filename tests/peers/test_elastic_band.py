@@ -84,7 +84,7 @@ def test_a_pillar_is_gone_around(scene: Scene) -> None:
     manifold = ConstraintManifold(scene.robot, Constraint((0,) * 6))
     start, goal = (np.array([angle, 0.3, -1.2, 0.0, 0.9, 0.0]) for angle in (-0.8, 0.8))
     with around.world() as loaded, Certifier(around, Limits()) as judge:
-        clearance = clearance_model(around.robot, around.workcell)
+        clearance = clearance_model(around)
         asked = PlanningProblem(start, goal, manifold, loaded.is_free, clearance)
         assert not loaded.free(start + np.linspace(0, 1, 50)[:, None] * (goal - start)).all()
         path = BandAfter(BIRRT).plan(asked, seed=0)

@@ -95,7 +95,7 @@ def test_a_query_from_a_configuration_to_itself_stands_still(
 def test_geodesic_goes_around_a_box_that_the_straight_line_hits(
     chart: LearnedManifold, world: World, certifier: Certifier
 ) -> None:
-    scene = packaged_planner().scene
+    scene = packaged_planner().scene.now
     manifold = manifold_of(packaged_planner(), "level_cup")
     free = StraightLatent(chart).plan(problem(world, "level_cup", 2), 0)
     middle = free.joints[len(free.joints) // 2]
@@ -103,7 +103,7 @@ def test_geodesic_goes_around_a_box_that_the_straight_line_hits(
     box = Box("post", tuple(float(x) for x in tool), (0.08, 0.08, 0.08))
     workcell = (*scene.workcell, box)
     with World(scene.robot, workcell) as fuller:
-        model = clearance_model(scene.robot, workcell)
+        model = clearance_model(replace(scene, workcell=workcell))
         blocked = PlanningProblem(free.joints[0], free.joints[-1], manifold, fuller.is_free, model)
         assert StraightLatent(chart).plan(blocked, 0).status == "not_found"
         path = GradientGeodesic(chart).plan(blocked, 0)

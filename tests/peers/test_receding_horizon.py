@@ -87,7 +87,7 @@ def test_a_pillar_is_passed() -> None:
     scene = Scene(planner.scene.robot, (*planner.scene.workcell, PILLAR))
     free = ConstraintManifold(scene.robot, Constraint((0,) * 6))
     start, goal = np.array([-0.5, 0, -1.0, 0, 0, 0]), np.array([0.5, 0, -1.0, 0, 0, 0])
-    clearance = clearance_model(scene.robot, scene.workcell)
+    clearance = clearance_model(scene)
     with scene.world() as world, Certifier(scene) as certifier:
         known = world.is_free, clearance, certifier.collisions.is_clear
         asked = PlanningProblem(start, goal, free, *known)

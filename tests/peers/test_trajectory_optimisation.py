@@ -113,7 +113,7 @@ def test_a_pillar_is_kept_clear_of(scene: Scene) -> None:
     manifold = manifold_of(packaged_planner(), "level_cup")
     judged = 0
     with around.world() as loaded, Certifier(around, Limits()) as judge:
-        clearance = clearance_model(around.robot, around.workcell)
+        clearance = clearance_model(around)
         for start, goal in pairs_of("level_cup", 30, 5):
             known = loaded.is_free, clearance, judge.collisions.is_clear
             asked = PlanningProblem(start, goal, manifold, *known)

@@ -23,7 +23,7 @@ def across(planner: Planner, name: str) -> tuple[Capsule, np.ndarray, np.ndarray
         middle = planner.scene.robot.forward(before.at(0.5))[0]
         x, y, z = (middle + np.array([0.03, 0.05, 0.15])).tolist()
         pipe = Capsule("pipe", (x, y, z), tuple((2.0 * middle - (x, y, z)).tolist()), 0.06)
-        with replace(planner.scene, workcell=(*planner.scene.workcell, pipe)).world() as world:
+        with replace(planner.scene.now, workcell=(*planner.scene.workcell, pipe)).world() as world:
             ends_free = world.is_free(start) and world.is_free(goal)
             if ends_free and world.first_collision(before.joints) is not None:
                 return pipe, start, goal

@@ -97,7 +97,7 @@ def test_its_sign_is_what_pybullet_says_of_shapes_and_of_the_arm_itself(
     request: pytest.FixtureRequest, name: str, shapes: tuple
 ) -> None:
     robot: SerialRobot = request.getfixturevalue(name)
-    clearance = clearance_model(robot, shapes).clearance(
+    clearance = clearance_model(Scene(robot, shapes)).clearance(
         robot, q := robot.sample(2000, np.random.default_rng(0))
     )
     with World(robot, shapes) as world:
@@ -116,7 +116,7 @@ def test_it_is_the_certificates_distance_on_the_searchs_own_kinematics(
     robot: SerialRobot = request.getfixturevalue(name)
     with Certifier(Scene(robot, shapes)) as certifier:
         collisions = certifier.collisions
-        model = clearance_model(robot, shapes, collisions.apart)
+        model = clearance_model(Scene(robot, shapes), collisions.apart)
         q = robot.sample(300, np.random.default_rng(1))
         found = model.clearance(robot, q)
         theirs = np.array([collisions.clearance(row) for row in q])
@@ -131,7 +131,7 @@ def test_each_row_is_the_gradient_of_its_contacts_distance(
     request: pytest.FixtureRequest, name: str, shapes: tuple
 ) -> None:
     robot: SerialRobot = request.getfixturevalue(name)
-    model, step = clearance_model(robot, shapes).arrays, 1e-6
+    model, step = clearance_model(Scene(robot, shapes)).arrays, 1e-6
     room, row, smooth, seen = new_contacts(model, robot.dof), np.empty(robot.dof), 0, 0
     for q in robot.sample(60, np.random.default_rng(2)):
         count = near_contacts(robot.chain, model, q, 0.1, room)
@@ -168,7 +168,7 @@ def test_a_line_that_stays_clear_is_free_between_its_ends_too(
     are no less safe than thick ones.
     """
     robot: SerialRobot = request.getfixturevalue(name)
-    model, rng = clearance_model(robot, shapes), np.random.default_rng(3)
+    model, rng = clearance_model(Scene(robot, shapes)), np.random.default_rng(3)
     starts = robot.sample(1500, rng)
     starts = starts[model.clearance(robot, starts) > 0.0][:60]
     answers = []
@@ -193,25 +193,25 @@ def test_a_plate_between_two_configurations_is_seen(xarm: SerialRobot) -> None:
     q[0, 0], q[1, 0] = -0.8, 0.8
     tool = xarm.forward(np.array([0.0, *q[0, 1:]]))[0]
     x, y, z = map(float, tool)
-    model = clearance_model(xarm, (Box("plate", (x, y, z), (0.3, 0.004, 0.3)),))
+    model = clearance_model(Scene(xarm, (Box("plate", (x, y, z), (0.3, 0.004, 0.3)),)))
     assert (model.clearance(xarm, q) > 0.03).all()
     assert not path_stays_clear(xarm.chain, model.arrays, q)
-    assert path_stays_clear(xarm.chain, clearance_model(xarm, ()).arrays, q)
+    assert path_stays_clear(xarm.chain, clearance_model(Scene(xarm, ())).arrays, q)
 
 
 def test_exempt_links_may_touch_their_box_and_no_other(xarm: SerialRobot) -> None:
     floor, exempt = ((0.0, 0.0, 0.1), (4.0, 4.0, 0.4)), ("link_base", "link1", "link2")
     q = xarm.sample(1000, np.random.default_rng(4))
     strict, loose = Box("strict", *floor, ("link_base",)), Box("loose", *floor, exempt)
-    assert (clearance_model(xarm, (strict,)).clearance(xarm, q) < 0.0).all(), (
+    assert (clearance_model(Scene(xarm, (strict,))).clearance(xarm, q) < 0.0).all(), (
         "the arm's first links stand in it"
     )
-    clearance = clearance_model(xarm, (loose,)).clearance(xarm, q)
+    clearance = clearance_model(Scene(xarm, (loose,))).clearance(xarm, q)
     assert 0.1 < (clearance > 0.0).mean() < 0.9
     free = {}
     for link in ("", "link3", "link4"):
         board = Box("board", (0.25, 0.0, 0.75), (0.02, 0.3, 0.5), (link,) if link else ())
-        clearance = clearance_model(xarm, (loose, board)).clearance(xarm, q)
+        clearance = clearance_model(Scene(xarm, (loose, board))).clearance(xarm, q)
         with World(xarm, (loose, board)) as world:
             free[link] = world.free(q)
         assert free[link][clearance > SKIN].all()
@@ -223,15 +223,15 @@ def test_exempt_links_may_touch_their_box_and_no_other(xarm: SerialRobot) -> Non
 
 def test_two_shapes_leave_the_smaller_clearance_of_each(xarm: SerialRobot) -> None:
     q = xarm.sample(300, np.random.default_rng(5))
-    alone = [clearance_model(xarm, (shape,)).clearance(xarm, q) for shape in (TABLE, WALL)]
-    both = clearance_model(xarm, (TABLE, WALL)).clearance(xarm, q)
+    alone = [clearance_model(Scene(xarm, (shape,))).clearance(xarm, q) for shape in (TABLE, WALL)]
+    both = clearance_model(Scene(xarm, (TABLE, WALL))).clearance(xarm, q)
     apart = both > 0.0
     np.testing.assert_allclose(both[apart], np.minimum(*alone)[apart], atol=1e-6)
     np.testing.assert_array_equal(apart, np.minimum(*alone) > 0.0)
 
 
 def test_any_batch_shape_is_answered_alike(xarm: SerialRobot) -> None:
-    model = clearance_model(xarm, (TABLE,))
+    model = clearance_model(Scene(xarm, (TABLE,)))
     q = xarm.sample(12, np.random.default_rng(6))
     flat = model.clearance(xarm, q)
     np.testing.assert_array_equal(model.clearance(xarm, q.reshape(3, 4, 6)), flat.reshape(3, 4))
@@ -240,7 +240,7 @@ def test_any_batch_shape_is_answered_alike(xarm: SerialRobot) -> None:
 
 
 def test_beyond_the_distance_asked_for_it_is_that(xarm: SerialRobot) -> None:
-    model: ClearanceModel = clearance_model(xarm, (TABLE, WALL))
+    model: ClearanceModel = clearance_model(Scene(xarm, (TABLE, WALL)))
     q = xarm.sample(500, np.random.default_rng(7))
     exact, bounded, far = model.clearance(xarm, q), np.empty(len(q)), 0.05
     clearance_batch(xarm.chain, model.arrays, far, q, bounded)
@@ -261,7 +261,7 @@ def test_beyond_the_distance_asked_for_it_is_that(xarm: SerialRobot) -> None:
 )
 def test_links_of_any_collision_shape_are_known(tmp_path: Path, shapes: tuple) -> None:
     robot = lift_robot(tmp_path, *shapes)
-    model = clearance_model(robot, (BESIDE,))
+    model = clearance_model(Scene(robot, (BESIDE,)))
     q = robot.sample(500, np.random.default_rng(8))
     with World(robot, (BESIDE,)) as world:
         free = world.free(q)

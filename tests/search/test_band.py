@@ -96,7 +96,7 @@ def spaces(scene: Scene, params: Params) -> Spaces:
         name: ConstraintManifold(robot, constraint.relative_to(reference))
         for name, constraint in OWN.items()
     }
-    return Spaces(manifolds, clearance_model(robot, scene.workcell))
+    return Spaces(manifolds, clearance_model(Scene(robot, scene.workcell)))
 
 
 def straight(start: np.ndarray, goal: np.ndarray, segments: int) -> np.ndarray:
@@ -378,7 +378,7 @@ def test_without_a_constraint_a_bent_band_becomes_the_straight_line(spaces) -> N
 def test_a_line_through_a_wall_is_lifted_out_of_it(spaces) -> None:
     manifold, rng = spaces.manifolds["free"], np.random.default_rng(6)
     robot = manifold.robot
-    model = clearance_model(robot, (Box("wall", (0.5, 0.0, 0.15), (0.2, 2.0, 0.3)),))
+    model = clearance_model(Scene(robot, (Box("wall", (0.5, 0.0, 0.15), (0.2, 2.0, 0.3)),)))
     space = space_of(manifold, model, MARGIN)
     lifted = 0
     for _ in range(800):
@@ -403,7 +403,7 @@ def test_another_robot_is_relaxed_as_well(kuka_scene) -> None:
     manifold = ConstraintManifold(
         robot, Constraint((0, 0, 1, 1, 1, 0), reference=Pose(*robot.forward(home)))
     )
-    spaces = Spaces({"slide": manifold}, clearance_model(robot, kuka_scene.workcell))
+    spaces = Spaces({"slide": manifold}, clearance_model(Scene(robot, kuka_scene.workcell)))
     for nodes in spaces.lines("slide", 8, 5, seed=7, spread=0.7):
         start, left = projected(spaces.open("slide"), nodes)
         assert left <= 1e-6
@@ -507,7 +507,7 @@ def test_a_guarded_band_ends_where_its_lines_are_blocked_at_first(spaces) -> Non
     """Lines that touch something from the start are left as they are; the others keep clear."""
     manifold, rng = spaces.manifolds["free"], np.random.default_rng(7)
     robot, tried = manifold.robot, 0
-    model = clearance_model(robot, (Box("wall", (0.5, 0.0, 0.15), (0.2, 2.0, 0.3)),))
+    model = clearance_model(Scene(robot, (Box("wall", (0.5, 0.0, 0.15), (0.2, 2.0, 0.3)),)))
     space = space_of(manifold, model, MARGIN)
     while tried < 5:
         line = straight(*robot.sample(2, rng), 8)

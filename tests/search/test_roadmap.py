@@ -180,7 +180,7 @@ class Made:
 @pytest.fixture(scope="module")
 def made(scene: Scene, params: Params) -> Made:
     manifold = constraint_manifold(scene.robot, params.constraints["level_cup"])
-    robot, model = scene.robot, clearance_model(scene.robot, scene.workcell)
+    robot, model = scene.robot, clearance_model(scene)
     drawn = retract(manifold, robot.sample(1500, np.random.default_rng(3)))
     nodes = drawn.joints[drawn.converged & (robot.limit_distance(drawn.joints) >= 0.0)]
     nodes = nodes[model.clearance(robot, nodes) > MARGIN][:400]
@@ -288,7 +288,7 @@ def test_edges_that_something_new_stands_on_are_left_out(made) -> None:
         assert before is not None
         np.testing.assert_array_equal(before, shortest_way(roadmap, start, goal, at_start, at_goal))
         ball = Sphere("ball", tuple(map(float, robot.forward(before[len(before) // 2])[0])), 0.1)
-        model = clearance_model(robot, (ball,))
+        model = clearance_model(Scene(robot, (ball,)))
         if model.clearance(robot, np.stack([start, goal])).min() < 0.01:
             continue
         space = space_of(made.manifold, model, MARGIN)

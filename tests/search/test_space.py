@@ -8,6 +8,7 @@ from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.clearance import clearance_model
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search.space import project_node, space_of, workspace
 
 MARGIN = 0.005
@@ -46,8 +47,8 @@ POST = Box("post", (0.3, 0.03, 0.6), (0.02, 0.014, 0.1))
 def test_contacts_that_no_joint_moves_leave_the_others_to_be_mended(turntable: SerialRobot) -> None:
     """As many as the arm has joints, and nearer than the one that can be mended."""
     free = ConstraintManifold(turntable, Constraint((0,) * 6))
-    space = space_of(free, clearance_model(turntable, (*BLOCKS, POST)), MARGIN)
-    post, q = clearance_model(turntable, (POST,)), np.zeros(2)
+    space = space_of(free, clearance_model(Scene(turntable, (*BLOCKS, POST))), MARGIN)
+    post, q = clearance_model(Scene(turntable, (POST,))), np.zeros(2)
     assert post.clearance(turntable, q) == pytest.approx(0.003, abs=1e-9)
     left = project_node(space, q, space.projection, workspace(space))
     assert post.clearance(turntable, q) == pytest.approx(MARGIN, abs=1e-6)
@@ -79,7 +80,7 @@ def test_a_short_step_over_a_limit_is_not_the_last(xarm) -> None:
 
 def test_where_no_joint_moves_any_contact_nothing_is_moved(turntable: SerialRobot) -> None:
     free = ConstraintManifold(turntable, Constraint((0,) * 6))
-    space = space_of(free, clearance_model(turntable, BLOCKS), MARGIN)
+    space = space_of(free, clearance_model(Scene(turntable, BLOCKS)), MARGIN)
     left = project_node(space, q := np.zeros(2), space.projection, workspace(space))
     np.testing.assert_array_equal(q, 0.0)
     assert left == pytest.approx(MARGIN - 0.001, abs=1e-9)

@@ -9,6 +9,7 @@ import pytest
 from tests.planner_fixtures import NAMES, manifold_of, packaged_planner, pairs_of
 
 from constraint_geodesics.scene.clearance import clearance_model
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.band import project
 from constraint_geodesics.search.roadmap import edge_lengths
@@ -19,8 +20,8 @@ MARGIN = 0.006
 
 
 def scene_space(name: str, *more: Sphere) -> Space:
-    scene = packaged_planner().scene
-    model = clearance_model(scene.robot, (*scene.workcell, *more))
+    scene = packaged_planner().scene.now
+    model = clearance_model(replace(scene, workcell=(*scene.workcell, *more)))
     return space_of(manifold_of(packaged_planner(), name), model, MARGIN)
 
 
@@ -92,7 +93,7 @@ def test_a_sphere_is_gone_round() -> None:
         line = np.linspace(start, goal, 50)
         x, y, z = map(float, robot.forward(line[25])[0])
         ball = Sphere("ball", (x, y, z), 0.08)
-        model = clearance_model(robot, (*planner.scene.workcell, ball))
+        model = clearance_model(Scene(robot, (*planner.scene.workcell, ball)))
         if model.clearance(robot, line[[0, -1]]).min() < 0.02:
             continue
         way = tree_way(scene_space("free", ball), start, goal, 0)

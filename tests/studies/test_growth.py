@@ -343,7 +343,7 @@ def test_spheres_that_do_not_fit_are_an_error(scene, queries, monkeypatch):
 def problems(params, scene, queries):
     manifold = constraint_manifold(scene.robot, params.constraints[CONSTRAINT])
     with scene.world() as world:
-        clearance = clearance_model(scene.robot, scene.workcell)
+        clearance = clearance_model(scene)
         pairs = zip(queries.starts, queries.goals, strict=True)
         yield [
             PlanningProblem(start, goal, manifold, world.is_free, clearance)
@@ -376,11 +376,7 @@ def test_band_and_trees_go_round_what_stops_the_straight_band(scene, problems):
             assert not world.free(path).all()
             if not (world.is_free(problem.start) and world.is_free(problem.goal)):
                 continue
-            blocked = replace(
-                problem,
-                is_free=world.is_free,
-                clearance=clearance_model(among.robot, among.workcell),
-            )
+            blocked = replace(problem, is_free=world.is_free, clearance=clearance_model(among))
             found = BandAndTrees().plan(blocked, 0)
             assert found.status == "solved"
             assert judge.certify(

@@ -185,7 +185,7 @@ def _answered(batch: QueryBatch, query: Query, jobs: Sequence[_Job]) -> Iterator
         batch.build(names, scene, query.constraint, manifold) as (planners, made_s),
     ):
         began = time.perf_counter()
-        clearance = clearance_model(scene.robot, scene.workcell, certifier.collisions.apart)
+        clearance = clearance_model(scene, certifier.collisions.apart)
         clearance_s = time.perf_counter() - began
         known = world.is_free, clearance, certifier.collisions.is_clear
         problem = PlanningProblem(query.start, query.goal, manifold, *known)

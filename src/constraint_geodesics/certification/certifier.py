@@ -107,6 +107,21 @@ class Certifier:
         )
         self._pose_difference, self._wrong_pose = self._compared_with_pybullet()
 
+    def change(self, scene: Scene) -> None:
+        """Certify in another scene of the same robot from now on.  Raises RobotError or ValueError,
+        with nothing changed, where a shape can't be bounded or a link does not exist.
+        """
+        try:
+            if self._world is not None:
+                self._world.change(scene.workcell, scene.attached, scene.allowed)
+            self.collisions.change(scene)
+        except BaseException:
+            old = self.scene
+            if self._world is not None:
+                self._world.change(old.workcell, old.attached, old.allowed)
+            raise
+        self.scene = scene
+
     def __enter__(self) -> Self:
         return self
 

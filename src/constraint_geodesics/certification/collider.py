@@ -2,17 +2,17 @@
 the joints' axes, and which pairs of bodies need a look.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
 
 import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.certification import collision_kernels as kernels
 from constraint_geodesics.certification.chain import Chain, rotated
-from constraint_geodesics.scene.bodies import Body, NodeTable, pairs_of, read_bodies
+from constraint_geodesics.scene.bodies import Body, BodyTable, Pair
 from constraint_geodesics.scene.pieces import NOT_CONVEX, Piece, prism
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.world import BodyKey
 
 _SIDES = 256
 _CELLS = 20_000
@@ -21,62 +21,90 @@ _FEW_JOINTS = 3
 """So many joints that move two bodies are few enough for that."""
 
 
-@dataclass(frozen=True)
 class Collider:
     """A scene's bodies as the kernels take them, and their pairs: those that may meet while the arm
     moves, which the first pairs of `arrays` are, those that never move relative to each other, and
     those that are proven to stay apart at all joint values within `limits` (2, D).
+
+    chain: the certifier's.  Two bodies that are proven to stay further apart than `margin` [m] need
+    no look at a path whose joints are within the limits, or `beyond` them by so much [rad]; it is
+    tried for those that are there at first.
     """
 
-    bodies: tuple[Body, ...]
-    limits: Float[np.ndarray, "2 D"]
-    moving: tuple[tuple[int, int], ...]
-    rigid: tuple[tuple[int, int], ...]
-    apart: tuple[tuple[int, int], ...]
-    arrays: kernels.Bodies
+    def __init__(self, scene: Scene, chain: Chain, margin: float, beyond: float) -> None:
+        robot = scene.robot
+        self.limits = np.stack([robot.lower - beyond, robot.upper + beyond])
+        self._chain = chain
+        frames = np.empty((robot.dof + 1, 12))
+        kernels.joint_frames(chain, np.zeros(robot.dof), frames)
+        self._table = BodyTable(scene, frames, _reach_on(chain, self.limits))
+        self._apart: frozenset[Pair] = frozenset()
+        self._arrange()
+        bodies, all_arrays = self.bodies, self.arrays
+        self._apart = frozenset(
+            (a, b)
+            for p, (a, b) in enumerate(self.moving)
+            if bodies[b].frame - bodies[a].frame <= _FEW_JOINTS
+            and kernels.never_meets(all_arrays, p, self.limits, margin, _CELLS)
+        )
+        self._arrange()
 
-    def pair(self, row: float) -> tuple[int, int]:
+    def change(self, scene: Scene) -> None:
+        """Follow the scene.  Raises RobotError, with nothing changed, where a shape can't be
+        bounded.
+        """
+        before = self.bodies
+        self._table.change(scene)
+        bodies = self.bodies
+        same = {key for key, body in before.items() if bodies.get(key) is body}
+        self._apart = frozenset(pair for pair in self._apart if same.issuperset(pair))
+        self._arrange()
+
+    @property
+    def bodies(self) -> dict[BodyKey, Body]:
+        """All of them."""
+        return self._table.bodies
+
+    @property
+    def links(self) -> Collection[str]:
+        """Names of all links."""
+        return self._table.links.keys()
+
+    def link_pose(self, q: Float[np.ndarray, "D"], link: str) -> Float[np.ndarray, "4 4"]:
+        """Of a link's frame in the base frame."""
+        frames, own = np.empty((len(q) + 1, 12)), self._table.links[link]
+        kernels.joint_frames(self._chain, q, frames)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = frames[own.frame, 3:].reshape(3, 3), frames[own.frame, :3]
+        return pose @ own.pose
+
+    @property
+    def apart(self) -> frozenset[Pair]:
+        """Pairs that never meet."""
+        return self._apart
+
+    def _arrange(self) -> None:
+        bodies, pairs = self.bodies, self._table.pairs
+        meeting = [(a, b) for a, b in pairs if bodies[a].frame != bodies[b].frame]
+        self.rigid = [(a, b) for a, b in pairs if bodies[a].frame == bodies[b].frame]
+        self.moving = [pair for pair in meeting if pair not in self._apart]
+        arrays = self._table.arrays(self.moving, self.rigid)
+        self.arrays = kernels.Bodies(self._chain, *arrays, len(self.moving))
+
+    def pair(self, row: float) -> tuple[Body, Body]:
         """The bodies of a row of `arrays.pairs`."""
         pairs = self.arrays.pairs
         tops = pairs[: self.arrays.top]
         own = int(row)
         if own >= self.arrays.top:
             own = int(np.flatnonzero((tops[:, 2] <= own) & (own < tops[:, 3]))[0])
-        return self.moving[own]
+        first, second = self.moving[own]
+        return self.bodies[first], self.bodies[second]
 
     def covered(self) -> list[str]:
         """Bodies whose meshes are not convex, so that their hulls cover more than them."""
-        deep = {b.name for b in self.bodies if any(p.hollow_m > NOT_CONVEX for p in b.pieces)}
-        return sorted(deep)
-
-
-def collider(scene: Scene, chain: Chain, margin: float, beyond: float) -> Collider:
-    """The collider of a scene on the certifier's chain.  Two bodies that are proven to stay further
-    apart than `margin` [m] need no look at a path whose joints are within the limits, or `beyond`
-    them by so much [rad].
-    """
-    robot = scene.robot
-    limits = np.stack([robot.lower - beyond, robot.upper + beyond])
-    frames = np.empty((robot.dof + 1, 12))
-    kernels.joint_frames(chain, np.zeros(robot.dof), frames)
-    bodies = read_bodies(robot, scene.workcell, frames)
-    table = NodeTable(bodies)
-    nodes = table.with_reaches(robot.dof, _reach_on(chain, limits))
-
-    def arrays(wanted: Sequence[tuple[int, int]], top: int) -> kernels.Bodies:
-        return kernels.Bodies(chain, table.hulls, nodes, table.pairs(wanted), top)
-
-    pairs = list(pairs_of(bodies, robot.allowed))
-    rigid = [pair for pair in pairs if bodies[pair[0]].frame == bodies[pair[1]].frame]
-    moving = [pair for pair in pairs if pair not in rigid]
-    all_arrays, apart = arrays(moving, len(moving)), []
-    for p, (a, b) in enumerate(moving):
-        few = bodies[b].frame - bodies[a].frame <= _FEW_JOINTS
-        if few and kernels.never_meets(all_arrays, p, limits, margin, _CELLS):
-            apart.append((a, b))
-    moving = [pair for pair in moving if pair not in apart]
-    looked_at = arrays([*moving, *rigid], len(moving))
-    return Collider(tuple(bodies), limits, tuple(moving), tuple(rigid), tuple(apart), looked_at)
+        bodies = self.bodies.values()
+        return sorted(b.name for b in bodies if any(p.hollow_m > NOT_CONVEX for p in b.pieces))
 
 
 def _reach_on(

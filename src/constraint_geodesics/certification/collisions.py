@@ -2,7 +2,6 @@
 distances where two bodies come closer than the proof's margin.
 """
 
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -11,9 +10,9 @@ from jaxtyping import Bool, Float
 from constraint_geodesics.certification import collision_kernels as kernels
 from constraint_geodesics.certification.certificate import Violation, malformed
 from constraint_geodesics.certification.chain import Chain
-from constraint_geodesics.certification.collider import collider
+from constraint_geodesics.certification.collider import Collider
 from constraint_geodesics.scene import convex_kernels as convex
-from constraint_geodesics.scene.bodies import Body
+from constraint_geodesics.scene.bodies import Body, Pair
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
 
@@ -26,6 +25,11 @@ _PARTS = (16, 256, 4096)
 _SHORTEST_M = 1e-6
 """Motion over which PyBullet is asked for no shorter parts."""
 _ROUNDING_M = 1e-9
+
+
+_WHAT = {"self_collision": "the arm itself", "workcell_collision": "the workcell"}
+_Contact = tuple[str, int | None, str]
+"""Kind, row and message of a contact that is there at every configuration."""
 
 
 class Separation(NamedTuple):
@@ -47,16 +51,38 @@ class CollisionCheck:
 
     def __init__(self, scene: Scene, chain: Chain, world: World | None, beyond_rad: float) -> None:
         self._world = world
-        self.collider = collider(scene, chain, MARGIN_M, beyond_rad)
-        self._allowed = sorted(scene.robot.allowed)
-        self._standing = self._rigid_contact(scene.robot.dof)
+        self.collider = Collider(scene, chain, MARGIN_M, beyond_rad)
+        self._rigid = dict[Pair, tuple[Body, Body, _Contact | None]]()
+        self._follow(scene)
 
-    @cached_property
+    def change(self, scene: Scene) -> None:
+        """Follow the scene.  Raises RobotError, with nothing changed, where a shape can't be
+        bounded.
+        """
+        self.collider.change(scene)
+        self._follow(scene)
+
+    def _follow(self, scene: Scene) -> None:
+        touching = ((one.name, other) for one in scene.attached for other in one.touching)
+        self._allowed = sorted({*scene.robot.allowed, *scene.allowed, *touching})
+        self._standing = self._rigid_contact(scene.robot.dof)
+        self._rests_on = ""
+
+    @property
     def rests_on(self) -> str:
         """What was taken for the bodies, and what was left out."""
-        bodies = self.collider.bodies
-        shapes = sum(body.shape is not None for body in bodies)
-        line = f"convex pieces of {len(bodies) - shapes} links and {shapes} shapes"
+        if not self._rests_on:
+            self._rests_on = self._said()
+        return self._rests_on
+
+    def _said(self) -> str:
+        bodies = self.collider.bodies.values()
+        shapes = sum(body.is_fixed for body in bodies)
+        carried = [body for body in bodies if body.carrier is not None]
+        links = len(bodies) - shapes - len(carried)
+        line = f"convex pieces of {links} links and {shapes} shapes"
+        if carried:
+            line += f", of {', '.join(f'{b.name} on {b.carrier}' for b in carried)}"
         if covered := self.collider.covered():
             line += f", hulls that cover more than the meshes of {', '.join(covered)}"
         if apart := len(self.collider.apart):
@@ -69,8 +95,8 @@ class CollisionCheck:
         return line
 
     @property
-    def apart(self) -> tuple[tuple[int, int], ...]:
-        """Pairs of `read_bodies` that are proven never to meet within the joint limits."""
+    def apart(self) -> frozenset[Pair]:
+        """Pairs of bodies that are proven never to meet within the joint limits."""
         return self.collider.apart
 
     def is_free(self, q: Float[np.ndarray, "D"]) -> bool:
@@ -88,14 +114,14 @@ class CollisionCheck:
         return np.array([self.is_free(row) for row in q], dtype=bool)
 
     def what_touches(self, q: Float[np.ndarray, "D"]) -> str:
-        """What a configuration touches that is not free."""
+        """What a configuration touches that is not free, and with what."""
         if self._standing is not None:
-            kind = self._standing[0]
-        else:
-            place = np.ascontiguousarray(q, float)
-            _, pair = kernels.nearest_pair(self.collider.arrays, place, np.inf)
-            kind = _kind(*self._named(pair))
-        return "the arm itself" if kind == "self_collision" else "the workcell"
+            kind, _, text = self._standing
+            return f"{_WHAT[kind]}: {text}"
+        place = np.ascontiguousarray(q, float)
+        _, pair = kernels.nearest_pair(self.collider.arrays, place, np.inf)
+        first, second = self.collider.pair(pair)
+        return f"{_WHAT[_kind(first, second)]}: {second.name} with {first.name}"
 
     def clearance(self, q: Float[np.ndarray, "D"]) -> float:
         """The least distance of bodies that may meet [m], inf where none may; 0 or less where they
@@ -138,7 +164,7 @@ class CollisionCheck:
         """How far any corner of a link's pieces is from where PyBullet has it at most [m]."""
         frames = np.empty((2, q.shape[1] + 1, 12))
         kernels.joint_frames(self.collider.arrays.chain, np.zeros(q.shape[1]), frames[0])
-        links = [(b, b.pose) for b in self.collider.bodies if b.pose is not None]
+        links = [(b, b.pose) for b in self.collider.bodies.values() if b.pose is not None]
         largest = 0.0
         for row in q:
             kernels.joint_frames(self.collider.arrays.chain, row, frames[1])
@@ -161,7 +187,7 @@ class CollisionCheck:
         """
         if self._world is None:
             return self._unproven(int(row), 0.5 * (start + end), pair)
-        first, second = self._named(pair)
+        first, second = self.collider.pair(pair)
         i, line = int(row), rows[int(row) + 1] - rows[int(row)]
         reach = self._reach(pair)
         waiting = [(start, end)]
@@ -179,10 +205,6 @@ class CollisionCheck:
                 waiting += [(middle, end), (start, middle)]
         return None
 
-    def _named(self, pair: float) -> tuple[Body, Body]:
-        a, b = self.collider.pair(pair)
-        return self.collider.bodies[a], self.collider.bodies[b]
-
     def _reach(self, pair: float) -> Float[np.ndarray, "D"]:
         """How far the second body's points get from the axes of the joints that move the two."""
         nodes, row = self.collider.arrays.nodes, self.collider.arrays.pairs[int(pair)]
@@ -191,20 +213,30 @@ class CollisionCheck:
         reach[: int(a[convex.FRAME])] = 0.0
         return reach
 
-    def _rigid_contact(self, dof: int) -> tuple[str, int | None, str] | None:
-        """Kind, row and message of a contact that is there at every configuration."""
+    def _rigid_contact(self, dof: int) -> _Contact | None:
+        """A contact that is there at every configuration, of bodies that were looked at before as
+        it was found then.
+        """
+        before, self._rigid = self._rigid, {}
+        for k, pair in enumerate(self.collider.rigid):
+            bodies = self.collider.bodies[pair[0]], self.collider.bodies[pair[1]]
+            known = before.get(pair)
+            if known is None or known[0] is not bodies[0] or known[1] is not bodies[1]:
+                known = *bodies, self._touch_always(k, *bodies, dof)
+            self._rigid[pair] = known
+        return next((found for *_, found in self._rigid.values() if found is not None), None)
+
+    def _touch_always(self, k: int, first: Body, second: Body, dof: int) -> _Contact | None:
         arrays, zeros = self.collider.arrays, np.zeros(dof)
-        for k, (a, b) in enumerate(self.collider.rigid):
-            first, second = self.collider.bodies[a], self.collider.bodies[b]
-            alone = arrays._replace(pairs=_only(arrays.pairs, arrays.top + k), top=1)
-            if kernels.nearest_pair(alone, zeros, MARGIN_M)[0] >= MARGIN_M:
-                continue
-            if self._world is None:
-                text = f"{second.name} and {first.name} are too close at every configuration"
-                return _kind(first, second), None, text
-            if self._world.distance(zeros, first.key, second.key, MARGIN_M) < 0.0:
-                text = f"{second.name} and {first.name} touch at every configuration"
-                return _kind(first, second), None, text
+        alone = arrays._replace(pairs=_only(arrays.pairs, arrays.top + k), top=1)
+        if kernels.nearest_pair(alone, zeros, MARGIN_M)[0] >= MARGIN_M:
+            return None
+        if self._world is None:
+            text = f"{second.name} and {first.name} are too close at every configuration"
+            return _kind(first, second), None, text
+        if self._world.distance(zeros, first.key, second.key, MARGIN_M) < 0.0:
+            text = f"{second.name} and {first.name} touch at every configuration"
+            return _kind(first, second), None, text
         return None
 
     def _touches(self, row: int, share: float, first: Body, second: Body) -> Violation:
@@ -215,7 +247,7 @@ class CollisionCheck:
         return malformed(_kind(first, second), row, text)
 
     def _unproven(self, row: int, share: float, pair: float) -> Violation:
-        first, second = self._named(pair)
+        first, second = self.collider.pair(pair)
         text = (
             f"{second.name} and {first.name} come so close on the line from row {row}, {share:.0%} "
             f"of the way to the next, that no proof keeps them apart"
@@ -228,12 +260,12 @@ def _in_base(points: Float[np.ndarray, "n 3"], frame: np.ndarray) -> Float[np.nd
 
 
 def _only(pairs: np.ndarray, row: int) -> np.ndarray:
-    """The table with one pair of bodies first, the pairs of their pieces where they were."""
-    table = pairs.copy()
-    table[0] = pairs[row]
+    """The table of one pair of bodies alone."""
+    first, last = int(pairs[row, 2]), int(pairs[row, 3])
+    table = np.concatenate([pairs[row : row + 1], pairs[first:last]])
+    table[0, 2:4] = (1.0, len(table)) if len(table) > 1 else 0.0
     return table
 
 
 def _kind(first: Body, second: Body) -> str:
-    own = first.shape is None and second.shape is None
-    return "self_collision" if own else "workcell_collision"
+    return "workcell_collision" if first.is_fixed or second.is_fixed else "self_collision"

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from constraint_geodesics.geodesics.learned_problem import LearnedProblem
 from constraint_geodesics.geodesics.problem import Ends
 from constraint_geodesics.scene.clearance import ClearanceModel, clearance_model
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.sphere import Sphere
 
@@ -46,7 +47,7 @@ def with_spheres(
         node = int(rng.integers(points // 4, points - points // 4))
         x, y, z = map(float, robot.forward(curves[row, node])[0])
         sphere = Sphere(NAME, (x, y, z), float(rng.uniform(*radii_m)))
-        clearance = clearance_model(robot, (*workcell, sphere))
+        clearance = clearance_model(Scene(robot, (*workcell, sphere)))
         on_way = met_by(problem, clearance, curves)
         if on_way.sum() >= FEWEST_PAIRS:
             pairs = np.stack([ends.q_start[on_way], ends.q_goal[on_way]], axis=1)

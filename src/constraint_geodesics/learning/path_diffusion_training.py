@@ -80,7 +80,8 @@ def planned_examples(task: PathTask) -> Examples:
     settings, name = task.settings, task.constraint
     with Planner(task.bundle, "for training") as planner:
         manifold = ConstraintManifold(planner.robot, planner.constraints[name])
-        ends = draw_queries(planner.scene, manifold, name, settings.queries, settings.query_seed)
+        scene, seed = planner.scene.now, settings.query_seed
+        ends = draw_queries(scene, manifold, name, settings.queries, seed)
         parts, found = replace(ALL_PARTS, tree=False), []
         for start, goal in zip(ends.starts, ends.goals, strict=True):
             path = planner.plan(start, goal, name, parts=parts)

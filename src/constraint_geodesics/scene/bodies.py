@@ -1,11 +1,13 @@
 """What may meet in a scene: convex pieces of links and shapes, the frames that carry them, and the
-pairs of bodies that move relative to each other, as convex_kernels.py takes them.
+pairs of bodies that move relative to each other, as convex_kernels.py takes them.  It follows a
+scene that changes: what stays is not read again.
 """
 
 import contextlib
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,8 +15,10 @@ from scipy.spatial import ConvexHull, QhullError
 
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene import convex_kernels as kernels
+from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.pieces import Piece, read_pieces
-from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.scene import Scene, SceneError
+from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.world import BodyKey
 
 _MIXED = 9
@@ -24,10 +28,11 @@ _TRIED, _ROUNDING_M = 200, 1e-9
 
 @dataclass(frozen=True)
 class Body:
-    """A link, or a shape around the arm: the frame that carries it, and its pieces there.
+    """A link, a shape around the arm, or one that a link carries: the frame that it moves with, and
+    its pieces there.
 
     parent: the link that a link hangs on.  pose: of a link's own frame in the base frame, all
-    joints at 0.
+    joints at 0.  carrier: the link that carries a shape.
     """
 
     name: str
@@ -36,137 +41,302 @@ class Body:
     parent: str | None = None
     pose: Float[np.ndarray, "4 4"] | None = None
     shape: Shape | None = None
+    carrier: str | None = None
 
     @property
     def key(self) -> BodyKey:
         """What it is in a world."""
         return BodyKey(self.name, self.shape is not None)
 
+    @property
+    def is_fixed(self) -> bool:
+        """Whether it is a shape around the arm."""
+        return self.shape is not None and self.carrier is None
 
-def read_bodies(
-    robot: SerialRobot, workcell: Sequence[Shape], frames: Float[np.ndarray, "D+1 12"]
-) -> list[Body]:
-    """Links and shapes that have a collision shape, carried by frames that are so placed with all
-    joints at 0.  Raises RobotError where one can't be bounded, naming it.
+
+Pair = tuple[BodyKey, BodyKey]
+"""Two bodies, that of the lower frame first."""
+Reach = Callable[[Piece, int], Float[np.ndarray, "D"]]
+"""How far a piece's points get from each joint's axis at most, given the frame that carries it."""
+
+
+class _Link(NamedTuple):
+    """Of any link, with collision shapes or without: the frame that carries it, and its own frame's
+    pose in that.
     """
-    found = []
+
+    frame: int
+    pose: Float[np.ndarray, "4 4"]
+
+
+def links_of(
+    robot: SerialRobot, frames: Float[np.ndarray, "D+1 12"]
+) -> tuple[list[Body], dict[str, _Link]]:
+    """Links that have a collision shape, and where all of them are, carried by frames that are so
+    placed with all joints at 0.  Raises RobotError where one can't be bounded, naming it.
+    """
+    found, links = list[Body](), dict[str, _Link]()
     for link in read_pieces(robot.urdf):
         moved = [robot.joint_names.index(j) for j in link.joints if j in robot.joint_names]
         frame = moved[-1] + 1 if moved else 0
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = frames[frame, 3:].reshape(3, 3), frames[frame, :3]
-        pieces = tuple(piece.at(np.linalg.inv(pose)) for piece in link.pieces)
-        if pieces:
+        into = np.linalg.inv(pose)
+        links[link.name] = _Link(frame, into @ link.pose)
+        if link.pieces:
+            pieces = tuple(piece.at(into) for piece in link.pieces)
             found.append(Body(link.name, frame, pieces, link.parent, link.pose))
-    shapes = ((shape, shape.pieces()) for shape in workcell)
-    return found + [Body(s.name, 0, pieces, shape=s) for s, pieces in shapes if pieces]
+    return found, links
 
 
-def pairs_of(
-    bodies: Sequence[Body], allowed: Collection[tuple[str, str]]
-) -> Iterator[tuple[int, int]]:
-    """Bodies whose contact PyBullet reports, that of the lower frame first: not a link and the one
-    it hangs on, not links that are allowed to touch, not a shape and a link that may touch it, or
-    the one that carries the arm, not two shapes.
+def touching(robot: SerialRobot, scene: Scene) -> frozenset[frozenset[str]]:
+    """Pairs of names that may touch: of links, of shapes and links, of shapes."""
+    pairs = [*robot.allowed, *scene.allowed]
+    for shape in (*scene.workcell, *(one.shape for one in scene.attached)):
+        pairs += [(shape.name, link) for link in shape.exempt_links]
+    for one in scene.attached:
+        pairs += [(one.name, other) for other in one.touching]
+    return frozenset(map(frozenset, pairs))
+
+
+def may_meet(first: Body, second: Body, allowed: Collection[frozenset[str]]) -> bool:
+    """Whether a contact counts: PyBullet's does.  Not that of a link and the one it hangs on, of a
+    shape and what carries it, of bodies that may touch, of a shape and the link that carries the
+    arm, of two shapes around it.
     """
-    order = sorted(range(len(bodies)), key=lambda i: (bodies[i].frame, bodies[i].shape is None, i))
-    for place, a in enumerate(order):
-        for b in order[place + 1 :]:
-            first, second = bodies[a], bodies[b]
-            if first.shape is not None and second.shape is not None:
-                continue
-            if first.shape is not None and (
-                second.name in first.shape.exempt_links or second.parent is None
-            ):
-                continue
-            if first.shape is None and first.name == second.parent:
-                continue
-            if first.shape is None and second.name == first.parent:
-                continue
-            if first.shape is None and second.shape is None and _may_touch(first, second, allowed):
-                continue
-            yield a, b
+    if first.is_fixed and second.is_fixed:
+        return False
+    for one, other in ((first, second), (second, first)):
+        if one.is_fixed and other.shape is None and other.parent is None:
+            return False
+        if other.shape is None and other.name in (one.parent, one.carrier):
+            return False
+    return frozenset((first.name, second.name)) not in allowed
 
 
-def _may_touch(first: Body, second: Body, allowed: Collection[tuple[str, str]]) -> bool:
-    return (first.name, second.name) in allowed or (second.name, first.name) in allowed
+class _Block(NamedTuple):
+    """A body as the kernels take it, on its own: nodes (n, REACH + D), that of the whole first
+    where it has more than one piece, its hulls, where among these its corners are and where what
+    leads to others of them.
+    """
+
+    nodes: np.ndarray
+    hulls: np.ndarray
+    corners: np.ndarray
+    links: np.ndarray
+
+    @property
+    def pieces(self) -> int:
+        """How many there are."""
+        return max(len(self.nodes) - 1, 1)
+
+    def at(self, pose: Float[np.ndarray, "4 4"], frame: int) -> "_Block":
+        """The same elsewhere, carried by another frame."""
+        nodes, hulls, turn = self.nodes.copy(), self.hulls.copy(), pose[:3, :3]
+        ball, own = slice(kernels.BALL, kernels.BALL + 3), slice(kernels.BOX + 3, kernels.PLACE)
+        nodes[:, kernels.FRAME] = frame
+        nodes[:, ball] = nodes[:, ball] @ turn.T + pose[:3, 3]
+        nodes[:, own] = (turn @ nodes[:, own].reshape(-1, 3, 3)).reshape(-1, 9)
+        nodes[nodes[:, kernels.BOX] < 0.0, own] = -1.0
+        at = self.corners[:, None] + np.arange(3)
+        hulls[at] = hulls[at] @ turn.T + pose[:3, 3]
+        return self._replace(nodes=nodes, hulls=hulls)
 
 
-class NodeTable:
-    """Bodies and their pieces as nodes (N, REACH): first all bodies, then all pieces."""
-
-    def __init__(self, bodies: Sequence[Body]) -> None:
-        self._bodies = bodies
-        self._pieces: list[np.ndarray] = []
-        self._ranges: list[range] = []
-        self._hulls: list[float] = []
-        rows = [self._body(body) for body in bodies]
-        self.nodes = np.array([*rows, *self._pieces], float).reshape(-1, kernels.REACH)
-        self.hulls = np.array(self._hulls)
-        self.pieces = [[len(rows) + k for k in own] for own in self._ranges]
-
-    def _body(self, body: Body) -> np.ndarray:
-        first = len(self._pieces)
-        for piece in body.pieces:
-            self._add_piece(body.frame, piece)
-        own = np.array(self._pieces[first:])
-        self._ranges.append(range(first, len(self._pieces)))
-        row = own[0].copy()
-        if len(own) > 1:
-            row[kernels.ROUNDING], row[kernels.BOX] = own[:, kernels.ROUNDING].max(), -1.0
-            corners = np.concatenate([piece.corners for piece in body.pieces])
-            ball, size = slice(kernels.BALL, kernels.BALL + 3), kernels.BALL + 3
-            row[ball] = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-            away = np.linalg.norm(own[:, ball] - row[ball], axis=1)
-            row[size] = (away + own[:, size]).max()
-        return row
-
-    def _add_piece(self, frame: int, piece: Piece) -> None:
-        row = np.zeros(kernels.REACH)
+def block_of(pieces: Sequence[Piece], dof: int) -> _Block:
+    """Pieces as the kernels take them, carried by the base."""
+    rows, hulls = list[np.ndarray](), list[float]()
+    places, leading = list[int](), list[int]()
+    for piece in pieces:
+        row = np.zeros(kernels.REACH + dof)
         corners, beside = _with_neighbours(piece.corners)
-        begins = len(self._hulls) + np.cumsum([0, *(4 + len(own) for own in beside)])
+        begins = len(hulls) + np.cumsum([0, *(4 + len(own) for own in beside)])
         for corner, own in zip(corners, beside, strict=True):
-            self._hulls += [*corner, len(own), *begins[own]]
+            places.append(len(hulls))
+            leading += range(len(hulls) + 4, len(hulls) + 4 + len(own))
+            hulls += [*corner, len(own), *begins[own]]
         centre = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
         radius = np.linalg.norm(corners - centre, axis=1).max() + piece.rounding
-        row[[kernels.FRAME, kernels.ROUNDING, kernels.CORNER]] = frame, piece.rounding, begins[0]
+        row[[kernels.ROUNDING, kernels.CORNER]] = piece.rounding, begins[0]
         row[kernels.BALL : kernels.BOX] = (*centre, radius * (1.0 + 1e-9))
         row[kernels.BOX : kernels.PLACE] = -1.0
         if piece.box is not None:
             row[kernels.BALL : kernels.BALL + 3] = piece.box[:3]
             row[kernels.BOX : kernels.PLACE] = piece.box[3:]
-        self._pieces.append(row)
+        rows.append(row)
+    if len(pieces) > 1:
+        own, whole = np.array(rows), rows[0].copy()
+        whole[kernels.ROUNDING], whole[kernels.BOX : kernels.PLACE] = own[:, 1].max(), -1.0
+        all_corners = np.concatenate([piece.corners for piece in pieces])
+        ball, size = slice(kernels.BALL, kernels.BALL + 3), kernels.BALL + 3
+        whole[ball] = 0.5 * (all_corners.min(axis=0) + all_corners.max(axis=0))
+        away = np.linalg.norm(own[:, ball] - whole[ball], axis=1)
+        whole[size] = (away + own[:, size]).max()
+        rows.insert(0, whole)
+    nodes = np.array(rows).reshape(-1, kernels.REACH + dof)
+    return _Block(nodes, np.array(hulls), np.array(places, int), np.array(leading, int))
 
-    def with_reaches(
-        self, dof: int, reach: Callable[[Piece, int], Float[np.ndarray, "D"]]
-    ) -> Float[np.ndarray, "N REACH+D"]:
-        """The nodes with how far their points get from each joint's axis at most.  reach: how far a
-        piece's do, given the frame that carries it.
+
+class _Own(NamedTuple):
+    """A shape in its own frame, its pieces there, and these as the kernels take them."""
+
+    shape: Shape
+    pieces: tuple[Piece, ...]
+    block: _Block | None
+
+
+class BodyTable:
+    """The bodies of a scene and the pairs of them that may meet, as the kernels take them.
+
+    frames: where the frames that carry the links are with all joints at 0.  reach: of pieces.
+    Raises RobotError where a body can't be bounded, naming it.
+    """
+
+    def __init__(self, scene: Scene, frames: Float[np.ndarray, "D+1 12"], reach: Reach) -> None:
+        self._dof, self._reach = scene.robot.dof, reach
+        links, self.links = links_of(scene.robot, frames)
+        self._robot = {body.key: body for body in links}
+        self._blocks = {
+            key: self._reaching(block_of(body.pieces, self._dof), body)
+            for key, body in self._robot.items()
+        }
+        self._own = dict[str, _Own]()
+        self.scene = Scene(scene.robot)
+        self.bodies = dict(self._robot)
+        self._allowed = touching(scene.robot, self.scene)
+        self.pairs = tuple(self._pairs(self._robot))
+        self.change(scene)
+
+    def change(self, scene: Scene) -> None:
+        """Follow the scene: shapes come, go and move, links and shapes may touch others than
+        before.  Nothing has changed where it raises RobotError.
         """
-        reaches = np.zeros((len(self.nodes), dof))
-        for b, (body, nodes) in enumerate(zip(self._bodies, self.pieces, strict=True)):
-            for node, piece in zip(nodes, body.pieces, strict=True):
-                reaches[node] = reach(piece, body.frame)
-            reaches[b] = reaches[nodes].max(axis=0)
-        return np.concatenate([self.nodes, reaches], axis=1)
-
-    def pairs(self, bodies: Sequence[tuple[int, int]]) -> Float[np.ndarray, "P 9"]:
-        """The table of these pairs of bodies, and behind them those of their pieces."""
-        pieces = self.pieces
-        table: list[tuple[int, int, int, int]] = []
-        children: list[tuple[int, int, int, int]] = []
-        for a, b in bodies:
-            if len(pieces[a]) == len(pieces[b]) == 1:
-                table.append((pieces[a][0], pieces[b][0], 0, 0))
+        old, bodies = self.scene, dict(self._robot)
+        own, blocks = dict(self._own), {key: self._blocks[key] for key in self._robot}
+        kept = set(old.workcell) | set(old.attached)
+        news = set[BodyKey]()
+        for shape, held in (*((s, None) for s in scene.workcell), *_carried(scene.attached)):
+            key = BodyKey(shape.name, True)
+            self._require(shape, held)
+            if key in bodies:
+                raise SceneError(f"two shapes of the workcell are called {shape.name!r}")
+            if (shape if held is None else held) in kept and key in self.bodies:
+                bodies[key], blocks[key] = self.bodies[key], self._blocks[key]
                 continue
-            first = len(bodies) + len(children)
-            children += [(i, k, 0, 0) for i in pieces[a] for k in pieces[b]]
-            table.append((a, b, first, len(bodies) + len(children)))
-        rows = np.zeros((len(table) + len(children), kernels.PAIR))
-        rows[:, : kernels.VECTOR] = np.array(table + children, float).reshape(-1, 4)
-        corners = self.nodes[rows[:, :2].astype(int), kernels.CORNER]
-        rows[:, kernels.CORNERS : kernels.CORNERS + 2] = corners
-        return rows
+            own[shape.name] = self._own_of(shape)
+            if own[shape.name].pieces:
+                bodies[key], blocks[key] = self._placed(shape, held, own[shape.name])
+                news.add(key)
+        allowed = touching(scene.robot, scene)
+        if allowed != self._allowed:  # of what is named there all pairs are looked at again
+            named = set().union(*(allowed ^ self._allowed))
+            news |= {key for key in bodies if key.name in named}
+        self.scene, self._allowed, self.bodies, self._blocks = scene, allowed, bodies, blocks
+        self._own = {name: own[name] for name in scene.names}
+        stay = bodies.keys() - news
+        left = [(a, b) for a, b in self.pairs if a in stay and b in stay]
+        self.pairs = (*left, *self._pairs(news))
+
+    def arrays(
+        self, pairs: Sequence[Pair], more: Sequence[Pair] = ()
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Hulls (H,), nodes (N, REACH + D) and pairs (P, PAIR) of these pairs of bodies, then of
+        more, behind all of which those of their pieces are.
+        """
+        blocks = list(self._blocks.values()) or [block_of([], self._dof)]
+        counts = np.array([len(block.nodes) for block in blocks])
+        sizes = np.array([len(block.hulls) for block in blocks])
+        begins, offsets = np.cumsum(counts) - counts, np.cumsum(sizes) - sizes
+        nodes = np.concatenate([block.nodes for block in blocks])
+        nodes[:, kernels.CORNER] += np.repeat(offsets, counts)
+        hulls = np.concatenate([block.hulls for block in blocks])
+        links = np.array([len(block.links) for block in blocks])
+        shifts = np.repeat(offsets, links)
+        hulls[np.concatenate([block.links for block in blocks]) + shifts] += shifts
+        number = {key: i for i, key in enumerate(self._blocks)}
+        ends = np.array([(number[a], number[b]) for a, b in (*pairs, *more)], int).reshape(-1, 2)
+        pieces = np.array([block.pieces for block in blocks])
+        return hulls, nodes, _pair_table(ends, begins, pieces, nodes)
+
+    def _pairs(self, news: Collection[BodyKey]) -> Iterator[Pair]:
+        """Pairs that may meet of which one is new, that of the lower frame first."""
+        rank = {key: i for i, key in enumerate(self.bodies)}
+
+        def order(body: Body) -> tuple[int, bool, int]:
+            return body.frame, body.shape is None, rank[body.key]
+
+        for key in sorted(news, key=rank.__getitem__):
+            for other, body in self.bodies.items():
+                if other == key or (other in news and rank[other] < rank[key]):
+                    continue
+                first, second = sorted((self.bodies[key], body), key=order)
+                if may_meet(first, second, self._allowed):
+                    yield first.key, second.key
+
+    def _require(self, shape: Shape, held: Attached | None) -> None:
+        if shape.name in self.links:
+            raise SceneError(f"workcell {shape.name!r}: a link of the robot has that name")
+        if held is not None and held.link not in self.links:
+            raise SceneError(f"{held.name!r} can't be attached: no link is called {held.link!r}")
+
+    def _own_of(self, shape: Shape) -> _Own:
+        """As it was before where it has only moved."""
+        at_origin, known = shape.placed(Placement()), self._own.get(shape.name)
+        if known is not None and known.shape == at_origin:
+            return known
+        pieces = at_origin.pieces()
+        return _Own(at_origin, pieces, block_of(pieces, self._dof) if pieces else None)
+
+    def _placed(self, shape: Shape, held: Attached | None, own: _Own) -> tuple[Body, _Block]:
+        pose, frame, carrier = shape.at.matrix, 0, None
+        if held is not None:
+            link = self.links[held.link]
+            pose, frame, carrier = link.pose @ pose, link.frame, held.link
+        assert own.block is not None
+        there = tuple(piece.at(pose) for piece in own.pieces)
+        body = Body(shape.name, frame, there, shape=shape, carrier=carrier)
+        return body, self._reaching(own.block.at(pose, frame), body)
+
+    def _reaching(self, block: _Block, body: Body) -> _Block:
+        """With how far its points get from each axis, carried by its frame."""
+        nodes = block.nodes.copy()
+        nodes[:, kernels.FRAME] = body.frame
+        if body.frame > 0:
+            reaches = np.array([self._reach(piece, body.frame) for piece in body.pieces])
+            if len(nodes) > 1:
+                reaches = np.concatenate([reaches.max(axis=0)[None], reaches])
+            nodes[:, kernels.REACH :] = reaches
+        return block._replace(nodes=nodes)
+
+
+def _carried(attached: Iterable[Attached]) -> Iterator[tuple[Shape, Attached]]:
+    return ((one.shape, one) for one in attached)
+
+
+def _pair_table(
+    ends: Int[np.ndarray, "n 2"],
+    begins: Int[np.ndarray, "B"],
+    pieces: Int[np.ndarray, "B"],
+    nodes: np.ndarray,
+) -> Float[np.ndarray, "P 9"]:
+    """Rows of pairs of bodies, and behind them those of their pieces."""
+    counts = pieces[ends]
+    whole = (counts == 1).all(axis=1)
+    several = np.where(whole, 0, counts.prod(axis=1))
+    last = len(ends) + np.cumsum(several)
+    rows = np.zeros((len(ends) + several.sum(), kernels.PAIR))
+    rows[: len(ends), :2] = begins[ends]
+    rows[: len(ends), 2] = np.where(whole, 0, last - several)
+    rows[: len(ends), 3] = np.where(whole, 0, last)
+    which = np.repeat(np.arange(len(ends)), several)
+    inner = np.arange(len(which)) - np.repeat(last - several - len(ends), several)
+    first, second = inner // counts[which, 1], inner % counts[which, 1]
+    # the whole of a body of several pieces is its first node
+    rows[len(ends) :, 0] = begins[ends[which, 0]] + first + (counts[which, 0] > 1)
+    rows[len(ends) :, 1] = begins[ends[which, 1]] + second + (counts[which, 1] > 1)
+    corners = nodes[rows[:, :2].astype(int), kernels.CORNER]
+    rows[:, kernels.CORNERS : kernels.CORNERS + 2] = corners
+    return rows
 
 
 def _with_neighbours(

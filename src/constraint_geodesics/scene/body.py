@@ -24,6 +24,11 @@ class Body(Shape):
     exempt_links: tuple[str, ...] = ()
     kind: Literal["urdf"] = "urdf"
 
+    @property
+    def at(self) -> Placement:
+        """The pose of the URDF's root."""
+        return Placement(self.position_m, self.rpy_rad)
+
     def placed(self, at: Placement) -> "Body":
         """The URDF elsewhere."""
         return replace(self, position_m=at.position_m, rpy_rad=at.rpy_rad)

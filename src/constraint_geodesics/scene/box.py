@@ -23,7 +23,8 @@ class Box(Shape):
     rpy_rad: Vector3 = (0.0, 0.0, 0.0)
 
     @property
-    def _at(self) -> Placement:
+    def at(self) -> Placement:
+        """Its centre, turned as its edges are."""
         return Placement(self.centre_m, self.rpy_rad)
 
     @property
@@ -33,7 +34,7 @@ class Box(Shape):
 
     def pieces(self) -> tuple[Piece, ...]:
         """It is one, without rounding."""
-        turn = self._at.turn
+        turn = self.at.turn
         return (RoundedBox(self.centre_m, self._half_edges, turn=turn).piece(),)
 
     def placed(self, at: Placement) -> "Box":
@@ -43,11 +44,11 @@ class Box(Shape):
     def add_to(self, bullet: Any) -> int:
         """A box of PyBullet."""
         kind = bullet.GEOM_BOX
-        turn, size = self._at.quaternion, self._half_edges
+        turn, size = self.at.quaternion, self._half_edges
         return add_body(bullet, self.centre_m, turn, shapeType=kind, halfExtents=size)
 
     def drawn(self, rerun: Any, style: Mapping[str, Any]) -> Any:
         """A box of Rerun."""
-        turn = rerun.Quaternion(xyzw=self._at.quaternion)
+        turn = rerun.Quaternion(xyzw=self.at.quaternion)
         size = {"sizes": [self.size_m], "quaternions": [turn]}
         return rerun.Boxes3D(centers=[self.centre_m], **size, **style)

@@ -2,15 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.fields import Positive, Vector3
+from constraint_geodesics.robot.kinematics import rpy_of
 from constraint_geodesics.scene.pieces import Piece
-from constraint_geodesics.scene.shape import Placement, RoundedBox, Shape, Triple, add_body
+from constraint_geodesics.scene.shape import Placement, RoundedBox, Shape, add_body
 
 
 @dataclass(frozen=True)
@@ -29,10 +30,16 @@ class Capsule(Shape):
         """Of the line between its ends, without the half spheres."""
         return float(np.linalg.norm(np.subtract(self.to_m, self.from_m)))
 
+    @cached_property
+    def at(self) -> Placement:
+        """Its middle, with the z axis along its line."""
+        x, y, z = (0.5 * (a + b) for a, b in zip(self.from_m, self.to_m, strict=True))
+        return Placement((x, y, z), rpy_of(self._turn()))
+
     def pieces(self) -> tuple[Piece, ...]:
         """A box with one edge, along the line, rounded by the radius."""
         half_edges = (0.0, 0.0, 0.5 * self.length_m)
-        return (RoundedBox(self._centre, half_edges, self.radius_m, self._turn()).piece(),)
+        return (RoundedBox(self.at.position_m, half_edges, self.radius_m, self._turn()).piece(),)
 
     def placed(self, at: Placement) -> "Capsule":
         """With its middle elsewhere, and its line along the z axis there."""
@@ -44,18 +51,13 @@ class Capsule(Shape):
         """A capsule of PyBullet, which has it along its z axis."""
         size = {"radius": self.radius_m, "height": self.length_m}
         kind = bullet.GEOM_CAPSULE
-        return add_body(bullet, self._centre, self._quaternion(), shapeType=kind, **size)
+        return add_body(bullet, self.at.position_m, self.at.quaternion, shapeType=kind, **size)
 
     def drawn(self, rerun: Any, style: Mapping[str, Any]) -> Any:
         """A capsule of Rerun, which begins at the origin and runs along its z axis."""
-        turn = rerun.Quaternion(xyzw=self._quaternion())
+        turn = rerun.Quaternion(xyzw=self.at.quaternion)
         size = {"lengths": [self.length_m], "radii": [self.radius_m]}
         return rerun.Capsules3D(translations=[self.from_m], quaternions=[turn], **size, **style)
-
-    @property
-    def _centre(self) -> Triple:
-        x, y, z = (0.5 * (a + b) for a, b in zip(self.from_m, self.to_m, strict=True))
-        return x, y, z
 
     def _turn(self) -> Float[np.ndarray, "3 3"]:
         """Turns the z axis into the direction of the line."""
@@ -65,7 +67,3 @@ class Capsule(Shape):
         across = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
         across /= np.linalg.norm(across)
         return np.column_stack([across, np.cross(axis, across), axis])
-
-    def _quaternion(self) -> list[float]:
-        quaternion: list[float] = Rotation.from_matrix(self._turn()).as_quat().tolist()
-        return quaternion

@@ -5,7 +5,7 @@ It is the distance of the convex pieces that the certificate knows too, on the s
 kinematics, with the direction in which it grows; where pieces overlap, how deep they do.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -18,9 +18,9 @@ from constraint_geodesics.compiled import COMPILE, LEAF
 from constraint_geodesics.robot.kernels import joint_frame, line_of
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene import convex_kernels as convex
-from constraint_geodesics.scene.bodies import NodeTable, pairs_of, read_bodies
+from constraint_geodesics.scene.bodies import BodyTable, Pair
 from constraint_geodesics.scene.pieces import Piece
-from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.scene import Scene
 
 # columns of a contact
 DISTANCE, PAIR = 0, 1
@@ -90,23 +90,39 @@ NO_CLEARANCE = ClearanceModel(ClearanceArrays(*_NOTHING, 0))
 """Where nothing can meet."""
 
 
-def clearance_model(
-    robot: SerialRobot, workcell: Sequence[Shape], apart: Collection[tuple[int, int]] = ()
-) -> ClearanceModel:
-    """The model of one robot among shapes.  apart: pairs of `read_bodies` that are known never to
-    meet, which need no look.  Raises RobotError where a collision shape can't be bounded, naming
-    it.
+class Clearances:
+    """The model of a scene that changes.  apart: pairs that are known never to meet, which need no
+    look.  Raises RobotError where a collision shape can't be bounded, naming it.
     """
-    frames = _frames(robot.chain, np.zeros(robot.dof))
-    bodies = read_bodies(robot, workcell, frames)
-    meeting = pairs_of(bodies, robot.allowed)
-    moving = ((a, b) for a, b in meeting if bodies[a].frame != bodies[b].frame)
-    pairs = [pair for pair in moving if pair not in apart]
-    if not pairs:
-        return NO_CLEARANCE
-    table = NodeTable(bodies)
-    nodes = table.with_reaches(robot.dof, partial(_reach, robot))
-    return ClearanceModel(ClearanceArrays(table.hulls, nodes, table.pairs(pairs), len(pairs)))
+
+    def __init__(self, scene: Scene, apart: Collection[Pair] = ()) -> None:
+        robot = scene.robot
+        frames = _frames(robot.chain, np.zeros(robot.dof))
+        self._table = BodyTable(scene, frames, partial(_reach, robot))
+        self._apart = frozenset(apart)
+
+    def change(self, scene: Scene, apart: Collection[Pair] = ()) -> None:
+        """Follow the scene."""
+        self._table.change(scene)
+        self._apart = frozenset(apart)
+
+    @property
+    def model(self) -> ClearanceModel:
+        """Of the scene as it is now."""
+        bodies = self._table.bodies
+        pairs = [
+            (a, b)
+            for a, b in self._table.pairs
+            if bodies[a].frame != bodies[b].frame and (a, b) not in self._apart
+        ]
+        if not pairs:
+            return NO_CLEARANCE
+        return ClearanceModel(ClearanceArrays(*self._table.arrays(pairs), len(pairs)))
+
+
+def clearance_model(scene: Scene, apart: Collection[Pair] = ()) -> ClearanceModel:
+    """The model of a scene, as `Clearances` makes it."""
+    return Clearances(scene, apart).model
 
 
 def _reach(robot: SerialRobot, piece: Piece, frame: int) -> Float[np.ndarray, "D"]:

@@ -28,6 +28,11 @@ class Cylinder(Shape):
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", Placement.of(self.pose))
 
+    @property
+    def at(self) -> Placement:
+        """Its pose."""
+        return self.pose
+
     def pieces(self) -> tuple[Piece, ...]:
         """The prism around it, and PyBullet's margin, since that takes a hull within it."""
         half = 0.5 * self.length_m

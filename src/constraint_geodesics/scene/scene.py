@@ -1,23 +1,35 @@
-"""What params.yaml names, as objects: the robot and the shapes around it."""
+"""What params.yaml names, as objects: the robot and the shapes around it; and what it carries."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from constraint_geodesics.params import Params, RobotParams, WorkcellParams
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, load_robot
 from constraint_geodesics.scene.arm import ADJACENT, load_arm
-from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.urdf import find_urdf, has_pybullet
 from constraint_geodesics.scene.world import World
 
 
+class SceneError(ValueError):
+    """A change that a scene can't take; the message names the shape and what is wrong."""
+
+
 @dataclass(frozen=True)
 class Scene:
-    """A robot in its workcell.  Picklable, so that a worker process can open a world of its own."""
+    """A robot in its workcell, and what it carries.  Picklable, so that a worker process can open a
+    world of its own.
+
+    allowed: pairs of names, of shapes and of links, that may touch, beside those that the robot
+    allows.  What changes a scene gives another one; it raises SceneError where that can't be.
+    """
 
     robot: SerialRobot
     workcell: tuple[Shape, ...] = ()
+    attached: tuple[Attached, ...] = ()
+    allowed: frozenset[tuple[str, str]] = frozenset()
 
     @classmethod
     def from_params(cls, params: Params) -> "Scene":
@@ -26,11 +38,76 @@ class Scene:
 
     def world(self) -> World:
         """A fresh PyBullet world; close it, or use it as a context manager."""
-        return World(self.robot, self.workcell)
+        return World(self.robot, self.workcell, self.attached, self.allowed)
 
     def world_if_installed(self) -> World | None:
         """The same; None where there is no PyBullet."""
         return self.world() if has_pybullet() else None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all shapes."""
+        shapes = (*self.workcell, *(one.shape for one in self.attached))
+        return tuple(shape.name for shape in shapes)
+
+    def adding(self, *shapes: Shape) -> "Scene":
+        """With more shapes, whose names are new."""
+        taken = set(self.names)
+        for shape in shapes:
+            if not isinstance(shape, Shape):
+                raise SceneError(f"{shape!r} is no shape: a scene takes Box, Sphere, …")
+            if shape.name in taken:
+                raise SceneError(f"there is a shape called {shape.name!r} already: remove it first")
+            taken.add(shape.name)
+        return replace(self, workcell=(*self.workcell, *shapes))
+
+    def removing(self, *names: str) -> "Scene":
+        """Without shapes that are not attached."""
+        for name in names:
+            self._shape(name)
+        left = tuple(shape for shape in self.workcell if shape.name not in names)
+        return replace(self, workcell=left)
+
+    def moving(self, name: str, at: Placement) -> "Scene":
+        """With a shape's own frame elsewhere: in the base frame, or for one that is attached in its
+        link's.
+        """
+        for one in self.attached:
+            if one.name == name:
+                moved = replace(one, shape=one.shape.placed(at))
+                others = (moved if other is one else other for other in self.attached)
+                return replace(self, attached=tuple(others))
+        moved_shape = self._shape(name).placed(at)
+        around = (moved_shape if other.name == name else other for other in self.workcell)
+        return replace(self, workcell=tuple(around))
+
+    def attaching(self, held: Attached) -> "Scene":
+        """With a shape that a link carries; one of that name around the arm is taken away."""
+        if held.name in {one.name for one in self.attached}:
+            raise SceneError(f"{held.name!r} is attached already: detach it first")
+        around = tuple(shape for shape in self.workcell if shape.name != held.name)
+        return replace(self, workcell=around, attached=(*self.attached, held))
+
+    def detaching(self, name: str) -> "Scene":
+        """Without a shape that a link carries."""
+        left = tuple(one for one in self.attached if one.name != name)
+        if len(left) == len(self.attached):
+            raise SceneError(f"nothing called {name!r} is attached{_of(self.attached)}")
+        return replace(self, attached=left)
+
+    def allowing(self, first: str, second: str) -> "Scene":
+        """With two bodies, links or shapes, that may touch."""
+        return replace(self, allowed=self.allowed | {(first, second)})
+
+    def _shape(self, name: str) -> Shape:
+        for shape in self.workcell:
+            if shape.name == name:
+                return shape
+        raise SceneError(f"there is no shape called {name!r}{_of(self.workcell)}")
+
+
+def _of(named: tuple[Shape, ...] | tuple[Attached, ...]) -> str:
+    return f": {', '.join(one.name for one in named)}" if named else ": there is none at all"
 
 
 def robot_from(params: RobotParams) -> SerialRobot:

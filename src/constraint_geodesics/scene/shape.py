@@ -12,7 +12,6 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from jaxtyping import Float
 from pydantic import ConfigDict
-from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.fields import Vector3
 from constraint_geodesics.robot.kinematics import RobotError, rotation_from_rpy, rpy_of
@@ -56,6 +55,12 @@ class Placement:
         x, y, z = (float(value) for value in pose.position)
         return cls((x, y, z), rpy_of(np.asarray(pose.rotation, float)))
 
+    @classmethod
+    def of_matrix(cls, matrix: Float[np.ndarray, "4 4"]) -> "Placement":
+        """From the pose of the frame."""
+        x, y, z = matrix[:3, 3].tolist()
+        return cls((x, y, z), rpy_of(matrix[:3, :3]))
+
     @property
     def turn(self) -> Float[np.ndarray, "3 3"]:
         """Into the base frame."""
@@ -64,8 +69,13 @@ class Placement:
     @property
     def quaternion(self) -> list[float]:
         """The same as x, y, z, w."""
-        found: list[float] = Rotation.from_matrix(self.turn).as_quat().tolist()
-        return found
+        (sr, sp, sy), (cr, cp, cy) = (
+            np.sin(np.multiply(0.5, self.rpy_rad)),
+            np.cos(np.multiply(0.5, self.rpy_rad)),
+        )
+        x, y = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy
+        z, w = cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy
+        return [float(x), float(y), float(z), float(w)]
 
     @property
     def matrix(self) -> Float[np.ndarray, "4 4"]:
@@ -94,6 +104,11 @@ class Shape(ABC):
     name: str
     exempt_links: tuple[str, ...]
 
+    @property
+    @abstractmethod
+    def at(self) -> Placement:
+        """Where its own frame is: that about its middle, or of its file."""
+
     def pieces(self) -> tuple[Piece, ...]:
         """Convex pieces that cover it, in the base frame.  Raises RobotError where there are
         none.
@@ -106,7 +121,7 @@ class Shape(ABC):
 
     @abstractmethod
     def placed(self, at: Placement) -> Self:
-        """The same shape with its own frame elsewhere: that about its middle, or of its file."""
+        """The same shape with its own frame elsewhere."""
 
     @abstractmethod
     def add_to(self, bullet: Any) -> int:

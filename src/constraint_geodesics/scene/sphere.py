@@ -19,6 +19,11 @@ class Sphere(Shape):
     exempt_links: tuple[str, ...] = ()
     kind: Literal["sphere"] = "sphere"
 
+    @property
+    def at(self) -> Placement:
+        """Its centre."""
+        return Placement(self.centre_m)
+
     def pieces(self) -> tuple[Piece, ...]:
         """A box without edges, rounded by the radius."""
         return (RoundedBox(self.centre_m, (0.0, 0.0, 0.0), self.radius_m).piece(),)

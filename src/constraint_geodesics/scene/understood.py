@@ -5,6 +5,7 @@ is missing for a certified plan, with the mend.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from constraint_geodesics.scene.allowed_collisions import (
     sampled,
 )
 from constraint_geodesics.scene.arm import ADJACENT, FOUND, LoadedArm, load_arm
-from constraint_geodesics.scene.bodies import Body, pairs_of
+from constraint_geodesics.scene.bodies import Body, may_meet
 from constraint_geodesics.scene.pieces import read_pieces
 from constraint_geodesics.scene.urdf import find_urdf, has_pybullet
 
@@ -113,7 +114,8 @@ def _looked_at(loaded: LoadedArm) -> int:
     """How many pairs of links are looked at for collisions."""
     links = read_pieces(loaded.robot.urdf)
     bodies = [Body(own.name, 0, own.pieces, own.parent) for own in links if own.pieces]
-    return sum(1 for _ in pairs_of(bodies, loaded.robot.allowed))
+    allowed = frozenset(map(frozenset, loaded.robot.allowed))
+    return sum(may_meet(first, second, allowed) for first, second in combinations(bodies, 2))
 
 
 def _missing(arm: Arm) -> Iterator[str]:

@@ -4,16 +4,18 @@ The only importer of pybullet.  Every world is a client of its own; nothing is s
 """
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import combinations
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
-from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.urdf import quiet
 
 
@@ -69,7 +71,7 @@ class BodyKey(NamedTuple):
     """A link of the robot, or a shape of the workcell."""
 
     name: str
-    fixed: bool
+    is_shape: bool
 
 
 class _Client:
@@ -99,15 +101,35 @@ _WITHOUT_CLIENT = [
 ]
 
 
+@dataclass(frozen=True)
+class _Placed:
+    """A shape's body: which one, its links, what was made into it, and the pose of its inertial
+    frame in its own.  carrier: the index of the link that carries it.
+    """
+
+    body: int
+    links: tuple[int, ...]
+    made: Shape | Attached
+    inertial: tuple[Any, Any]
+    carrier: int | None = None
+
+
 class World:
-    """One robot among fixed bodies.  Adjacent links, pairs of links that the robot allows and
-    links exempt from a shape may touch; nothing else may.
+    """One robot among fixed bodies, and what it carries.  Adjacent links, pairs of links that the
+    robot allows, links exempt from a shape, what carries a shape and what is said to touch it, and
+    allowed pairs of names may touch; nothing else may.
 
     Raises RobotError if PyBullet has not all of the robot's collision shapes, and ValueError if an
     exempt link is not the robot's.
     """
 
-    def __init__(self, robot: SerialRobot, fixed: Sequence[Shape] = ()) -> None:
+    def __init__(
+        self,
+        robot: SerialRobot,
+        fixed: Sequence[Shape] = (),
+        attached: Sequence[Attached] = (),
+        allowed: Collection[tuple[str, str]] = (),
+    ) -> None:
         self._bullet = bullet = _Client()
         self.robot = robot
         flags = bullet.URDF_USE_SELF_COLLISION | bullet.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
@@ -131,16 +153,84 @@ class World:
         for pair in robot.allowed:
             first, second = (self._link_index[name] for name in pair)
             bullet.setCollisionFilterPair(body, body, first, second, 0)
-        names = [shape.name for shape in fixed]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"two shapes of the workcell are called {twice[0]!r}")
-        with quiet():
-            bodies = [shape.add_to(bullet) for shape in fixed]
-        self._fixed = dict(zip(names, bodies, strict=True))
-        self._exempt = dict(zip(bodies, map(self._links, fixed), strict=True))
-        for other, links in self._exempt.items():
-            for link in links:  # a pair that may touch need not be examined again and again
-                bullet.setCollisionFilterPair(body, other, link, -1, 0)
+        self._shapes = dict[str, _Placed]()
+        self._allowed = frozenset[frozenset[str]]()
+        try:
+            self.change(fixed, attached, allowed)
+        except BaseException:
+            self.close()
+            raise
+
+    def change(
+        self,
+        fixed: Sequence[Shape],
+        attached: Sequence[Attached] = (),
+        allowed: Collection[tuple[str, str]] = (),
+    ) -> None:
+        """Other shapes around the robot, other ones that it carries: what stays is left alone."""
+        wanted: dict[str, Shape | Attached] = {}
+        everything: list[Shape | Attached] = [*fixed, *attached]
+        for one in everything:
+            if one.name in wanted:
+                raise ValueError(f"two shapes of the workcell are called {one.name!r}")
+            if one.name in self._link_index:
+                raise ValueError(
+                    f"workcell {one.name!r}: a link of {self.robot.name} has that name"
+                )
+            wanted[one.name] = one
+        pairs = [*map(frozenset, allowed)]
+        for shape in (*fixed, *(one.shape for one in attached)):
+            self._require_links(shape.name, shape.exempt_links)
+            pairs += [frozenset((shape.name, link)) for link in shape.exempt_links]
+        for held in attached:
+            self._require_links(held.name, [held.link])
+            pairs += [frozenset((held.name, other)) for other in (held.link, *held.touching)]
+        gone = {name for name, own in self._shapes.items() if wanted.get(name) != own.made}
+        now = frozenset(pairs)
+        # before a body goes, since PyBullet gives its number to another
+        over = {p for p in self._allowed if p not in now or p & gone}
+        self._filter(over, 1)
+        self._allowed -= over
+        for name in gone:
+            self._bullet.removeBody(self._shapes.pop(name).body)
+        news = {name: one for name, one in wanted.items() if name not in self._shapes}
+        if news:
+            with quiet():
+                for name, one in news.items():
+                    self._shapes[name] = self._add(one)
+        self._filter(now - self._allowed, 0)
+        self._allowed = now
+
+    def _add(self, one: Shape | Attached) -> _Placed:
+        bullet = self._bullet
+        if isinstance(one, Shape):
+            body = one.add_to(bullet)
+        else:
+            body = one.shape.placed(Placement()).add_to(bullet)
+        links = (-1, *range(bullet.getNumJoints(body)))
+        inertial = bullet.getDynamicsInfo(body, -1)[3:5]
+        if isinstance(one, Shape):
+            return _Placed(body, links, one, inertial)
+        for link in links:  # what stands still meets nothing else that does, which this does not
+            bullet.setCollisionFilterGroupMask(body, link, _MOVING, _ALL)
+        place, turn = bullet.multiplyTransforms(
+            one.shape.at.position_m, one.shape.at.quaternion, *inertial
+        )
+        return _Placed(body, links, one, (place, turn), self._link_index[one.link])
+
+    def _filter(self, pairs: Iterable[frozenset[str]], counts: int) -> None:
+        """Whether pairs are examined: what may touch need not be, again and again."""
+        for pair in pairs:
+            ends = [part for name in pair for part in self._parts(name)]
+            for (first, link), (second, other) in combinations(ends, 2):
+                self._bullet.setCollisionFilterPair(first, second, link, other, counts)
+
+    def _parts(self, name: str) -> list[tuple[int, int]]:
+        """Bodies with their links that are called so: a shape, or a link of the robot."""
+        if name in self._shapes:
+            own = self._shapes[name]
+            return [(own.body, link) for link in own.links]
+        return [(self._body, self._link_index[name])] if name in self._link_index else []
 
     def __enter__(self) -> Self:
         return self
@@ -208,8 +298,8 @@ class World:
 
     def _indices(self, key: BodyKey) -> tuple[int, int]:
         """A body's index and that of its link; -2 stands for all links."""
-        if key.fixed:
-            return self._fixed[key.name], -2
+        if key.is_shape:
+            return self._shapes[key.name].body, -2
         return self._body, self._link_index[key.name]
 
     def loaded_chain(self) -> LoadedChain:
@@ -249,26 +339,43 @@ class World:
 
     def _place(self, q: np.ndarray) -> None:
         values = np.asarray(q, float)[:, None].tolist()
-        self._bullet.resetJointStatesMultiDof(self._body, self._joints, values)
+        bullet = self._bullet
+        bullet.resetJointStatesMultiDof(self._body, self._joints, values)
+        for own in self._shapes.values():
+            if own.carrier is None:
+                continue
+            if own.carrier < 0:
+                position, turn = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+            else:
+                state = bullet.getLinkState(self._body, own.carrier, computeForwardKinematics=1)
+                position, turn = state[4:6]
+            pose = bullet.multiplyTransforms(position, turn, *own.inertial)
+            bullet.resetBasePositionAndOrientation(own.body, *pose)
 
     def _collisions(self) -> tuple[bool, bool]:
+        """Whether the arm, or what it carries, touches itself, and whether it touches the
+        workcell.
+        """
         self._bullet.performCollisionDetection()
-        own = workcell = False
-        for contact in self._bullet.getContactPoints(bodyA=self._body):
-            if contact[8] >= 0.0:  # a contact is listed from a small positive distance on
-                continue
-            if contact[2] == self._body:
-                own = True
-            elif contact[3] not in self._exempt[contact[2]]:
-                workcell = True
+        carried = [own.body for own in self._shapes.values() if own.carrier is not None]
+        moving, own, workcell = {self._body, *carried}, False, False
+        for body in moving:
+            for contact in self._bullet.getContactPoints(bodyA=body):
+                if contact[8] >= 0.0:  # a contact is listed from a small positive distance on
+                    continue
+                if contact[2] in moving:
+                    own = True
+                else:
+                    workcell = True
         return own, workcell
 
-    def _links(self, body: Shape) -> frozenset[int]:
-        if unknown := [name for name in body.exempt_links if name not in self._link_index]:
-            raise ValueError(
-                f"workcell {body.name!r}: {unknown} are not links of {self.robot.name}"
-            )
-        return frozenset(self._link_index[name] for name in body.exempt_links)
+    def _require_links(self, shape: str, links: Sequence[str]) -> None:
+        if unknown := [name for name in links if name not in self._link_index]:
+            raise ValueError(f"workcell {shape!r}: {unknown} are not links of {self.robot.name}")
+
+
+_MOVING, _ALL = 1, -1
+"""PyBullet's groups of bodies: those that move, and what they may meet."""
 
 
 @dataclass(frozen=True)
@@ -286,6 +393,5 @@ def physics(world: World) -> Physics:
     """What simulating in a world takes; the world is no judge afterwards, and closing it ends the
     simulation.
     """
-    return Physics(
-        world._bullet, world._body, tuple(world._joints), world._tool, tuple(world._exempt)
-    )
+    fixed = tuple(own.body for own in world._shapes.values() if own.carrier is None)
+    return Physics(world._bullet, world._body, tuple(world._joints), world._tool, fixed)

@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from constraint_geodesics.certification.certifier import Certifier
-from constraint_geodesics.certification.collisions import CollisionCheck
+from constraint_geodesics.certification.collisions import MARGIN_M, CollisionCheck
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.geometry.graph import components
 from constraint_geodesics.params import PlannerParams
-from constraint_geodesics.scene.clearance import clearance_model
+from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.clearance import ClearanceModel, Clearances, clearance_model
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
 from constraint_geodesics.search.band import BandSettings, project
@@ -61,9 +62,23 @@ class Query:
     regions: tuple[Constraint, ...] = ()
 
 
+class _Apart:
+    """Freedom by a model of clearance."""
+
+    def __init__(self, robot: SerialRobot, model: ClearanceModel) -> None:
+        self._robot, self._model = robot, model
+
+    def free(self, q: Float[np.ndarray, "n D"]) -> Bool[np.ndarray, "n"]:
+        """Where all that may meet is further apart than the certificate's margin."""
+        return self._model.clearance(self._robot, q, MARGIN_M) >= MARGIN_M
+
+
 class Preparation:
     """The tasks of a scene by constraint, each with its roadmap: given, or made when it is asked
     for.
+
+    Roadmaps are made among the shapes that are there at first: what comes later is looked at where
+    a way leads.  Once one of the first is gone they are made anew.
     """
 
     def __init__(
@@ -75,11 +90,23 @@ class Preparation:
     ) -> None:
         self.scene, self.checks, self.settings = scene, checks, settings
         self.draw = draw or scene.robot.sample
-        self._clearance = clearance_model(scene.robot, scene.workcell, checks.apart)
+        self._clearances = Clearances(scene, checks.apart)
+        self._clearance = self._first_clearance = self._clearances.model
         self.band = self._band()
         self._tasks: dict[tuple, Task] = {}
         self._roadmaps: dict[tuple, Roadmap | None] = {}
         self._named: frozenset[tuple] = frozenset()
+
+    def change(self, scene: Scene) -> None:
+        """Follow the scene, after the checks have."""
+        self._clearances.change(scene, self.checks.apart)
+        self._clearance = self._clearances.model
+        left = tuple(shape for shape in self.scene.workcell if shape in scene.workcell)
+        held = tuple(one for one in self.scene.attached if one in scene.attached)
+        if (left, held) != (self.scene.workcell, self.scene.attached):
+            self.scene = replace(self.scene, workcell=left, attached=held)
+            self._first_clearance = clearance_model(self.scene)
+            self._roadmaps = {}
 
     def _band(self) -> BandSettings:
         """With the clearance that this arm can keep."""
@@ -114,16 +141,18 @@ class Preparation:
             manifold = ConstraintManifold(self.scene.robot, constraint)
             roadmap = partial(self._roadmap, key, manifold)
             self._tasks[key] = Task(manifold, self._clearance, roadmap, self.band)
+        elif self._tasks[key].clearance is not self._clearance:
+            self._tasks[key] = replace(self._tasks[key], clearance=self._clearance)
         return self._tasks[key]
 
     def _roadmap(self, key: tuple, manifold: ConstraintManifold) -> Roadmap | None:
         if key not in self._roadmaps:
             settings = self.settings
             rng = np.random.default_rng(settings.seed)
-            nodes = free_configurations(
-                manifold, self.checks, self.draw, settings.roadmap_nodes, rng
-            )
-            space = self._tasks[key].clear
+            first = self._first_clearance
+            freedom, count = _Apart(self.scene.robot, first), settings.roadmap_nodes
+            nodes = free_configurations(manifold, freedom, self.draw, count, rng)
+            space = replace(self._tasks[key], clearance=first).clear
             self._roadmaps[key] = (
                 build_roadmap(space, nodes, settings.roadmap_neighbours) if len(nodes) > 1 else None
             )

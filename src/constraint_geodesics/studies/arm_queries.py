@@ -130,10 +130,10 @@ class BiRRT:
 @contextmanager
 def birrt_beside(planner: Planner, constraint: Constraint) -> Iterator[BiRRT]:
     """BiRRT in the planner's scene, with a certifier of its own for the planner's promises."""
-    scene, bundle = planner.scene, planner.bundle
+    scene, bundle = planner.scene.now, planner.bundle
     limits = limits_of(bundle.planner, bundle.judge, scene.robot)
     with Certifier(scene, limits) as certifier:
-        clearance = clearance_model(scene.robot, scene.workcell, certifier.collisions.apart)
+        clearance = clearance_model(scene, certifier.collisions.apart)
         manifold = ConstraintManifold(scene.robot, constraint)
         yield BiRRT(planner, certifier, manifold, clearance)
 

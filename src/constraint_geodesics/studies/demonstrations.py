@@ -207,7 +207,7 @@ def pairs_of(cell: Cell, planner: Planner, count: int) -> list[Query]:
     through the hole.
     """
     task, rng = cell.hidden, np.random.default_rng(9000 + cell.seed)
-    ends = task.draw(planner.scene, 1500, 9000 + cell.seed)
+    ends = task.draw(planner.scene.now, 1500, 9000 + cell.seed)
     own, found = task.manifold(planner.robot).constraint, []
     for _ in range(TRIES * count):
         start = ends[rng.integers(len(ends))]

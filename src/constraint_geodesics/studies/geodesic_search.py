@@ -238,7 +238,7 @@ def policy_problem(
     """What policies are asked under one constraint in a workcell, in their chart."""
     settings = params.policy_settings()
     curve = PinnedPolynomial(chart.dim, settings.degree)
-    clearance = clearance_model(scene.robot, scene.workcell)
+    clearance = clearance_model(scene)
     space = chart, manifold, curve, joints, settings.length_degree, True, 0.0
     return LearnedProblem(*space, clearance=clearance)
 

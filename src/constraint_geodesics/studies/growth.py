@@ -311,7 +311,7 @@ class _Asked:
     def problems(self, world: World, certifier: Certifier) -> list[PlanningProblem]:
         """As the planners are asked; world and certifier: of the same scene."""
         apart = certifier.collisions.apart
-        clearance = clearance_model(self.scene.robot, self.scene.workcell, apart)
+        clearance = clearance_model(self.scene, apart)
         ends = zip(self.queries.starts, self.queries.goals, strict=True)
         known = world.is_free, clearance, certifier.collisions.is_clear
         return [PlanningProblem(start, goal, self.manifold, *known) for start, goal in ends]
@@ -433,7 +433,7 @@ def _roadmaps(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
     scene, manifold, settings = subject.scene, subject.manifold, subject.params.planner
     drawn = draw_queries(scene, manifold, CONSTRAINT, -(-max(sizes.nodes) // 2), sizes.seed)
     nodes = np.concatenate([drawn.starts, drawn.goals])
-    clearance = clearance_model(scene.robot, scene.workcell)
+    clearance = clearance_model(scene)
     space = space_of(manifold, clearance, settings.clearance_m)
     build_roadmap(space, nodes[: min(sizes.nodes)], settings.roadmap_neighbours)
     for _ in range(sizes.roadmap_repeats):

@@ -352,7 +352,7 @@ def _queries(
     studies = params.studies
     changed = {"queries": studies.queries, "seed": studies.seed}
     with Certifier(scene, judge_limits(params.judge)) as certifier, scene.world() as world:
-        clearance = clearance_model(scene.robot, scene.workcell, certifier.collisions.apart)
+        clearance = clearance_model(scene, certifier.collisions.apart)
 
         def plan(
             start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]
@@ -375,7 +375,7 @@ def _query_rows(
     scene = query.in_scene(Scene.from_params(params))
     manifold, ends = problem.manifold, problem.ends(query.start[None], query.goal[None])
     with Certifier(scene, judge_limits(params.judge)) as certifier, scene.world() as world:
-        clearance = clearance_model(scene.robot, scene.workcell, certifier.collisions.apart)
+        clearance = clearance_model(scene, certifier.collisions.apart)
         asked = Asked(replace(problem, clearance=clearance), ends, query.number, certifier)
         answered(asked, straight(asked, 0.0))  # what is loaded late is no method's
         answers = query_answers(asked, compared)

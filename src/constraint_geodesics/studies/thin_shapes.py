@@ -79,7 +79,10 @@ def try_thicket(task: Thicket) -> Solved:
     solved: list[tuple[bool, bool]] = []
     bundle = replace(task.bundle, workcell=workcell)
     limits = limits_of(bundle.planner, judge, robot_from(bundle.robot))
-    with Planner(bundle, "thin shapes") as planner, Certifier(planner.scene, limits) as certifier:
+    with (
+        Planner(bundle, "thin shapes") as planner,
+        Certifier(planner.scene.now, limits) as certifier,
+    ):
         checks = certifier.collisions
         for name in task.constraints:
             manifold = ConstraintManifold(planner.scene.robot, planner.constraints[name])

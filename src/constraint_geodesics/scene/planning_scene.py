@@ -1,0 +1,134 @@
+"""The scene of a planner, which changes between queries."""
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.scene import Scene, SceneError
+from constraint_geodesics.scene.shape import Placement, Shape
+from constraint_geodesics.scene.world import World
+
+LinkPoses = Callable[[Float[np.ndarray, "D"], str], Float[np.ndarray, "4 4"]]
+
+
+class PlanningScene:
+    """Shapes around the robot, shapes that it carries, and what may touch.  Every change is in
+    force for the next query; what raises SceneError, or RobotError for a shape that can't be
+    bounded, has changed nothing.
+
+    follow: takes the changed scene, all or nothing.  links: names of all links of the robot.
+    link_pose: of one of them in the base frame at a configuration [rad].
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        follow: Callable[[Scene], None],
+        links: Collection[str],
+        link_pose: LinkPoses,
+    ) -> None:
+        self._now, self._follow = scene, follow
+        self._links, self._link_pose = links, link_pose
+
+    @property
+    def now(self) -> Scene:
+        """As it is: a value that no later change alters."""
+        return self._now
+
+    @property
+    def robot(self) -> SerialRobot:
+        """The robot."""
+        return self._now.robot
+
+    @property
+    def workcell(self) -> tuple[Shape, ...]:
+        """The shapes around it."""
+        return self._now.workcell
+
+    @property
+    def attached(self) -> tuple[Attached, ...]:
+        """What it carries."""
+        return self._now.attached
+
+    def world(self) -> World:
+        """A fresh PyBullet world of the scene as it is now."""
+        return self._now.world()
+
+    def add(self, *shapes: Shape) -> None:
+        """Put shapes around the robot, in the base frame, beside what is there.  Several at once
+        cost little more than one.
+        """
+        self._change(self._now.adding(*shapes))
+
+    def remove(self, *names: str) -> None:
+        """Take shapes away."""
+        self._change(self._now.removing(*names))
+
+    def move(self, name: str, pose: Any) -> None:
+        """Put a shape's own frame, that about its middle or of its file, elsewhere: in the base
+        frame, or for what is attached in its link's.  pose: a Pose, or a Placement.
+        """
+        self._change(self._now.moving(name, Placement.of(pose)))
+
+    def attach(self, shape: Shape | str, link: str, touching: Sequence[str] = ()) -> None:
+        """Let a link carry a shape, placed in the link's frame; a shape around the robot of that
+        name is taken away.  touching: names of links and shapes that may touch it.
+        """
+        if isinstance(touching, str) or not isinstance(shape, Shape):
+            wrong = "touching is a list of names" if isinstance(touching, str) else "no shape"
+            raise SceneError(f"{shape!r} can't be attached: {wrong}")
+        held = Attached(shape, link, tuple(touching))
+        changed = self._now.attaching(held)
+        self._require_known(changed, *touching)
+        self._change(changed)
+
+    def detach(self, name: str, at: Float[np.ndarray, "D"] | None = None) -> None:
+        """Carry a shape no longer.  at: the configuration [rad] at which it is let go: it stays
+        around the robot where it is then; without one it is gone.
+        """
+        held = next((one for one in self._now.attached if one.name == name), None)
+        changed = self._now.detaching(name)
+        if at is not None and held is not None:
+            pose = self._link_pose(np.asarray(at, float), held.link) @ held.shape.at.matrix
+            changed = changed.adding(held.shape.placed(Placement.of_matrix(pose)))
+        self._change(changed)
+
+    def allow(self, first: str, second: str) -> None:
+        """Let two bodies touch: shapes, attached or not, or links, by their names."""
+        self._require_known(self._now, first, second)
+        self._change(self._now.allowing(first, second))
+
+    @contextmanager
+    def including(self, shapes: Sequence[Shape]) -> Iterator[None]:
+        """With more shapes for a while."""
+        before = self._now
+        if shapes:
+            self._change(before.adding(*shapes))
+        try:
+            yield
+        finally:
+            if shapes:
+                self._change(before)
+
+    def _require_known(self, scene: Scene, *names: str) -> None:
+        for name in names:
+            if name not in self._links and name not in scene.names:
+                raise SceneError(f"{name!r} is no link of the robot, nor a shape of the scene")
+
+    def _change(self, scene: Scene) -> None:
+        shapes = (*scene.workcell, *(one.shape for one in scene.attached))
+        named = [link for shape in shapes for link in shape.exempt_links]
+        named += [one.link for one in scene.attached]
+        for link in named:
+            if link not in self._links:
+                raise SceneError(f"no link is called {link!r}: {', '.join(self._links)}")
+        for shape in shapes:
+            if shape.name in self._links:
+                raise SceneError(f"{shape.name!r} is a link of the robot: give the shape another")
+        self._follow(scene)
+        self._now = scene

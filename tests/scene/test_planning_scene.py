@@ -1,0 +1,219 @@
+"""A scene that changes: what follows it is what would be made anew."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.planner_fixtures import pairs_of
+
+from constraint_geodesics.certification.certifier import Certifier
+from constraint_geodesics.constraints.constraint import Constraint, Pose
+from constraint_geodesics.planner import Planner
+from constraint_geodesics.robot.kinematics import RobotError
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.capsule import Capsule
+from constraint_geodesics.scene.clearance import clearance_model
+from constraint_geodesics.scene.cylinder import Cylinder
+from constraint_geodesics.scene.scene import Scene, SceneError
+from constraint_geodesics.scene.shape import Placement, Shape
+from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.scene.world import BodyKey
+
+CRATE = Box("crate", (0.45, 0.25, 0.2), (0.2, 0.2, 0.2))
+BALL = Sphere("ball", (-0.3, 0.4, 0.5), 0.12)
+PIPE = Capsule("pipe", (0.3, -0.5, 0.2), (0.5, -0.2, 0.7), 0.05)
+CUP = Cylinder("cup", Placement((0.0, 0.0, 0.09)), 0.12, 0.04)
+CARRYING = Placement((0.0, 0.05, 0.12), (0.3, 0.8, -0.2))
+FREE = Constraint((0,) * 6)
+
+
+@pytest.fixture
+def planner() -> Iterator[Planner]:
+    with Planner.load() as loaded:
+        yield loaded
+
+
+def changed(planner: Planner) -> None:
+    """Every kind of change, some of them taken back."""
+    scene = planner.scene
+    scene.add(CRATE, BALL)
+    scene.add(PIPE)
+    scene.attach(CUP, "link6")
+    scene.move("crate", Placement((0.4, -0.3, 0.3), (0.1, 0.2, 0.3)))
+    scene.remove("ball")
+    scene.attach(Box("tray", (0.0, 0.0, 0.05), (0.1, 0.2, 0.02)), "link4")
+    scene.detach("tray")
+    scene.move("cup", CARRYING)
+    scene.allow("cup", "pipe")
+    scene.add(BALL)
+
+
+def test_what_follows_a_scene_is_what_is_made_anew(planner: Planner) -> None:
+    """Clearance, certificate and PyBullet."""
+    changed(planner)
+    now, robot = planner.scene.now, planner.robot
+    assert planner.scene.workcell[-1] == BALL
+    q = robot.sample(400, np.random.default_rng(0))
+    task = planner._preparation.task(FREE)
+    fresh = clearance_model(now, planner._certifier.collisions.apart)
+    np.testing.assert_allclose(
+        task.clearance.clearance(robot, q), fresh.clearance(robot, q), atol=1e-6
+    )
+    own = planner._certifier
+    with Certifier(now, own.limits) as anew, now.world() as world:
+        assert set(own.collisions.collider.bodies) == set(anew.collisions.collider.bodies)
+        for row in q:
+            # one that is made anew leaves out more pairs that never meet
+            assert own.collisions.clearance(row) <= anew.collisions.clearance(row) + 1e-6
+        np.testing.assert_array_equal(own._world.free(q), world.free(q))
+        np.testing.assert_array_equal(own.collisions.free(q), anew.collisions.free(q))
+
+
+def test_what_is_carried_is_where_pybullet_has_it(planner: Planner) -> None:
+    """Distances of a carried shape to links and shapes, and contacts found in the same places."""
+    planner.scene.add(CRATE, PIPE)
+    planner.scene.attach(CUP.placed(CARRYING), "link6")
+    now, checks = planner.scene.now, planner._certifier.collisions
+    seen, touched = 0, 0
+    with now.world() as world:
+        for q in planner.robot.sample(300, np.random.default_rng(1)):
+            near = [
+                world.distance(q, BodyKey("cup", True), key, 0.2)
+                for key in checks.collider.bodies
+                if key.name not in ("cup", "link6")
+            ]
+            label = world.label(q[None])
+            hit = bool(label.self_collision[0] or label.workcell_collision[0])
+            assert hit >= (min(near) < -1e-9)
+            touched += min(near) < 0.0
+            whole = checks.clearance(q)
+            if min(near) < 0.2:
+                seen += 1
+                assert whole < max(min(near), 0.0) + 3e-5
+            assert checks.is_free(q) == (not hit)
+    assert seen > 100
+    assert touched > 20
+
+
+def test_a_shape_is_let_go_where_it_is(planner: Planner) -> None:
+    planner.scene.attach(CUP, "link6")
+    q = planner.robot.sample(1, np.random.default_rng(2))[0]
+    planner.scene.detach("cup", q)
+    (cup,) = [shape for shape in planner.scene.workcell if shape.name == "cup"]
+    with planner.scene.world() as world:
+        (link,) = world.link_poses(q, ["link6"])
+    np.testing.assert_allclose(cup.at.matrix, link @ CUP.at.matrix, atol=1e-7)
+
+
+def test_a_path_keeps_off_what_was_added_and_what_is_carried(planner: Planner) -> None:
+    """Checked densely by a world that is made anew."""
+    planner.scene.attach(CUP, "link6")
+    kept = 0
+    for start, goal in pairs_of("level_cup", 8, seed=21):
+        between = planner.robot.forward(0.5 * (start + goal))[0].tolist()
+        ball = Sphere("ball", tuple(between), 0.06)
+        before = planner.scene.now
+        path = planner.plan(start, goal, "level_cup", scene=[ball])
+        assert planner.scene.now is before
+        if path.status != "solved":
+            continue
+        asked = path.asked.scene
+        assert asked.workcell[-1] == ball
+        assert asked.attached == planner.scene.attached
+        steps = np.linspace(0.0, 1.0, 5)[:, None]
+        dense = [a + steps * (b - a) for a, b in zip(path.joints, path.joints[1:], strict=False)]
+        with asked.world() as world:
+            assert world.free(np.concatenate(dense)).all()
+        kept += 1
+    assert kept >= 4
+
+
+def test_adding_adds(planner: Planner) -> None:
+    """What was there before is still looked at."""
+    planner.scene.add(CRATE)
+    into_table = np.array([0.0, 1.9, -0.6, 0.0, 0.0, 0.0])
+    assert not planner._certifier.collisions.is_free(into_table)
+
+
+def test_what_touches_the_carrier_is_said_to(planner: Planner) -> None:
+    """A shape that overlaps other links is refused for good, until it may touch them."""
+    wide = Box("wide", (0.0, 0.0, 0.0), (0.2, 0.2, 0.1))
+    planner.scene.attach(wide, "link6")
+    start, goal = pairs_of("free", 1, seed=3)[0]
+    assert planner.plan(start, goal, "free").status == "in_collision"
+    planner.scene.detach("wide")
+    planner.scene.attach(wide, "link6", touching=("link5", "link4"))
+    assert planner.plan(start, start, "free").status in ("solved", "in_collision")
+    said = planner._certifier.collisions.rests_on
+    assert "wide on link6" in said
+    assert "wide with link5" in said
+
+
+def test_a_change_that_fails_changes_nothing(planner: Planner, tmp_path: Path) -> None:
+    planner.scene.add(CRATE)
+    before, q = planner.scene.now, planner.robot.sample(50, np.random.default_rng(4))
+    free = planner._certifier.collisions.free(q)
+    wrong: list[tuple[type[Exception], str, object]] = [
+        (SceneError, "already", lambda s: s.add(CRATE)),
+        (SceneError, "no shape called 'crates': table, crate", lambda s: s.remove("crates")),
+        (SceneError, "no shape called 'cup'", lambda s: s.move("cup", Placement())),
+        (SceneError, "nothing called 'cup' is attached", lambda s: s.detach("cup")),
+        (SceneError, "no link is called 'hand'", lambda s: s.attach(CUP, "hand")),
+        (SceneError, "'gripper' is no link", lambda s: s.attach(CUP, "link6", ["gripper"])),
+        (SceneError, "list of names", lambda s: s.attach(CUP, "link6", "link5")),
+        (SceneError, "'tabel' is no link", lambda s: s.allow("crate", "tabel")),
+        (SceneError, "is a link of the robot", lambda s: s.add(Sphere("link5", (1, 1, 1), 0.1))),
+        (SceneError, "is no shape", lambda s: s.add("crate")),
+        (SceneError, "wrist", lambda s: s.add(Sphere("ball", (1, 1, 1), 0.1, ("wrist",)))),
+        (RobotError, "no such URDF", lambda s: s.add(_missing(tmp_path))),
+    ]
+    for kind, text, change in wrong:
+        with pytest.raises(kind, match=text):
+            change(planner.scene)  # type: ignore[operator]
+        assert planner.scene.now is before
+    with pytest.raises(SceneError, match="already"):
+        planner.plan(q[0], q[1], "free", scene=[CRATE])
+    assert planner.scene.now is before
+    np.testing.assert_array_equal(planner._certifier.collisions.free(q), free)
+    np.testing.assert_array_equal(planner._certifier._world.free(q), free)
+
+
+def _missing(folder: Path) -> Shape:
+    from constraint_geodesics.scene.body import Body
+
+    return Body("gone", folder / "gone.urdf")
+
+
+def test_a_body_that_comes_after_another_one_is_not_taken_for_it(planner: Planner) -> None:
+    """PyBullet gives its numbers again: what one was allowed the next is not."""
+    into = np.zeros(6)
+    (link,) = planner._certifier._world.link_poses(into, ["link3"])
+    x, y, z = link[:3, 3].tolist()
+    planner.scene.add(Sphere("soft", (x, y, z), 0.05, ("link2", "link3", "link4", "link5")))
+    assert planner._certifier._world.is_free(into)
+    planner.scene.remove("soft")
+    planner.scene.add(Sphere("hard", (x, y, z), 0.05))
+    assert not planner._certifier._world.is_free(into)
+    assert not planner._certifier.collisions.is_free(into)
+
+
+def test_a_roadmap_outlives_what_comes_and_goes(planner: Planner) -> None:
+    """And is made anew once something is gone that it was made round."""
+    before = planner.nodes("level_cup")
+    planner.scene.add(CRATE)
+    planner.scene.remove("crate")
+    np.testing.assert_array_equal(planner.nodes("level_cup"), before)
+    planner.scene.remove("table")
+    below = planner.robot.forward(planner.nodes("level_cup"))[0][:, 2]
+    assert (below < 0.0).any()
+
+
+def test_a_scene_is_a_value(planner: Planner) -> None:
+    """A pose as a user has it moves a shape, and no snapshot."""
+    planner.scene.add(CRATE)
+    now = planner.scene.now
+    planner.scene.move("crate", Pose(np.array([0.5, 0.0, 0.4]), np.eye(3)))
+    assert isinstance(now, Scene)
+    assert now.workcell[-1] == CRATE
+    assert planner.scene.workcell[-1].at.position_m == (0.5, 0.0, 0.4)
