@@ -49,6 +49,16 @@ Hold = Annotated[
 Srdf = Annotated[
     Path | None, typer.Option(help="Which links may touch; without it that is found by sampling.")
 ]
+SceneFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--scene", help="YAML with shapes to add: what is there stays; repeatable. docs/scenes.md."
+    ),
+]
+AttachFiles = Annotated[
+    list[Path] | None,
+    typer.Option("--attach", help="YAML with shapes that links carry; repeatable."),
+]
 Limit = Annotated[
     str | None,
     typer.Option(
@@ -67,9 +77,27 @@ class Arm(NamedTuple):
     tool_pose: str | None
     hold: list[str] | None
     srdf: Path | None
+    scenes: list[Path] | None = None
+    attached: list[Path] | None = None
 
     def open(self, method: str = "planner") -> "Planner":
-        """Raises PlannerError, BundleError or RobotError for options that name none."""
+        """With what files add to the scene.  Raises PlannerError, BundleError or RobotError for
+        options that name none, SceneError for such files.
+        """
+        from constraint_geodesics.scene.scene_file import read_attached, read_scene
+
+        files = [read_scene(file) for file in self.scenes or ()]
+        files += [read_attached(file) for file in self.attached or ()]
+        found = self._planner(method)
+        try:
+            for file in files:
+                file.into(found.scene)
+        except BaseException:
+            found.close()
+            raise
+        return found
+
+    def _planner(self, method: str = "planner") -> "Planner":
         from constraint_geodesics.planner import Planner, PlannerError
 
         own = (self.tool_link, self.tool_pose, self.hold, self.srdf)
@@ -128,6 +156,8 @@ def plan(
     tool_pose: ToolPose = None,
     hold: Hold = None,
     srdf: Srdf = None,
+    scene: SceneFiles = None,
+    attach: AttachFiles = None,
     budget: Annotated[
         float | None,
         typer.Option(help="Look for shorter paths for about so many seconds; by default do not."),
@@ -164,12 +194,12 @@ def plan(
         DemonstrationError,
         demonstrations_from,
     )
-    from constraint_geodesics.planner import PlannerError
+    from constraint_geodesics.planner import PlannerError, SceneError
     from constraint_geodesics.robot.kinematics import RobotError
 
     if record is not None:
         require("record")
-    arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf)
+    arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf, scene, attach)
     try:
         if demonstrations is not None and record is None:
             raise PlannerError("--demonstrations is drawn in what --record names: give it, too")
@@ -189,7 +219,9 @@ def plan(
                 acceleration_scale=acceleration_scale,
             )
             source = loaded.source
-    except (BundleError, ConstraintError, DemonstrationError, PlannerError, RobotError) as error:
+    except (
+        *(BundleError, ConstraintError, DemonstrationError, PlannerError, RobotError, SceneError),
+    ) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
     print(f"planner: {source}", file=sys.stderr)
     about: dict[str, Any] = path.summary()
@@ -215,6 +247,8 @@ def inverse_kinematics(
     tool_pose: ToolPose = None,
     hold: Hold = None,
     srdf: Srdf = None,
+    scene: SceneFiles = None,
+    attach: AttachFiles = None,
     as_json: AsJson = False,
 ) -> None:
     """Print the configurations that reach a tool pose, free of collision and within the limits, one
@@ -222,15 +256,15 @@ def inverse_kinematics(
     usage; 3: there is none.
     """
     from constraint_geodesics.bundle import BundleError
-    from constraint_geodesics.planner import PlannerError
+    from constraint_geodesics.planner import PlannerError, SceneError
     from constraint_geodesics.robot.kinematics import RobotError
 
-    arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf)
+    arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf, scene, attach)
     try:
         wanted = _pose(pose, "--pose")
         with loading(), arm.open() as loaded:
             found, names = loaded.ik(wanted), loaded.robot.joint_names
-    except (BundleError, PlannerError, RobotError) as error:
+    except (BundleError, PlannerError, RobotError, SceneError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
     if as_json:
         print(json.dumps({"joint_names": list(names), "configurations": found.tolist()}))
@@ -256,6 +290,8 @@ def check(
     tool_pose: ToolPose = None,
     hold: Hold = None,
     srdf: Srdf = None,
+    scene: SceneFiles = None,
+    attach: AttachFiles = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the certificate as one JSON object.")
     ] = False,
@@ -265,15 +301,15 @@ def check(
     """
     from constraint_geodesics.bundle import BundleError
     from constraint_geodesics.constraints.constraint import ConstraintError
-    from constraint_geodesics.planner import PlannerError
+    from constraint_geodesics.planner import PlannerError, SceneError
     from constraint_geodesics.robot.kinematics import RobotError
 
-    arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf)
+    arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf, scene, attach)
     try:
         with loading(), arm.open() as loaded:
             own = None if constraint is None else _constraint(constraint, loaded)
             certificate = loaded.check(file, own)
-    except (BundleError, ConstraintError, PlannerError, RobotError) as error:
+    except (BundleError, ConstraintError, PlannerError, RobotError, SceneError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
     broken = certificate.violation
     untimed = (

@@ -1,17 +1,18 @@
-"""What a plain installation leaves out, and how it is asked for: recordings, the pipeline, the
-benchmark's planners.
+"""What a plain installation leaves out, and how it is asked for: meshes that are not convex,
+recordings, the pipeline, the benchmark's planners.
 """
 
 from importlib.util import find_spec
 
+_MESHES = ("coacd",)
 _RECORD = ("rerun", "pyarrow")
 _PIPELINE = (
     *("torch", "mlflow", "dvc", "pandas", "pandera", "lightning", "stable_baselines3"),
     *("gymnasium", "sklearn", "joblib", "dask", "distributed", "sqlalchemy", "filelock"),
     *("jinja2", "packaging", "threadpoolctl", *_RECORD),
 )
-_BENCH = ("ompl", "bayes_opt", "gpytorch", *_PIPELINE)
-EXTRAS = {"record": _RECORD, "pipeline": _PIPELINE, "bench": _BENCH}
+_BENCH = ("ompl", "bayes_opt", "gpytorch", *_MESHES, *_PIPELINE)
+EXTRAS = {"meshes": _MESHES, "record": _RECORD, "pipeline": _PIPELINE, "bench": _BENCH}
 """The modules that each extra of pyproject.toml brings."""
 
 

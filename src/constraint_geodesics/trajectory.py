@@ -227,7 +227,8 @@ class Trajectory:
             "planner", name, 0, 0, self.joints, text, goal=goal, demonstrations=shown
         )
         manifold = ConstraintManifold(self.scene.robot, self.constraint)
-        record_path(Path(file), record, manifold, self.scene.workcell, frames=frames)
+        around, carried = self.scene.workcell, self.scene.attached
+        record_path(Path(file), record, manifold, around, frames=frames, attached=carried)
 
     def draw(self, file: str | Path) -> None:
         """Draw joints and violation over time as PNG.  Raises PlannerError without a path."""

@@ -105,8 +105,11 @@ class CollisionCheck:
         """
         low, high = self.collider.limits
         inside = bool((q >= low).all() and (q <= high).all())
-        if inside and self._standing is None and self._nearest(q, MARGIN_M) >= MARGIN_M:
+        near = self._nearest(q, MARGIN_M)
+        if inside and self._standing is None and near >= MARGIN_M:
             return True
+        if near < -MARGIN_M:  # PyBullet knows a mesh by its surface alone
+            return False
         return self._world is not None and self._world.is_free(q)
 
     def free(self, q: Float[np.ndarray, "n D"]) -> Bool[np.ndarray, "n"]:

@@ -29,7 +29,7 @@ from constraint_geodesics.scene.urdf import find_urdf
 OTHERS_OPACITY = 0.45
 """Of the robots over the first one."""
 
-_IN_SPACE = ("robot", "transforms", "tool", "cup", "spheres", "workcell")
+_IN_SPACE = ("robot", "transforms", "tool", "attached", "cup", "spheres", "workcell")
 _LIMITED = ("constraint/", "violation")
 
 Colour = tuple[int, int, int]

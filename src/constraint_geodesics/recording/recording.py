@@ -31,6 +31,7 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold, Seri
 from constraint_geodesics.recording.goal import GoalView, goal_drawings
 from constraint_geodesics.recording.shown import ENTITIES, shown_drawings
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.urdf import urdf_name
 
@@ -167,8 +168,10 @@ def record_path(
     workcell: Sequence[Shape],
     *,
     frames: int,
+    attached: Sequence[Attached] = (),
 ) -> None:
-    """Write the recording of one path at so many frames, its blueprint inside.
+    """Write the recording of one path at so many frames, its blueprint inside.  attached: what the
+    robot carries.
 
     Raises RecordingError if the path is not one of the manifold's robot or a mesh that is to be
     written is missing.
@@ -179,7 +182,7 @@ def record_path(
         *_violations(manifold, sampled.joints, path.tolerance),
     ]
     chunks = [
-        *scene_chunks(robot, workcell, sampled, meshes=path.meshes),
+        *scene_chunks(robot, workcell, sampled, meshes=path.meshes, attached=attached),
         *tool_chunks(sampled, rgb(palette.planner_colour(path.planner))),
         *(static(*drawing) for drawing in goal_drawings(robot, path.goal)),
         *(
@@ -305,22 +308,28 @@ def _interpolate(at: np.ndarray, length: np.ndarray, values: np.ndarray) -> np.n
 
 
 def scene_chunks(
-    robot: SerialRobot, workcell: Sequence[Shape], sampled: Frames, *, meshes: bool
+    robot: SerialRobot,
+    workcell: Sequence[Shape],
+    sampled: Frames,
+    *,
+    meshes: bool,
+    attached: Sequence[Attached] = (),
 ) -> Iterator[Chunk]:
-    """The robot over the timeline and the workcell, with their meshes or with the names of their
-    URDFs alone.
+    """The robot over the timeline, the workcell and what the robot carries, with their meshes or
+    with the names of their URDFs alone.
 
     Raises RecordingError if a mesh that is asked for is missing.
     """
     yield from _robot_chunks(robot, sampled)
-    for shape in workcell:
-        yield from _shape_chunks(shape)
+    shapes = [(shape, "workcell", ROOT_FRAME) for shape in workcell]
+    shapes += [(held.shape, "attached", held.link) for held in attached]
+    for shape, group, frame in shapes:
+        yield from _shape_chunks(shape, _entity(group, shape.name), frame)
     if meshes:
         yield from mesh_chunks(robot.urdf, "/robot")
-        for shape in workcell:
+        for shape, group, _ in shapes:
             if placed := shape.urdf_model():
-                entity = _entity("workcell", shape.name)
-                yield from mesh_chunks(placed.file, entity, f"{shape.name}/")
+                yield from mesh_chunks(placed.file, _entity(group, shape.name), f"{shape.name}/")
 
 
 def _robot_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
@@ -342,19 +351,21 @@ def _robot_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
             yield static(entity, joint.compute_transform(0.0, clamp=False))
 
 
-def _shape_chunks(shape: Shape) -> Iterator[Chunk]:
-    """A shape of the workcell at its place."""
-    entity, placed = _entity("workcell", shape.name), shape.urdf_model()
+def _shape_chunks(shape: Shape, entity: str, frame: str) -> Iterator[Chunk]:
+    """A shape at its place in a frame: the base's, or that of the link that carries it."""
+    placed = shape.urdf_model()
     style = {"colors": [_BOX], "fill_mode": "solid", "labels": [shape.name], "show_labels": False}
     archetype = shape.drawn(rr, style)
     if archetype is not None:
         yield static(entity, archetype)
+        if frame != ROOT_FRAME:
+            yield static(entity, rr.CoordinateFrame(frame))
     if placed is None:
         return
     prefix = f"{shape.name}/"
     tree = UrdfTree.from_file_path(placed.file, frame_prefix=prefix)
     yield static(entity, rr.AnyValues(urdf=urdf_name(placed.file), frame_prefix=prefix))
-    root = {"parent_frame": ROOT_FRAME, "child_frame": prefix + tree.root_link().name}
+    root = {"parent_frame": frame, "child_frame": prefix + tree.root_link().name}
     pose = rr.Transform3D(translation=placed.position, mat3x3=placed.rotation, **root)
     yield static(_entity("transforms", shape.name, "base"), pose)
     for joint in tree.joints():
@@ -557,7 +568,7 @@ def blueprint(panels: Any, time: Any) -> Any:
 
 def scene_panel(sampled: Frames, *more: str) -> Any:
     """The robot in its workcell with its tool's trace, and what lies below more entities."""
-    shown = ("robot", "workcell", "tool", "transforms", *more)
+    shown = ("robot", "workcell", "attached", "tool", "transforms", *more)
     return scene_view("Robot", shown, float(np.linalg.norm(sampled.tool, axis=1).max()))
 
 

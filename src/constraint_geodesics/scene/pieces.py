@@ -220,32 +220,45 @@ def read_mesh(file: Path) -> list[Float[np.ndarray, "n 3"]]:
 
 
 def _read_obj(file: Path) -> list[Float[np.ndarray, "n 3"]]:
+    try:
+        points, objects = parse_obj(file.read_text(errors="replace"))
+    except ValueError as error:
+        raise ValueError(f"{file.name}: {error}") from None
+    used = [sorted({number for face in faces for number in face}) for faces in objects]
+    return [points[own] for own in used if own]
+
+
+def parse_obj(text: str) -> tuple[Float[np.ndarray, "n 3"], list[list[list[int]]]]:
+    """Corners of an OBJ file, and the faces of each of its objects as numbers of corners.  Raises
+    ValueError for a face with a corner that is not there.
+    """
     corners: list[list[float]] = []
-    objects: list[set[int]] = [set()]
-    for line in file.read_text(errors="replace").splitlines():
+    objects: list[list[list[int]]] = [[]]
+    for line in text.splitlines():
         kind, *words = line.split() or [""]
         if kind in ("o", "g") and words:  # without a name PyBullet goes on with the same one
-            objects.append(set())
+            objects.append([])
         elif kind == "v":
             corners.append([float(x) for x in words[:3]])
         elif kind == "f":
             # numbers count from 1, negative ones from the last corner backwards
             numbers = [int(word.split("/")[0]) for word in words]
-            objects[-1].update(n - 1 if n > 0 else len(corners) + n for n in numbers)
+            objects[-1].append([n - 1 if n > 0 else len(corners) + n for n in numbers])
     points = np.array(corners, float).reshape(-1, 3)
-    if not all(0 <= number < len(points) for used in objects for number in used):
-        raise ValueError(f"{file.name} has a face with a corner that is not there")
-    return [points[sorted(used)] for used in objects if used]
+    if not all(0 <= n < len(points) for faces in objects for face in faces for n in face):
+        raise ValueError("a face with a corner that is not there")
+    return points, objects
 
 
 def _read_stl(file: Path) -> list[Float[np.ndarray, "n 3"]]:
-    if is_binary_stl(file):
-        face = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-        faces = np.fromfile(file, face, offset=_STL_HEAD)
-        points = faces["corners"].reshape(-1, 3).astype(float)
-    else:
-        points = _stl_corners(file)
+    points = stl_triangles(file).reshape(-1, 3) if is_binary_stl(file) else _stl_corners(file)
     return [np.unique(points, axis=0)] if len(points) else []
+
+
+def stl_triangles(file: Path) -> Float[np.ndarray, "n 3 3"]:
+    """The corners of each triangle of a binary STL file."""
+    face = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    return np.fromfile(file, face, offset=_STL_HEAD)["corners"].astype(float)
 
 
 def is_binary_stl(file: Path) -> bool:

@@ -63,17 +63,17 @@ class PlanningScene:
         """Put shapes around the robot, in the base frame, beside what is there.  Several at once
         cost little more than one.
         """
-        self._change(self._now.adding(*shapes))
+        self.become(self._now.adding(*shapes))
 
     def remove(self, *names: str) -> None:
         """Take shapes away."""
-        self._change(self._now.removing(*names))
+        self.become(self._now.removing(*names))
 
     def move(self, name: str, pose: Any) -> None:
         """Put a shape's own frame, that about its middle or of its file, elsewhere: in the base
         frame, or for what is attached in its link's.  pose: a Pose, or a Placement.
         """
-        self._change(self._now.moving(name, Placement.of(pose)))
+        self.become(self._now.moving(name, Placement.of(pose)))
 
     def attach(self, shape: Shape | str, link: str, touching: Sequence[str] = ()) -> None:
         """Let a link carry a shape, placed in the link's frame; a shape around the robot of that
@@ -85,7 +85,7 @@ class PlanningScene:
         held = Attached(shape, link, tuple(touching))
         changed = self._now.attaching(held)
         self._require_known(changed, *touching)
-        self._change(changed)
+        self.become(changed)
 
     def detach(self, name: str, at: Float[np.ndarray, "D"] | None = None) -> None:
         """Carry a shape no longer.  at: the configuration [rad] at which it is let go: it stays
@@ -96,31 +96,27 @@ class PlanningScene:
         if at is not None and held is not None:
             pose = self._link_pose(np.asarray(at, float), held.link) @ held.shape.at.matrix
             changed = changed.adding(held.shape.placed(Placement.of_matrix(pose)))
-        self._change(changed)
+        self.become(changed)
 
     def allow(self, first: str, second: str) -> None:
         """Let two bodies touch: shapes, attached or not, or links, by their names."""
         self._require_known(self._now, first, second)
-        self._change(self._now.allowing(first, second))
+        self.become(self._now.allowing(first, second))
 
     @contextmanager
     def including(self, shapes: Sequence[Shape]) -> Iterator[None]:
         """With more shapes for a while."""
         before = self._now
         if shapes:
-            self._change(before.adding(*shapes))
+            self.become(before.adding(*shapes))
         try:
             yield
         finally:
             if shapes:
-                self._change(before)
+                self.become(before)
 
-    def _require_known(self, scene: Scene, *names: str) -> None:
-        for name in names:
-            if name not in self._links and name not in scene.names:
-                raise SceneError(f"{name!r} is no link of the robot, nor a shape of the scene")
-
-    def _change(self, scene: Scene) -> None:
+    def become(self, scene: Scene) -> None:
+        """Take all of another scene of the same robot."""
         shapes = (*scene.workcell, *(one.shape for one in scene.attached))
         named = [link for shape in shapes for link in shape.exempt_links]
         named += [one.link for one in scene.attached]
@@ -132,3 +128,8 @@ class PlanningScene:
                 raise SceneError(f"{shape.name!r} is a link of the robot: give the shape another")
         self._follow(scene)
         self._now = scene
+
+    def _require_known(self, scene: Scene, *names: str) -> None:
+        for name in names:
+            if name not in self._links and name not in scene.names:
+                raise SceneError(f"{name!r} is no link of the robot, nor a shape of the scene")
