@@ -33,7 +33,7 @@ class PlanningScene:
         link_pose: LinkPoses,
     ) -> None:
         self._now, self._follow = scene, follow
-        self._links, self._link_pose = links, link_pose
+        self.links, self._link_pose = links, link_pose
 
     @property
     def now(self) -> Scene:
@@ -58,6 +58,12 @@ class PlanningScene:
     def world(self) -> World:
         """A fresh PyBullet world of the scene as it is now."""
         return self._now.world()
+
+    def link_pose(self, q: Float[np.ndarray, "D"], link: str) -> Float[np.ndarray, "4 4"]:
+        """Of a link's frame in the base frame at a configuration [rad]."""
+        if link not in self.links:
+            raise SceneError(f"no link is called {link!r}: {', '.join(self.links)}")
+        return self._link_pose(np.asarray(q, float), link)
 
     def add(self, *shapes: Shape) -> None:
         """Put shapes around the robot, in the base frame, beside what is there.  Several at once
@@ -94,7 +100,7 @@ class PlanningScene:
         held = next((one for one in self._now.attached if one.name == name), None)
         changed = self._now.detaching(name)
         if at is not None and held is not None:
-            pose = self._link_pose(np.asarray(at, float), held.link) @ held.shape.at.matrix
+            pose = self.link_pose(at, held.link) @ held.shape.at.matrix
             changed = changed.adding(held.shape.placed(Placement.of_matrix(pose)))
         self.become(changed)
 
@@ -121,15 +127,15 @@ class PlanningScene:
         named = [link for shape in shapes for link in shape.exempt_links]
         named += [one.link for one in scene.attached]
         for link in named:
-            if link not in self._links:
-                raise SceneError(f"no link is called {link!r}: {', '.join(self._links)}")
+            if link not in self.links:
+                raise SceneError(f"no link is called {link!r}: {', '.join(self.links)}")
         for shape in shapes:
-            if shape.name in self._links:
+            if shape.name in self.links:
                 raise SceneError(f"{shape.name!r} is a link of the robot: give the shape another")
         self._follow(scene)
         self._now = scene
 
     def _require_known(self, scene: Scene, *names: str) -> None:
         for name in names:
-            if name not in self._links and name not in scene.names:
+            if name not in self.links and name not in scene.names:
                 raise SceneError(f"{name!r} is no link of the robot, nor a shape of the scene")
