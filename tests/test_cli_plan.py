@@ -360,3 +360,46 @@ def test_what_bench_does_not_know_is_one_line(monkeypatch, capfd, tmp_path, word
     assert code == 1
     assert said in error_line(err)
     assert not (tmp_path / "bench").exists()
+
+
+SCENE = "shapes:\n  ball: {kind: sphere, centre_m: [0.2, 0.6, 0.9], radius_m: 0.05}\n"
+CUP = "cup: {link: link6, kind: cylinder, pose: {}, length_m: 0.05, radius_m: 0.02}\n"
+
+
+def test_a_scene_and_what_is_carried_come_from_files(command, query, tmp_path) -> None:
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    (tmp_path / "cup.yaml").write_text(CUP)
+    files = ("--scene", str(tmp_path / "scene.yaml"), "--attach", str(tmp_path / "cup.yaml"))
+    csv, rrd = tmp_path / "path.csv", tmp_path / "path.rrd"
+    code, out, _ = command(*asked(*query), *files, "--out", str(csv), "--record", str(rrd))
+    assert (code, out.startswith("solved: ")) == (0, True)
+    entities = read_recording(rrd).entity_paths
+    assert {"/workcell/ball", "/attached/cup"} <= set(entities)
+    code, out, _ = command("check", str(csv), *files, "--json")
+    assert code == 0
+    assert "cup on link6" in strict(out)["rests_on"]
+    (tmp_path / "scene.yaml").write_text(SCENE.replace("ball", "table"))
+    code, out, err = command(*asked(*query), *files)
+    assert (code, out) == (2, "")
+    assert "'table' already" in error_line(err)
+
+
+def test_a_request_of_moveit_says_it_all(command, query, tmp_path) -> None:
+    names = [f"joint{k}" for k in range(1, 7)]
+    start, goal = ([float(x) for x in ends.split()] for ends in query)
+    joints = [f"{{joint_name: {n}, position: {x}}}" for n, x in zip(names, goal, strict=True)]
+    state = f"joint_state: {{name: [{', '.join(names)}], position: {start}}}"
+    (tmp_path / "request.yaml").write_text(
+        f"goal_constraints:\n- joint_constraints: [{', '.join(joints)}]\n"
+    )
+    (tmp_path / "scene.yaml").write_text(f"robot_state: {{{state}}}\n")
+    request = ("--moveit-request", str(tmp_path / "request.yaml"))
+    scene = ("--moveit-scene", str(tmp_path / "scene.yaml"))
+    code, out, _ = command("plan", *request, *scene)
+    assert (code, out.startswith("solved: ")) == (0, True)
+    code, out, err = command("plan", *request)
+    assert (code, out) == (2, "")
+    assert "start_state: has no value for joint1" in error_line(err)
+    code, _, err = command(*asked(*query), *request)
+    assert code == 2
+    assert "goes without --start" in error_line(err)

@@ -18,6 +18,7 @@ from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
 if TYPE_CHECKING:
     from constraint_geodesics.certification.certifier import Certificate
     from constraint_geodesics.constraints.constraint import Constraint, Pose
+    from constraint_geodesics.goals.goal import Wanted
     from constraint_geodesics.planner import Planner
 
 NO_PATH = 3
@@ -114,18 +115,42 @@ class Arm(NamedTuple):
         return Planner.from_urdf(self.urdf, self.tool_link, self.srdf, tool, hold=held)
 
 
+class Ends(NamedTuple):
+    """What to plan, as options say it."""
+
+    start: str | None
+    constraint: str | None
+    goal: str | None
+    goal_pose: str | None
+    goal_free: str | None
+    goal_tolerance: str | None
+
+    def asked(self) -> "tuple[list[float], Wanted, str]":
+        """Start, goal and the constraint's name.  Raises PlannerError where they are not all
+        given.
+        """
+        from constraint_geodesics.planner import PlannerError
+
+        if self.start is None or self.constraint is None:
+            missing = "--start" if self.start is None else "--constraint"
+            raise PlannerError(f"{missing} is missing: plan needs --start, --goal and --constraint")
+        start = _joints(self.start, "--start")
+        goal = _goal(self.goal, self.goal_pose, self.goal_free, self.goal_tolerance)
+        return start, goal, self.constraint
+
+
 def plan(
     start: Annotated[
-        str, typer.Option(help='Start configuration: the joints in rad, as in "0.1 -0.5 …".')
-    ],
+        str | None, typer.Option(help='Start configuration: the joints in rad, as in "0.1 -0.5 …".')
+    ] = None,
     constraint: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="A name that `geodesics constraints` lists, or a file that `geodesics identify` "
             "wrote; with --urdf free, or level: the tilt that the tool has at the start.",
             shell_complete=completion.planned_constraints,
         ),
-    ],
+    ] = None,
     goal: Annotated[str | None, typer.Option(help="Goal configuration: the joints in rad.")] = None,
     goal_pose: Annotated[
         str | None, typer.Option(help=f"Or a pose of the tool, as {POSE}, base frame.")
@@ -158,6 +183,13 @@ def plan(
     srdf: Srdf = None,
     scene: SceneFiles = None,
     attach: AttachFiles = None,
+    moveit_scene: Annotated[
+        Path | None, typer.Option(help="A planning scene of MoveIt to add, as YAML.")
+    ] = None,
+    moveit_request: Annotated[
+        Path | None,
+        typer.Option(help="A motion request of MoveIt, as YAML: start, goal and constraint."),
+    ] = None,
     budget: Annotated[
         float | None,
         typer.Option(help="Look for shorter paths for about so many seconds; by default do not."),
@@ -194,6 +226,7 @@ def plan(
         DemonstrationError,
         demonstrations_from,
     )
+    from constraint_geodesics.moveit import MoveitError, add_moveit_scene, read_moveit_request
     from constraint_geodesics.planner import PlannerError, SceneError
     from constraint_geodesics.robot.kinematics import RobotError
 
@@ -203,16 +236,30 @@ def plan(
     try:
         if demonstrations is not None and record is None:
             raise PlannerError("--demonstrations is drawn in what --record names: give it, too")
-        first = _joints(start, "--start")
-        wanted = _goal(goal, goal_pose, goal_free, goal_tolerance)
+        ends = Ends(start, constraint, goal, goal_pose, goal_free, goal_tolerance)
+        asked = None if moveit_request is not None else ends.asked()
+        if moveit_request is not None and any(ends):
+            raise PlannerError("--moveit-request goes without --start, --constraint and --goal…")
         with loading(), arm.open(method) as loaded:
-            shown = None
+            shown, state = None, None
             if demonstrations is not None:
                 shown, _ = demonstrations_from(demonstrations, loaded.robot)
+            if moveit_scene is not None:
+                state = add_moveit_scene(moveit_scene, loaded.scene)
+            if moveit_request is not None:
+                request = read_moveit_request(moveit_request, loaded, state)
+                velocity_scale *= request.velocity_scale
+                acceleration_scale *= request.acceleration_scale
+                first, wanted = request.start, request.goals
+                kept: str | Constraint = request.constraint
+            else:
+                assert asked is not None
+                first, wanted = asked[0], [asked[1]]
+                kept = _constraint(asked[2], loaded)
             path = loaded.plan(
                 first,
                 wanted,
-                _constraint(constraint, loaded),
+                kept,
                 budget_s=budget,
                 snap=snap,
                 velocity_scale=velocity_scale,
@@ -220,7 +267,8 @@ def plan(
             )
             source = loaded.source
     except (
-        *(BundleError, ConstraintError, DemonstrationError, PlannerError, RobotError, SceneError),
+        *(BundleError, ConstraintError, DemonstrationError, MoveitError, PlannerError),
+        *(RobotError, SceneError),
     ) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
     print(f"planner: {source}", file=sys.stderr)

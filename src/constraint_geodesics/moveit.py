@@ -1,0 +1,415 @@
+"""MoveIt's planning scenes and motion requests, as YAML of its messages moveit_msgs/PlanningScene
+and moveit_msgs/MotionPlanRequest.
+
+What has no counterpart here is refused by its name, never left out: cones, planes, octomaps with
+something in them, other path constraints than an orientation's, links other than the tool's.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from constraint_geodesics.constraints.constraint import Constraint, Pose
+from constraint_geodesics.errors import ParamsError
+from constraint_geodesics.goals.goal import Wanted
+from constraint_geodesics.goals.region import GoalRegion
+from constraint_geodesics.params import read_yaml
+from constraint_geodesics.planner import Planner
+from constraint_geodesics.robot.arm_file import write_file
+from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.arm import arms_folder
+from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.cylinder import Cylinder
+from constraint_geodesics.scene.mesh import Mesh
+from constraint_geodesics.scene.planning_scene import PlanningScene
+from constraint_geodesics.scene.shape import Placement, Shape
+from constraint_geodesics.scene.sphere import Sphere
+
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+_KINDS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
+"""Of shape_msgs/SolidPrimitive, whose names some files write in place of the numbers."""
+_WORLD = ("", "world")
+"""Names of the base frame beside those of its links."""
+_SAME = 1e-9
+_ALONG = 1e-6
+"""What directions of axes may differ by."""
+_FREE_RAD = math.pi - 1e-6
+"""A tolerance from which on an angle is free."""
+
+
+class MoveitError(ValueError):
+    """A file that is none of MoveIt's, or says what can't be kept; one line with the entry."""
+
+
+@dataclass(frozen=True)
+class MoveitRequest:
+    """What `Planner.plan` takes, as a request says it."""
+
+    start: list[float]
+    goals: list[Wanted]
+    constraint: Constraint
+    velocity_scale: float = 1.0
+    acceleration_scale: float = 1.0
+
+
+def add_moveit_scene(file: Path, scene: PlanningScene) -> dict[str, float]:
+    """Add a planning scene's objects, attached ones and allowed collisions to a planner's scene,
+    all or nothing; returns the values of joints [rad or m] that it names.
+
+    Raises MoveitError, SceneError or RobotError, one line.
+    """
+    raw = _read(file)
+    try:
+        world, state = _entry(raw, "world", {}), _entry(raw, "robot_state", {})
+        if _entry(_entry(world, "octomap", {}), "octomap", {}).get("data"):
+            raise MoveitError("world.octomap: give its points as a point_cloud in a scene's file")
+        joints = _joint_state(_entry(state, "joint_state", {}), "robot_state")
+        named = dict[str, list[str]]()
+        now, q = scene.now, _configuration(joints, scene.robot)
+        for number, own in enumerate(_list(world, "collision_objects")):
+            where = f"world.collision_objects[{number}]"
+            shapes = _shapes(own, where, lambda frame: _fixed(scene, frame))
+            named[str(own["id"])] = [shape.name for shape in shapes]
+            now = now.adding(*shapes)
+        for number, own in enumerate(_list(state, "attached_collision_objects")):
+            where = f"robot_state.attached_collision_objects[{number}]"
+            for held in _held(own, where, scene, q):
+                named.setdefault(str(own["object"]["id"]), []).append(held.name)
+                now = now.attaching(held)
+        known = {*scene.links, *named}
+        for first, second in _allowed(_entry(raw, "allowed_collision_matrix", {}), known):
+            for a in named.get(first, [first]):
+                for b in named.get(second, [second]):
+                    now = now.allowing(a, b)
+    except MoveitError as error:
+        raise MoveitError(f"{file}: {error}") from None
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        if type(error).__module__.startswith("constraint_geodesics"):
+            raise
+        raise MoveitError(f"{file}: no planning scene of MoveIt: {_said(error)}") from None
+    scene.become(now)
+    return joints
+
+
+def read_moveit_request(
+    file: Path, planner: Planner, state: Mapping[str, float] | None = None
+) -> MoveitRequest:
+    """A motion request for a planner's arm.  state: of joints, where the request names none.
+
+    Raises MoveitError, one line.
+    """
+    raw, robot = _read(file), planner.robot
+    try:
+        given = _joint_state(
+            _entry(_entry(raw, "start_state", {}), "joint_state", {}), "start_state"
+        )
+        start = _named_joints({**(state or {}), **given}, robot, "start_state")
+        goals = [
+            _goal(own, robot, f"goal_constraints[{number}]")
+            for number, own in enumerate(_list(raw, "goal_constraints"))
+        ]
+        if not goals:
+            raise MoveitError("goal_constraints: there is none")
+        constraint = _path_constraint(_entry(raw, "path_constraints", {}), robot)
+        scales = [  # 0 means the whole, as in MoveIt
+            float(raw.get(f"max_{what}_scaling_factor") or 1.0)
+            for what in ("velocity", "acceleration")
+        ]
+    except MoveitError as error:
+        raise MoveitError(f"{file}: {error}") from None
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise MoveitError(f"{file}: no motion request of MoveIt: {_said(error)}") from None
+    return MoveitRequest(start, goals, constraint, *scales)
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        raw = read_yaml(file)
+    except ParamsError as error:
+        raise MoveitError(str(error)) from None
+    if not isinstance(raw, dict):
+        raise MoveitError(f"{file}: nothing of MoveIt: must be entries by name")
+    return raw
+
+
+def _said(error: Exception) -> str:
+    return f"{error} is missing" if isinstance(error, KeyError) else str(error).splitlines()[0]
+
+
+def _entry(raw: Any, name: str, default: Any) -> Any:
+    found = raw.get(name)
+    return default if found is None else found
+
+
+def _list(raw: Any, name: str) -> list[Any]:
+    found = _entry(raw, name, [])
+    if not isinstance(found, list):
+        raise MoveitError(f"{name}: must be a list")
+    return found
+
+
+def _numbers(raw: Any, names: str) -> list[float]:
+    """Of a dictionary, or of a list in that order."""
+    found = [raw[name] for name in names] if isinstance(raw, dict) else list(raw)
+    values = [float(value) for value in found]
+    if len(values) != len(names) or not all(map(math.isfinite, values)):
+        raise MoveitError(f"{raw}: must be {len(names)} finite numbers")
+    return values
+
+
+def _turn(raw: Any) -> Float[np.ndarray, "3 3"]:
+    quaternion = np.array(_numbers(raw, "xyzw"))
+    if not np.linalg.norm(quaternion) > _SAME:
+        raise MoveitError(f"{raw}: no orientation: all four numbers are 0")
+    found: Float[np.ndarray, "3 3"] = Rotation.from_quat(quaternion).as_matrix()
+    return found
+
+
+def _pose(raw: Any) -> Float[np.ndarray, "4 4"]:
+    pose = np.eye(4)
+    if raw:
+        pose[:3, :3], pose[:3, 3] = _turn(raw["orientation"]), _numbers(raw["position"], "xyz")
+    return pose
+
+
+def _joint_state(raw: Any, where: str) -> dict[str, float]:
+    names, values = _list(raw, "name"), _list(raw, "position")
+    if len(names) != len(values):
+        raise MoveitError(f"{where}.joint_state: {len(names)} names, {len(values)} positions")
+    return {str(name): float(value) for name, value in zip(names, values, strict=True)}
+
+
+def _configuration(joints: Mapping[str, float], robot: SerialRobot) -> np.ndarray | None:
+    """The arm's, if all its joints are named."""
+    if not set(robot.joint_names) <= joints.keys():
+        return None
+    return np.array([joints[name] for name in robot.joint_names])
+
+
+def _named_joints(joints: Mapping[str, float], robot: SerialRobot, where: str) -> list[float]:
+    if missing := [name for name in robot.joint_names if name not in joints]:
+        raise MoveitError(f"{where}: has no value for {', '.join(missing)}")
+    return [joints[name] for name in robot.joint_names]
+
+
+def _fixed(scene: PlanningScene, frame: str) -> Float[np.ndarray, "4 4"]:
+    """The pose of a frame that does not move."""
+    if frame not in scene.links:
+        if frame in _WORLD:
+            return np.eye(4)
+        raise MoveitError(f"frame {frame!r}: is no link of the robot: write poses in its base")
+    robot = scene.robot
+    poses = [scene.link_pose(q, frame) for q in robot.sample(2, np.random.default_rng(0))]
+    if np.abs(poses[0] - poses[1]).max() > _SAME:
+        raise MoveitError(f"frame {frame!r}: moves with the arm: write poses in its base")
+    return poses[0]
+
+
+def _shapes(
+    raw: Any, where: str, frame_of: Callable[[str], Float[np.ndarray, "4 4"]]
+) -> list[Shape]:
+    """The shapes of a collision object."""
+    name = str(raw["id"])
+    frame = str(_entry(_entry(raw, "header", {}), "frame_id", ""))
+    pose = frame_of(frame) @ _pose(raw.get("pose"))
+    if _list(raw, "planes"):
+        raise MoveitError(f"{where}: {name!r} has a plane, which has no end: write it as a box")
+    found: list[Shape] = []
+
+    def named() -> str:
+        return f"{name}_{len(found) + 1}" if found else name
+
+    for own, place in _with_poses(raw, "primitives", "primitive_poses", where):
+        at = Placement.of_matrix(pose @ _pose(place))
+        found.append(_primitive(own, named(), at, where))
+    for own, place in _with_poses(raw, "meshes", "mesh_poses", where):
+        at = Placement.of_matrix(pose @ _pose(place))
+        found.append(Mesh(named(), _mesh_file(own), at))
+    if not found:
+        raise MoveitError(f"{where}: {name!r} has neither primitives nor meshes")
+    return found
+
+
+def _with_poses(raw: Any, shapes: str, poses: str, where: str) -> Iterator[tuple[Any, Any]]:
+    own, places = _list(raw, shapes), _list(raw, poses)
+    if len(own) != len(places):
+        raise MoveitError(f"{where}: {len(own)} {shapes}, {len(places)} {poses}")
+    return zip(own, places, strict=True)
+
+
+def _primitive(raw: Any, name: str, at: Placement, where: str) -> Shape:
+    kind, sizes = raw["type"], [float(x) for x in raw["dimensions"]]
+    kind = _KINDS.get(kind, str(kind)) if isinstance(kind, int) else str(kind).lower()
+    counts = {"box": 3, "sphere": 1, "cylinder": 2}
+    if kind not in counts:
+        raise MoveitError(f"{where}: {name!r} is a {kind}: must be one of {', '.join(counts)}")
+    if len(sizes) < counts[kind] or not all(0.0 < x < math.inf for x in sizes[: counts[kind]]):
+        what = f"{counts[kind]} positive numbers"
+        raise MoveitError(f"{where}: {name!r}: dimensions {sizes}: must be {what}")
+    if kind == "box":
+        return Box(name, at.position_m, (sizes[0], sizes[1], sizes[2]), rpy_rad=at.rpy_rad)
+    if kind == "sphere":
+        return Sphere(name, at.position_m, sizes[0])
+    return Cylinder(name, at, sizes[0], sizes[1])
+
+
+def _mesh_file(raw: Any) -> Path:
+    """An inline mesh as a file of the user's cache, named by its content."""
+    lines = ["v " + " ".join(map(repr, _numbers(own, "xyz"))) for own in raw["vertices"]]
+    for own in raw["triangles"]:
+        indices = own["vertex_indices"] if isinstance(own, dict) else own
+        lines.append("f " + " ".join(str(int(k) + 1) for k in indices))
+    text = "\n".join(lines) + "\n"
+    file = arms_folder() / f"mesh-{sha256(text.encode()).hexdigest()[:16]}.obj"
+    if not file.is_file():
+        write_file(file, text)
+    return file
+
+
+def _held(raw: Any, where: str, scene: PlanningScene, q: np.ndarray | None) -> Iterable[Attached]:
+    """An attached object's shapes, in their link's frame."""
+    link = str(raw["link_name"])
+
+    def into_link(frame: str) -> Float[np.ndarray, "4 4"]:
+        if frame == link:
+            return np.eye(4)
+        if q is None:
+            raise MoveitError(f"{where}: is in the frame {frame!r}, and no joint_state says where")
+        there = scene.link_pose(q, frame) if frame in scene.links else _fixed(scene, frame)
+        own: Float[np.ndarray, "4 4"] = np.linalg.inv(scene.link_pose(q, link)) @ there
+        return own
+
+    shapes = _shapes(raw["object"], where, into_link)
+    names = [shape.name for shape in shapes]
+    touching = [str(other) for other in _list(raw, "touch_links")]
+    return [Attached(shape, link, (*touching, *_others(names, shape.name))) for shape in shapes]
+
+
+def _others(names: Sequence[str], own: str) -> list[str]:
+    """The other parts of one object, which may touch it."""
+    return [name for name in names if name != own]
+
+
+def _allowed(raw: Any, known: set[str]) -> Iterator[tuple[str, str]]:
+    """Pairs of what is known that may touch."""
+    names, rows = [str(name) for name in _list(raw, "entry_names")], _list(raw, "entry_values")
+    if len(names) != len(rows):
+        raise MoveitError(f"allowed_collision_matrix: {len(names)} names, {len(rows)} rows")
+    said = dict[frozenset[str], bool]()
+    for name, row in zip(names, rows, strict=True):
+        enabled = row["enabled"] if isinstance(row, dict) else row
+        if len(enabled) != len(names):
+            raise MoveitError(f"allowed_collision_matrix: the row of {name!r} has not {len(names)}")
+        for other, value in zip(names, enabled, strict=True):
+            if other != name:
+                said[frozenset((name, other))] = bool(value)
+    defaults = zip(
+        _list(raw, "default_entry_names"), _list(raw, "default_entry_values"), strict=False
+    )
+    for name, value in defaults:
+        for other in known - {str(name)}:
+            said.setdefault(frozenset((str(name), other)), bool(value))
+    for pair, value in sorted(said.items(), key=lambda one: sorted(one[0])):
+        if value and pair <= known:
+            first, second = sorted(pair)
+            yield first, second
+
+
+def _goal(raw: Any, robot: SerialRobot, where: str) -> Wanted:
+    """Joint values, or a pose of the tool with what may be off."""
+    if joints := _list(raw, "joint_constraints"):
+        values = {str(own["joint_name"]): float(own["position"]) for own in joints}
+        return _named_joints(values, robot, where)
+    positions, turns = _list(raw, "position_constraints"), _list(raw, "orientation_constraints")
+    if len(positions) != 1 or len(turns) > 1 or _list(raw, "visibility_constraints"):
+        raise MoveitError(f"{where}: must be joints, or one position and at most one orientation")
+    own = positions[0]
+    _require_tool(own, robot, where)
+    if any(_numbers(_entry(own, "target_point_offset", [0, 0, 0]), "xyz")):
+        raise MoveitError(f"{where}: target_point_offset: give the tool a frame of its own")
+    region = own["constraint_region"]
+    if len(_list(region, "primitives")) != 1 or _list(region, "meshes"):
+        raise MoveitError(f"{where}: constraint_region: must be one box or sphere")
+    centre = _pose(region["primitive_poses"][0])
+    shape = _primitive(region["primitives"][0], "region", Placement.of_matrix(centre), where)
+    if isinstance(shape, Sphere):
+        widths = [shape.radius_m / math.sqrt(3.0)] * 3
+    elif isinstance(shape, Box):
+        widths = _along_base(np.multiply(0.5, shape.size_m), centre[:3, :3])
+    else:
+        raise MoveitError(f"{where}: constraint_region: must be one box or sphere")
+    turn, angles = np.eye(3), [math.inf] * 3
+    if turns:
+        _require_tool(turns[0], robot, where)
+        turn, angles = _orientation(turns[0], where)
+    free = [AXES[3 + k] for k in range(3) if angles[k] == math.inf]
+    tolerance = (*widths, *(0.0 if angle == math.inf else angle for angle in angles))
+    return GoalRegion(Pose(centre[:3, 3], turn), free, tolerance)
+
+
+def _along_base(half: Float[np.ndarray, "3"], turn: Float[np.ndarray, "3 3"]) -> list[float]:
+    """Half edges along the base's axes of a box within a turned one: those of the same box where it
+    is turned by right angles, else of the largest cube in its ball.
+    """
+    if np.abs(np.abs(turn).max(axis=0) - 1.0).max() < _ALONG:
+        own: list[float] = (np.abs(turn.round()) @ half).tolist()
+        return own
+    return [float(half.min()) / math.sqrt(3.0)] * 3
+
+
+def _orientation(raw: Any, where: str) -> tuple[Float[np.ndarray, "3 3"], list[float]]:
+    """A rotation, and how far it may be off about the base's axes [rad]: inf for an axis that is
+    free.  MoveIt's are about the axes of the rotation itself: what is not along one of the base's
+    gets the least of them all.
+    """
+    turn = _turn(raw["orientation"])
+    given = [float(raw[f"absolute_{axis}_axis_tolerance"]) for axis in "xyz"]
+    if not all(value >= 0.0 for value in given):
+        raise MoveitError(f"{where}: tolerances of an orientation are {given}: must be 0 or more")
+    free = [value >= _FREE_RAD for value in given]
+    if all(free):
+        return turn, [math.inf] * 3
+    held = [value for value, is_free in zip(given, free, strict=True) if not is_free]
+    found = [min(held)] * 3
+    for axis in range(3):
+        along = np.abs(turn[:, axis])
+        base = int(along.argmax())
+        if abs(along[base] - 1.0) < _ALONG:
+            found[base] = math.inf if free[axis] else given[axis]
+        elif free[axis]:
+            raise MoveitError(
+                f"{where}: the {'xyz'[axis]} axis is free, and is along no axis of the base: no "
+                "constraint here says that"
+            )
+    return turn, found
+
+
+def _path_constraint(raw: Any, robot: SerialRobot) -> Constraint:
+    """Nothing, or the orientation that is held."""
+    where = "path_constraints"
+    for other in ("joint_constraints", "position_constraints", "visibility_constraints"):
+        if _list(raw, other):
+            raise MoveitError(f"{where}.{other}: must be one of orientation alone")
+    turns = _list(raw, "orientation_constraints")
+    if not turns:
+        return Constraint((0,) * 6)
+    if len(turns) > 1:
+        raise MoveitError(f"{where}: {len(turns)} orientations: must be one")
+    _require_tool(turns[0], robot, where)
+    turn, angles = _orientation(turns[0], where)
+    held = tuple(int(angle != math.inf) for angle in angles)
+    widths = (0.0, 0.0, 0.0, *(angle if angle != math.inf else 0.0 for angle in angles))
+    return Constraint((0, 0, 0, *held), widths, Pose(np.zeros(3), turn))
+
+
+def _require_tool(raw: Any, robot: SerialRobot, where: str) -> None:
+    if (link := str(_entry(raw, "link_name", ""))) not in ("", robot.tool_link):
+        raise MoveitError(f"{where}: of link {link!r}: must be of the tool's, {robot.tool_link!r}")

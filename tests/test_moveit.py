@@ -1,0 +1,309 @@
+"""MoveIt's planning scenes and motion requests."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+from scipy.spatial.transform import Rotation
+
+from constraint_geodesics.goals.region import GoalRegion
+from constraint_geodesics.moveit import MoveitError, add_moveit_scene, read_moveit_request
+from constraint_geodesics.planner import Planner, SceneError
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.cylinder import Cylinder
+from constraint_geodesics.scene.mesh import Mesh
+from constraint_geodesics.scene.shape import Placement
+from constraint_geodesics.scene.sphere import Sphere
+from tests.planner_fixtures import pairs_of
+
+UPRIGHT = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+QUARTER = Rotation.from_euler("z", 90, degrees=True)
+
+
+def pose(x: float, y: float, z: float, turn: Rotation | None = None) -> dict[str, Any]:
+    own = UPRIGHT if turn is None else dict(zip("xyzw", turn.as_quat().tolist(), strict=True))
+    return {"position": {"x": x, "y": y, "z": z}, "orientation": own}
+
+
+def an_object(name: str, kind: Any, sizes: list[float], at: dict[str, Any], **more: Any) -> dict:
+    primitive = {"type": kind, "dimensions": sizes}
+    return {
+        "id": name,
+        "header": {"frame_id": more.pop("frame", "world")},
+        "primitives": [primitive],
+        "primitive_poses": [at],
+        **more,
+    }
+
+
+def a_scene(robot_names: tuple[str, ...]) -> dict[str, Any]:
+    lists = {"position": [0.4, 0.3, 0.2], "orientation": [0.0, 0.0, 0.0, 1.0]}
+    tetrahedron = {
+        "vertices": [
+            pose(*at)["position"] for at in ((0, 0, 0), (0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1))
+        ],
+        "triangles": [{"vertex_indices": f} for f in ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))],
+    }
+    names = ["crate", "link6", "cup", "elsewhere"]
+    return {
+        "name": "scene",
+        "robot_state": {
+            "joint_state": {"name": list(robot_names), "position": [0.1] * len(robot_names)},
+            "attached_collision_objects": [
+                {
+                    "link_name": "link6",
+                    "touch_links": ["link5"],
+                    "object": an_object("cup", 3, [0.1, 0.03], pose(0, 0, 0.07), frame="link6"),
+                }
+            ],
+        },
+        "world": {
+            "octomap": {"octomap": {"data": []}},
+            "collision_objects": [
+                an_object(
+                    "crate", 1, [0.1, 0.2, 0.3], pose(0.1, 0, 0), pose=pose(0.4, 0.2, 0.1, QUARTER)
+                ),
+                an_object("ball", "sphere", [0.05], lists),
+                an_object("can", "cylinder", [0.2, 0.03], pose(-0.4, 0.3, 0.2), frame="link_base"),
+                {
+                    "id": "wedge",
+                    "header": {"frame_id": ""},
+                    "meshes": [tetrahedron],
+                    "mesh_poses": [pose(0.5, -0.5, 0.1)],
+                },
+            ],
+        },
+        "allowed_collision_matrix": {
+            "entry_names": names,
+            "entry_values": [
+                {"enabled": [a != b and "crate" in (a, b) for b in names]} for a in names
+            ],
+            "default_entry_names": ["ball"],
+            "default_entry_values": [True],
+        },
+    }
+
+
+@pytest.fixture
+def planner() -> Iterator[Planner]:
+    with Planner.load() as loaded:
+        yield loaded
+
+
+def written(folder: Path, what: Any) -> Path:
+    file = folder / "own.yaml"
+    with file.open("w") as out:
+        YAML(typ="safe", pure=True).dump(what, out)
+    return file
+
+
+def test_objects_come_where_they_are(planner: Planner, tmp_path: Path) -> None:
+    file = written(tmp_path, a_scene(planner.robot.joint_names))
+    joints = add_moveit_scene(file, planner.scene)
+    assert list(joints) == list(planner.robot.joint_names)
+    table, crate, ball, can, wedge = planner.scene.workcell
+    assert table.name == "table"
+    assert isinstance(crate, Box)
+    # the box lies 0.1 m along the turned x axis of its object
+    np.testing.assert_allclose(crate.centre_m, (0.4, 0.3, 0.1), atol=1e-12)
+    assert crate.rpy_rad == pytest.approx((0.0, 0.0, 0.5 * math.pi))
+    assert crate.size_m == (0.1, 0.2, 0.3)
+    assert ball == Sphere("ball", (0.4, 0.3, 0.2), 0.05)
+    assert can == Cylinder("can", Placement((-0.4, 0.3, 0.2)), 0.2, 0.03)
+    assert isinstance(wedge, Mesh)
+    assert wedge.at == Placement((0.5, -0.5, 0.1))
+    assert len(wedge.pieces()) == 1
+    (cup,) = planner.scene.attached
+    assert cup.shape == Cylinder("cup", Placement((0.0, 0.0, 0.07)), 0.1, 0.03)
+    assert (cup.link, cup.touching) == ("link6", ("link5",))
+    allowed = planner.scene.now.allowed
+    assert {("crate", "link6"), ("crate", "cup")} <= allowed
+    assert ("cup", "link6") not in allowed  # the matrix says so, and its default none
+    assert ("ball", "link3") in allowed
+    assert not any("elsewhere" in pair for pair in allowed)
+
+
+def test_what_is_attached_in_the_base_frame_is_where_the_arm_has_it(
+    planner: Planner, tmp_path: Path
+) -> None:
+    raw, q = a_scene(planner.robot.joint_names), np.full(6, 0.1)
+    place = planner.scene.link_pose(q, "link6") @ Placement((0.0, 0.0, 0.07)).matrix
+    quaternion = Rotation.from_matrix(place[:3, :3])
+    cup = raw["robot_state"]["attached_collision_objects"][0]["object"]
+    cup |= {
+        "header": {"frame_id": "world"},
+        "primitive_poses": [pose(*place[:3, 3].tolist(), quaternion)],
+    }
+    add_moveit_scene(written(tmp_path, raw), planner.scene)
+    (held,) = planner.scene.attached
+    np.testing.assert_allclose(held.shape.at.matrix, Placement((0.0, 0.0, 0.07)).matrix, atol=1e-9)
+
+
+def set_in(raw: Any, path: str, value: Any) -> Any:
+    at = raw
+    *outer, last = [int(p) if p.isdigit() else p for p in path.split(".")]
+    for part in outer:
+        at = at[part]
+    at[last] = value
+    return raw
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        ("world.collision_objects.0.primitives.0.type", 4, "is a cone"),
+        ("world.collision_objects.0.primitives.0.type", "blob", "is a blob"),
+        ("world.collision_objects.0.primitives.0.dimensions", [1, -1, 1], "3 positive numbers"),
+        ("world.collision_objects.0.primitives.0.dimensions", [1], "3 positive numbers"),
+        ("world.collision_objects.0.primitive_poses", [], "1 primitives, 0 primitive_poses"),
+        ("world.collision_objects.0.primitives", [], "0 primitives, 1 primitive_poses"),
+        ("world.collision_objects.0.planes", [{"coef": [0, 0, 1, 0]}], "plane"),
+        ("world.collision_objects.0.header.frame_id", "link6", "moves with the arm"),
+        ("world.collision_objects.0.header.frame_id", "map", "no link of the robot"),
+        ("world.collision_objects.0.primitive_poses.0.orientation", [0, 0, 0, 0], "no orientation"),
+        ("world.collision_objects.0.primitive_poses.0.position", [0, 0], "3 finite numbers"),
+        ("world.collision_objects.0.id", "table", "already"),
+        ("world.collision_objects.3.meshes.0.triangles", [], "no faces"),
+        ("world.collision_objects", {"crate": 1}, "must be a list"),
+        ("world.octomap.octomap.data", [1, 2], "octomap"),
+        ("robot_state.attached_collision_objects.0.link_name", "hand", "'hand'"),
+        ("robot_state.joint_state.position", [0.0], "6 names, 1 positions"),
+        ("allowed_collision_matrix.entry_values", [], "4 names, 0 rows"),
+        ("world", 3, "no planning scene"),
+    ],
+)
+def test_what_can_not_be_kept_is_named(
+    planner: Planner, tmp_path: Path, path: str, value: Any, said: str
+) -> None:
+    before, raw = planner.scene.now, set_in(a_scene(planner.robot.joint_names), path, value)
+    with pytest.raises((MoveitError, SceneError, ValueError)) as error:
+        add_moveit_scene(written(tmp_path, raw), planner.scene)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+    assert planner.scene.now is before
+
+
+def a_request(planner: Planner) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
+    start, goal = pairs_of("free", 1, seed=1)[0]
+    names = list(planner.robot.joint_names)
+    joints = [
+        {"joint_name": name, "position": value, "tolerance_above": 0.01, "tolerance_below": 0.01}
+        for name, value in zip(names, goal.tolist(), strict=True)
+    ]
+    state = {"joint_state": {"name": names, "position": start.tolist()}}
+    raw = {
+        "group_name": "xarm6",
+        "start_state": state,
+        "goal_constraints": [{"joint_constraints": joints}],
+        "max_velocity_scaling_factor": 0.5,
+        "max_acceleration_scaling_factor": 0.0,
+        "allowed_planning_time": 5.0,
+    }
+    return raw, start, goal
+
+
+def test_a_request_is_planned(planner: Planner, tmp_path: Path) -> None:
+    raw, start, goal = a_request(planner)
+    request = read_moveit_request(written(tmp_path, raw), planner)
+    assert (request.velocity_scale, request.acceleration_scale) == (0.5, 1.0)
+    path = planner.plan(
+        request.start, request.goals, request.constraint, velocity_scale=request.velocity_scale
+    )
+    assert path.status == "solved"
+    np.testing.assert_array_equal(path.joints[[0, -1]], [start, goal])
+
+
+def test_the_state_of_a_scene_is_where_a_request_begins(planner: Planner, tmp_path: Path) -> None:
+    raw, start, _ = a_request(planner)
+    del raw["start_state"]
+    with pytest.raises(MoveitError, match="start_state: has no value for joint1"):
+        read_moveit_request(written(tmp_path, raw), planner)
+    state = dict(zip(planner.robot.joint_names, start.tolist(), strict=True))
+    assert read_moveit_request(written(tmp_path, raw), planner, state).start == start.tolist()
+
+
+def of_pose(planner: Planner, tolerances: tuple[float, float, float], turn: Rotation) -> dict:
+    link = planner.robot.tool_link
+    quaternion = dict(zip("xyzw", turn.as_quat().tolist(), strict=True))
+    widths = {f"absolute_{k}_axis_tolerance": t for k, t in zip("xyz", tolerances, strict=True)}
+    region = {
+        "primitives": [{"type": 1, "dimensions": [0.02, 0.04, 0.06]}],
+        "primitive_poses": [pose(0.4, 0.1, 0.3)],
+    }
+    return {
+        "position_constraints": [{"link_name": link, "constraint_region": region}],
+        "orientation_constraints": [{"link_name": link, "orientation": quaternion, **widths}],
+    }
+
+
+def test_a_pose_with_tolerances_is_a_region(planner: Planner, tmp_path: Path) -> None:
+    raw, _, _ = a_request(planner)
+    down = Rotation.from_euler("x", 180, degrees=True)
+    raw["goal_constraints"] = [of_pose(planner, (0.1, 0.2, math.pi), down)]
+    (goal,) = read_moveit_request(written(tmp_path, raw), planner).goals
+    assert isinstance(goal, GoalRegion)
+    assert list(goal.free) == ["yaw"]
+    np.testing.assert_allclose(goal.tolerance, (0.01, 0.02, 0.03, 0.1, 0.2, 0.0))
+    np.testing.assert_allclose(goal.pose.position, (0.4, 0.1, 0.3))
+    np.testing.assert_allclose(goal.pose.rotation, down.as_matrix(), atol=1e-12)
+
+
+def test_tolerances_about_other_axes_than_the_bases_become_the_least(
+    planner: Planner, tmp_path: Path
+) -> None:
+    """All that is kept then, MoveIt's tolerances keep too; a free axis has no such bound."""
+    raw, _, _ = a_request(planner)
+    askew = Rotation.from_euler("xyz", [0.4, 0.7, -0.3])
+    raw["goal_constraints"] = [of_pose(planner, (0.1, 0.2, 0.3), askew)]
+    (goal,) = read_moveit_request(written(tmp_path, raw), planner).goals
+    assert goal.tolerance[3:] == pytest.approx((0.1, 0.1, 0.1))
+    raw["goal_constraints"] = [of_pose(planner, (0.1, 0.2, 4.0), askew)]
+    with pytest.raises(MoveitError, match="the z axis is free"):
+        read_moveit_request(written(tmp_path, raw), planner)
+
+
+def test_a_held_orientation_is_a_constraint(planner: Planner, tmp_path: Path) -> None:
+    raw, _, _ = a_request(planner)
+    own = of_pose(planner, (0.1, 0.1, 3.2), Rotation.identity())["orientation_constraints"]
+    raw["path_constraints"] = {"orientation_constraints": own}
+    kept = read_moveit_request(written(tmp_path, raw), planner).constraint
+    assert kept.axes == (0, 0, 0, 1, 1, 0)
+    assert kept.tolerance == (0.0, 0.0, 0.0, 0.1, 0.1, 0.0)
+    assert kept.is_placed
+    raw["path_constraints"] = {"position_constraints": [{}]}
+    with pytest.raises(MoveitError, match=r"path_constraints\.position_constraints"):
+        read_moveit_request(written(tmp_path, raw), planner)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        ("goal_constraints", [], "there is none"),
+        ("goal_constraints.0.joint_constraints", [], "must be joints, or one position"),
+        ("goal_constraints.0.joint_constraints.0.joint_name", "elbow", "no value for joint1"),
+        ("goal_constraints.0.joint_constraints.0.position", "far", "could not convert"),
+        ("start_state.joint_state.name", ["joint1"], "1 names, 6 positions"),
+        ("max_velocity_scaling_factor", "fast", "could not convert"),
+    ],
+)
+def test_what_is_no_request_is_named(
+    planner: Planner, tmp_path: Path, path: str, value: Any, said: str
+) -> None:
+    raw = set_in(a_request(planner)[0], path, value)
+    with pytest.raises(MoveitError) as error:
+        read_moveit_request(written(tmp_path, raw), planner)
+    assert said in str(error.value)
+    assert str(error.value).startswith(str(tmp_path))
+
+
+def test_a_file_that_is_none_is_one_line(planner: Planner, tmp_path: Path) -> None:
+    for text, said in (("a: [", "not YAML"), ("- 1", "must be entries"), ("", "must be entries")):
+        (tmp_path / "own.yaml").write_text(text)
+        with pytest.raises(MoveitError, match=said):
+            add_moveit_scene(tmp_path / "own.yaml", planner.scene)
+        with pytest.raises(MoveitError, match=said):
+            read_moveit_request(tmp_path / "own.yaml", planner)
