@@ -109,7 +109,7 @@ def test_the_first_path_is_what_its_page_says(monkeypatch, tmp_path) -> None:
     assert names["certificate"].valid
     assert names["longer"].length_rad <= names["path"].length_rad
     assert sum(path.status == "solved" for path in names["paths"]) > 15
-    for file in ("path.csv", "path.png", "path.rrd", "with_ball/planner.json"):
+    for file in ("path.csv", "path.png", "path.rrd"):
         assert (tmp_path / file).is_file(), file
 
 
@@ -119,6 +119,16 @@ def test_any_arm_goes_to_any_goal_as_its_page_says(monkeypatch, tmp_path) -> Non
     assert names["level"].distance_rad > 0.01
     assert names["path"].length_rad <= names["trajectory"].length_rad
     assert len(names["message"]["points"]) == len(names["path"].times)
+
+
+def test_scenes_change_as_their_page_says(monkeypatch, tmp_path) -> None:
+    for file, text in zip(("scene.yaml", "cup.yaml"), blocks("scenes.md", "yaml"), strict=True):
+        (tmp_path / file).write_text(text)
+    names = run("scenes.md", monkeypatch, tmp_path)
+    assert names["path"].status == "solved"
+    assert [shape.name for shape in names["planner"].scene.workcell] == ["table", "pipe", "cup"]
+    assert not names["planner"].scene.attached
+    assert names["seen"].status in ("solved", "not_found")
 
 
 def test_the_extensions_work(monkeypatch, tmp_path) -> None:
@@ -205,7 +215,8 @@ def test_the_notebook_holds_its_pictures_and_is_small() -> None:
 
 def entries(page: str) -> list[str]:
     """Blocks that belong into params.yaml."""
-    return [block for block in blocks(page, "yaml") if not block.startswith("search:")]
+    found = [] if page == "scenes.md" else blocks(page, "yaml")  # those are scenes of their own
+    return [block for block in found if not block.startswith("search:")]
 
 
 def test_every_search_space_is_valid(tmp_path) -> None:
@@ -425,6 +436,7 @@ def test_every_parameter_that_the_text_names_exists(page) -> None:
             re.fullmatch(r"[a-z_]+(\.\w+)+", key)
             and key.split(".")[0] in PARAMS
             and not key.endswith((".py", ".json"))
+            and not key.startswith("planner.scene")  # of a Planner
         ):
             looked_up(PARAMS, key)
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from constraint_geodesics import bundle
 from tests.identification.hidden import demonstrations
@@ -130,6 +131,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     numbers = np.repeat(np.arange(10.0), 60)[:, None]
     rows = np.hstack([numbers, np.concatenate(shown)])
     np.savetxt(folder / "demos.csv", rows, delimiter=",")
+    names = list(packaged_planner().robot.joint_names)
+    joints = [{"joint_name": n, "position": x} for n, x in zip(names, goal, strict=True)]
+    state = {"robot_state": {"joint_state": {"name": names, "position": start}}}
+    (folder / "moveit_scene.yaml").write_text(yaml.safe_dump(state))
+    request = {"goal_constraints": [{"joint_constraints": joints}]}
+    (folder / "moveit_request.yaml").write_text(yaml.safe_dump(request))
     return folder
 
 
