@@ -127,6 +127,18 @@ def test_objects_come_where_they_are(planner: Planner, tmp_path: Path) -> None:
     assert not any("elsewhere" in pair for pair in allowed)
 
 
+def test_of_two_defaults_both_must_allow(planner: Planner, tmp_path: Path) -> None:
+    raw = a_scene(planner.robot.joint_names)
+    raw["allowed_collision_matrix"] |= {
+        "default_entry_names": ["ball", "link3"],
+        "default_entry_values": [True, False],
+    }
+    add_moveit_scene(written(tmp_path, raw), planner.scene)
+    allowed = planner.scene.now.allowed
+    assert ("ball", "link4") in allowed
+    assert ("ball", "link3") not in allowed
+
+
 def test_what_is_attached_in_the_base_frame_is_where_the_arm_has_it(
     planner: Planner, tmp_path: Path
 ) -> None:
@@ -174,6 +186,11 @@ def set_in(raw: Any, path: str, value: Any) -> Any:
         ("robot_state.joint_state.position", [0.0], "6 names, 1 positions"),
         ("allowed_collision_matrix.entry_values", [], "4 names, 0 rows"),
         ("world", 3, "no planning scene"),
+        ("world.collision_objects.0.operation", 1, "objects are added alone"),
+        ("link_padding", [{"link_name": "link3", "padding": 0.01}], "link_padding"),
+        ("link_scale", [{"link_name": "link3", "scale": 1.1}], "link_scale"),
+        ("robot_state.multi_dof_joint_state", {"joint_names": ["base"]}, "multi_dof_joint_state"),
+        ("allowed_collision_matrix.default_entry_values", [], "1 default names, 0 values"),
     ],
 )
 def test_what_can_not_be_kept_is_named(
@@ -288,6 +305,9 @@ def test_a_held_orientation_is_a_constraint(planner: Planner, tmp_path: Path) ->
         ("goal_constraints.0.joint_constraints.0.position", "far", "could not convert"),
         ("start_state.joint_state.name", ["joint1"], "1 names, 6 positions"),
         ("max_velocity_scaling_factor", "fast", "could not convert"),
+        ("max_cartesian_speed", 0.2, "max_cartesian_speed"),
+        ("trajectory_constraints", {"constraints": [{}]}, "trajectory_constraints"),
+        ("start_state.attached_collision_objects", [{}], "attached_collision_objects"),
     ],
 )
 def test_what_is_no_request_is_named(

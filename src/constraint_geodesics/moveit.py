@@ -36,6 +36,8 @@ from constraint_geodesics.scene.sphere import Sphere
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _KINDS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
 """Of shape_msgs/SolidPrimitive, whose names some files write in place of the numbers."""
+_ADD = (None, 0, "add", "ADD", "\0", b"\0")
+"""How files write that an object is added."""
 _WORLD = ("", "world")
 """Names of the base frame beside those of its links."""
 _SAME = 1e-9
@@ -71,6 +73,11 @@ def add_moveit_scene(file: Path, scene: PlanningScene) -> dict[str, float]:
         world, state = _entry(raw, "world", {}), _entry(raw, "robot_state", {})
         if _entry(_entry(world, "octomap", {}), "octomap", {}).get("data"):
             raise MoveitError("world.octomap: give its points as a point_cloud in a scene's file")
+        for entry, neutral in (("link_padding", ("padding", 0.0)), ("link_scale", ("scale", 1.0))):
+            for own in _list(raw, entry):
+                if float(own[neutral[0]]) != neutral[1]:
+                    raise MoveitError(f"{entry}: links are taken as they are: {own}")
+        _require_none(state, "robot_state.multi_dof_joint_state", "joint_names")
         joints = _joint_state(_entry(state, "joint_state", {}), "robot_state")
         named = dict[str, list[str]]()
         now, q = scene.now, _configuration(joints, scene.robot)
@@ -111,6 +118,10 @@ def read_moveit_request(
         given = _joint_state(
             _entry(_entry(raw, "start_state", {}), "joint_state", {}), "start_state"
         )
+        _require_none(raw, "start_state", "attached_collision_objects")
+        _require_none(raw, "trajectory_constraints", "constraints")
+        if float(raw.get("max_cartesian_speed") or 0.0) > 0.0:
+            raise MoveitError("max_cartesian_speed: speeds are limited joint by joint alone")
         start = _named_joints({**(state or {}), **given}, robot, "start_state")
         goals = [
             _goal(own, robot, f"goal_constraints[{number}]")
@@ -154,6 +165,12 @@ def _list(raw: Any, name: str) -> list[Any]:
     if not isinstance(found, list):
         raise MoveitError(f"{name}: must be a list")
     return found
+
+
+def _require_none(raw: Any, path: str, name: str) -> None:
+    """That nothing is said there which would be left out."""
+    if _list(_entry(raw, path.split(".")[-1], {}), name):
+        raise MoveitError(f"{path}.{name}: is not taken over: leave it out")
 
 
 def _numbers(raw: Any, names: str) -> list[float]:
@@ -218,6 +235,8 @@ def _shapes(
 ) -> list[Shape]:
     """The shapes of a collision object."""
     name = str(raw["id"])
+    if raw.get("operation") not in _ADD:
+        raise MoveitError(f"{where}: operation {raw['operation']!r}: objects are added alone")
     frame = str(_entry(_entry(raw, "header", {}), "frame_id", ""))
     pose = frame_of(frame) @ _pose(raw.get("pose"))
     if _list(raw, "planes"):
@@ -300,23 +319,26 @@ def _others(names: Sequence[str], own: str) -> list[str]:
 
 def _allowed(raw: Any, known: set[str]) -> Iterator[tuple[str, str]]:
     """Pairs of what is known that may touch."""
+    where = "allowed_collision_matrix"
     names, rows = [str(name) for name in _list(raw, "entry_names")], _list(raw, "entry_values")
     if len(names) != len(rows):
-        raise MoveitError(f"allowed_collision_matrix: {len(names)} names, {len(rows)} rows")
+        raise MoveitError(f"{where}: {len(names)} names, {len(rows)} rows")
     said = dict[frozenset[str], bool]()
     for name, row in zip(names, rows, strict=True):
         enabled = row["enabled"] if isinstance(row, dict) else row
         if len(enabled) != len(names):
-            raise MoveitError(f"allowed_collision_matrix: the row of {name!r} has not {len(names)}")
+            raise MoveitError(f"{where}: the row of {name!r} has not {len(names)} values")
         for other, value in zip(names, enabled, strict=True):
             if other != name:
                 said[frozenset((name, other))] = bool(value)
-    defaults = zip(
-        _list(raw, "default_entry_names"), _list(raw, "default_entry_values"), strict=False
-    )
-    for name, value in defaults:
-        for other in known - {str(name)}:
-            said.setdefault(frozenset((str(name), other)), bool(value))
+    names, values = _list(raw, "default_entry_names"), _list(raw, "default_entry_values")
+    if len(names) != len(values):
+        raise MoveitError(f"{where}: {len(names)} default names, {len(values)} values")
+    defaults = {str(name): bool(value) for name, value in zip(names, values, strict=True)}
+    for name in defaults:
+        for other in known - {name}:
+            # of two defaults, both must allow it
+            said.setdefault(frozenset((name, other)), defaults[name] and defaults.get(other, True))
     for pair, value in sorted(said.items(), key=lambda one: sorted(one[0])):
         if value and pair <= known:
             first, second = sorted(pair)

@@ -137,7 +137,8 @@ class _Block(NamedTuple):
         nodes[:, kernels.FRAME] = frame
         nodes[:, ball] = nodes[:, ball] @ turn.T + pose[:3, 3]
         nodes[:, own] = (turn @ nodes[:, own].reshape(-1, 3, 3)).reshape(-1, 9)
-        nodes[nodes[:, kernels.BOX] < 0.0, own] = -1.0
+        # a box is looked at by its turn in the base frame, which one that moves has not for good
+        nodes[(nodes[:, kernels.BOX] < 0.0) | (frame > 0), kernels.BOX : kernels.PLACE] = -1.0
         at = self.corners[:, None] + np.arange(3)
         hulls[at] = hulls[at] @ turn.T + pose[:3, 3]
         return self._replace(nodes=nodes, hulls=hulls)

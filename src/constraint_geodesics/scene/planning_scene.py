@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -101,7 +102,8 @@ class PlanningScene:
         changed = self._now.detaching(name)
         if at is not None and held is not None:
             pose = self.link_pose(at, held.link) @ held.shape.at.matrix
-            changed = changed.adding(held.shape.placed(Placement.of_matrix(pose)))
+            stays = changed.adding(held.shape.placed(Placement.of_matrix(pose)))
+            changed = replace(stays, allowed=self._now.allowed)
         self.become(changed)
 
     def allow(self, first: str, second: str) -> None:

@@ -62,11 +62,11 @@ class Scene:
         return replace(self, workcell=(*self.workcell, *shapes))
 
     def removing(self, *names: str) -> "Scene":
-        """Without shapes that are not attached."""
+        """Without shapes that are not attached, and what they may touch."""
         for name in names:
             self._shape(name)
         left = tuple(shape for shape in self.workcell if shape.name not in names)
-        return replace(self, workcell=left)
+        return replace(self, workcell=left, allowed=self._without(*names))
 
     def moving(self, name: str, at: Placement) -> "Scene":
         """With a shape's own frame elsewhere: in the base frame, or for one that is attached in its
@@ -89,15 +89,19 @@ class Scene:
         return replace(self, workcell=around, attached=(*self.attached, held))
 
     def detaching(self, name: str) -> "Scene":
-        """Without a shape that a link carries."""
+        """Without a shape that a link carries, and what it may touch."""
         left = tuple(one for one in self.attached if one.name != name)
         if len(left) == len(self.attached):
             raise SceneError(f"nothing called {name!r} is attached{_of(self.attached)}")
-        return replace(self, attached=left)
+        return replace(self, attached=left, allowed=self._without(name))
 
     def allowing(self, first: str, second: str) -> "Scene":
         """With two bodies, links or shapes, that may touch."""
         return replace(self, allowed=self.allowed | {(first, second)})
+
+    def _without(self, *names: str) -> frozenset[tuple[str, str]]:
+        """The allowed pairs that none of the names is in."""
+        return frozenset(pair for pair in self.allowed if not set(pair) & set(names))
 
     def _shape(self, name: str) -> Shape:
         for shape in self.workcell:
