@@ -15,6 +15,7 @@ from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.cylinder import Cylinder
+from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.point_cloud import PointCloud
 from constraint_geodesics.scene.scene import Scene, SceneError
 from constraint_geodesics.scene.shape import Placement, Shape
@@ -244,3 +245,74 @@ def test_a_scene_is_a_value(planner: Planner) -> None:
     assert isinstance(now, Scene)
     assert now.workcell[-1] == CRATE
     assert planner.scene.workcell[-1].at.position_m == (0.5, 0.0, 0.4)
+
+
+def cube(file: Path, half_m: float) -> Path:
+    signs = (-half_m, half_m)
+    corners = [(x, y, z) for x in signs for y in signs for z in signs]
+    faces = ["1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {face}" for face in faces]
+    file.write_text("\n".join(lines) + "\n")
+    return file
+
+
+def overlapping(kind: str, folder: Path) -> tuple[Shape, Shape]:
+    """Two shapes that overlap by centimetres, at one place of a link's frame."""
+    mesh, at = cube(folder / "own.obj", 0.05), Placement((0.0, 0.0, 0.3))
+    cloud = np.random.default_rng(7).uniform(-0.03, 0.03, (200, 3))
+    return {
+        "mesh and mesh": (Mesh("one", mesh, at), Mesh("other", mesh, at)),
+        "ball in a mesh": (Mesh("one", mesh, at), Sphere("other", (0.0, 0.0, 0.3), 0.01)),
+        "cloud and cloud": (
+            PointCloud("one", cloud, 0.02, at),
+            PointCloud("other", cloud[::-1], 0.02, at),
+        ),
+        "box and box": tuple(Box(n, at.position_m, (0.1, 0.1, 0.1)) for n in ("one", "other")),
+    }[kind]  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(
+    "kind", ["mesh and mesh", "ball in a mesh", "cloud and cloud", "box and box"]
+)
+def test_what_overlaps_for_good_is_refused_though_pybullet_sees_surfaces(
+    planner: Planner, tmp_path: Path, kind: str
+) -> None:
+    """Carried by one link, where nothing moves them apart."""
+    start, goal = pairs_of("free", 1, seed=3)[0]
+    for shape in overlapping(kind, tmp_path):
+        planner.scene.attach(shape, "link6", touching=("link4", "link5"))
+    path = planner.plan(start, goal, "free")
+    assert path.status == "in_collision"
+    assert "touch at every configuration" in path.explanation
+
+
+def test_a_link_within_a_mesh_is_refused(planner: Planner, tmp_path: Path) -> None:
+    """Whose surface it does not reach."""
+    start, goal = pairs_of("free", 1, seed=3)[0]
+    planner.scene.add(Mesh("room", cube(tmp_path / "own.obj", 3.0)))
+    assert planner.plan(start, goal, "free").status == "in_collision"
+
+
+def test_a_file_that_was_written_anew_is_read_anew_where_its_shape_moves(
+    planner: Planner, tmp_path: Path
+) -> None:
+    file = cube(tmp_path / "own.obj", 0.02)
+    planner.scene.add(Mesh("part", file, Placement((0.0, 2.0, 1.0))))
+    cube(file, 0.3)
+    planner.scene.move("part", Placement((0.0, 2.0, 1.2)))
+    body = planner._certifier.collisions.collider.bodies[BodyKey("part", True)]
+    assert np.ptp(body.pieces[0].corners, axis=0) == pytest.approx([0.6] * 3)
+
+
+def test_what_is_away_is_allowed_to_touch_once_it_comes_back(planner: Planner) -> None:
+    """PyBullet's filters are those of a world that is made anew."""
+    q = planner.robot.sample(200, np.random.default_rng(8))
+    planner.scene.attach(CUP.placed(CARRYING), "link6", touching=["link5"])
+    planner.scene.add(CRATE)
+    planner.scene.allow("cup", "crate")
+    planner.scene.attach(Sphere("pad", (0.0, 0.0, 0.2), 0.1), "link6", touching=["cup", "crate"])
+    for _ in range(2):
+        planner.scene.remove("crate")
+        planner.scene.add(CRATE)
+        with planner.scene.world() as world:
+            np.testing.assert_array_equal(planner._certifier._world.free(q), world.free(q))

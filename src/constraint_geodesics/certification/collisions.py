@@ -108,7 +108,8 @@ class CollisionCheck:
         near = self._nearest(q, MARGIN_M)
         if inside and self._standing is None and near >= MARGIN_M:
             return True
-        if near < -MARGIN_M:  # PyBullet knows a mesh by its surface alone
+        # PyBullet knows a mesh by its surface alone
+        if near < -MARGIN_M or self._standing is not None:
             return False
         return self._world is not None and self._world.is_free(q)
 
@@ -232,12 +233,15 @@ class CollisionCheck:
     def _touch_always(self, k: int, first: Body, second: Body, dof: int) -> _Contact | None:
         arrays, zeros = self.collider.arrays, np.zeros(dof)
         alone = arrays._replace(pairs=_only(arrays.pairs, arrays.top + k), top=1)
-        if kernels.nearest_pair(alone, zeros, MARGIN_M)[0] >= MARGIN_M:
+        near = float(kernels.nearest_pair(alone, zeros, MARGIN_M)[0])
+        if near >= MARGIN_M:
             return None
         if self._world is None:
             text = f"{second.name} and {first.name} are too close at every configuration"
             return _kind(first, second), None, text
-        if self._world.distance(zeros, first.key, second.key, MARGIN_M) < 0.0:
+        # PyBullet knows meshes by their surfaces, and none of two of them
+        apart = self._world.distance(zeros, first.key, second.key, MARGIN_M)
+        if apart < 0.0 or near < -MARGIN_M:
             text = f"{second.name} and {first.name} touch at every configuration"
             return _kind(first, second), None, text
         return None

@@ -186,6 +186,13 @@ class _Own(NamedTuple):
     block: _Block | None
 
 
+def _are_same(first: Sequence[Piece], second: Sequence[Piece]) -> bool:
+    return len(first) == len(second) and all(
+        np.array_equal(a.corners, b.corners) and a.rounding == b.rounding
+        for a, b in zip(first, second, strict=True)
+    )
+
+
 class BodyTable:
     """The bodies of a scene and the pairs of them that may meet, as the kernels take them.
 
@@ -281,11 +288,14 @@ class BodyTable:
             raise SceneError(f"{held.name!r} can't be attached: no link is called {held.link!r}")
 
     def _own_of(self, shape: Shape) -> _Own:
-        """As it was before where it has only moved."""
+        """As it was before where it has only moved, and a file has the same in it."""
         at_origin, known = shape.placed(Placement()), self._own.get(shape.name)
-        if known is not None and known.shape == at_origin:
+        same = known is not None and known.shape == at_origin
+        if same and known is not None and not known.shape.reads_files:
             return known
         pieces = at_origin.pieces()
+        if same and known is not None and _are_same(pieces, known.pieces):
+            return known
         return _Own(at_origin, pieces, block_of(pieces, self._dof) if pieces else None)
 
     def _placed(self, shape: Shape, held: Attached | None, own: _Own) -> tuple[Body, _Block]:

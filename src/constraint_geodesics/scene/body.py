@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from constraint_geodesics.scene.urdf import find_urdf
 class Body(Shape):
     """A URDF at a pose [m, rad]: a path in this checkout, or one in pybullet_data."""
 
+    reads_files: ClassVar[bool] = True
     name: str
     urdf: str | Path
     position_m: Vector3 = (0.0, 0.0, 0.0)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -23,6 +23,7 @@ class Mesh(Shape):
     is not convex is covered by convex parts.
     """
 
+    reads_files: ClassVar[bool] = True
     name: str
     file: str | Path
     pose: Placement = field(default_factory=Placement)

@@ -101,6 +101,8 @@ class Shape(ABC):
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+    reads_files: ClassVar[bool] = False
+    """Whether its pieces come from files, which may be written anew."""
     name: str
     exempt_links: tuple[str, ...]
 

@@ -197,9 +197,13 @@ class World:
         if news:
             with quiet():
                 for name, one in news.items():
-                    self._shapes[name] = self._add(one)
+                    try:
+                        self._shapes[name] = self._add(one)
+                    except self._bullet.error as error:
+                        raise RobotError(f"{name!r}: PyBullet can't make it: {error}") from None
         self._filter(now - self._allowed, 0)
-        self._allowed = now
+        # a pair of which one is away is filtered when it comes
+        self._allowed = frozenset(p for p in now if all(self._parts(name) for name in p))
 
     def _add(self, one: Shape | Attached) -> _Placed:
         bullet = self._bullet
@@ -365,7 +369,7 @@ class World:
                     continue
                 if contact[2] in moving:
                     own = True
-                else:
+                elif body != self._body or contact[3] != _BASE:  # what carries the arm may touch
                     workcell = True
         return own, workcell
 
@@ -374,6 +378,8 @@ class World:
             raise ValueError(f"workcell {shape!r}: {unknown} are not links of {self.robot.name}")
 
 
+_BASE = -1
+"""The index of a robot's base among its links."""
 _MOVING, _ALL = 1, -1
 """PyBullet's groups of bodies: those that move, and what they may meet."""
 
