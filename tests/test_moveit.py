@@ -264,7 +264,7 @@ def test_a_pose_with_tolerances_is_a_region(planner: Planner, tmp_path: Path) ->
     (goal,) = read_moveit_request(written(tmp_path, raw), planner).goals
     assert isinstance(goal, GoalRegion)
     assert list(goal.free) == ["yaw"]
-    np.testing.assert_allclose(goal.tolerance, (0.01, 0.02, 0.03, 0.1, 0.2, 0.0))
+    np.testing.assert_allclose(goal.tolerance, (0.01, 0.02, 0.03, 0.1, 0.1, 0.0))
     np.testing.assert_allclose(goal.pose.position, (0.4, 0.1, 0.3))
     np.testing.assert_allclose(goal.pose.rotation, down.as_matrix(), atol=1e-12)
 
@@ -301,7 +301,7 @@ def test_a_held_orientation_is_a_constraint(planner: Planner, tmp_path: Path) ->
     [
         ("goal_constraints", [], "there is none"),
         ("goal_constraints.0.joint_constraints", [], "must be joints, or one position"),
-        ("goal_constraints.0.joint_constraints.0.joint_name", "elbow", "no value for joint1"),
+        ("goal_constraints.0.joint_constraints.0.joint_name", "elbow", "elbow is no joint that is planned"),
         ("goal_constraints.0.joint_constraints.0.position", "far", "could not convert"),
         ("start_state.joint_state.name", ["joint1"], "1 names, 6 positions"),
         ("max_velocity_scaling_factor", "fast", "could not convert"),
@@ -327,3 +327,84 @@ def test_a_file_that_is_none_is_one_line(planner: Planner, tmp_path: Path) -> No
             add_moveit_scene(tmp_path / "own.yaml", planner.scene)
         with pytest.raises(MoveitError, match=said):
             read_moveit_request(tmp_path / "own.yaml", planner)
+
+
+def moveit_keeps(off: np.ndarray, tolerances: tuple[float, float, float]) -> bool:
+    """Its test of a rotation away from the one that is wanted: XYZ Euler angles, one by one."""
+    angles = np.abs(Rotation.from_matrix(off).as_euler("XYZ"))
+    return bool((angles <= np.array(tolerances) + 1e-9).all())
+
+
+@pytest.mark.parametrize("tolerances", [(0.1, 0.1, 0.1), (1.0, 1.0, 0.2), (0.6, 0.1, 0.9)])
+@pytest.mark.parametrize("turn", [(0, 0, 0), (math.pi, 0, 0), (0.4, 0.7, -0.3)])
+def test_what_is_kept_here_moveit_keeps(
+    planner: Planner,
+    tmp_path: Path,
+    tolerances: tuple[float, float, float],
+    turn: tuple[float, float, float],
+) -> None:
+    """Rotations drawn in the region, those at its edge among them."""
+    raw, _, _ = a_request(planner)
+    wanted = Rotation.from_euler("xyz", turn)
+    raw["goal_constraints"] = [of_pose(planner, tolerances, wanted)]
+    (goal,) = read_moveit_request(written(tmp_path, raw), planner).goals
+    rng, angle = np.random.default_rng(0), goal.tolerance[3]
+    assert goal.tolerance[3:] == pytest.approx((min(tolerances),) * 3)
+    for k in range(500):
+        axis = rng.normal(size=3)
+        size = angle * (1.0 if k % 2 else rng.uniform())
+        off = Rotation.from_rotvec(size * axis / np.linalg.norm(axis)).as_matrix()
+        reached = off @ wanted.as_matrix()
+        assert moveit_keeps(wanted.as_matrix().T @ reached, tolerances)
+
+
+def test_poses_are_in_the_frame_that_their_header_names(planner: Planner, tmp_path: Path) -> None:
+    raw, _, _ = a_request(planner)
+    raw["goal_constraints"] = [of_pose(planner, (0.1, 0.1, 0.1), Rotation.identity())]
+    for kind in ("position_constraints", "orientation_constraints"):
+        moved = raw["goal_constraints"][0][kind][0]
+        moved["header"] = {"frame_id": "link6"}
+        with pytest.raises(MoveitError, match="moves with the arm"):
+            read_moveit_request(written(tmp_path, raw), planner)
+        moved["header"] = {"frame_id": "map"}
+        with pytest.raises(MoveitError, match="no link of the robot"):
+            read_moveit_request(written(tmp_path, raw), planner)
+        moved["header"] = {"frame_id": "link_base"}
+    (goal,) = read_moveit_request(written(tmp_path, raw), planner).goals
+    np.testing.assert_allclose(goal.pose.position, (0.4, 0.1, 0.3))
+    own = of_pose(planner, (0.1, 0.1, 0.1), Rotation.identity())["orientation_constraints"]
+    own[0]["header"] = {"frame_id": "link6"}
+    raw["path_constraints"] = {"orientation_constraints": own}
+    with pytest.raises(MoveitError, match="moves with the arm"):
+        read_moveit_request(written(tmp_path, raw), planner)
+
+
+def test_nothing_of_a_request_is_dropped(planner: Planner, tmp_path: Path) -> None:
+    raw, _, _ = a_request(planner)
+    raw["goal_constraints"][0] |= of_pose(planner, (0.1, 0.1, 0.1), Rotation.identity())
+    with pytest.raises(MoveitError, match="goes without joint_constraints"):
+        read_moveit_request(written(tmp_path, raw), planner)
+    raw, _, _ = a_request(planner)
+    raw["goal_constraints"][0]["joint_constraints"].append({"joint_name": "lift", "position": 1})
+    with pytest.raises(MoveitError, match="lift is no joint that is planned"):
+        read_moveit_request(written(tmp_path, raw), planner)
+    raw, _, _ = a_request(planner)
+    raw["start_state"]["joint_state"]["position"][2] = math.nan
+    with pytest.raises(MoveitError, match="joint3 is nan"):
+        read_moveit_request(written(tmp_path, raw), planner)
+
+
+def test_a_scene_of_another_format_and_rows_that_disagree(planner: Planner, tmp_path: Path) -> None:
+    with pytest.raises(MoveitError, match="neither world nor robot_state"):
+        add_moveit_scene(written(tmp_path, {"shapes": {}}), planner.scene)
+    raw = a_scene(planner.robot.joint_names)
+    raw["allowed_collision_matrix"] = {
+        "entry_names": ["crate", "link6", "table"],
+        "entry_values": [
+            {"enabled": [False, True, True]},
+            {"enabled": [False, False, False]},
+            {"enabled": [True, False, False]},
+        ],
+    }
+    add_moveit_scene(written(tmp_path, raw), planner.scene)
+    assert planner.scene.now.allowed == {("crate", "table")}

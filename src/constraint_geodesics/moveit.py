@@ -43,6 +43,8 @@ _WORLD = ("", "world")
 _SAME = 1e-9
 _ALONG = 1e-6
 """What directions of axes may differ by."""
+_ROTATION_VECTOR = 1
+"""Of moveit_msgs/OrientationConstraint's ways to bound a rotation."""
 _FREE_RAD = math.pi - 1e-6
 """A tolerance from which on an angle is free."""
 
@@ -70,6 +72,8 @@ def add_moveit_scene(file: Path, scene: PlanningScene) -> dict[str, float]:
     """
     raw = _read(file)
     try:
+        if not raw.keys() & {"world", "robot_state", "allowed_collision_matrix"}:
+            raise MoveitError("no planning scene of MoveIt: has neither world nor robot_state")
         world, state = _entry(raw, "world", {}), _entry(raw, "robot_state", {})
         if _entry(_entry(world, "octomap", {}), "octomap", {}).get("data"):
             raise MoveitError("world.octomap: give its points as a point_cloud in a scene's file")
@@ -91,7 +95,7 @@ def add_moveit_scene(file: Path, scene: PlanningScene) -> dict[str, float]:
             for held in _held(own, where, scene, q):
                 named.setdefault(str(own["object"]["id"]), []).append(held.name)
                 now = now.attaching(held)
-        known = {*scene.links, *named}
+        known = {*scene.links, *scene.now.names, *named}
         for first, second in _allowed(_entry(raw, "allowed_collision_matrix", {}), known):
             for a in named.get(first, [first]):
                 for b in named.get(second, [second]):
@@ -124,12 +128,12 @@ def read_moveit_request(
             raise MoveitError("max_cartesian_speed: speeds are limited joint by joint alone")
         start = _named_joints({**(state or {}), **given}, robot, "start_state")
         goals = [
-            _goal(own, robot, f"goal_constraints[{number}]")
+            _goal(own, planner.scene, f"goal_constraints[{number}]")
             for number, own in enumerate(_list(raw, "goal_constraints"))
         ]
         if not goals:
             raise MoveitError("goal_constraints: there is none")
-        constraint = _path_constraint(_entry(raw, "path_constraints", {}), robot)
+        constraint = _path_constraint(_entry(raw, "path_constraints", {}), planner.scene)
         scales = [  # 0 means the whole, as in MoveIt
             float(raw.get(f"max_{what}_scaling_factor") or 1.0)
             for what in ("velocity", "acceleration")
@@ -201,7 +205,11 @@ def _joint_state(raw: Any, where: str) -> dict[str, float]:
     names, values = _list(raw, "name"), _list(raw, "position")
     if len(names) != len(values):
         raise MoveitError(f"{where}.joint_state: {len(names)} names, {len(values)} positions")
-    return {str(name): float(value) for name, value in zip(names, values, strict=True)}
+    found = {str(name): float(value) for name, value in zip(names, values, strict=True)}
+    for name, value in found.items():
+        if not math.isfinite(value):
+            raise MoveitError(f"{where}.joint_state: {name} is {value}: must be finite")
+    return found
 
 
 def _configuration(joints: Mapping[str, float], robot: SerialRobot) -> np.ndarray | None:
@@ -329,8 +337,9 @@ def _allowed(raw: Any, known: set[str]) -> Iterator[tuple[str, str]]:
         if len(enabled) != len(names):
             raise MoveitError(f"{where}: the row of {name!r} has not {len(names)} values")
         for other, value in zip(names, enabled, strict=True):
-            if other != name:
-                said[frozenset((name, other))] = bool(value)
+            if other != name:  # where the two halves disagree, both must allow it
+                pair = frozenset((name, other))
+                said[pair] = bool(value) and said.get(pair, True)
     names, values = _list(raw, "default_entry_names"), _list(raw, "default_entry_values")
     if len(names) != len(values):
         raise MoveitError(f"{where}: {len(names)} default names, {len(values)} values")
@@ -345,10 +354,16 @@ def _allowed(raw: Any, known: set[str]) -> Iterator[tuple[str, str]]:
             yield first, second
 
 
-def _goal(raw: Any, robot: SerialRobot, where: str) -> Wanted:
+def _goal(raw: Any, scene: PlanningScene, where: str) -> Wanted:
     """Joint values, or a pose of the tool with what may be off."""
+    robot = scene.robot
     if joints := _list(raw, "joint_constraints"):
+        for other in ("position_constraints", "orientation_constraints", "visibility_constraints"):
+            if _list(raw, other):
+                raise MoveitError(f"{where}.{other}: goes without joint_constraints")
         values = {str(own["joint_name"]): float(own["position"]) for own in joints}
+        if unknown := sorted(values.keys() - set(robot.joint_names)):
+            raise MoveitError(f"{where}: {', '.join(unknown)} is no joint that is planned")
         return _named_joints(values, robot, where)
     positions, turns = _list(raw, "position_constraints"), _list(raw, "orientation_constraints")
     if len(positions) != 1 or len(turns) > 1 or _list(raw, "visibility_constraints"):
@@ -360,7 +375,7 @@ def _goal(raw: Any, robot: SerialRobot, where: str) -> Wanted:
     region = own["constraint_region"]
     if len(_list(region, "primitives")) != 1 or _list(region, "meshes"):
         raise MoveitError(f"{where}: constraint_region: must be one box or sphere")
-    centre = _pose(region["primitive_poses"][0])
+    centre = _frame_of(own, scene) @ _pose(region["primitive_poses"][0])
     shape = _primitive(region["primitives"][0], "region", Placement.of_matrix(centre), where)
     if isinstance(shape, Sphere):
         widths = [shape.radius_m / math.sqrt(3.0)] * 3
@@ -371,7 +386,7 @@ def _goal(raw: Any, robot: SerialRobot, where: str) -> Wanted:
     turn, angles = np.eye(3), [math.inf] * 3
     if turns:
         _require_tool(turns[0], robot, where)
-        turn, angles = _orientation(turns[0], where)
+        turn, angles = _orientation(turns[0], scene, where)
     free = [AXES[3 + k] for k in range(3) if angles[k] == math.inf]
     tolerance = (*widths, *(0.0 if angle == math.inf else angle for angle in angles))
     return GoalRegion(Pose(centre[:3, 3], turn), free, tolerance)
@@ -387,34 +402,48 @@ def _along_base(half: Float[np.ndarray, "3"], turn: Float[np.ndarray, "3 3"]) ->
     return [float(half.min()) / math.sqrt(3.0)] * 3
 
 
-def _orientation(raw: Any, where: str) -> tuple[Float[np.ndarray, "3 3"], list[float]]:
+def _frame_of(raw: Any, scene: PlanningScene) -> Float[np.ndarray, "4 4"]:
+    """The pose of a header's frame, which must not move."""
+    return _fixed(scene, str(_entry(_entry(raw, "header", {}), "frame_id", "")))
+
+
+def _orientation(
+    raw: Any, scene: PlanningScene, where: str
+) -> tuple[Float[np.ndarray, "3 3"], list[float]]:
     """A rotation, and how far it may be off about the base's axes [rad]: inf for an axis that is
-    free.  MoveIt's are about the axes of the rotation itself: what is not along one of the base's
-    gets the least of them all.
+    free.
+
+    MoveIt's tolerances are about the axes of the rotation itself, and bound Euler angles unless
+    `parameterization` is 1.  The least of them for all held axes, a cone, lies within; so do
+    rotation vectors bounded one by one where these axes are along the base's.
     """
-    turn = _turn(raw["orientation"])
+    turn = _frame_of(raw, scene)[:3, :3] @ _turn(raw["orientation"])
     given = [float(raw[f"absolute_{axis}_axis_tolerance"]) for axis in "xyz"]
     if not all(value >= 0.0 for value in given):
         raise MoveitError(f"{where}: tolerances of an orientation are {given}: must be 0 or more")
     free = [value >= _FREE_RAD for value in given]
     if all(free):
         return turn, [math.inf] * 3
-    held = [value for value, is_free in zip(given, free, strict=True) if not is_free]
-    found = [min(held)] * 3
+    least = min(value for value, is_free in zip(given, free, strict=True) if not is_free)
+    along = np.abs(turn)
+    bases = [int(along[:, axis].argmax()) for axis in range(3)]
+    aligned = [abs(along[bases[axis], axis] - 1.0) < _ALONG for axis in range(3)]
+    by_themselves = raw.get("parameterization") == _ROTATION_VECTOR and not any(free)
+    found = [least] * 3
     for axis in range(3):
-        along = np.abs(turn[:, axis])
-        base = int(along.argmax())
-        if abs(along[base] - 1.0) < _ALONG:
-            found[base] = math.inf if free[axis] else given[axis]
-        elif free[axis]:
+        if free[axis] and not aligned[axis]:
             raise MoveitError(
                 f"{where}: the {'xyz'[axis]} axis is free, and is along no axis of the base: no "
                 "constraint here says that"
             )
+        if free[axis]:
+            found[bases[axis]] = math.inf
+        elif by_themselves and all(aligned):
+            found[bases[axis]] = given[axis]
     return turn, found
 
 
-def _path_constraint(raw: Any, robot: SerialRobot) -> Constraint:
+def _path_constraint(raw: Any, scene: PlanningScene) -> Constraint:
     """Nothing, or the orientation that is held."""
     where = "path_constraints"
     for other in ("joint_constraints", "position_constraints", "visibility_constraints"):
@@ -425,8 +454,8 @@ def _path_constraint(raw: Any, robot: SerialRobot) -> Constraint:
         return Constraint((0,) * 6)
     if len(turns) > 1:
         raise MoveitError(f"{where}: {len(turns)} orientations: must be one")
-    _require_tool(turns[0], robot, where)
-    turn, angles = _orientation(turns[0], where)
+    _require_tool(turns[0], scene.robot, where)
+    turn, angles = _orientation(turns[0], scene, where)
     held = tuple(int(angle != math.inf) for angle in angles)
     widths = (0.0, 0.0, 0.0, *(angle if angle != math.inf else 0.0 for angle in angles))
     return Constraint((0, 0, 0, *held), widths, Pose(np.zeros(3), turn))

@@ -164,3 +164,8 @@ def test_boxes_cover_every_point_of_a_cloud(count: int) -> None:
 def test_what_is_no_cloud_is_refused(points: object) -> None:
     with pytest.raises(ValueError, match="points"):
         PointCloud("seen", points, 0.01)
+
+
+def test_a_cloud_that_pybullet_could_not_take_is_refused() -> None:
+    with pytest.raises(ValueError, match="12000 points: at most 10000"):
+        PointCloud("seen", np.zeros((12_000, 3)), 0.01)

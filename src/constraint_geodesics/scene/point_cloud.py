@@ -16,6 +16,8 @@ from constraint_geodesics.fields import Positive
 from constraint_geodesics.scene.pieces import HULL_MARGIN, Piece
 from constraint_geodesics.scene.shape import Placement, RoundedBox, Shape, add_body
 
+MOST = 10_000
+"""Points at most: PyBullet takes no larger mesh of balls."""
 CELLS = 256
 """Boxes that cover a cloud, at most."""
 _GOLDEN = 0.5 * (1.0 + np.sqrt(5.0))
@@ -37,6 +39,8 @@ class Points:
             raise ValueError("points are no array of numbers: must be (n, 3) [m]") from None
         if own.ndim != 2 or own.shape[1] != 3 or not len(own) or not np.isfinite(own).all():
             raise ValueError(f"points of shape {own.shape}: must be (n, 3) finite numbers [m]")
+        if len(own) > MOST:
+            raise ValueError(f"{len(own)} points: at most {MOST}: keep one a voxel")
         own.flags.writeable = False
         self.array: Float[np.ndarray, "n 3"] = own
         self._hash = hash(own.tobytes())
