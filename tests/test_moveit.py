@@ -10,6 +10,8 @@ import pytest
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
+from constraint_geodesics.constraints.constraint import ConstraintManifold
+from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.goals.region import GoalRegion
 from constraint_geodesics.moveit import MoveitError, add_moveit_scene, read_moveit_request
 from constraint_geodesics.planner import Planner, SceneError
@@ -301,7 +303,11 @@ def test_a_held_orientation_is_a_constraint(planner: Planner, tmp_path: Path) ->
     [
         ("goal_constraints", [], "there is none"),
         ("goal_constraints.0.joint_constraints", [], "must be joints, or one position"),
-        ("goal_constraints.0.joint_constraints.0.joint_name", "elbow", "elbow is no joint that is planned"),
+        (
+            "goal_constraints.0.joint_constraints.0.joint_name",
+            "elbow",
+            "elbow is no joint that is planned",
+        ),
         ("goal_constraints.0.joint_constraints.0.position", "far", "could not convert"),
         ("start_state.joint_state.name", ["joint1"], "1 names, 6 positions"),
         ("max_velocity_scaling_factor", "fast", "could not convert"),
@@ -329,33 +335,74 @@ def test_a_file_that_is_none_is_one_line(planner: Planner, tmp_path: Path) -> No
             read_moveit_request(tmp_path / "own.yaml", planner)
 
 
-def moveit_keeps(off: np.ndarray, tolerances: tuple[float, float, float]) -> bool:
-    """Its test of a rotation away from the one that is wanted: XYZ Euler angles, one by one."""
-    angles = np.abs(Rotation.from_matrix(off).as_euler("XYZ"))
-    return bool((angles <= np.array(tolerances) + 1e-9).all())
+FREE = 4.0
+PATTERNS = [
+    *[(None, own) for own in ((0.1, 0.1, 0.1), (1.0, 1.0, 0.2), (0.6, 0.1, 0.9))],
+    *[(None, own) for own in ((0.3, 0.2, FREE), (FREE, 0.3, 0.2))],
+    *[(1, own) for own in ((0.3, 0.2, 0.1), (FREE, FREE, 0.3), (FREE, 0.3, FREE))],
+]
+TURNS = [(0, 0, 0), (math.pi, 0, 0), (0, 0, math.pi / 2), (math.pi / 2, 0, math.pi / 2)]
 
 
-@pytest.mark.parametrize("tolerances", [(0.1, 0.1, 0.1), (1.0, 1.0, 0.2), (0.6, 0.1, 0.9)])
-@pytest.mark.parametrize("turn", [(0, 0, 0), (math.pi, 0, 0), (0.4, 0.7, -0.3)])
+def moveit_keeps(off: Rotation, tolerances: tuple[float, ...], vectors: bool) -> bool:
+    """Its test of a rotation away from the one that is wanted, about that one's axes."""
+    angles = np.abs(off.as_rotvec() if vectors else off.as_euler("XYZ"))
+    return bool((angles <= np.array(tolerances) + 1e-6).all())
+
+
+@pytest.mark.parametrize(("parameterization", "tolerances"), PATTERNS)
+@pytest.mark.parametrize("turn", TURNS)
 def test_what_is_kept_here_moveit_keeps(
     planner: Planner,
     tmp_path: Path,
+    parameterization: int | None,
     tolerances: tuple[float, float, float],
     turn: tuple[float, float, float],
 ) -> None:
-    """Rotations drawn in the region, those at its edge among them."""
+    """Configurations of the path constraint, by MoveIt's formulas."""
     raw, _, _ = a_request(planner)
     wanted = Rotation.from_euler("xyz", turn)
-    raw["goal_constraints"] = [of_pose(planner, tolerances, wanted)]
-    (goal,) = read_moveit_request(written(tmp_path, raw), planner).goals
-    rng, angle = np.random.default_rng(0), goal.tolerance[3]
-    assert goal.tolerance[3:] == pytest.approx((min(tolerances),) * 3)
-    for k in range(500):
-        axis = rng.normal(size=3)
-        size = angle * (1.0 if k % 2 else rng.uniform())
-        off = Rotation.from_rotvec(size * axis / np.linalg.norm(axis)).as_matrix()
-        reached = off @ wanted.as_matrix()
-        assert moveit_keeps(wanted.as_matrix().T @ reached, tolerances)
+    (own,) = of_pose(planner, tolerances, wanted)["orientation_constraints"]
+    if parameterization is not None:
+        own["parameterization"] = parameterization
+    raw["path_constraints"] = {"orientation_constraints": [own]}
+    kept = read_moveit_request(written(tmp_path, raw), planner).constraint
+    manifold = ConstraintManifold(planner.robot, kept)
+    rng = np.random.default_rng(0)
+    # within, and at the edge
+    share = rng.choice([1.0, 0.6], 1500)
+    found = retract(manifold, planner.robot.sample(1500, rng), Retraction(), band=share)
+    q = found.joints[found.converged]
+    assert len(q) > 100
+    reached = Rotation.from_matrix(planner.robot.forward(q)[1])
+    for one in wanted.inv() * reached:
+        assert moveit_keeps(one, tolerances, parameterization == 1)
+
+
+@pytest.mark.parametrize(
+    ("parameterization", "tolerances"),
+    [
+        *[(None, (0.3, FREE, 0.3)), (None, (FREE, FREE, 0.3)), (0, (FREE, 0.3, FREE))],
+        *[(1, (0.3, 0.2, FREE)), (1, (FREE, 0.3, 0.2)), (1, (0.3, FREE, 0.3))],
+    ],
+)
+def test_what_no_constraint_lies_within_is_refused(
+    planner: Planner, tmp_path: Path, parameterization: int | None, tolerances: Any
+) -> None:
+    raw, _, _ = a_request(planner)
+    (own,) = of_pose(planner, tolerances, Rotation.identity())["orientation_constraints"]
+    if parameterization is not None:
+        own["parameterization"] = parameterization
+    raw["path_constraints"] = {"orientation_constraints": [own]}
+    with pytest.raises(MoveitError, match="no constraint here lies within that"):
+        read_moveit_request(written(tmp_path, raw), planner)
+
+
+def test_texts_are_no_flags(planner: Planner, tmp_path: Path) -> None:
+    raw = a_scene(planner.robot.joint_names)
+    raw["allowed_collision_matrix"]["default_entry_values"] = ["no"]
+    with pytest.raises(MoveitError, match="'no': must be true or false"):
+        add_moveit_scene(written(tmp_path, raw), planner.scene)
 
 
 def test_poses_are_in_the_frame_that_their_header_names(planner: Planner, tmp_path: Path) -> None:

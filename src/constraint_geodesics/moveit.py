@@ -43,6 +43,8 @@ _WORLD = ("", "world")
 _SAME = 1e-9
 _ALONG = 1e-6
 """What directions of axes may differ by."""
+_TILTS = ([True, False, False], [False, False, True])
+"""What may be free of Euler angles: x, or z, alone."""
 _ROTATION_VECTOR = 1
 """Of moveit_msgs/OrientationConstraint's ways to bound a rotation."""
 _FREE_RAD = math.pi - 1e-6
@@ -102,7 +104,7 @@ def add_moveit_scene(file: Path, scene: PlanningScene) -> dict[str, float]:
                     now = now.allowing(a, b)
     except MoveitError as error:
         raise MoveitError(f"{file}: {error}") from None
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         if type(error).__module__.startswith("constraint_geodesics"):
             raise
         raise MoveitError(f"{file}: no planning scene of MoveIt: {_said(error)}") from None
@@ -126,6 +128,9 @@ def read_moveit_request(
         _require_none(raw, "trajectory_constraints", "constraints")
         if float(raw.get("max_cartesian_speed") or 0.0) > 0.0:
             raise MoveitError("max_cartesian_speed: speeds are limited joint by joint alone")
+        moving = _entry(_entry(raw, "start_state", {}), "joint_state", {}).get("velocity") or []
+        if any(float(value) != 0.0 for value in moving):
+            raise MoveitError("start_state.joint_state.velocity: motions begin at rest")
         start = _named_joints({**(state or {}), **given}, robot, "start_state")
         goals = [
             _goal(own, planner.scene, f"goal_constraints[{number}]")
@@ -140,7 +145,7 @@ def read_moveit_request(
         ]
     except MoveitError as error:
         raise MoveitError(f"{file}: {error}") from None
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise MoveitError(f"{file}: no motion request of MoveIt: {_said(error)}") from None
     return MoveitRequest(start, goals, constraint, *scales)
 
@@ -325,6 +330,13 @@ def _others(names: Sequence[str], own: str) -> list[str]:
     return [name for name in names if name != own]
 
 
+def _flag(value: Any) -> bool:
+    """Of the matrix; texts, as YAML 1.2 reads `no` and `off`, are none."""
+    if value not in (True, False):
+        raise MoveitError(f"allowed_collision_matrix: {value!r}: must be true or false")
+    return bool(value)
+
+
 def _allowed(raw: Any, known: set[str]) -> Iterator[tuple[str, str]]:
     """Pairs of what is known that may touch."""
     where = "allowed_collision_matrix"
@@ -339,11 +351,11 @@ def _allowed(raw: Any, known: set[str]) -> Iterator[tuple[str, str]]:
         for other, value in zip(names, enabled, strict=True):
             if other != name:  # where the two halves disagree, both must allow it
                 pair = frozenset((name, other))
-                said[pair] = bool(value) and said.get(pair, True)
+                said[pair] = _flag(value) and said.get(pair, True)
     names, values = _list(raw, "default_entry_names"), _list(raw, "default_entry_values")
     if len(names) != len(values):
         raise MoveitError(f"{where}: {len(names)} default names, {len(values)} values")
-    defaults = {str(name): bool(value) for name, value in zip(names, values, strict=True)}
+    defaults = {str(name): _flag(value) for name, value in zip(names, values, strict=True)}
     for name in defaults:
         for other in known - {name}:
             # of two defaults, both must allow it
@@ -413,9 +425,9 @@ def _orientation(
     """A rotation, and how far it may be off about the base's axes [rad]: inf for an axis that is
     free.
 
-    MoveIt's tolerances are about the axes of the rotation itself, and bound Euler angles unless
-    `parameterization` is 1.  The least of them for all held axes, a cone, lies within; so do
-    rotation vectors bounded one by one where these axes are along the base's.
+    MoveIt's tolerances are about the axes of the rotation itself, and bound Euler angles x, y, z in
+    turn unless `parameterization` is 1.  The least of them as a cone lies within if none, or x or z
+    alone, is free; rotation vectors lie within if none or two are.  Others are refused.
     """
     turn = _frame_of(raw, scene)[:3, :3] @ _turn(raw["orientation"])
     given = [float(raw[f"absolute_{axis}_axis_tolerance"]) for axis in "xyz"]
@@ -424,11 +436,15 @@ def _orientation(
     free = [value >= _FREE_RAD for value in given]
     if all(free):
         return turn, [math.inf] * 3
+    vectors = raw.get("parameterization") == _ROTATION_VECTOR
+    kept = sum(free) != 1 if vectors else not any(free) or free in _TILTS
+    if not kept:
+        names = ", ".join(axis for axis, is_free in zip("xyz", free, strict=True) if is_free)
+        raise MoveitError(f"{where}: free about {names}: no constraint here lies within that")
     least = min(value for value, is_free in zip(given, free, strict=True) if not is_free)
     along = np.abs(turn)
     bases = [int(along[:, axis].argmax()) for axis in range(3)]
     aligned = [abs(along[bases[axis], axis] - 1.0) < _ALONG for axis in range(3)]
-    by_themselves = raw.get("parameterization") == _ROTATION_VECTOR and not any(free)
     found = [least] * 3
     for axis in range(3):
         if free[axis] and not aligned[axis]:
@@ -438,7 +454,7 @@ def _orientation(
             )
         if free[axis]:
             found[bases[axis]] = math.inf
-        elif by_themselves and all(aligned):
+        elif vectors and all(aligned):
             found[bases[axis]] = given[axis]
     return turn, found
 

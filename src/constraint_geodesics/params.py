@@ -729,7 +729,9 @@ def read_yaml(path: Path) -> Any:
         return YAML(typ="safe", pure=True).load(path.read_text())
     except OSError as error:
         raise ParamsError(f"{path}: {error.strerror}") from None
-    except YAMLError as error:
+    except (UnicodeError, RecursionError) as error:
+        raise ParamsError(f"{path}: not YAML: {str(error).splitlines()[0]}") from None
+    except (YAMLError, ValueError) as error:
         raise ParamsError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
 
 

@@ -174,8 +174,8 @@ class Planner:
 
     def _follow(self, scene: Scene) -> None:
         self._require_open()
-        self._certifier.change(scene)
-        self._preparation.change(scene)
+        with self._preparation.changing(scene):
+            self._certifier.change(scene)
 
     def prepare(self, constraint: str | Constraint) -> None:
         """Make the constraint's roadmap now (about a second), and load the compiled code, so that

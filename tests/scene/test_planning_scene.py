@@ -1,6 +1,7 @@
 """A scene that changes: what follows it is what would be made anew."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -190,6 +191,10 @@ def test_a_change_that_fails_changes_nothing(planner: Planner, tmp_path: Path) -
         (SceneError, "no link is called 'hand'", lambda s: s.attach(CUP, "hand")),
         (SceneError, "'gripper' is no link", lambda s: s.attach(CUP, "link6", ["gripper"])),
         (SceneError, "list of names", lambda s: s.attach(CUP, "link6", "link5")),
+        (SceneError, "list of names", lambda s: s.attach(CUP, "link6", 5)),
+        (SceneError, "no configuration", lambda s: s.link_pose([0.0, 0.0], "link6")),
+        (SceneError, "no configuration", lambda s: s.link_pose([np.nan] * 6, "link6")),
+        (ValueError, "no pose", lambda s: s.move("crate", [1, 2, 3])),
         (SceneError, "'tabel' is no link", lambda s: s.allow("crate", "tabel")),
         (SceneError, "is a link of the robot", lambda s: s.add(Sphere("link5", (1, 1, 1), 0.1))),
         (SceneError, "is no shape", lambda s: s.add("crate")),
@@ -316,3 +321,131 @@ def test_what_is_away_is_allowed_to_touch_once_it_comes_back(planner: Planner) -
         planner.scene.add(CRATE)
         with planner.scene.world() as world:
             np.testing.assert_array_equal(planner._certifier._world.free(q), world.free(q))
+
+
+@pytest.fixture
+def fixtured(tmp_path: Path) -> Iterator[tuple[Planner, Path]]:
+    """A planner that was made with a mesh, whose file is gone since, and with a crate."""
+    file = cube(tmp_path / "own.obj", 0.05)
+    with Planner.load() as packaged:
+        bundle = packaged.bundle
+    mesh = Mesh("fixture", file, Placement((0.0, 2.0, 1.0)))
+    around = bundle.workcell.including(mesh, CRATE)
+    with Planner(replace(bundle, workcell=around), "with a mesh") as made:
+        file.unlink()
+        yield made, file
+
+
+def in_step(planner: Planner) -> None:
+    """Scene, certificate, both models and PyBullet have the same shapes."""
+    names = {shape.name for shape in planner.scene.workcell}
+    names |= {one.name for one in planner.scene.attached}
+    own, search = planner._certifier, planner._preparation._clearances._table
+    assert own.scene is planner.scene.now
+    assert {key.name for key in own.collisions.collider.bodies if key.is_shape} == names
+    assert {key.name for key in search.bodies if key.is_shape} == names
+    assert own._world._shapes.keys() == names
+
+
+def test_what_stays_is_not_read_again(fixtured: tuple[Planner, Path]) -> None:
+    """Nor is it for the roadmaps that are made anew."""
+    planner, _ = fixtured
+    planner.scene.remove("crate")
+    in_step(planner)
+    assert len(planner.nodes("level_cup"))
+
+
+def test_a_change_that_can_not_be_taken_back_by_reading_is_taken_back(
+    fixtured: tuple[Planner, Path],
+) -> None:
+    planner, _ = fixtured
+    q = planner.robot.sample(100, np.random.default_rng(9))
+    free = planner._certifier.collisions.free(q)
+    for _ in range(2):
+        with pytest.raises(RobotError, match="there is no mesh"):
+            planner.scene.move("fixture", Placement((0.0, 2.0, 1.2)))
+        in_step(planner)
+        np.testing.assert_array_equal(planner._certifier.collisions.free(q), free)
+    planner.scene.remove("fixture")
+    in_step(planner)
+
+
+def test_what_the_searchs_model_refuses_is_taken_back(
+    planner: Planner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what the certificate's, or PyBullet's."""
+    planner.scene.add(CRATE)
+    q = planner.robot.sample(100, np.random.default_rng(9))
+    free = planner._certifier.collisions.free(q)
+
+    def fail(*_: object) -> None:
+        raise RobotError("not now")
+
+    own = planner._certifier
+    for thing, name in (
+        (planner._preparation._clearances, "change"),
+        (own.collisions.collider, "change"),
+        (own._world, "change"),
+        (own._world, "_add"),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(thing, name, fail)
+            with pytest.raises(RobotError, match="not now"):
+                planner.scene.become(planner.scene.now.removing("crate").adding(BALL))
+        in_step(planner)
+        np.testing.assert_array_equal(own.collisions.free(q), free)
+
+
+def test_allowances_of_what_is_carried_end_with_the_shape_that_they_name(planner: Planner) -> None:
+    planner.scene.add(CRATE)
+    planner.scene.attach(CUP, "link6", touching=["crate", "link5"])
+    planner.scene.remove("crate")
+    assert planner.scene.attached[0].touching == ("link5",)
+
+
+def test_another_shape_of_a_name_inherits_nothing(planner: Planner) -> None:
+    planner.scene.add(CRATE)
+    planner.scene.allow("crate", "link4")
+    planner.scene.attach(CRATE.placed(CARRYING), "link6")
+    assert planner.scene.now.allowed == {("crate", "link4")}
+    planner.scene.detach("crate", np.zeros(6))
+    planner.scene.attach(Sphere("crate", (0.0, 0.0, 0.1), 0.05), "link6")
+    assert not planner.scene.now.allowed
+
+
+def test_what_the_robot_allows_it_allows_after_a_change_is_taken_back() -> None:
+    """PyBullet is not told to examine links that may always touch."""
+    with Planner.from_urdf("franka_panda/panda.urdf", "panda_hand") as panda:
+        q = panda.robot.sample(100, np.random.default_rng(10))
+        before, free = panda.scene.now, panda._certifier._world.free(q)
+        panda.scene.become(replace(before, allowed=panda.robot.allowed))
+        panda.scene.become(before)
+        np.testing.assert_array_equal(panda._certifier._world.free(q), free)
+    assert free.any()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Box("x", (0, 0, np.nan), (1, 1, 1)),
+        lambda: Box("x", (0, 0, 0), (1, -1, 1)),
+        lambda: Box("x", ("a", 0, 0), (1, 1, 1)),
+        lambda: Sphere("x", (0, 0, 0), 0.0),
+        lambda: Capsule("x", (0, 0, 0), (0, 0, np.inf), 0.1),
+        lambda: Cylinder("x", Placement(), -1.0, 0.1),
+        lambda: Cylinder("x", [1, 2, 3], 1.0, 0.1),  # type: ignore[arg-type]
+        lambda: PointCloud("x", np.zeros((1, 3)), np.nan),
+        lambda: Placement((0.0, 0.0), (0.0, 0.0, 0.0)),  # type: ignore[arg-type]
+        lambda: Placement((0.0, 0.0, np.nan)),
+    ],
+)
+def test_numbers_that_are_none_make_no_shape(make: Callable[[], object]) -> None:
+    with pytest.raises(ValueError, match="must be|no pose"):
+        make()
+
+
+def test_lists_and_arrays_are_taken_for_tuples(planner: Planner) -> None:
+    box = Box("x", [0.5, 0.3, 0.1], np.full(3, 0.1))  # type: ignore[arg-type]
+    assert box == Box("x", (0.5, 0.3, 0.1), (0.1, 0.1, 0.1))
+    planner.scene.add(box)
+    in_step(planner)

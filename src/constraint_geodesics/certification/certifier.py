@@ -111,15 +111,9 @@ class Certifier:
         """Certify in another scene of the same robot from now on.  Raises RobotError or ValueError,
         with nothing changed, where a shape can't be bounded or a link does not exist.
         """
-        try:
+        with self.collisions.changing(scene):
             if self._world is not None:
                 self._world.change(scene.workcell, scene.attached, scene.allowed)
-            self.collisions.change(scene)
-        except BaseException:
-            old = self.scene
-            if self._world is not None:
-                self._world.change(old.workcell, old.attached, old.allowed)
-            raise
         self.scene = scene
 
     def __enter__(self) -> Self:

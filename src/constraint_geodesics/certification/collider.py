@@ -3,6 +3,7 @@ the joints' axes, and which pairs of bodies need a look.
 """
 
 from collections.abc import Callable, Collection
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -58,6 +59,17 @@ class Collider:
         bodies = self.bodies
         same = {key for key, body in before.items() if bodies.get(key) is body}
         self._apart = frozenset(pair for pair in self._apart if same.issuperset(pair))
+        self._arrange()
+
+    @property
+    def state(self) -> tuple[Any, ...]:
+        """To be taken back by `restore`."""
+        return self._table.state, self._apart
+
+    def restore(self, state: tuple[Any, ...]) -> None:
+        """Be as before."""
+        table, self._apart = state
+        self._table.restore(table)
         self._arrange()
 
     @property

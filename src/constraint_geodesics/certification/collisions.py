@@ -2,6 +2,8 @@
 distances where two bodies come closer than the proof's margin.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -55,11 +57,18 @@ class CollisionCheck:
         self._rigid = dict[Pair, tuple[Body, Body, _Contact | None]]()
         self._follow(scene)
 
-    def change(self, scene: Scene) -> None:
-        """Follow the scene.  Raises RobotError, with nothing changed, where a shape can't be
-        bounded.
+    @contextmanager
+    def changing(self, scene: Scene) -> Iterator[None]:
+        """Follow the scene, once the world has, which is what happens within; where it, or this,
+        can't, all is as it was.
         """
-        self.collider.change(scene)
+        before = self.collider.state
+        try:
+            self.collider.change(scene)
+            yield
+        except BaseException:
+            self.collider.restore(before)
+            raise
         self._follow(scene)
 
     def _follow(self, scene: Scene) -> None:

@@ -7,13 +7,13 @@ import contextlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
-from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
 from constraint_geodesics.scene import convex_kernels as kernels
 from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.pieces import Piece, read_pieces
@@ -183,7 +183,7 @@ class _Own(NamedTuple):
 
     shape: Shape
     pieces: tuple[Piece, ...]
-    block: _Block | None
+    block: _Block
 
 
 def _are_same(first: Sequence[Piece], second: Sequence[Piece]) -> bool:
@@ -232,9 +232,8 @@ class BodyTable:
                 bodies[key], blocks[key] = self.bodies[key], self._blocks[key]
                 continue
             own[shape.name] = self._own_of(shape)
-            if own[shape.name].pieces:
-                bodies[key], blocks[key] = self._placed(shape, held, own[shape.name])
-                news.add(key)
+            bodies[key], blocks[key] = self._placed(shape, held, own[shape.name])
+            news.add(key)
         allowed = touching(scene.robot, scene)
         if allowed != self._allowed:  # of what is named there all pairs are looked at again
             named = set().union(*(allowed ^ self._allowed))
@@ -244,6 +243,15 @@ class BodyTable:
         stay = bodies.keys() - news
         left = [(a, b) for a, b in self.pairs if a in stay and b in stay]
         self.pairs = (*left, *self._pairs(news))
+
+    @property
+    def state(self) -> tuple[Any, ...]:
+        """All that changes, to be taken back by `restore`; nothing is read again for that."""
+        return self.scene, self._allowed, self.bodies, self._blocks, self._own, self.pairs
+
+    def restore(self, state: tuple[Any, ...]) -> None:
+        """Be as before."""
+        self.scene, self._allowed, self.bodies, self._blocks, self._own, self.pairs = state
 
     def arrays(
         self, pairs: Sequence[Pair], more: Sequence[Pair] = ()
@@ -296,14 +304,15 @@ class BodyTable:
         pieces = at_origin.pieces()
         if same and known is not None and _are_same(pieces, known.pieces):
             return known
-        return _Own(at_origin, pieces, block_of(pieces, self._dof) if pieces else None)
+        if not pieces:
+            raise RobotError(f"{shape.name!r} has no collision shape: nothing could touch it")
+        return _Own(at_origin, pieces, block_of(pieces, self._dof))
 
     def _placed(self, shape: Shape, held: Attached | None, own: _Own) -> tuple[Body, _Block]:
         pose, frame, carrier = shape.at.matrix, 0, None
         if held is not None:
             link = self.links[held.link]
             pose, frame, carrier = link.pose @ pose, link.frame, held.link
-        assert own.block is not None
         there = tuple(piece.at(pose) for piece in own.pieces)
         body = Body(shape.name, frame, there, shape=shape, carrier=carrier)
         return body, self._reaching(own.block.at(pose, frame), body)

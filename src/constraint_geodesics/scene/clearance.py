@@ -8,7 +8,7 @@ kinematics, with the direction in which it grows; where pieces overlap, how deep
 from collections.abc import Collection
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -21,6 +21,7 @@ from constraint_geodesics.scene import convex_kernels as convex
 from constraint_geodesics.scene.bodies import BodyTable, Pair
 from constraint_geodesics.scene.pieces import Piece
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.world import BodyKey
 
 # columns of a contact
 DISTANCE, PAIR = 0, 1
@@ -101,19 +102,34 @@ class Clearances:
         self._table = BodyTable(scene, frames, partial(_reach, robot))
         self._apart = frozenset(apart)
 
-    def change(self, scene: Scene, apart: Collection[Pair] = ()) -> None:
-        """Follow the scene."""
+    def change(self, scene: Scene) -> None:
+        """Follow the scene; nothing has changed where it raises."""
         self._table.change(scene)
-        self._apart = frozenset(apart)
 
     @property
-    def model(self) -> ClearanceModel:
-        """Of the scene as it is now."""
-        bodies = self._table.bodies
+    def state(self) -> tuple[Any, ...]:
+        """To be taken back by `restore`."""
+        return self._table.state
+
+    def restore(self, state: tuple[Any, ...]) -> None:
+        """Be as before."""
+        self._table.restore(state)
+
+    def model(
+        self, apart: Collection[Pair] | None = None, without: Collection[str] = ()
+    ) -> ClearanceModel:
+        """Of the scene as it is now.  apart: as above, where others are known by now.  without:
+        names of shapes that are left out.
+        """
+        bodies, left_out = self._table.bodies, {BodyKey(name, True) for name in without}
+        never = self._apart if apart is None else frozenset(apart)
         pairs = [
             (a, b)
             for a, b in self._table.pairs
-            if bodies[a].frame != bodies[b].frame and (a, b) not in self._apart
+            if bodies[a].frame != bodies[b].frame
+            and (a, b) not in never
+            and a not in left_out
+            and b not in left_out
         ]
         if not pairs:
             return NO_CLEARANCE
@@ -122,7 +138,7 @@ class Clearances:
 
 def clearance_model(scene: Scene, apart: Collection[Pair] = ()) -> ClearanceModel:
     """The model of a scene, as `Clearances` makes it."""
-    return Clearances(scene, apart).model
+    return Clearances(scene, apart).model()
 
 
 def _reach(robot: SerialRobot, piece: Piece, frame: int) -> Float[np.ndarray, "D"]:

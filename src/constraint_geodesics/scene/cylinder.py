@@ -26,6 +26,7 @@ class Cylinder(Shape):
     kind: Literal["cylinder"] = "cylinder"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         object.__setattr__(self, "pose", Placement.of(self.pose))
 
     @property

@@ -32,6 +32,7 @@ class Mesh(Shape):
     scale: Positive = 1.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         object.__setattr__(self, "pose", Placement.of(self.pose))
 
     @property

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -64,7 +63,14 @@ class PlanningScene:
         """Of a link's frame in the base frame at a configuration [rad]."""
         if link not in self.links:
             raise SceneError(f"no link is called {link!r}: {', '.join(self.links)}")
-        return self._link_pose(np.asarray(q, float), link)
+        try:
+            place = np.array(q, float)
+        except (TypeError, ValueError):
+            place = np.empty(0)
+        dof = self.robot.dof
+        if place.shape != (dof,) or not np.isfinite(place).all():
+            raise SceneError(f"{q!r} is no configuration: must be {dof} finite numbers")
+        return self._link_pose(place, link)
 
     def add(self, *shapes: Shape) -> None:
         """Put shapes around the robot, in the base frame, beside what is there.  Several at once
@@ -82,33 +88,29 @@ class PlanningScene:
         """
         self.become(self._now.moving(name, Placement.of(pose)))
 
-    def attach(self, shape: Shape | str, link: str, touching: Sequence[str] = ()) -> None:
+    def attach(self, shape: Shape, link: str, touching: Sequence[str] = ()) -> None:
         """Let a link carry a shape, placed in the link's frame; a shape around the robot of that
         name is taken away.  touching: names of links and shapes that may touch it.
         """
-        if isinstance(touching, str) or not isinstance(shape, Shape):
-            wrong = "touching is a list of names" if isinstance(touching, str) else "no shape"
-            raise SceneError(f"{shape!r} can't be attached: {wrong}")
-        held = Attached(shape, link, tuple(touching))
-        changed = self._now.attaching(held)
-        self._require_known(changed, *touching)
-        self.become(changed)
+        if not isinstance(shape, Shape):
+            raise SceneError(f"{shape!r} can't be attached: it is no shape")
+        if isinstance(touching, str) or not isinstance(touching, Sequence):
+            raise SceneError(f"touching = {touching!r}: must be a list of names")
+        self.become(self._now.attaching(Attached(shape, link, tuple(touching))))
 
     def detach(self, name: str, at: Float[np.ndarray, "D"] | None = None) -> None:
         """Carry a shape no longer.  at: the configuration [rad] at which it is let go: it stays
         around the robot where it is then; without one it is gone.
         """
         held = next((one for one in self._now.attached if one.name == name), None)
-        changed = self._now.detaching(name)
+        stays = None
         if at is not None and held is not None:
             pose = self.link_pose(at, held.link) @ held.shape.at.matrix
-            stays = changed.adding(held.shape.placed(Placement.of_matrix(pose)))
-            changed = replace(stays, allowed=self._now.allowed)
-        self.become(changed)
+            stays = Placement.of_matrix(pose)
+        self.become(self._now.detaching(name, stays))
 
     def allow(self, first: str, second: str) -> None:
         """Let two bodies touch: shapes, attached or not, or links, by their names."""
-        self._require_known(self._now, first, second)
         self.become(self._now.allowing(first, second))
 
     @contextmanager
@@ -134,10 +136,9 @@ class PlanningScene:
         for shape in shapes:
             if shape.name in self.links:
                 raise SceneError(f"{shape.name!r} is a link of the robot: give the shape another")
-        self._follow(scene)
-        self._now = scene
-
-    def _require_known(self, scene: Scene, *names: str) -> None:
-        for name in names:
+        touching = [other for one in scene.attached for other in one.touching]
+        for name in (*touching, *(end for pair in scene.allowed for end in pair)):
             if name not in self.links and name not in scene.names:
                 raise SceneError(f"{name!r} is no link of the robot, nor a shape of the scene")
+        self._follow(scene)
+        self._now = scene

@@ -85,6 +85,7 @@ class PointCloud(Shape):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points_m", Points.of(self.points_m))
+        super().__post_init__()
         object.__setattr__(self, "pose", Placement.of(self.pose))
 
     @property

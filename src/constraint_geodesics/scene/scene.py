@@ -66,7 +66,7 @@ class Scene:
         for name in names:
             self._shape(name)
         left = tuple(shape for shape in self.workcell if shape.name not in names)
-        return replace(self, workcell=left, allowed=self._without(*names))
+        return replace(self, workcell=left)._forgetting(*names)
 
     def moving(self, name: str, at: Placement) -> "Scene":
         """With a shape's own frame elsewhere: in the base frame, or for one that is attached in its
@@ -82,26 +82,45 @@ class Scene:
         return replace(self, workcell=tuple(around))
 
     def attaching(self, held: Attached) -> "Scene":
-        """With a shape that a link carries; one of that name around the arm is taken away."""
+        """With a shape that a link carries; one of that name around the arm is taken away, and what
+        it may touch as well unless it is the same shape elsewhere.
+        """
         if held.name in {one.name for one in self.attached}:
             raise SceneError(f"{held.name!r} is attached already: detach it first")
+        found, origin = self, Placement()
+        for shape in self.workcell:
+            if shape.name == held.name and shape.placed(origin) != held.shape.placed(origin):
+                found = found._forgetting(held.name)
         around = tuple(shape for shape in self.workcell if shape.name != held.name)
-        return replace(self, workcell=around, attached=(*self.attached, held))
+        return replace(found, workcell=around, attached=(*found.attached, held))
 
-    def detaching(self, name: str) -> "Scene":
-        """Without a shape that a link carries, and what it may touch."""
+    def detaching(self, name: str, stays: Placement | None = None) -> "Scene":
+        """Without a shape that a link carries, and what it may touch.  stays: where in the base
+        frame it is from then on, and may touch what it might; without one it is gone.
+        """
         left = tuple(one for one in self.attached if one.name != name)
         if len(left) == len(self.attached):
             raise SceneError(f"nothing called {name!r} is attached{_of(self.attached)}")
-        return replace(self, attached=left, allowed=self._without(name))
+        if stays is None:
+            return replace(self, attached=left)._forgetting(name)
+        (held,) = (one for one in self.attached if one.name == name)
+        return replace(self, attached=left, workcell=(*self.workcell, held.shape.placed(stays)))
 
     def allowing(self, first: str, second: str) -> "Scene":
         """With two bodies, links or shapes, that may touch."""
         return replace(self, allowed=self.allowed | {(first, second)})
 
-    def _without(self, *names: str) -> frozenset[tuple[str, str]]:
-        """The allowed pairs that none of the names is in."""
-        return frozenset(pair for pair in self.allowed if not set(pair) & set(names))
+    def _forgetting(self, *names: str) -> "Scene":
+        """Without what the names may touch."""
+        gone = set(names)
+        attached = tuple(
+            replace(one, touching=tuple(other for other in one.touching if other not in gone))
+            if gone & set(one.touching)
+            else one
+            for one in self.attached
+        )
+        allowed = frozenset(pair for pair in self.allowed if not gone & set(pair))
+        return replace(self, attached=attached, allowed=allowed)
 
     def _shape(self, name: str) -> Shape:
         for shape in self.workcell:

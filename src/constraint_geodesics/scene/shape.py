@@ -5,7 +5,7 @@ A new kind is one more file in this folder, and its name in shapes.py.
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -18,6 +18,22 @@ from constraint_geodesics.robot.kinematics import RobotError, rotation_from_rpy,
 from constraint_geodesics.scene.pieces import Piece, box_corners
 
 Triple = tuple[float, float, float]
+
+
+_SIZES = ("size_m", "radius_m", "length_m")
+"""Fields of shapes that must be positive."""
+
+
+def _numbers(shape: str, name: str, value: Any) -> Any:
+    """A field as a float, or a tuple of them."""
+    try:
+        given = np.array(value, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{shape!r}: {name} = {value!r}: must be numbers") from None
+    if not np.isfinite(given).all() or (name in _SIZES and not (given > 0.0).all()):
+        what = "positive and finite" if name in _SIZES else "finite"
+        raise ValueError(f"{shape!r}: {name} = {value!r}: must be {what}")
+    return float(given) if given.ndim == 0 else tuple(given.tolist())
 
 
 class RoundedBox(NamedTuple):
@@ -47,13 +63,23 @@ class Placement:
     position_m: Vector3 = (0.0, 0.0, 0.0)
     rpy_rad: Vector3 = (0.0, 0.0, 0.0)
 
+    def __post_init__(self) -> None:
+        for name in ("position_m", "rpy_rad"):
+            own = _numbers("placement", name, getattr(self, name))
+            if not isinstance(own, tuple) or len(own) != 3:
+                raise ValueError(f"placement: {name} = {own!r}: must be three numbers")
+            object.__setattr__(self, name, own)
+
     @classmethod
     def of(cls, pose: Any) -> "Placement":
         """From a Pose, or anything that has a `position` (3,) [m] and a `rotation` (3, 3)."""
         if isinstance(pose, cls):
             return pose
-        x, y, z = (float(value) for value in pose.position)
-        return cls((x, y, z), rpy_of(np.asarray(pose.rotation, float)))
+        try:
+            x, y, z = (float(value) for value in pose.position)
+            return cls((x, y, z), rpy_of(np.asarray(pose.rotation, float)))
+        except (AttributeError, TypeError):
+            raise ValueError(f"{pose!r} is no pose: must be a Pose or a Placement") from None
 
     @classmethod
     def of_matrix(cls, matrix: Float[np.ndarray, "4 4"]) -> "Placement":
@@ -101,6 +127,15 @@ class Shape(ABC):
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for numbers that are none, and for sizes that are not positive."""
+        for own in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, own.name)
+            if own.name.endswith(("_m", "_rad")) and not hasattr(value, "array"):
+                object.__setattr__(self, own.name, _numbers(self.name, own.name, value))
+        object.__setattr__(self, "exempt_links", tuple(self.exempt_links))
+
     reads_files: ClassVar[bool] = False
     """Whether its pieces come from files, which may be written anew."""
     name: str

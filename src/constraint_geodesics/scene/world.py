@@ -4,7 +4,7 @@ The only importer of pybullet.  Every world is a client of its own; nothing is s
 """
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
@@ -150,9 +150,9 @@ class World:
         self._check_shapes()
         self._joints = [joint_index[name] for name in robot.joint_names]
         self._tool = self._link_index[robot.tool_link]
-        for pair in robot.allowed:
-            first, second = (self._link_index[name] for name in pair)
-            bullet.setCollisionFilterPair(body, body, first, second, 0)
+        names = {index: name for name, index in self._link_index.items()}
+        hanging = (frozenset((names[row[0]], names[row[16]])) for row in info)
+        self._never = frozenset([*map(frozenset, robot.allowed), *hanging])
         self._shapes = dict[str, _Placed]()
         self._allowed = frozenset[frozenset[str]]()
         try:
@@ -167,7 +167,9 @@ class World:
         attached: Sequence[Attached] = (),
         allowed: Collection[tuple[str, str]] = (),
     ) -> None:
-        """Other shapes around the robot, other ones that it carries: what stays is left alone."""
+        """Other shapes around the robot, other ones that it carries: what stays is left alone, and
+        all does where this raises.
+        """
         wanted: dict[str, Shape | Attached] = {}
         everything: list[Shape | Attached] = [*fixed, *attached]
         for one in everything:
@@ -186,24 +188,37 @@ class World:
             self._require_links(held.name, [held.link])
             pairs += [frozenset((held.name, other)) for other in (held.link, *held.touching)]
         gone = {name for name, own in self._shapes.items() if wanted.get(name) != own.made}
-        now = frozenset(pairs)
+        news = {n: one for n, one in wanted.items() if n not in self._shapes or n in gone}
+        made = self._made(news)  # all that can fail, before anything goes
+        now = frozenset(pairs) | self._never
         # before a body goes, since PyBullet gives its number to another
         over = {p for p in self._allowed if p not in now or p & gone}
         self._filter(over, 1)
         self._allowed -= over
         for name in gone:
             self._bullet.removeBody(self._shapes.pop(name).body)
-        news = {name: one for name, one in wanted.items() if name not in self._shapes}
-        if news:
-            with quiet():
-                for name, one in news.items():
-                    try:
-                        self._shapes[name] = self._add(one)
-                    except self._bullet.error as error:
-                        raise RobotError(f"{name!r}: PyBullet can't make it: {error}") from None
+        self._shapes |= made
         self._filter(now - self._allowed, 0)
         # a pair of which one is away is filtered when it comes
         self._allowed = frozenset(p for p in now if all(self._parts(name) for name in p))
+
+    def _made(self, news: Mapping[str, Shape | Attached]) -> dict[str, _Placed]:
+        """Bodies of new shapes; none of them where one can't be made."""
+        made = dict[str, _Placed]()
+        if not news:
+            return made
+        try:
+            with quiet():
+                for name, one in news.items():
+                    try:
+                        made[name] = self._add(one)
+                    except self._bullet.error as error:
+                        raise RobotError(f"{name!r}: PyBullet can't make it: {error}") from None
+        except BaseException:
+            for own in made.values():
+                self._bullet.removeBody(own.body)
+            raise
+        return made
 
     def _add(self, one: Shape | Attached) -> _Placed:
         bullet = self._bullet

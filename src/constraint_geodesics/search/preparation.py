@@ -1,6 +1,7 @@
 """What is prepared once for each constraint and kept for the next query: its space and roadmap."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Protocol
@@ -15,7 +16,7 @@ from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.geometry.graph import components
 from constraint_geodesics.params import PlannerParams
 from constraint_geodesics.robot.kinematics import SerialRobot
-from constraint_geodesics.scene.clearance import ClearanceModel, Clearances, clearance_model
+from constraint_geodesics.scene.clearance import ClearanceModel, Clearances
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
 from constraint_geodesics.search.band import BandSettings, project
@@ -91,21 +92,31 @@ class Preparation:
         self.scene, self.checks, self.settings = scene, checks, settings
         self.draw = draw or scene.robot.sample
         self._clearances = Clearances(scene, checks.apart)
-        self._clearance = self._first_clearance = self._clearances.model
+        self._clearance = self._first_clearance = self._clearances.model()
         self.band = self._band()
         self._tasks: dict[tuple, Task] = {}
         self._roadmaps: dict[tuple, Roadmap | None] = {}
         self._named: frozenset[tuple] = frozenset()
 
-    def change(self, scene: Scene) -> None:
-        """Follow the scene, after the checks have."""
-        self._clearances.change(scene, self.checks.apart)
-        self._clearance = self._clearances.model
+    @contextmanager
+    def changing(self, scene: Scene) -> Iterator[None]:
+        """Follow the scene, once the checks have, which is what happens within; where they, or
+        this, can't, all is as it was.
+        """
+        before = self._clearances.state
+        try:
+            self._clearances.change(scene)
+            yield
+        except BaseException:
+            self._clearances.restore(before)
+            raise
+        self._clearance = self._clearances.model(self.checks.apart)
         left = tuple(shape for shape in self.scene.workcell if shape in scene.workcell)
         held = tuple(one for one in self.scene.attached if one in scene.attached)
         if (left, held) != (self.scene.workcell, self.scene.attached):
             self.scene = replace(self.scene, workcell=left, attached=held)
-            self._first_clearance = clearance_model(self.scene)
+            later = set(scene.names) - set(self.scene.names)
+            self._first_clearance = self._clearances.model(self.checks.apart, later)
             self._roadmaps = {}
 
     def _band(self) -> BandSettings:
