@@ -36,12 +36,13 @@ from constraint_geodesics.scene.clearance import clearance_model, path_stays_cle
 from constraint_geodesics.scene.pieces import Piece, prism
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere
-from constraint_geodesics.search.band import project
+from constraint_geodesics.search.band import PROJECTION, project
 from constraint_geodesics.search.candidates import Task, refined, rows_of
 from constraint_geodesics.search.nearest import nearest_on
-from constraint_geodesics.search.roadmap import build_roadmap, join, shortest_way
+from constraint_geodesics.search.roadmap import build_roadmap, join, points_along, shortest_way
 from constraint_geodesics.search.space import Space, space_of
 from constraint_geodesics.search.tree import tree_way
+from constraint_geodesics.search.ways_round import bent_round
 
 DONE, FAILED = "done", "failed: "
 """What an answer begins with."""
@@ -115,12 +116,14 @@ def _band() -> None:
     found = refined(task, "straight", _ROWS)
     assert found is not None
     rows_of(found, 1e-4)
+    bent_round(task.open, task.clear, _ROWS.copy(), 1.0, PROJECTION)
 
 
 def _roadmap() -> None:
     own, (start, goal) = _space(), _ROWS[[0, -1]]
     graph = build_roadmap(own, _ROWS, 3)
     shortest_way(graph, start, goal, join(graph, own, start), join(graph, own, goal), own)
+    points_along(own, _ROWS[[0, -1]].copy())
 
 
 def _trees() -> None:

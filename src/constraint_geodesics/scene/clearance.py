@@ -367,15 +367,6 @@ def stays_clear(chain, model, first, second, room):
     return True
 
 
-@njit(**LEAF)
-def same_contacts(chain, model, q, count, room):
-    """The contacts of the same pairs of pieces at another configuration, as near or not."""
-    simplex, bodies = room.simplex, (model.hulls, room.nodes, room.pairs)
-    _place(chain, q, room)
-    for c in range(count):
-        _measure(bodies, room.frames, simplex, int(room.found[c, PAIR]), np.inf, room.found[c])
-
-
 @njit(inline="always", **COMPILE)
 def frames_of(room, c):
     """The frames that carry the two bodies of a contact; joint j carries frame j + 1."""

@@ -17,6 +17,8 @@ ACCURACY = 1e-9
 PROJECTION = Retraction(ACCURACY, iterations=12, last_step=1e-5, damping=1e-6)
 _AFTER_STEP = PROJECTION._replace(iterations=6, damping=1e-9)
 """The projection of a node after a step of the band."""
+PUSHED_M = 0.006
+"""Bodies that are nearer are pushed apart, at least [m]."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +34,14 @@ class BandSettings:
     largest_step_rad: float = 0.5
     clearance_m: float = 0.006
 
-    def steps(self, guarded: bool) -> tuple[int, Retraction, float, float, bool]:
+    def steps(
+        self, guarded: bool = False, wider: float = 1.0
+    ) -> tuple[int, Retraction, float, float, float, bool]:
         """As `relax_band` takes them.  guarded: no line between two nodes that touches nothing is
-        moved into something.
+        moved into something.  wider: how many times as far what is near is pushed away.
         """
-        return self.iterations, _AFTER_STEP, self.accuracy, self.largest_step_rad, guarded
+        margin, longest = wider * max(self.clearance_m, PUSHED_M), self.largest_step_rad
+        return self.iterations, _AFTER_STEP, self.accuracy, longest, margin, guarded
 
 
 def step_lengths(points: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T-1"]:

@@ -30,24 +30,9 @@ from constraint_geodesics.constraints.kernels import (
 )
 from constraint_geodesics.constraints.projection import normal_matrix
 from constraint_geodesics.robot.kernels import LANES
-from constraint_geodesics.scene.clearance import (
-    DISTANCE,
-    PAIR,
-    contact_row,
-    near_contacts,
-    same_contacts,
-)
-from constraint_geodesics.search.space import (
-    CLOSE,
-    NEAR,
-    STILL,
-    Workspace,
-    is_free,
-    look_at,
-    project_all,
-    project_node,
-    workspace,
-)
+from constraint_geodesics.scene.clearance import Contacts, new_contacts, stays_clear
+from constraint_geodesics.search.push_kernels import Push, new_push, penalise
+from constraint_geodesics.search.space import NEAR, Workspace, look_at, project_all, workspace
 
 _DIFFERENCE = 1e-5
 _SMALLEST_PIVOT = 1e-12
@@ -62,8 +47,7 @@ class _Active(NamedTuple):
     """The rows (D, D) of a node that count: what each is of, its sign, whether it is an inequality,
     which may be let go, how far its bound is away, and its multiplier; (D,) each.
 
-    of: i < m a row of the residual, m the rows that are bounded together, m + 1 a joint limit, m +
-    2 + c the contact of the pair c of pieces.
+    of: i < m a row of the residual, m the rows that are bounded together, m + 1 a joint limit.
     """
 
     rows: np.ndarray
@@ -75,18 +59,16 @@ class _Active(NamedTuple):
 
 
 class _BandWork(NamedTuple):
-    """What the kernels of a band write into: what is known of LANES nodes; contact_weights, here,
-    there, moved, row, gradient (D,); the second derivatives full (D, D).
+    """What the kernels of a band write into: what is known of LANES nodes; here, there, moved,
+    gradient (D,); the second derivatives full (D, D).
     """
 
     node: Workspace
     looked: Looked
     active: _Active
-    contact_weights: np.ndarray
     here: np.ndarray
     there: np.ndarray
     moved: np.ndarray
-    row: np.ndarray
     gradient: np.ndarray
     full: np.ndarray
 
@@ -112,8 +94,6 @@ def new_work(space):
         np.empty(dof),
         np.empty(dof),
         np.empty(dof),
-        np.empty(dof),
-        np.empty(dof),
         np.empty((dof, dof)),
     )
 
@@ -128,9 +108,9 @@ def _size_together(bounds, residual):
 
 
 @njit(**LEAF)
-def _weighted_gradient(space, q, cone_weight, contacts, work, out):
-    """Σ_j λ_j ∇c_j (D,) of one configuration: of the residual's rows, of the size of those that are
-    bounded together, and of so many contacts.
+def _weighted_gradient(space, q, cone_weight, work, out):
+    """Σ_j λ_j ∇c_j (D,) of one configuration: of the residual's rows, and of the size of those that
+    are bounded together.
     """
     node, bounds = work.node, space.constraint.rows
     look_at(space, q, node)
@@ -146,13 +126,6 @@ def _weighted_gradient(space, q, cone_weight, contacts, work, out):
         if weight != 0.0:
             for d in range(q.shape[0]):
                 out[d] += weight * jacobian[i, d]
-    if contacts == 0:
-        return
-    same_contacts(space.chain, space.clearance, q, contacts, node.contacts)
-    for c in range(contacts):
-        contact_row(space.chain.prismatic, node.contacts, c, work.row)
-        for d in range(q.shape[0]):
-            out[d] -= work.contact_weights[c] * work.row[d]
 
 
 @njit(**LEAF)
@@ -160,7 +133,7 @@ def _gather(space, q, which, work):
     """The rows at q that count into `work.active`: exact ones, and inequalities that are near;
     returns how many.
     """
-    dof, node, active, bounds = q.shape[0], work.node, work.active, space.constraint.rows
+    dof, active, bounds = q.shape[0], work.active, space.constraint.rows
     residual, jacobian = work.looked.residuals[which], work.looked.jacobians[which]
     limits = space.limits
     rows, of, signs, loose, slack = (
@@ -206,23 +179,6 @@ def _gather(space, q, which, work):
             rows[size, d] = side
             of[size], signs[size], loose[size] = count + 1, side, True
             slack[size] = limits[1, d] - q[d] if side > 0.0 else q[d] - limits[0, d]
-            size += 1
-    if space.clearance.top > 0:
-        far, found = space.margin + CLOSE, node.contacts.found
-        near = near_contacts(space.chain, space.clearance, q, far, node.contacts)
-        for c in range(near):
-            if size == dof:
-                break
-            length = contact_row(space.chain.prismatic, node.contacts, c, rows[size])
-            if length < STILL:
-                continue
-            slack[size] = (found[c, DISTANCE] - space.margin) / length
-            # whether the joints get so far in a step is told in their own units
-            if slack[size] > NEAR:
-                continue
-            for j in range(dof):
-                rows[size, j] = -rows[size, j] / length
-            of[size], signs[size], loose[size] = count + 2 + int(found[c, PAIR]), 1.0 / length, True
             size += 1
     return size
 
@@ -317,14 +273,12 @@ def _reflect(v, first, x):
 
 @njit(**LEAF)
 def _weigh(active, size, work):
-    """The multipliers as weights of the constraint's rows and of the contacts, those that count
-    first; returns the weight of the rows bounded together, how many contacts count, and whether
-    anything is curved.
+    """The multipliers as weights of the constraint's rows; returns the weight of the rows bounded
+    together, and whether anything is curved.
     """
     weights, count = work.node.weights, work.node.weights.shape[0]
     weights[:] = 0.0
-    cone_weight, contacts = 0.0, 0
-    curved = False
+    cone_weight, curved = 0.0, False
     for i in range(size):
         of = active.of[i]
         if of < count:
@@ -333,45 +287,45 @@ def _weigh(active, size, work):
         elif of == count:
             cone_weight = active.multipliers[i]
             curved = True
-        elif of >= count + 2:
-            work.contact_weights[contacts] = active.multipliers[i] * active.signs[i]
-            work.node.contacts.found[contacts, PAIR] = of - count - 2
-            contacts += 1
-            curved = True
-    return cone_weight, contacts, curved
+    return cone_weight, curved
 
 
 @njit(**LEAF)
-def _add_curvature(space, q, which, weighed, basis, count, hessian, work):
-    """Add Nᵀ (Σ λ_j ∇²c_j) N to the leading (k, k) of `hessian`, N the leading k columns of
-    `basis`: in closed form where the kind knows one, else by finite differences.  weighed: the
-    weight of the rows bounded together, and how many contacts count.
+def _add_reduced(full, basis, count, hessian, here):
+    """Add Nᵀ F N to the leading (k, k) of `hessian`, F (D, D) symmetric, N the leading k columns of
+    `basis`.
     """
-    dof, (cone_weight, contacts) = q.shape[0], weighed
-    node, full, here, there, moved = work.node, work.full, work.here, work.there, work.moved
-    if (
-        cone_weight == 0.0
-        and contacts == 0
-        and curvature(space, node.weights, work.looked, which, full)
-    ):
-        for k in range(count):
+    dof = full.shape[0]
+    for k in range(count):
+        for i in range(dof):
+            here[i] = 0.0
+            for d in range(dof):
+                here[i] += full[i, d] * basis[d, k]
+        for j in range(k + 1):
+            value = 0.0
             for i in range(dof):
-                here[i] = 0.0
-                for d in range(dof):
-                    here[i] += full[i, d] * basis[d, k]
-            for j in range(k + 1):
-                value = 0.0
-                for i in range(dof):
-                    value += here[i] * basis[i, j]
-                hessian[k, j] += value
-                if j < k:
-                    hessian[j, k] += value
+                value += here[i] * basis[i, j]
+            hessian[k, j] += value
+            if j < k:
+                hessian[j, k] += value
+
+
+@njit(**LEAF)
+def _add_curvature(space, q, which, cone_weight, basis, count, hessian, work):
+    """Add Nᵀ (Σ λ_j ∇²c_j) N to the leading (k, k) of `hessian`, N the leading k columns of
+    `basis`: in closed form where the kind knows one, else by finite differences.  cone_weight: of
+    the rows bounded together.
+    """
+    dof, node = q.shape[0], work.node
+    full, here, there, moved = work.full, work.here, work.there, work.moved
+    if cone_weight == 0.0 and curvature(space, node.weights, work.looked, which, full):
+        _add_reduced(full, basis, count, hessian, here)
         return
-    _weighted_gradient(space, q, cone_weight, contacts, work, here)
+    _weighted_gradient(space, q, cone_weight, work, here)
     for k in range(count):
         for d in range(dof):
             moved[d] = q[d] + _DIFFERENCE * basis[d, k]
-        _weighted_gradient(space, moved, cone_weight, contacts, work, there)
+        _weighted_gradient(space, moved, cone_weight, work, there)
         for j in range(count):
             value = 0.0
             for d in range(dof):
@@ -386,21 +340,36 @@ def _add_curvature(space, q, which, weighed, basis, count, hessian, work):
 def reduced(space, q, which, gradient, basis, hessian, onto, work):
     """Null space `basis` (D, k) of the active rows at q and the reduced Hessian (k, k); returns k.
 
-    which: of the configurations in `work.looked` q is.  gradient: e = 2 q_i − q_{i−1} − q_{i+1}
-    (D,).  An inequality whose multiplier would hold the node back is let go.
+    which: of the configurations in `work.looked` q is.  gradient (D,): e = 2 q_i − q_{i−1} −
+    q_{i+1} and what pushes.  An inequality whose multiplier would hold the node back is let go.
     onto (D,): the shortest step that ends on the inequalities that are kept.
     """
     node = work.node
     size = _gather(space, q, which, work)
     size = _let_go(work.active, size, gradient, node.normal, work.here, onto)
     count = null_space(work.active.rows, size, basis)
-    cone_weight, contacts, curved = _weigh(work.active, size, work)
+    cone_weight, curved = _weigh(work.active, size, work)
     for k in range(count):
         for j in range(count):
             hessian[k, j] = 2.0 if k == j else 0.0
     if curved:
-        _add_curvature(space, q, which, (cone_weight, contacts), basis, count, hessian, work)
+        _add_curvature(space, q, which, cone_weight, basis, count, hessian, work)
     return count
+
+
+@njit(**LEAF)
+def _coupling(band, i, a, b):
+    """An entry of the block between node i and the one before: −N_iᵀ N_{i−1}, and what pushes their
+    line.
+    """
+    dof, push, value = band.gradients.shape[1], band.push, 0.0
+    for d in range(dof):
+        value -= band.bases[i, d, a] * band.bases[i - 1, d, b]
+    if push.touched[i]:
+        for d in range(dof):
+            for e in range(dof):
+                value += band.bases[i, d, a] * push.crosses[i, d, e] * band.bases[i - 1, e, b]
+    return value
 
 
 @njit(**LEAF)
@@ -423,10 +392,7 @@ def _newton(band, m, shift):
             before = counts[i - 1]
             for a in range(size):
                 for b in range(before):
-                    value = 0.0
-                    for d in range(dof):
-                        value -= bases[i, d, a] * bases[i - 1, d, b]
-                    couplings[i, a, b] = value
+                    couplings[i, a, b] = _coupling(band, i, a, b)
                 forward(factors[i - 1], before, couplings[i, a])
             for a in range(size):
                 for b in range(size):
@@ -470,33 +436,11 @@ def gradient_of(nodes, i, d):
     return 2.0 * nodes[i, d] - nodes[i - 1, d] - nodes[i + 1, d]
 
 
-@njit(inline="always", **LEAF)
-def _hold_back(space, nodes, trial, held, work):
-    """Leave nodes where they were, `nodes`, if the line from or to where they would be, `trial`,
-    runs into something.
-    """
-    n = nodes.shape[0] - 1
-    for k in range(n + 1):
-        held[k] = k == 0 or k == n
-    i = 0
-    while i < n:
-        # the line between two nodes that are held is one of before, whatever it touches
-        if (held[i] and held[i + 1]) or is_free(space, trial[i], trial[i + 1], work):
-            i += 1
-            continue
-        back = not held[i] and i > 0
-        for k in (i, i + 1):
-            held[k] = True
-            for d in range(nodes.shape[1]):
-                trial[k, d] = nodes[k, d]
-        # the line before ends elsewhere now
-        i = i - 1 if back else i + 1
-
-
 class _Band(NamedTuple):
     """What the m inner nodes of a band have: bases, hessians, factors, couplings (m, D, D), counts
-    (m,), gradients, right, steps, onto (m, D); trial (m + 2, D), held (m + 2,); shares, left (m,)
-    of `project_all`.
+    (m,), gradients, right, steps, onto (m, D); shares, left (m,) of `project_all`; trial (m + 2, D)
+    with what pushes it, and what pushes the band; held (m + 2,); blocked, still (m + 1,): the lines
+    that touch something, and those of the trial.
     """
 
     bases: np.ndarray
@@ -508,14 +452,19 @@ class _Band(NamedTuple):
     right: np.ndarray
     steps: np.ndarray
     onto: np.ndarray
-    trial: np.ndarray
-    held: np.ndarray
     shares: np.ndarray
     left: np.ndarray
+    trial: np.ndarray
+    pushed: Push
+    push: Push
+    held: np.ndarray
+    blocked: np.ndarray
+    still: np.ndarray
+    contacts: Contacts
 
 
 @njit(**COMPILE)
-def _new_band(nodes):
+def _new_band(around, nodes):
     """What a band of these nodes needs."""
     m, dof = nodes.shape[0] - 2, nodes.shape[1]
     return _Band(
@@ -528,32 +477,73 @@ def _new_band(nodes):
         np.empty((m, dof)),
         np.empty((m, dof)),
         np.empty((m, dof)),
-        nodes.copy(),
-        np.zeros(m + 2, dtype=np.bool_),
         np.ones(m),
         np.empty(m),
+        nodes.copy(),
+        new_push(nodes),
+        new_push(nodes),
+        np.zeros(m + 2, dtype=np.bool_),
+        np.zeros(m + 1, dtype=np.bool_),
+        np.zeros(m + 1, dtype=np.bool_),
+        new_contacts(around.clearance, dof),
     )
 
 
-@njit(inline="always", **LEAF)
+@njit(**LEAF)
+def _is_clear(around, first, second, contacts):
+    return stays_clear(around.chain, around.clearance, first, second, contacts)
+
+
+@njit(**LEAF)
+def _hold_back(around, nodes, band):
+    """Leave nodes where they were, `nodes`, if a line that touched nothing would from or to where
+    they would be, `band.trial`; tells which lines touch something still.
+    """
+    n, trial, held = nodes.shape[0] - 1, band.trial, band.held
+    for k in range(n + 1):
+        held[k] = k == 0 or k == n
+    i = 0
+    while i < n:
+        # the line between two nodes that are held is one of before, whatever it touches
+        both = held[i] and held[i + 1]
+        clear = not both and _is_clear(around, trial[i], trial[i + 1], band.contacts)
+        band.still[i] = band.blocked[i] and not clear
+        if both or clear or band.blocked[i]:
+            i += 1
+            continue
+        back = not held[i] and i > 0
+        for k in (i, i + 1):
+            held[k] = True
+            for d in range(nodes.shape[1]):
+                trial[k, d] = nodes[k, d]
+        # the line before ends elsewhere now
+        i = i - 1 if back else i + 1
+
+
+@njit(inline="always", **COMPILE)
 def _linearise_band(space, nodes, band, work):
     """The reduced problem of all inner nodes: bases, Hessians, and gradients where all steps onto
     bounds are taken.
     """
     n, dof = nodes.shape[0] - 1, nodes.shape[1]
-    onto, gradient = band.onto, work.gradient
+    onto, gradient, push = band.onto, work.gradient, band.push
     for i in range(n - 1):
         which = i % LANES
         if which == 0:
             linearise(space, nodes[i + 1 : min(i + 1 + LANES, n)], work.looked)
         for d in range(dof):
-            gradient[d] = gradient_of(nodes, i + 1, d)
+            gradient[d] = gradient_of(nodes, i + 1, d) + push.slopes[i + 1, d]
         band.counts[i] = reduced(
             space, nodes[i + 1], which, gradient, band.bases[i], band.hessians[i], onto[i], work
         )
+        if push.touched[i] or push.touched[i + 1]:
+            _add_reduced(
+                push.curvatures[i + 1], band.bases[i], band.counts[i], band.hessians[i], work.here
+            )
     for i in range(n - 1):
         for d in range(dof):
             gradient[d] = 2.0 * (nodes[i + 1, d] + onto[i, d]) - nodes[i, d] - nodes[i + 2, d]
+            gradient[d] += push.slopes[i + 1, d]
             if i > 0:
                 gradient[d] -= onto[i - 1, d]
             if i < n - 2:
@@ -582,57 +572,67 @@ def _promise(nodes, band):
         for d in range(dof):
             band.steps[i, d] += band.onto[i, d]
             square += band.steps[i, d] ** 2
-            promised += abs(gradient_of(nodes, i + 1, d) * band.onto[i, d])
+            gradient = gradient_of(nodes, i + 1, d) + band.push.slopes[i + 1, d]
+            promised += abs(gradient * band.onto[i, d])
         longest = max(longest, np.sqrt(square))
     return promised, longest
 
 
 @njit(**LEAF)
-def _project_nodes(space, nodes, settings, enough, band, work):
-    """Project inner nodes (m, D) in place; returns what remains of the violation of the worst, or
-    of the first of which more than `enough` does: those behind it are then left alone.
-
-    Side by side where nothing may meet; else onto all bounds at once, which leads to shorter bands
-    than the constraint first and what is near only then.
-    """
-    if space.clearance.top == 0:
-        return project_all(space, nodes, band.shares, settings, band.left, work)
-    worst = 0.0
-    for i in range(nodes.shape[0]):
-        worst = max(worst, project_node(space, nodes[i], settings, work))
-        if worst > enough:
-            break
-    return worst
+def _valued(around, margin, nodes, push, contacts):
+    """Energy and penalty of a band, whose derivatives are written into `push`."""
+    energy = band_energy(nodes)
+    if around.clearance.top > 0:
+        energy += penalise(around, margin, nodes, push, contacts)
+    return energy
 
 
-@njit(inline="always", **LEAF)
-def _moved(space, nodes, scale, projection, enough, band, work):
+@njit(inline="always", **COMPILE)
+def _moved(space, around, nodes, scale, settings, band, work):
     """The nodes after a share of the steps, projected, into `band.trial`; returns what remains of
-    the violation.
+    the violation, and the value.
     """
     trial, n = band.trial, nodes.shape[0] - 1
+    _, projection, _, _, margin, guarded = settings
     for i in range(1, n):
         for d in range(nodes.shape[1]):
             trial[i, d] = nodes[i, d] + scale * band.steps[i - 1, d]
-    return _project_nodes(space, trial[1:n], projection, enough, band, work)
+    left = project_all(space, trial[1:n], band.shares, projection, band.left, work)
+    if guarded:
+        _hold_back(around, nodes, band)
+    return left, _valued(around, margin, trial, band.pushed, band.contacts)
+
+
+@njit(inline="always", **COMPILE)
+def _accept(nodes, band):
+    """Go on from the trial."""
+    nodes[:, :] = band.trial
+    band.blocked[:] = band.still
+    band.push.slopes[:] = band.pushed.slopes
+    band.push.curvatures[:] = band.pushed.curvatures
+    band.push.crosses[:] = band.pushed.crosses
+    band.push.touched[:] = band.pushed.touched
 
 
 @njit(**COMPILE)
-def relax_band(space, nodes, settings):
+def relax_band(space, around, nodes, settings):
     """Shorten a band (n + 1, D) in place; returns (what remains of the violation, iterations used,
     converged).
 
-    settings: iterations at most; a node's projection after a step; relative decrease of energy,
+    space: without what may meet; around: with it, where the band is to be pushed clear of it.
+    settings: iterations at most; a node's projection after a step; relative decrease of the value,
     predicted by Newton's step or made, below which it has converged; longest step of a node [rad];
-    whether lines between its nodes that touch nothing keep that.
+    margin within which bodies are pushed apart [m]; whether lines that touch nothing keep that.
     """
-    most, projection, accuracy, largest, guarded = settings
+    most, projection, accuracy, largest, margin, guarded = settings
     n = nodes.shape[0] - 1
-    work, band = new_work(space), _new_band(nodes)
-    trial = band.trial
+    work, band = new_work(space), _new_band(around, nodes)
     used, converged, reach = 0, False, largest
-    worst = _project_nodes(space, nodes[1:n], space.projection, np.inf, band, work.node)
-    energy = band_energy(nodes)
+    worst = project_all(space, nodes[1:n], band.shares, projection, band.left, work.node)
+    value = _valued(around, margin, nodes, band.push, band.contacts)
+    if guarded:
+        for i in range(n):
+            band.blocked[i] = not _is_clear(around, nodes[i], nodes[i + 1], band.contacts)
     for _ in range(most):
         used += 1
         _linearise_band(space, nodes, band, work)
@@ -642,18 +642,15 @@ def relax_band(space, nodes, settings):
             if shift > 1e4:
                 return worst, used, False
         promised, longest = _promise(nodes, band)
-        if promised <= accuracy * energy:
+        if promised <= accuracy * value:
             converged = True
             if longest > 0.05:
                 break
         scale, improved, at_once = min(1.0, reach / longest) if longest > 0.0 else 1.0, False, True
         enough = max(worst, 1e-6)
         for _ in range(6):
-            left = _moved(space, nodes, scale, projection, enough, band, work.node)
-            if guarded and left <= enough:
-                _hold_back(space, nodes, trial, band.held, work.node)
-            after = band_energy(trial)
-            if after < energy and left <= enough:
+            left, after = _moved(space, around, nodes, scale, settings, band, work.node)
+            if after < value and left <= enough:
                 improved = True
                 break
             scale, at_once = 0.4 * scale, False
@@ -661,10 +658,11 @@ def relax_band(space, nodes, settings):
             break
         # what was too far once is so again a little further on
         reach = min(largest, 2.5 * reach) if at_once else scale * longest
-        nodes[:, :] = trial
+        _accept(nodes, band)
         # between two kinks of a contact no step promises little, and none gains much
-        converged = converged or energy - after <= scale * accuracy * energy
-        energy, worst = after, max(worst, left) if guarded else left
+        converged = converged or value - after <= scale * accuracy * value
+        # nodes that were held back are as far off as before
+        value, worst = after, max(worst, left) if guarded else left
         if converged:
             break
     return worst, used, converged

@@ -9,7 +9,7 @@ constraint, and goes to the caller, who has it certified.  Curves of another kin
 of their own (methods.py), through `refined` or not.
 """
 
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Literal
@@ -22,14 +22,27 @@ from constraint_geodesics.problem import Status
 from constraint_geodesics.scene.clearance import ClearanceModel, path_stays_clear
 from constraint_geodesics.search.band import PROJECTION, BandSettings
 from constraint_geodesics.search.curve_kernels import relaxed_curve, rows_along
-from constraint_geodesics.search.roadmap import Joined, Roadmap, join, resample, shortest_way
+from constraint_geodesics.search.roadmap import (
+    Joined,
+    Roadmap,
+    join,
+    nearest,
+    points_along,
+    resample,
+    shortest_way,
+)
 from constraint_geodesics.search.space import Space, space_of
 from constraint_geodesics.search.tree import TreeSettings, tree_way
+from constraint_geodesics.search.ways_round import SIDES, bent_round
 
 Source = Literal["straight", "policy", "graph", "tree", "bend"]
 
 ROW_SAFETY = 0.95
 """Share of the allowed violation between two rows that their distance is chosen for."""
+ALMOST = 1.1
+"""A way that is no longer than so many times the straight distance is short enough."""
+MARGINS, AGAIN = (1.0, 2.0, 4.0), 10
+"""Of what is pushed clear, as multiples; iterations with more than the first."""
 PARTLY_RELAXED = (3, 1, 0)
 """Iterations of a band that must stay near the graph."""
 TREES = 4
@@ -91,7 +104,8 @@ class Task:
 @dataclass(frozen=True)
 class Candidate:
     """A curve that looks sound: where it came from, the space that it is in, its points about
-    CHECK_STEP apart and their length [rad]; the nodes of its band, and the iterations that took.
+    CHECK_STEP apart and their length [rad]; the nodes of its band, the iterations that took,
+    whether it was pushed clear of what may meet, and the other ways that were found with it.
     """
 
     source: Source
@@ -100,6 +114,8 @@ class Candidate:
     length: float
     nodes: Float[np.ndarray, "n D"]
     iterations: int = 0
+    pushed: bool = False
+    others: tuple["Candidate", ...] = ()
 
 
 @dataclass(frozen=True)
@@ -123,8 +139,8 @@ def candidates(
     """Sound curves from the cheapest proposals to the dearest, of one kind the shortest first; None
     where dearer ones begin, and an Answer at the end.
 
-    A straight start that touches something is pushed out of it only after the graph was asked: that
-    takes longer.  Trees come last.
+    Where the straight line touches something it is bent round that to either side, and the graph is
+    asked for a way.  Trees come last.
     """
     blocked = None
     if parts.straight:
@@ -136,14 +152,17 @@ def candidates(
         else:
             blocked = found
     yield None
-    answer = Answer("not_found")
-    if parts.graph:
-        answer = yield from _over_graph(task, start, goal, parts.refinement, blocked is not None)
-        yield None
+    answer, known = Answer("not_found"), list[Candidate]()
     if blocked is not None and parts.refinement:
-        pushed = _relaxed(task, "straight", blocked.nodes, task.settings, clear=True)
-        if pushed is not None and _is_clear(task, pushed.points):
-            yield pushed
+        known = _round(task, blocked)
+        enough = ALMOST * float(np.linalg.norm(goal - start))
+        if not parts.graph or any(one.length <= enough for one in known):
+            yield from _shortest_first(known)
+            known = []
+    if parts.graph:
+        clear = blocked is not None
+        answer = yield from _over_graph(task, start, goal, parts.refinement, known, clear)
+        yield None
     if parts.tree:
         apart = answer.status == "not_connected"
         for seed in range(TREES_APART if apart else TREES):
@@ -155,6 +174,25 @@ def candidates(
             yield None
             yield from _over_tree(task.narrow, start, goal, parts.refinement, seed, settings)
     yield answer
+
+
+def _round(task: Task, blocked: Candidate) -> list[Candidate]:
+    """The ways round what a straight start leads through, to either side of it."""
+    found = list[Candidate]()
+    for side in SIDES:
+        nodes = bent_round(task.open, task.clear, blocked.nodes, side, PROJECTION)
+        pushed = None if nodes is None else _pushed(task, blocked.source, nodes, task.settings)
+        if pushed is not None:
+            found.append(pushed)
+    return found
+
+
+def _shortest_first(found: Iterable[Candidate]) -> Iterator[Candidate]:
+    """Each with those that are longer."""
+    rest = sorted(found, key=lambda one: one.length)
+    while rest:
+        best, *rest = rest
+        yield replace(best, others=tuple(rest))
 
 
 def improvements(
@@ -192,20 +230,39 @@ def _over_graph(
     start: Float[np.ndarray, "D"],
     goal: Float[np.ndarray, "D"],
     refine: bool,
+    others: Sequence[Candidate],
     clear: bool,
 ) -> Generator[Candidate, None, Answer]:
-    """The relaxed way over the graph; returns `connection`.  clear: whether it has
-    to be pushed clear of something.
+    """The relaxed way over the graph, and other ways that are known; where there is none, returns
+    `connection`.  clear: whether it is to be pushed clear of something at once.
     """
-    answer, roadmap = connection(task, start, goal), task.roadmap()
-    if answer.status == "not_connected" or roadmap is None:
-        return answer
-    assert answer.at_start is not None
-    assert answer.at_goal is not None
-    corners = shortest_way(roadmap, start, goal, answer.at_start, answer.at_goal, task.clear)
-    if corners is not None:
-        yield from _along(task, "graph", corners, refine, clear)
+    roadmap, answer, corners = task.roadmap(), Answer("not_found"), None
+    if roadmap is not None:
+        ends = nearest(roadmap, start), nearest(roadmap, goal)
+        corners = shortest_way(roadmap, start, goal, *ends, task.clear)
+        if corners is None:
+            answer = connection(task, start, goal)
+            corners = _joined_way(task, roadmap, start, goal, answer)
+    over = iter(()) if corners is None else _along(task, "graph", corners, refine, clear)
+    first = next(over, None)
+    yield from _shortest_first(others if first is None else (*others, first))
+    yield from over
     return answer
+
+
+def _joined_way(
+    task: Task,
+    roadmap: Roadmap,
+    start: Float[np.ndarray, "D"],
+    goal: Float[np.ndarray, "D"],
+    joined: Answer,
+) -> Float[np.ndarray, "k D"] | None:
+    """The way over the graph where more nodes were looked at for an edge to the ends."""
+    if joined.status == "not_connected":
+        return None
+    assert joined.at_start is not None
+    assert joined.at_goal is not None
+    return shortest_way(roadmap, start, goal, joined.at_start, joined.at_goal, task.clear)
 
 
 def connection(task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]) -> Answer:
@@ -237,21 +294,27 @@ def _over_tree(
 def _along(
     task: Task, source: Source, corners: Float[np.ndarray, "k D"], refine: bool, clear: bool
 ) -> Iterator[Candidate]:
-    """The relaxed way over a graph or tree, with more nodes where fewer jump; then one that is held
-    back from what is thinner than the distance of its nodes, and then less and less relaxed.
+    """The relaxed way over a graph or tree, with more nodes where fewer jump; where there is
+    something on the way from the points that its edges were looked at, pushed clear of it, then
+    with no line moved into anything, and then less and less relaxed.
     """
     segments = task.settings.segments
-    if refine:
+    if refine and not clear:
+        found = None
         for pieces in (segments, 2 * segments, 4 * segments):
-            found = refined(task, source, resample(corners, pieces + 1), clear=clear)
+            found = _relaxed(task, source, resample(corners, pieces + 1), task.settings)
             if found is not None:
-                yield found
                 break
-    nodes = resample(corners, 4 * segments + 1)
-    if refine:
-        found = _relaxed(task, source, nodes, task.settings, clear=True, guarded=True)
         if found is not None and _is_clear(task, found.points):
             yield found
+    if refine:
+        points = points_along(task.clear, corners)
+        found = _pushed(task, source, points, task.settings)
+        if found is None:
+            found = _relaxed(task, source, points, task.settings, clear=True, guarded=True)
+        if found is not None and _is_clear(task, found.points):
+            yield found
+    nodes = resample(corners, 4 * segments + 1)
     yield from less_and_less_relaxed(task, source, nodes, clear, PARTLY_RELAXED if refine else (0,))
 
 
@@ -289,8 +352,33 @@ def refined(
             return found
         if found is None and source not in ("graph", "tree"):
             return None
-    found = _relaxed(task, source, nodes, settings, clear=True)
-    return found if found is not None and _is_clear(task, found.points) else None
+    return _pushed(task, source, nodes, settings)
+
+
+def _pushed(
+    task: Task, source: Source, nodes: Float[np.ndarray, "n D"], settings: BandSettings
+) -> Candidate | None:
+    """The curve through a band that is pushed clear of what may meet; where it clips something
+    between the places that are looked at, with a wider margin, and then with more nodes too.
+    """
+    for wider in MARGINS:
+        found = _relaxed(task, source, nodes, settings, clear=True, wider=wider)
+        if found is None:
+            return None
+        if _is_clear(task, found.points):
+            return found
+        if settings.iterations < task.settings.iterations:
+            return None
+        nodes = found.nodes if wider == 1.0 else _halved(found.nodes)
+        settings = replace(settings, iterations=AGAIN)
+    return None
+
+
+def _halved(nodes: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "m D"]:
+    """With a node in the middle of every line."""
+    finer = np.empty((2 * len(nodes) - 1, nodes.shape[1]))
+    finer[::2], finer[1::2] = nodes, 0.5 * (nodes[1:] + nodes[:-1])
+    return finer
 
 
 @cache
@@ -309,15 +397,18 @@ def _relaxed(
     settings: BandSettings,
     clear: bool = False,
     guarded: bool = False,
+    wider: float = 1.0,
 ) -> Candidate | None:
     """The curve through relaxed nodes, whether or not it meets something; None if its points leave
     the constraint or the limits, or jump.
     """
-    space = task.clear if clear else task.open
+    around = task.clear if clear else task.open
     sound, relaxed, points, length, iterations = relaxed_curve(
-        space, np.ascontiguousarray(nodes), settings.steps(guarded), PROJECTION
+        task.open, around, np.ascontiguousarray(nodes), settings.steps(guarded, wider), PROJECTION
     )
-    return Candidate(source, space, points, length, relaxed, iterations) if sound else None
+    if not sound:
+        return None
+    return Candidate(source, task.open, points, length, relaxed, iterations, clear)
 
 
 def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:

@@ -136,15 +136,15 @@ def curve_points(space, curve, shares, settings):
 
 
 @njit(**COMPILE)
-def relaxed_curve(space, nodes, steps, settings):
+def relaxed_curve(space, around, nodes, steps, settings):
     """The curve through a relaxed band, as points about CHECK_STEP apart.
 
-    steps: of `relax_band`; settings: of the projection.  Returns whether it is sound: its points
-    are on the space, and none jumps; the band's nodes, the points, their length and the
+    around, steps: of `relax_band`; settings: of the projection.  Returns whether it is sound: its
+    points are on the space, and none jumps; the band's nodes, the points, their length and the
     iterations.
     """
     moved = nodes.copy()
-    _, used, _ = relax_band(space, moved, steps)
+    _, used, _ = relax_band(space, around, moved, steps)
     curve, sound = spline_through(moved)
     if not sound:
         return False, moved, moved, 0.0, used

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
-from constraint_geodesics.search.candidates import Answer, Candidate, Task, refined
+from constraint_geodesics.search.candidates import ALMOST, Answer, Candidate, Task, refined
 from constraint_geodesics.search.nearest import nearest_on
 
 Certified = TypeVar("Certified")
@@ -23,8 +23,6 @@ _WORTHWHILE = 1e-4
 """Share by which another path must be shorter to be looked for."""
 _CHEAP_ROUNDS, _PATIENTLY = 3, 4
 """After so many rounds trees are grown, towards so many of the goals, the nearest."""
-_ALMOST = 1.1
-"""A path that is no longer than so many times the straight distance is short enough."""
 _SLIDES = 6
 _MOVED_RAD = 1e-3
 """An end that would move by less stays."""
@@ -66,7 +64,7 @@ def shortest(
     """
     pursuit = _Pursuit(task, certify)
     left = pursuit.go_on(pursued, _CHEAP_ROUNDS)
-    if pursuit.least > _ALMOST * pursued[0].distance:
+    if pursuit.least > ALMOST * pursued[0].distance:
         left += pursuit.go_on(more(), _CHEAP_ROUNDS)
     left = sorted(left, key=lambda one: one.distance)[:_PATIENTLY]
     if pursuit.best is not None:
@@ -143,8 +141,7 @@ def slid(task: Task, candidate: Candidate, room: ConstraintManifold) -> Candidat
         if task.manifold.violation(found) <= _ON:
             nodes = candidate.nodes + share * (found[0] - end)
             nodes[-1] = found[0]
-            clear = candidate.space is task.clear
-            better = refined(task, candidate.source, nodes, clear=clear)
+            better = refined(task, candidate.source, nodes, clear=candidate.pushed)
         if better is not None and better.length < (1.0 - _WORTHWHILE) * candidate.length:
             candidate = better
             share = np.linspace(0.0, 1.0, len(candidate.nodes))[:, None]

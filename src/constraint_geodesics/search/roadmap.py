@@ -30,6 +30,8 @@ NEAREST = 32
 """Nodes that an end is tried to be joined to, the nearest first."""
 JOINED = 4
 """Nodes that are enough for an end."""
+LOOKED_AT = 8
+"""Nodes, the nearest, that a way may begin or end with whose edges are looked at only then."""
 EDGE_STEP = 0.15
 """Distance of the points that an edge is checked at [rad]."""
 _NO_EDGES = np.empty((0, 2), dtype=np.int64)
@@ -77,16 +79,22 @@ class Joined:
         return {int(roadmap.labels[node]) for node in self.nodes}
 
 
+def nearest(roadmap: Roadmap, q: Float[np.ndarray, "D"], most: int = LOOKED_AT) -> Joined:
+    """The nearest nodes and how far they are, straight; nothing is known of the edges to them."""
+    distances = np.linalg.norm(roadmap.joints - q, axis=1)
+    count = min(most, len(distances))
+    nodes = np.argpartition(distances, count - 1)[:count]
+    nodes = nodes[np.argsort(distances[nodes], kind="stable")]
+    return Joined(nodes, distances[nodes])
+
+
 def join(roadmap: Roadmap, space: Space, q: Float[np.ndarray, "D"]) -> Joined:
     """The edges from a configuration to the graph."""
-    distances = np.linalg.norm(roadmap.joints - q, axis=1)
-    count = min(NEAREST, len(distances))
-    nearest = np.argpartition(distances, count - 1)[:count]
-    nearest = nearest[np.argsort(distances[nearest], kind="stable")]
-    lengths = np.empty(count)
-    _edges(space, q, roadmap.joints, nearest, lengths, JOINED)
+    tried = nearest(roadmap, q, NEAREST).nodes
+    lengths = np.empty(len(tried))
+    _edges(space, q, roadmap.joints, tried, lengths, JOINED)
     holds = np.isfinite(lengths)
-    return Joined(nearest[holds], lengths[holds])
+    return Joined(tried[holds], lengths[holds])
 
 
 def shortest_way(
@@ -100,14 +108,16 @@ def shortest_way(
     """Corners of the shortest way over the graph, both ends included; None where the graph does not
     join them.
 
-    space: the edges of a way that was found are looked at in it, since the
-    graph may be of a workcell with less in it.  Those that fail are left out, and the search is
-    begun again [lazy shortest paths, Dellin and Srinivasa 2016].
+    space: the edges of a way that was found are looked at in it, those to its ends as well, since
+    nothing may be known of them, and the graph may be of a workcell with less in it.  Those that
+    fail are left out, and the search is begun again [lazy shortest paths, Dellin and Srinivasa
+    2016].
     """
     if not len(at_start.nodes) or not len(at_goal.nodes):
         return None
     begins, leads, lengths = roadmap.neighbours
     own, looked_at = lengths.copy(), np.zeros(len(lengths), bool)
+    ends = _End(start, at_start), _End(goal, at_goal)
     while True:
         nodes = _a_star(
             roadmap.joints,
@@ -116,14 +126,34 @@ def shortest_way(
             own,
             goal,
             at_start.nodes,
-            at_start.lengths,
+            ends[0].lengths,
             at_goal.nodes,
-            at_goal.lengths,
+            ends[1].lengths,
         )
         if not len(nodes):
             return None
-        if space is None or _holds(space, roadmap.joints, begins, leads, own, looked_at, nodes):
+        if space is None or (
+            ends[0].holds(space, roadmap, nodes[0])
+            and ends[1].holds(space, roadmap, nodes[-1])
+            and _holds(space, roadmap.joints, begins, leads, own, looked_at, nodes)
+        ):
             return np.concatenate([start[None], roadmap.joints[nodes], goal[None]])
+
+
+class _End:
+    """The edges between an end and the graph, looked at when a way has one."""
+
+    def __init__(self, q: Float[np.ndarray, "D"], joined: Joined) -> None:
+        self._q, self._nodes, self.lengths = q, joined.nodes, joined.lengths.copy()
+        self._looked_at = np.zeros(len(joined.nodes), bool)
+
+    def holds(self, space: Space, roadmap: Roadmap, node: int) -> bool:
+        """Whether the edge to a node does; one that does not becomes infinitely long."""
+        at = int(np.flatnonzero(self._nodes == node)[0])
+        if not self._looked_at[at]:
+            _edges(space, self._q, roadmap.joints, self._nodes[at:], self.lengths[at : at + 1], 1)
+            self._looked_at[at] = True
+        return bool(np.isfinite(self.lengths[at]))
 
 
 def build_roadmap(space: Space, joints: Float[np.ndarray, "n D"], neighbours: int) -> Roadmap:
@@ -189,6 +219,28 @@ def edge_length(space, first, second, work):
 
 
 @njit(**COMPILE)
+def points_along(space, corners):
+    """The points (n, D) of a way over corners (k, D) at which `edge_length` looked at its edges,
+    corners included: no straight line between two neighbours touches anything.
+    """
+    count, dof, work = 1, corners.shape[1], workspace(space)
+    for c in range(corners.shape[0] - 1):
+        count += int(np.ceil(distance(corners[c], corners[c + 1]) / EDGE_STEP)) + 1
+    points, i = np.empty((count, dof)), 0
+    for c in range(corners.shape[0] - 1):
+        first, second = corners[c], corners[c + 1]
+        pieces = int(np.ceil(distance(first, second) / EDGE_STEP)) + 1
+        for k in range(pieces):
+            for d in range(dof):
+                points[i, d] = first[d] + k / pieces * (second[d] - first[d])
+            if k > 0:
+                project_node(space, points[i], space.projection, work)
+            i += 1
+    points[i] = corners[-1]
+    return points
+
+
+@njit(**COMPILE)
 def _edges(space, q, nodes, tried, lengths, enough):
     """Lengths of the edges from q to the nodes named by `tried`, until `enough` of them hold; inf
     for the others.
@@ -196,7 +248,7 @@ def _edges(space, q, nodes, tried, lengths, enough):
     work = workspace(space)
     lengths[:] = np.inf
     found = 0
-    for k in range(tried.shape[0]):
+    for k in range(lengths.shape[0]):
         lengths[k] = edge_length(space, q, nodes[tried[k]], work)
         if lengths[k] < np.inf:
             found += 1

@@ -35,8 +35,6 @@ from constraint_geodesics.scene.clearance import (
 
 NEAR = 0.05
 """Bounds so near [rad or m] are looked at."""
-CLOSE = 0.03
-"""So are bodies that are so close beyond their margin [m]."""
 SHORT = 5e-7
 """What may lack of a margin [m]: the last of it would take as many steps again."""
 STILL = 1e-9
