@@ -449,3 +449,18 @@ def test_lists_and_arrays_are_taken_for_tuples(planner: Planner) -> None:
     assert box == Box("x", (0.5, 0.3, 0.1), (0.1, 0.1, 0.1))
     planner.scene.add(box)
     in_step(planner)
+
+
+class _Refused(Sphere):
+    """A shape that PyBullet's binding breaks down at, as at some numbers of corners."""
+
+    def add_to(self, bullet: object) -> int:
+        raise SystemError("returned a result with an exception set")
+
+
+def test_what_pybullet_breaks_down_at_is_refused_by_its_name(planner: Planner) -> None:
+    before = planner.scene.now
+    with pytest.raises(RobotError, match="'odd': PyBullet can't make it"):
+        planner.scene.add(CRATE, _Refused("odd", (0.5, 0.0, 1.0), 0.05))
+    assert planner.scene.now is before
+    in_step(planner)

@@ -212,7 +212,7 @@ class World:
                 for name, one in news.items():
                     try:
                         made[name] = self._add(one)
-                    except self._bullet.error as error:
+                    except (self._bullet.error, SystemError) as error:
                         raise RobotError(f"{name!r}: PyBullet can't make it: {error}") from None
         except BaseException:
             for own in made.values():
