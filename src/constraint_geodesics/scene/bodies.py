@@ -16,8 +16,9 @@ from scipy.spatial import ConvexHull, QhullError
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
 from constraint_geodesics.scene import convex_kernels as kernels
 from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.names import require_names
 from constraint_geodesics.scene.pieces import Piece, read_pieces
-from constraint_geodesics.scene.scene import Scene, SceneError
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.world import BodyKey
 
@@ -217,17 +218,15 @@ class BodyTable:
 
     def change(self, scene: Scene) -> None:
         """Follow the scene: shapes come, go and move, links and shapes may touch others than
-        before.  Nothing has changed where it raises RobotError.
+        before.  Nothing has changed where it raises RobotError, or SceneError for names.
         """
+        require_names(self.links, scene.workcell, scene.attached, scene.allowed)
         old, bodies = self.scene, dict(self._robot)
         own, blocks = dict(self._own), {key: self._blocks[key] for key in self._robot}
         kept = set(old.workcell) | set(old.attached)
         news = set[BodyKey]()
         for shape, held in (*((s, None) for s in scene.workcell), *_carried(scene.attached)):
             key = BodyKey(shape.name, True)
-            self._require(shape, held)
-            if key in bodies:
-                raise SceneError(f"two shapes of the workcell are called {shape.name!r}")
             if (shape if held is None else held) in kept and key in self.bodies:
                 bodies[key], blocks[key] = self.bodies[key], self._blocks[key]
                 continue
@@ -288,12 +287,6 @@ class BodyTable:
                 first, second = sorted((self.bodies[key], body), key=order)
                 if may_meet(first, second, self._allowed):
                     yield first.key, second.key
-
-    def _require(self, shape: Shape, held: Attached | None) -> None:
-        if shape.name in self.links:
-            raise SceneError(f"workcell {shape.name!r}: a link of the robot has that name")
-        if held is not None and held.link not in self.links:
-            raise SceneError(f"{held.name!r} can't be attached: no link is called {held.link!r}")
 
     def _own_of(self, shape: Shape) -> _Own:
         """As it was before where it has only moved, and a file has the same in it."""

@@ -91,8 +91,9 @@ def _scaled(file: Path, digest: str, scale: float) -> Triangles:
 
 @lru_cache(maxsize=64)
 def _pieces(file: Path, digest: str, scale: float) -> tuple[Piece, ...]:
+    mesh = _scaled(file, digest, scale)
     try:
-        found = convex_pieces(_scaled(file, digest, scale))
+        found = convex_pieces(mesh)
     except RobotError as error:
         raise RobotError(f"{file}: {error}") from None
     return tuple(piece._replace(rounding=HULL_MARGIN) for piece in found)
