@@ -105,7 +105,16 @@ class RandomScene:
             shape = self.shape(f"load{number}", held=True)
             x, y, z = shape.at.position_m
             out = shape.placed(Placement((x, y, z + 0.1), shape.at.rpy_rad))
-            self.planner.scene.attach(out, self.links[-1], [*self.links[-5:], *self.now.names])
+            touching = [*self.links[-5:], *(one.name for one in self.now.attached)]
+            self.planner.scene.attach(out, self.links[-1], touching)
+
+    def read_anew(self) -> None:
+        """A mesh whose file is written again before it moves."""
+        file = self._write(self._folder / "again.obj")
+        mesh = Mesh("again", file, self._place(False), scale=0.1)
+        self.planner.scene.add(self._read(mesh))
+        self._write(file)
+        self.planner.scene.move(self._read(mesh).name, self._place(False))
 
     def shape(self, name: str, held: bool = False) -> Shape:
         """One of any kind, size and place; its bricks are known from here on."""

@@ -70,6 +70,7 @@ def test_random_changes(arm: str, seed: int, tmp_path: Path) -> None:
         while len(free_places(random)) < 20 and planner.scene.attached:
             planner.scene.detach(planner.scene.attached[0].name)  # what touches for good
         random.carry()
+        random.read_anew()
         lines_are_judged(random)
         paths_are_judged(random)
         is_as_made_anew(random)
@@ -95,6 +96,12 @@ def is_as_made_anew(random: RandomScene) -> None:
     with Certifier(now, own.limits) as anew:
         assert own._world is not None
         assert anew._world is not None
+        bodies, others = own.collisions.collider.bodies, anew.collisions.collider.bodies
+        assert bodies.keys() == others.keys()
+        for key, body in bodies.items():
+            assert (body.frame, body.carrier) == (others[key].frame, others[key].carrier)
+            for piece, other in zip(body.pieces, others[key].pieces, strict=True):
+                np.testing.assert_allclose(piece.corners, other.corners, atol=1e-9)
         np.testing.assert_array_equal(own._world.free(q), anew._world.free(q))
         np.testing.assert_array_equal(own.collisions.free(q), anew.collisions.free(q))
         more = anew.collisions.apart - own.collisions.apart

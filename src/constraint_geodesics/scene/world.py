@@ -179,7 +179,11 @@ class World:
             pairs += [frozenset((shape.name, link)) for link in shape.exempt_links]
         for held in attached:
             pairs += [frozenset((held.name, other)) for other in (held.link, *held.touching)]
-        gone = {name for name, own in self._shapes.items() if wanted.get(name) != own.made}
+        gone = {
+            name
+            for name, own in self._shapes.items()
+            if wanted.get(name) is not own.made and wanted.get(name) != own.made
+        }
         news = {n: one for n, one in wanted.items() if n not in self._shapes or n in gone}
         made = self._made(news)  # all that can fail, before anything goes
         now = frozenset(pairs) | self._never
