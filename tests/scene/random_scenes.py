@@ -42,6 +42,7 @@ BRICKS = {
 """Meshes of size 1, convex and not."""
 Kind = TypeVar("Kind", bound=Shape)
 UPRIGHT = np.pi * np.array([-0.5, 0.0, 0.5, 1.0])
+LOADS = ("load0", "load1")
 NAMES = [f"shape{k}" for k in range(8)]
 
 
@@ -99,14 +100,26 @@ class RandomScene:
         search = self.planner._preparation._clearance
         np.testing.assert_array_equal(search.clearance(self.planner.robot, q), apart)
 
+    def take_away(self) -> None:
+        """A shape, what is carried first; the loads stay."""
+        held = [one.shape for one in self.now.attached if one.name not in LOADS]
+        if shape := self._one(held):
+            self.planner.scene.detach(shape.name)
+        else:
+            shape = self._one(self._around())
+            assert shape is not None, "nothing is free though nothing is there"
+            self.planner.scene.remove(shape.name)
+
     def carry(self) -> None:
-        """Two shapes that keep off the links."""
-        for number in range(2):
-            shape = self.shape(f"load{number}", held=True)
-            x, y, z = shape.at.position_m
-            out = shape.placed(Placement((x, y, z + 0.1), shape.at.rpy_rad))
-            touching = [*self.links[-5:], *(one.name for one in self.now.attached)]
-            self.planner.scene.attach(out, self.links[-1], touching)
+        """A long box and a bar, each at its own link, that keep off the links beside it and meet
+        what stands around.
+        """
+        rng = self.rng
+        turn = tuple(rng.uniform(-0.3, 0.3, 3).tolist())
+        box = Box(LOADS[0], (0.0, 0.0, 0.2), (0.08, 0.12, 0.25), rpy_rad=turn)
+        bar = Capsule(LOADS[1], (0.0, 0.0, 0.0), (0.0, 0.2, 0.1), 0.03)
+        for shape, link in ((box, self.links[-1]), (bar, self.links[-4])):
+            self.planner.scene.attach(shape, link, self.links[-5:])
 
     def read_anew(self) -> None:
         """A mesh whose file is written again before it moves."""

@@ -31,7 +31,7 @@ STEP_RAD = 0.005
 CHANGES, LINES, QUERIES = 24, 80, 2
 FINGERS = {"panda_finger_joint1": 0.04, "panda_finger_joint2": 0.04}
 MORE = int(os.environ.get("GEODESICS_RANDOM_SCENES", "0"))
-SEEDS = [("xarm", seed) for seed in (1, 2, 4, 6)]  # whose meshes are soon divided
+SEEDS = [("xarm", seed) for seed in (1, 2, 4, 6, 13)]  # whose meshes are soon divided
 if MORE:
     SEEDS = [(arm, seed) for seed in range(MORE) for arm in ("xarm", "panda")]
 
@@ -67,10 +67,10 @@ def test_random_changes(arm: str, seed: int, tmp_path: Path) -> None:
             if random.rng.random() < 0.3:
                 random.fail()
         is_as_made_anew(random)
-        while len(free_places(random)) < 20 and planner.scene.attached:
-            planner.scene.detach(planner.scene.attached[0].name)  # what touches for good
         random.carry()
         random.read_anew()
+        while len(free_places(random)) < 20:
+            random.take_away()  # what touches for good
         lines_are_judged(random)
         paths_are_judged(random)
         is_as_made_anew(random)
@@ -114,22 +114,25 @@ def is_as_made_anew(random: RandomScene) -> None:
 
 
 def lines_are_judged(random: RandomScene) -> None:
-    """Short lines of which some touch: none of those that do is certified, and PyBullet's world
-    says the same of all but surfaces.
+    """Short lines of which some touch: none of those that do is certified, PyBullet's world says
+    the same of all but surfaces, and hardly any place is refused that touches nothing.
     """
     own, robot, rng = random.planner._certifier, random.planner.robot, random.rng
     free = free_places(random)[: LINES // 2]
     starts = np.concatenate([free, robot.sample(LINES - len(free), rng)])
-    ends = starts + rng.normal(size=starts.shape) * 0.15
+    ends = starts + rng.normal(size=starts.shape) * 0.4
     shapes = (*random.now.workcell, *(one.shape for one in random.now.attached))
     surfaces = {shape.name for shape in shapes if isinstance(shape, (Mesh, PointCloud))}
     with Judge(random.now, random.bricks) as judge:
+        apart = np.array([row for row in starts if judge.deepest(row)[0] > 0.0])
+        assert own._world is not None
+        assert own._world.free(apart).mean() > 0.9
+        assert own.collisions.free(apart).mean() > 0.9
         for line in np.stack([starts, np.clip(ends, robot.lower, robot.upper)], axis=1):
             judged = [(row, *judge.deepest(row)) for row in dense(line, 0.03)]
             touching = [(row, names) for row, least, names in judged if least < -DEEP_M]
             for row, names in touching:
                 assert not own.collisions.is_free(row), names
-                assert own._world is not None
                 if surfaces.isdisjoint(names):
                     assert not own._world.is_free(row), names
             if touching:
