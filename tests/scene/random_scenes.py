@@ -118,8 +118,9 @@ class RandomScene:
         turn = tuple(rng.uniform(-0.3, 0.3, 3).tolist())
         box = Box(LOADS[0], (0.0, 0.0, 0.2), (0.08, 0.12, 0.25), rpy_rad=turn)
         bar = Capsule(LOADS[1], (0.0, 0.0, 0.0), (0.0, 0.2, 0.1), 0.03)
-        for shape, link in ((box, self.links[-1]), (bar, self.links[-4])):
-            self.planner.scene.attach(shape, link, self.links[-5:])
+        middle = len(self.links) // 2
+        self.planner.scene.attach(box, self.links[-1], self.links[-6:])
+        self.planner.scene.attach(bar, self.links[middle], self.links[middle - 2 :])
 
     def read_anew(self) -> None:
         """A mesh whose file is written again before it moves."""
