@@ -206,6 +206,29 @@ def test_what_can_not_be_kept_is_named(
     assert planner.scene.now is before
 
 
+@pytest.mark.parametrize(
+    ("triangles", "said"),
+    [
+        ([], "no mesh: has no faces, or corners that are no finite numbers"),
+        ([[0, 1, 9]], "no mesh: a face with a corner that is not there"),
+        ([[0, 1, 2]], "a mesh without volume can't be bounded: take a box in its place"),
+    ],
+)
+def test_a_fault_of_an_inline_mesh_is_told_by_its_object(
+    planner: Planner, tmp_path: Path, triangles: list[list[int]], said: str
+) -> None:
+    """Not by a file that no user has written."""
+    raw = a_scene(planner.robot.joint_names)
+    (mesh,) = raw["world"]["collision_objects"][3]["meshes"]
+    mesh["triangles"] = triangles
+    if triangles == [[0, 1, 2]]:
+        mesh["vertices"].pop()
+    file = written(tmp_path, raw)
+    with pytest.raises(MoveitError) as error:
+        add_moveit_scene(file, planner.scene)
+    assert str(error.value) == f"{file}: world.collision_objects[3]: 'wedge': {said}"
+
+
 def a_request(planner: Planner) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
     start, goal = pairs_of("free", 1, seed=1)[0]
     names = list(planner.robot.joint_names)

@@ -23,7 +23,7 @@ from constraint_geodesics.goals.region import GoalRegion
 from constraint_geodesics.params import read_yaml
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.robot.arm_file import write_file
-from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
 from constraint_geodesics.scene.arm import arms_folder
 from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.box import Box
@@ -264,7 +264,7 @@ def _shapes(
         found.append(_primitive(own, named(), at, where))
     for own, place in _with_poses(raw, "meshes", "mesh_poses", where):
         at = Placement.of_matrix(pose @ _pose(place))
-        found.append(Mesh(named(), _mesh_file(own), at))
+        found.append(_mesh(own, named(), at, where))
     if not found:
         raise MoveitError(f"{where}: {name!r} has neither primitives nor meshes")
     return found
@@ -291,6 +291,19 @@ def _primitive(raw: Any, name: str, at: Placement, where: str) -> Shape:
     if kind == "sphere":
         return Sphere(name, at.position_m, sizes[0])
     return Cylinder(name, at, sizes[0], sizes[1])
+
+
+def _mesh(raw: Any, name: str, at: Placement, where: str) -> Mesh:
+    """An inline mesh, whose faults are told by the name of its object: it has no file that a user
+    knows.
+    """
+    found = Mesh(name, _mesh_file(raw), at)
+    try:
+        found.pieces()
+    except RobotError as error:
+        text = str(error).removeprefix(f"{found.file}: ")
+        raise MoveitError(f"{where}: {name!r}: {text}") from None
+    return found
 
 
 def _mesh_file(raw: Any) -> Path:

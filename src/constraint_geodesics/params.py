@@ -726,13 +726,18 @@ def read_yaml(path: Path) -> Any:
     from ruamel.yaml.error import YAMLError
 
     try:
-        return YAML(typ="safe", pure=True).load(path.read_text())
+        documents = list(YAML(typ="safe", pure=True).load_all(path.read_text()))
     except OSError as error:
         raise ParamsError(f"{path}: {error.strerror}") from None
     except (UnicodeError, RecursionError) as error:
         raise ParamsError(f"{path}: not YAML: {str(error).splitlines()[0]}") from None
     except (YAMLError, ValueError) as error:
         raise ParamsError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    while len(documents) > 1 and documents[-1] is None:  # as after a last `---`
+        documents.pop()
+    if len(documents) > 1:
+        raise ParamsError(f"{path}: has {len(documents)} documents of YAML: must have one")
+    return documents[0] if documents else None
 
 
 def one_line(error: ValidationError) -> str:

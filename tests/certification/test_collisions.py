@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.scene.mesh_files import Brick, write_bricks
 
 from constraint_geodesics.certification import collision_kernels as kernels
 from constraint_geodesics.certification.certifier import Certifier
@@ -16,12 +17,15 @@ from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.robot.kinematics import RobotError, load_robot
 from constraint_geodesics.scene import bodies
 from constraint_geodesics.scene import convex_kernels as convex
+from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.body import Body
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.capsule import Capsule
+from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.pieces import Piece
+from constraint_geodesics.scene.point_cloud import PointCloud
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.studies.collision_proof import KINDS, Grazing, Trial, graze, try_scene
 
@@ -344,6 +348,83 @@ def test_a_collision_is_named(certifier: Certifier, scene: Scene) -> None:
     assert violation.kind == "workcell_collision"
     assert " touches table on the line from row " in violation.message
     assert 0 <= violation.row < len(rows)
+
+
+def meeting_half_way(scene: Scene, kind: str, folder: Path) -> tuple[Scene, np.ndarray]:
+    """A scene in which a carried shape comes to touch one around the arm in the middle of a line of
+    joint 0, to 0.1 µm, and overlaps it by millimetres from there on; the line's middle.
+    """
+    file = write_bricks(folder / "own.obj", [Brick((0.0, 0.0, 0.0), (0.03, 0.03, 0.03))])
+    q, origin = np.array([0.3, -0.5, -1.2, 0.2, 0.5, 0.1]), Placement()
+    held, other = {
+        "mesh and mesh": (Mesh("held", file), Mesh("other", file)),
+        "mesh and cloud": (Mesh("held", file), PointCloud("other", [[0.0, 0.0, 0.0]], 0.05)),
+        "cloud and ball": (
+            PointCloud("held", [[0.0, 0.0, 0.0]], 0.05),
+            Sphere("other", origin.position_m, 0.05),
+        ),
+    }[kind]
+    carried = Attached(
+        held.placed(Placement((0.0, 0.0, 0.2))), "link6", ("link3", "link4", "link5")
+    )
+    with scene.world() as world:
+        (link,) = world.link_poses(q, ["link6"])
+    middle = (link @ carried.shape.at.matrix)[:3, 3]
+    ahead = np.cross([0.0, 0.0, 1.0], middle)
+    ahead /= np.linalg.norm(ahead)
+
+    def at(way: float) -> Scene:
+        place = Placement(tuple((middle + way * ahead).tolist()), (0.0, 0.0, 0.0))
+        return replace(scene, workcell=(*scene.workcell, other.placed(place)), attached=(carried,))
+
+    low, high = 0.0, 0.3
+    with Certifier(at(high)) as own:
+        while high - low > 1e-7:
+            way = 0.5 * (low + high)
+            own.change(at(way))
+            low, high = (low, way) if own.collisions.clearance(q) > 0.0 else (way, high)
+    return at(high), q
+
+
+@pytest.mark.parametrize("kind", ["mesh and mesh", "mesh and cloud", "cloud and ball"])
+def test_what_pybullet_does_not_see_is_no_way_through(
+    scene: Scene, tmp_path: Path, kind: str
+) -> None:
+    """It has no distance of two meshes, and less than the balls of a cloud: that bodies are apart
+    in the middle of a part says nothing of its ends.
+    """
+    met, q = meeting_half_way(scene, kind, tmp_path)
+    with Certifier(met) as own:
+        for half in (0.002, 0.02, 0.1):
+            line = np.stack([q - half * np.eye(6)[0], q + half * np.eye(6)[0]])
+            found = own.collisions.along(line).violation
+            assert found is not None
+            assert found.kind == "workcell_collision"
+            assert own.collisions.along(line - 0.2 * half * np.eye(6)[0]).violation is not None
+            before = line - half * np.eye(6)[0] - 0.01 * np.eye(6)[0]
+            assert own.collisions.along(before).violation is None
+
+
+def test_boxes_are_as_sharp_as_they_are(scene: Scene) -> None:
+    """PyBullet rounds the edges of two boxes that cross, by up to 0.8 mm."""
+    q, edge = np.array([0.3, -0.5, -1.2, 0.2, 0.5, 0.1]), 0.1
+    with scene.world() as world:
+        (link,) = world.link_poses(q, ["link6"])
+    carried = Attached(
+        Box("held", (0.0, 0.0, 0.2), (edge, edge, edge), rpy_rad=(0.0, 0.0, 0.25 * np.pi)),
+        "link6",
+        ("link3", "link4", "link5"),
+    )
+    for overlap, free in ((3e-4, False), (-3e-4, True)):
+        there = np.eye(4)  # edge across edge, along the link's x axis
+        there[:3, 3] = (np.sqrt(2.0) * edge - overlap, 0.0, 0.2)
+        there[:3, :3] = Placement((0.0, 0.0, 0.0), (0.0, 0.25 * np.pi, 0.0)).turn
+        other = Box("other", (0.0, 0.0, 0.0), (edge, edge, edge))
+        around = other.placed(Placement.of_matrix(link @ there))
+        own = replace(scene, workcell=(*scene.workcell, around), attached=(carried,))
+        with Certifier(own) as certifier:
+            assert certifier.collisions.is_free(q) == free
+            assert (certifier.collisions.along(np.stack([q, q])).violation is None) == free
 
 
 def test_what_touches_for_good_refuses_every_path(scene: Scene) -> None:

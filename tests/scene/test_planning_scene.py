@@ -1,5 +1,6 @@
 """A scene that changes: what follows it is what would be made anew."""
 
+import pickle
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import Constraint, Pose
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.robot.kinematics import RobotError
+from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.clearance import clearance_model
@@ -210,6 +212,39 @@ def test_a_change_that_fails_changes_nothing(planner: Planner, tmp_path: Path) -
     assert planner.scene.now is before
     np.testing.assert_array_equal(planner._certifier.collisions.free(q), free)
     np.testing.assert_array_equal(planner._certifier._world.free(q), free)
+
+
+def test_names_are_refused_in_the_same_words_everywhere(planner: Planner) -> None:
+    """By a planner, by a certificate of its own and by PyBullet's world."""
+    now = planner.scene.now
+    twice = replace(now, workcell=(CRATE, CRATE), attached=())
+    wrong = (
+        (twice, "two shapes are called 'crate'"),
+        (replace(now, attached=(Attached(CUP, "link6"), Attached(CUP, "link5"))), "called 'cup'"),
+        (replace(now, workcell=(Sphere("link5", (1, 1, 1), 0.1),)), "'link5' is a link of the"),
+        (replace(now, workcell=(replace(CRATE, exempt_links=("wrist",)),)), "is called 'wrist'"),
+        (replace(now, attached=(Attached(CUP, "hand"),)), "no link is called 'hand'"),
+        (replace(now, attached=(Attached(CUP, "link6", ("hand",)),)), "'hand' is no link of the"),
+        (replace(now, allowed=frozenset({("table", "hand")})), "'hand' is no link of the robot"),
+    )
+    for scene, text in wrong:
+        for change in (planner.scene.become, clearance_model, Certifier, Scene.world):
+            with pytest.raises(SceneError, match=text):
+                change(scene)  # type: ignore[operator]
+        assert planner.scene.now is now
+
+
+def test_a_scene_of_another_robot_is_refused(planner: Planner) -> None:
+    """That of a robot with other pairs that may touch as well; a copy is the same."""
+    now = planner.scene.now
+    planner.scene.become(pickle.loads(pickle.dumps(now)).adding(CRATE))
+    in_step(planner)
+    may = replace(now.robot, allowed=now.robot.allowed | {("link2", "link5")})
+    with Planner.from_urdf("franka_panda/panda.urdf", "panda_hand") as panda:
+        for robot in (may, panda.robot):
+            with pytest.raises(SceneError, match=r"another robot: this one is"):
+                planner.scene.become(Scene(robot))
+    assert planner.scene.now.names == ("table", "crate")
 
 
 def _missing(folder: Path) -> Shape:
@@ -448,4 +483,19 @@ def test_lists_and_arrays_are_taken_for_tuples(planner: Planner) -> None:
     box = Box("x", [0.5, 0.3, 0.1], np.full(3, 0.1))  # type: ignore[arg-type]
     assert box == Box("x", (0.5, 0.3, 0.1), (0.1, 0.1, 0.1))
     planner.scene.add(box)
+    in_step(planner)
+
+
+class _Refused(Sphere):
+    """A shape that PyBullet's binding breaks down at, as at some numbers of corners."""
+
+    def add_to(self, bullet: object) -> int:
+        raise SystemError("returned a result with an exception set")
+
+
+def test_what_pybullet_breaks_down_at_is_refused_by_its_name(planner: Planner) -> None:
+    before = planner.scene.now
+    with pytest.raises(RobotError, match="'odd': PyBullet can't make it"):
+        planner.scene.add(CRATE, _Refused("odd", (0.5, 0.0, 1.0), 0.05))
+    assert planner.scene.now is before
     in_step(planner)

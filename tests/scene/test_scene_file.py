@@ -59,6 +59,12 @@ def test_a_file_of_attached_shapes_alone(planner: Planner, tmp_path: Path) -> No
     assert [one.name for one in planner.scene.attached] == ["cup"]
 
 
+@pytest.mark.parametrize("end", ["---\n", "---\n---\n", "...\n", "--- # no more\n"])
+def test_a_further_document_may_be_empty(tmp_path: Path, end: str) -> None:
+    (tmp_path / "cup.yaml").write_text("---\n" + CUP + end)
+    assert list(read_attached(tmp_path / "cup.yaml").attached) == ["cup"]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -77,6 +83,8 @@ def test_a_file_of_attached_shapes_alone(planner: Planner, tmp_path: Path) -> No
         ("shapes: {b: {kind: point_cloud, points_m: [[1, 2]], radius_m: 1}}", "points"),
         ("attached: {b: {kind: sphere, centre_m: [0, 0, 0], radius_m: 1}}", "link is missing"),
         ("allowed: [[a, b, c]]", "allowed"),
+        ("allowed: []\n---\nallowed: []\n", "has 2 documents of YAML: must have one"),
+        ("allowed: []\n---\nshapes: [", "not YAML"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, said: str) -> None:

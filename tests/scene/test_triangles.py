@@ -1,5 +1,6 @@
 """Meshes and point clouds: every triangle and every ball is covered, and holes stay open."""
 
+import os
 import struct
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from constraint_geodesics.robot.kinematics import RobotError
+from constraint_geodesics.scene import triangles
 from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.pieces import Piece
 from constraint_geodesics.scene.point_cloud import CELLS, PointCloud
@@ -133,12 +135,17 @@ def test_a_mesh_that_is_not_there_is_named(tmp_path: Path) -> None:
         Mesh("part", tmp_path / "none.obj").pieces()
 
 
-def test_a_mesh_that_was_written_anew_is_read_anew(tmp_path: Path) -> None:
+@pytest.mark.parametrize("keeps_its_time", [False, True])
+def test_a_mesh_that_was_written_anew_is_read_anew(tmp_path: Path, keeps_its_time: bool) -> None:
+    """As by a copy that keeps times, or by two writes that the clock does not tell apart."""
     file = written(tmp_path, notched())["own.obj"]
     assert len(Mesh("part", file).pieces()) > 1
+    before = file.stat()
     hull = ConvexHull(np.random.default_rng(1).normal(size=(20, 3)))
     mesh = Triangles(hull.points, hull.simplices)
-    file.write_bytes(written(tmp_path, mesh)["own.obj"].read_bytes())
+    written(tmp_path, mesh)
+    if keeps_its_time:
+        os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
     assert len(Mesh("part", file).pieces()) == 1
 
 
@@ -169,3 +176,23 @@ def test_what_is_no_cloud_is_refused(points: object) -> None:
 def test_a_cloud_that_pybullet_could_not_take_is_refused() -> None:
     with pytest.raises(ValueError, match="12000 points: at most 10000"):
         PointCloud("seen", np.zeros((12_000, 3)), 0.01)
+
+
+def test_a_mesh_of_many_triangles_is_looked_at_a_part_at_a_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """All triangles by all planes are no array that fits into memory."""
+    whole = [convex_pieces(mesh) for mesh in (ring(30, 16), notched())]
+    most, beyond = [], triangles._beyond
+
+    def seen(places: np.ndarray, hull: ConvexHull) -> np.ndarray:
+        found = beyond(places, hull)
+        most.append(found.size)
+        return found
+
+    monkeypatch.setattr(triangles, "_BLOCK", 3000)
+    monkeypatch.setattr(triangles, "_beyond", seen)
+    for mesh, pieces in zip((ring(30, 16), notched()), whole, strict=True):
+        for own, other in zip(convex_pieces(mesh), pieces, strict=True):
+            np.testing.assert_array_equal(own.corners, other.corners)
+    assert max(most) <= 2 * 3000

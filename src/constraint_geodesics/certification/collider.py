@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from constraint_geodesics.certification import collision_kernels as kernels
 from constraint_geodesics.certification.chain import Chain, rotated
@@ -96,12 +96,21 @@ class Collider:
         return self._apart
 
     def _arrange(self) -> None:
-        bodies, pairs = self.bodies, self._table.pairs
-        meeting = [(a, b) for a, b in pairs if bodies[a].frame != bodies[b].frame]
-        self.rigid = [(a, b) for a, b in pairs if bodies[a].frame == bodies[b].frame]
-        self.moving = [pair for pair in meeting if pair not in self._apart]
-        arrays = self._table.arrays(self.moving, self.rigid)
-        self.arrays = kernels.Bodies(self._chain, *arrays, len(self.moving))
+        table, frames = self._table, self._table.frames
+        is_rigid = frames[:, 0] == frames[:, 1]
+        self._keys, rigid = list(table.bodies), table.ends[is_rigid]
+        self._moving = table.ends[~is_rigid & ~table.named(self._apart)]
+        self.rigid = self._named(rigid)
+        arrays = table.arrays(np.concatenate([self._moving, rigid]))
+        self.arrays = kernels.Bodies(self._chain, *arrays, len(self._moving))
+
+    @property
+    def moving(self) -> list[Pair]:
+        """Pairs that may meet while the arm moves."""
+        return self._named(self._moving)
+
+    def _named(self, ends: Int[np.ndarray, "n 2"]) -> list[Pair]:
+        return [(self._keys[a], self._keys[b]) for a, b in ends.tolist()]
 
     def pair(self, row: float) -> tuple[Body, Body]:
         """The bodies of a row of `arrays.pairs`."""
@@ -110,8 +119,8 @@ class Collider:
         own = int(row)
         if own >= self.arrays.top:
             own = int(np.flatnonzero((tops[:, 2] <= own) & (own < tops[:, 3]))[0])
-        first, second = self.moving[own]
-        return self.bodies[first], self.bodies[second]
+        first, second = self._moving[own]
+        return self.bodies[self._keys[first]], self.bodies[self._keys[second]]
 
     def covered(self) -> list[str]:
         """Bodies whose meshes are not convex, so that their hulls cover more than them."""

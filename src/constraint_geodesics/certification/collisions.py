@@ -114,11 +114,11 @@ class CollisionCheck:
         """
         low, high = self.collider.limits
         inside = bool((q >= low).all() and (q <= high).all())
-        near = self._nearest(q, MARGIN_M)
+        near, pair = self._nearest(q, MARGIN_M)
         if inside and self._standing is None and near >= MARGIN_M:
             return True
-        # PyBullet knows a mesh by its surface alone
-        if near < -MARGIN_M or self._standing is not None:
+        # PyBullet knows a mesh by its surface alone, and rounds the edges of boxes
+        if self._standing is not None or (pair >= 0 and near + self._overlap(pair) <= 0.0):
             return False
         return self._world is not None and self._world.is_free(q)
 
@@ -131,20 +131,19 @@ class CollisionCheck:
         if self._standing is not None:
             kind, _, text = self._standing
             return f"{_WHAT[kind]}: {text}"
-        place = np.ascontiguousarray(q, float)
-        _, pair = kernels.nearest_pair(self.collider.arrays, place, np.inf)
-        first, second = self.collider.pair(pair)
+        first, second = self.collider.pair(self._nearest(q, np.inf)[1])
         return f"{_WHAT[_kind(first, second)]}: {second.name} with {first.name}"
 
     def clearance(self, q: Float[np.ndarray, "D"]) -> float:
         """The least distance of bodies that may meet [m], inf where none may; 0 or less where they
         touch.
         """
-        return self._nearest(q, np.inf)
+        return self._nearest(q, np.inf)[0]
 
-    def _nearest(self, q: Float[np.ndarray, "D"], most: float) -> float:
+    def _nearest(self, q: Float[np.ndarray, "D"], most: float) -> tuple[float, int]:
         place = np.ascontiguousarray(q, float)
-        return float(kernels.nearest_pair(self.collider.arrays, place, most)[0])
+        near, pair = kernels.nearest_pair(self.collider.arrays, place, most)
+        return float(near), int(pair)
 
     def is_clear(self, rows: Float[np.ndarray, "T D"]) -> bool:
         """Whether the straight joint lines between rows are within the limits and touch nothing."""
@@ -196,7 +195,8 @@ class CollisionCheck:
         self, rows: np.ndarray, row: float, start: float, end: float, pair: float
     ) -> Violation | None:
         """What PyBullet's distances say of a part of a line: between two places they change by no
-        more than the bodies move.  Where bodies overlap by more than the margin, they touch.
+        more than the bodies move, and so do the distances here.  Where bodies overlap by more than
+        the margin, they touch.
         """
         if self._world is None:
             return self._unproven(int(row), 0.5 * (start + end), pair)
@@ -209,14 +209,30 @@ class CollisionCheck:
             middle, motion = 0.5 * (start + end), 0.5 * (end - start) * float(np.abs(line) @ reach)
             q = rows[i] + middle * line
             apart = self._world.distance(q, first.key, second.key, motion)
-            # PyBullet rounds the edges of boxes: what is deeper than the margin is a contact too
-            if apart < 0.0 or self.clearance(q) < -MARGIN_M:
+            # PyBullet rounds the edges of boxes, has less than the balls of a cloud, and says
+            # nothing of two meshes: what overlaps here is a contact too
+            beyond = self._near(int(pair), q) + self._overlap(int(pair))
+            if apart < 0.0 or beyond <= 0.0:
                 return self._touches(i, middle, first, second)
-            if apart <= motion + _ROUNDING_M:
+            if min(apart, beyond) <= motion + _ROUNDING_M:
                 if motion < _SHORTEST_M:
                     return self._unproven(i, middle, pair)
                 waiting += [(middle, end), (start, middle)]
         return None
+
+    def _near(self, row: int, q: Float[np.ndarray, "D"]) -> float:
+        """The distance of a row of the table of pairs [m]."""
+        arrays = self.collider.arrays
+        alone = arrays._replace(pairs=_only(arrays.pairs, row), top=1)
+        return float(kernels.nearest_pair(alone, np.ascontiguousarray(q, float), np.inf)[0])
+
+    def _overlap(self, row: int) -> float:
+        """How far a row of the table of pairs may overlap until it is a contact whatever PyBullet
+        says [m]: by the margin, where their roundings leave room for that.
+        """
+        arrays = self.collider.arrays
+        ends = arrays.pairs[row, :2].astype(int)
+        return min(MARGIN_M, float(arrays.nodes[ends, convex.ROUNDING].sum()))
 
     def _reach(self, pair: float) -> Float[np.ndarray, "D"]:
         """How far the second body's points get from the axes of the joints that move the two."""
@@ -240,9 +256,8 @@ class CollisionCheck:
         return next((found for *_, found in self._rigid.values() if found is not None), None)
 
     def _touch_always(self, k: int, first: Body, second: Body, dof: int) -> _Contact | None:
-        arrays, zeros = self.collider.arrays, np.zeros(dof)
-        alone = arrays._replace(pairs=_only(arrays.pairs, arrays.top + k), top=1)
-        near = float(kernels.nearest_pair(alone, zeros, MARGIN_M)[0])
+        zeros = np.zeros(dof)
+        near = self._near(self.collider.arrays.top + k, zeros)
         if near >= MARGIN_M:
             return None
         if self._world is None:
@@ -276,7 +291,7 @@ def _in_base(points: Float[np.ndarray, "n 3"], frame: np.ndarray) -> Float[np.nd
 
 
 def _only(pairs: np.ndarray, row: int) -> np.ndarray:
-    """The table of one pair of bodies alone."""
+    """The table of one pair of bodies, or of pieces, alone."""
     first, last = int(pairs[row, 2]), int(pairs[row, 3])
     table = np.concatenate([pairs[row : row + 1], pairs[first:last]])
     table[0, 2:4] = (1.0, len(table)) if len(table) > 1 else 0.0

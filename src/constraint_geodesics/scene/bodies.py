@@ -4,20 +4,21 @@ scene that changes: what stays is not read again.
 """
 
 import contextlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
 from constraint_geodesics.scene import convex_kernels as kernels
 from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.names import require_names
 from constraint_geodesics.scene.pieces import Piece, read_pieces
-from constraint_geodesics.scene.scene import Scene, SceneError
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.world import BodyKey
 
@@ -197,7 +198,8 @@ class BodyTable:
     """The bodies of a scene and the pairs of them that may meet, as the kernels take them.
 
     frames: where the frames that carry the links are with all joints at 0.  reach: of pieces.
-    Raises RobotError where a body can't be bounded, naming it.
+    ends: the pairs (P, 2) as places among `bodies`, that of the lower frame first.  Raises
+    RobotError where a body can't be bounded, naming it.
     """
 
     def __init__(self, scene: Scene, frames: Float[np.ndarray, "D+1 12"], reach: Reach) -> None:
@@ -212,52 +214,64 @@ class BodyTable:
         self.scene = Scene(scene.robot)
         self.bodies = dict(self._robot)
         self._allowed = touching(scene.robot, self.scene)
-        self.pairs = tuple(self._pairs(self._robot))
+        self._made = dict[str, Shape | Attached]()
+        self.ends = self._pairs(self.bodies, self._allowed, self._robot)
         self.change(scene)
 
     def change(self, scene: Scene) -> None:
         """Follow the scene: shapes come, go and move, links and shapes may touch others than
-        before.  Nothing has changed where it raises RobotError.
+        before.  Nothing has changed where it raises RobotError, or SceneError for names.
         """
-        old, bodies = self.scene, dict(self._robot)
-        own, blocks = dict(self._own), {key: self._blocks[key] for key in self._robot}
-        kept = set(old.workcell) | set(old.attached)
+        require_names(self.links, scene.workcell, scene.attached, scene.allowed)
+        bodies, own, made = dict(self._robot), dict[str, _Own](), dict[str, Shape | Attached]()
+        blocks = {key: self._blocks[key] for key in self._robot}
         news = set[BodyKey]()
-        for shape, held in (*((s, None) for s in scene.workcell), *_carried(scene.attached)):
-            key = BodyKey(shape.name, True)
-            self._require(shape, held)
-            if key in bodies:
-                raise SceneError(f"two shapes of the workcell are called {shape.name!r}")
-            if (shape if held is None else held) in kept and key in self.bodies:
+        everything: list[Shape | Attached] = [*scene.workcell, *scene.attached]
+        for one in everything:
+            key, before = BodyKey(one.name, True), self._made.get(one.name)
+            made[one.name] = one
+            if before is one or before == one:
+                own[one.name] = self._own[one.name]
                 bodies[key], blocks[key] = self.bodies[key], self._blocks[key]
                 continue
-            own[shape.name] = self._own_of(shape)
-            bodies[key], blocks[key] = self._placed(shape, held, own[shape.name])
+            own[one.name] = self._own_of(one.shape if isinstance(one, Attached) else one)
+            bodies[key], blocks[key] = self._placed(one, own[one.name])
             news.add(key)
         allowed = touching(scene.robot, scene)
         if allowed != self._allowed:  # of what is named there all pairs are looked at again
             named = set().union(*(allowed ^ self._allowed))
             news |= {key for key in bodies if key.name in named}
+        place = {key: i for i, key in enumerate(bodies) if key not in news}
+        moved = np.array([place.get(key, -1) for key in self.bodies], int)[self.ends]
+        ends = np.concatenate([moved[(moved >= 0).all(axis=1)], self._pairs(bodies, allowed, news)])
         self.scene, self._allowed, self.bodies, self._blocks = scene, allowed, bodies, blocks
-        self._own = {name: own[name] for name in scene.names}
-        stay = bodies.keys() - news
-        left = [(a, b) for a, b in self.pairs if a in stay and b in stay]
-        self.pairs = (*left, *self._pairs(news))
+        self._own, self._made, self.ends = own, made, ends
 
     @property
     def state(self) -> tuple[Any, ...]:
         """All that changes, to be taken back by `restore`; nothing is read again for that."""
-        return self.scene, self._allowed, self.bodies, self._blocks, self._own, self.pairs
+        kept = self.scene, self._allowed, self.bodies, self._blocks
+        return *kept, self._own, self._made, self.ends
 
     def restore(self, state: tuple[Any, ...]) -> None:
         """Be as before."""
-        self.scene, self._allowed, self.bodies, self._blocks, self._own, self.pairs = state
+        self.scene, self._allowed, self.bodies, self._blocks = state[:4]
+        self._own, self._made, self.ends = state[4:]
 
-    def arrays(
-        self, pairs: Sequence[Pair], more: Sequence[Pair] = ()
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Hulls (H,), nodes (N, REACH + D) and pairs (P, PAIR) of these pairs of bodies, then of
-        more, behind all of which those of their pieces are.
+    @property
+    def frames(self) -> Int[np.ndarray, "P 2"]:
+        """Those that carry the bodies of each pair."""
+        return np.array([body.frame for body in self.bodies.values()], int)[self.ends]
+
+    def named(self, pairs: Collection[Pair]) -> Bool[np.ndarray, "P"]:
+        """Which pairs are among those."""
+        place, count = {key: i for i, key in enumerate(self.bodies)}, len(self.bodies)
+        known = [place[a] * count + place[b] for a, b in pairs if a in place and b in place]
+        return np.isin(self.ends[:, 0] * count + self.ends[:, 1], known)
+
+    def arrays(self, ends: Int[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Hulls (H,), nodes (N, REACH + D) and pairs (P, PAIR) of these pairs of bodies, behind
+        which those of their pieces are.
         """
         blocks = list(self._blocks.values()) or [block_of([], self._dof)]
         counts = np.array([len(block.nodes) for block in blocks])
@@ -269,31 +283,31 @@ class BodyTable:
         links = np.array([len(block.links) for block in blocks])
         shifts = np.repeat(offsets, links)
         hulls[np.concatenate([block.links for block in blocks]) + shifts] += shifts
-        number = {key: i for i, key in enumerate(self._blocks)}
-        ends = np.array([(number[a], number[b]) for a, b in (*pairs, *more)], int).reshape(-1, 2)
         pieces = np.array([block.pieces for block in blocks])
         return hulls, nodes, _pair_table(ends, begins, pieces, nodes)
 
-    def _pairs(self, news: Collection[BodyKey]) -> Iterator[Pair]:
+    @staticmethod
+    def _pairs(
+        bodies: Mapping[BodyKey, Body],
+        allowed: Collection[frozenset[str]],
+        news: Collection[BodyKey],
+    ) -> Int[np.ndarray, "n 2"]:
         """Pairs that may meet of which one is new, that of the lower frame first."""
-        rank = {key: i for i, key in enumerate(self.bodies)}
-
-        def order(body: Body) -> tuple[int, bool, int]:
-            return body.frame, body.shape is None, rank[body.key]
-
-        for key in sorted(news, key=rank.__getitem__):
-            for other, body in self.bodies.items():
-                if other == key or (other in news and rank[other] < rank[key]):
+        around = [(i, body) for i, body in enumerate(bodies.values()) if body.is_fixed]
+        others = [(i, body) for i, body in enumerate(bodies.values()) if not body.is_fixed]
+        found = list[tuple[int, int]]()
+        for place, key in enumerate(bodies):
+            if key not in news:
+                continue
+            own = bodies[key]
+            for other, body in others if own.is_fixed else (*others, *around):
+                if other == place or (other < place and body.key in news):
                     continue
-                first, second = sorted((self.bodies[key], body), key=order)
-                if may_meet(first, second, self._allowed):
-                    yield first.key, second.key
-
-    def _require(self, shape: Shape, held: Attached | None) -> None:
-        if shape.name in self.links:
-            raise SceneError(f"workcell {shape.name!r}: a link of the robot has that name")
-        if held is not None and held.link not in self.links:
-            raise SceneError(f"{held.name!r} can't be attached: no link is called {held.link!r}")
+                a, b = (place, own), (other, body)
+                first, second = (a, b) if _order(*a) < _order(*b) else (b, a)
+                if may_meet(first[1], second[1], allowed):
+                    found.append((first[0], second[0]))
+        return np.array(found, int).reshape(-1, 2)
 
     def _own_of(self, shape: Shape) -> _Own:
         """As it was before where it has only moved, and a file has the same in it."""
@@ -308,11 +322,12 @@ class BodyTable:
             raise RobotError(f"{shape.name!r} has no collision shape: nothing could touch it")
         return _Own(at_origin, pieces, block_of(pieces, self._dof))
 
-    def _placed(self, shape: Shape, held: Attached | None, own: _Own) -> tuple[Body, _Block]:
+    def _placed(self, one: Shape | Attached, own: _Own) -> tuple[Body, _Block]:
+        shape = one.shape if isinstance(one, Attached) else one
         pose, frame, carrier = shape.at.matrix, 0, None
-        if held is not None:
-            link = self.links[held.link]
-            pose, frame, carrier = link.pose @ pose, link.frame, held.link
+        if isinstance(one, Attached):
+            link = self.links[one.link]
+            pose, frame, carrier = link.pose @ pose, link.frame, one.link
         there = tuple(piece.at(pose) for piece in own.pieces)
         body = Body(shape.name, frame, there, shape=shape, carrier=carrier)
         return body, self._reaching(own.block.at(pose, frame), body)
@@ -329,8 +344,9 @@ class BodyTable:
         return block._replace(nodes=nodes)
 
 
-def _carried(attached: Iterable[Attached]) -> Iterator[tuple[Shape, Attached]]:
-    return ((one.shape, one) for one in attached)
+def _order(place: int, body: Body) -> tuple[int, bool, int]:
+    """Of two bodies that may meet, which is the first."""
+    return body.frame, body.shape is None, place
 
 
 def _pair_table(

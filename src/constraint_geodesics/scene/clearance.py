@@ -121,19 +121,17 @@ class Clearances:
         """Of the scene as it is now.  apart: as above, where others are known by now.  without:
         names of shapes that are left out.
         """
-        bodies, left_out = self._table.bodies, {BodyKey(name, True) for name in without}
-        never = self._apart if apart is None else frozenset(apart)
-        pairs = [
-            (a, b)
-            for a, b in self._table.pairs
-            if bodies[a].frame != bodies[b].frame
-            and (a, b) not in never
-            and a not in left_out
-            and b not in left_out
-        ]
-        if not pairs:
+        table, frames = self._table, self._table.frames
+        kept = (frames[:, 0] != frames[:, 1]) & ~table.named(
+            self._apart if apart is None else apart
+        )
+        if without:
+            left_out = {BodyKey(name, True) for name in without}
+            kept &= ~np.array([key in left_out for key in table.bodies])[table.ends].any(axis=1)
+        ends = table.ends[kept]
+        if not len(ends):
             return NO_CLEARANCE
-        return ClearanceModel(ClearanceArrays(*self._table.arrays(pairs), len(pairs)))
+        return ClearanceModel(ClearanceArrays(*table.arrays(ends), len(ends)))
 
 
 def clearance_model(scene: Scene, apart: Collection[Pair] = ()) -> ClearanceModel:

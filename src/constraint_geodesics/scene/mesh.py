@@ -10,7 +10,7 @@ import numpy as np
 
 from constraint_geodesics.fields import Positive
 from constraint_geodesics.robot.kinematics import RobotError
-from constraint_geodesics.scene.pieces import HULL_MARGIN, Piece
+from constraint_geodesics.scene.pieces import HULL_MARGIN, Piece, digest_of
 from constraint_geodesics.scene.shape import Placement, Shape, add_body
 from constraint_geodesics.scene.triangles import Triangles, convex_pieces, read_triangles
 
@@ -44,8 +44,7 @@ class Mesh(Shape):
         """The convex parts, and the margin that PyBullet has around the boxes of links that come
         near triangles.
         """
-        file, changed = self._read()
-        found = _pieces(file, changed, self.scale)
+        found = _pieces(*self._read(), self.scale)
         return tuple(piece.at(self.pose.matrix) for piece in found)
 
     def placed(self, at: Placement) -> "Mesh":
@@ -76,25 +75,25 @@ class Mesh(Shape):
             vertex_positions=corners, triangle_indices=mesh.faces, albedo_factor=colour
         )
 
-    def _read(self) -> tuple[Path, int]:
-        """The file, and when it was changed."""
-        file = Path(self.file)
+    def _read(self) -> tuple[Path, str]:
+        """The file, and what is in it."""
         try:
-            return file, file.stat().st_mtime_ns
+            return Path(self.file), digest_of(Path(self.file))
         except OSError:
             raise RobotError(f"{self.name!r}: there is no mesh {str(self.file)!r}") from None
 
 
 @lru_cache(maxsize=64)
-def _scaled(file: Path, changed_ns: int, scale: float) -> Triangles:
-    mesh = read_triangles(file, changed_ns)
+def _scaled(file: Path, digest: str, scale: float) -> Triangles:
+    mesh = read_triangles(file, digest)
     return Triangles(scale * mesh.corners, mesh.faces)
 
 
 @lru_cache(maxsize=64)
-def _pieces(file: Path, changed_ns: int, scale: float) -> tuple[Piece, ...]:
+def _pieces(file: Path, digest: str, scale: float) -> tuple[Piece, ...]:
+    mesh = _scaled(file, digest, scale)
     try:
-        found = convex_pieces(_scaled(file, changed_ns, scale))
+        found = convex_pieces(mesh)
     except RobotError as error:
         raise RobotError(f"{file}: {error}") from None
     return tuple(piece._replace(rounding=HULL_MARGIN) for piece in found)

@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from hashlib import blake2b
 from pathlib import Path
 from typing import NamedTuple
 
@@ -168,11 +169,11 @@ def _mesh(shape: ElementTree.Element, urdf: Path) -> Iterator[Piece]:
     if file is None:
         raise ValueError(f"there is no mesh {name!r}")
     scale = _numbers(shape, "scale", "1 1 1")
-    yield from _mesh_pieces(file, file.stat().st_mtime_ns, tuple(scale))
+    yield from _mesh_pieces(file, digest_of(file), tuple(scale))
 
 
 @lru_cache(maxsize=256)
-def _mesh_pieces(file: Path, _changed_ns: int, scale: tuple[float, ...]) -> tuple[Piece, ...]:
+def _mesh_pieces(file: Path, _digest: str, scale: tuple[float, ...]) -> tuple[Piece, ...]:
     """Search and certificate ask for the same meshes; a changed file is read again."""
     return tuple(mesh_piece(points * np.array(scale)) for points in read_mesh(file))
 
@@ -203,6 +204,11 @@ def _deepest(corners: Float[np.ndarray, "n 3"], faces: Float[np.ndarray, "f 4"])
             break
         found = max(found, float(depths(corners[own], faces).max()))
     return found
+
+
+def digest_of(file: Path) -> str:
+    """Of what is in a file: its time is no sign, which a copy may keep.  Raises OSError."""
+    return blake2b(file.read_bytes()).hexdigest()
 
 
 def read_mesh(file: Path) -> list[Float[np.ndarray, "n 3"]]:

@@ -127,18 +127,16 @@ class PlanningScene:
 
     def become(self, scene: Scene) -> None:
         """Take all of another scene of the same robot."""
-        shapes = (*scene.workcell, *(one.shape for one in scene.attached))
-        named = [link for shape in shapes for link in shape.exempt_links]
-        named += [one.link for one in scene.attached]
-        for link in named:
-            if link not in self.links:
-                raise SceneError(f"no link is called {link!r}: {', '.join(self.links)}")
-        for shape in shapes:
-            if shape.name in self.links:
-                raise SceneError(f"{shape.name!r} is a link of the robot: give the shape another")
-        touching = [other for one in scene.attached for other in one.touching]
-        for name in (*touching, *(end for pair in scene.allowed for end in pair)):
-            if name not in self.links and name not in scene.names:
-                raise SceneError(f"{name!r} is no link of the robot, nor a shape of the scene")
+        if not _are_same(scene.robot, self.robot):
+            raise SceneError(f"a scene of another robot: this one is {self.robot.name}")
         self._follow(scene)
         self._now = scene
+
+
+def _are_same(first: SerialRobot, second: SerialRobot) -> bool:
+    """Whether all is the same that a scene takes of a robot."""
+    return first is second or (
+        (first.urdf, first.tool_link, first.joint_names, first.allowed)
+        == (second.urdf, second.tool_link, second.joint_names, second.allowed)
+        and np.array_equal([first.lower, first.upper], [second.lower, second.upper])
+    )

@@ -8,13 +8,10 @@ from constraint_geodesics.params import Params, RobotParams, WorkcellParams
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, load_robot
 from constraint_geodesics.scene.arm import ADJACENT, load_arm
 from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.names import SceneError as SceneError
 from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.urdf import find_urdf, has_pybullet
 from constraint_geodesics.scene.world import World
-
-
-class SceneError(ValueError):
-    """A change that a scene can't take; the message names the shape and what is wrong."""
 
 
 @dataclass(frozen=True)

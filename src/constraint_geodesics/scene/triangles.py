@@ -27,7 +27,8 @@ _HALVINGS = 12
 _THRESHOLD = 0.1
 """CoACD's concavity, of the mesh's size, from which on a part is divided."""
 _MOST_PARTS = 32
-_BLOCK = 1024
+_BLOCK = 1 << 22
+"""Numbers that are looked at at once, of a mesh with many triangles."""
 
 
 class Triangles:
@@ -42,9 +43,9 @@ class Triangles:
 
 
 @lru_cache(maxsize=64)
-def read_triangles(file: Path, _changed_ns: int) -> Triangles:
-    """Of an OBJ, STL or Collada file; a changed one is read again.  Raises RobotError, one line,
-    for what is none, and for one without faces.
+def read_triangles(file: Path, _digest: str) -> Triangles:
+    """Of an OBJ, STL or Collada file; one with something else in it is read again.  Raises
+    RobotError, one line, for what is none, and for one without faces.
     """
     kind = file.suffix.lower()
     if kind not in KINDS:
@@ -90,15 +91,25 @@ def convex_pieces(mesh: Triangles) -> tuple[Piece, ...]:
         raise RobotError(
             "a mesh without volume can't be bounded: take a box in its place"
         ) from None
-    depths = -(mesh.corners @ hull.equations[:, :3].T + hull.equations[:, 3])
     # a face lies on the hull where all its corners lie on one plane of it
-    deepest = max(
-        float(depths[own].max(axis=1).min(axis=1).max())
-        for own in np.array_split(mesh.faces, len(mesh.faces) // _BLOCK + 1)
-    )
-    if deepest <= NOT_CONVEX:
+    if all(
+        ((-_beyond(own, hull)).max(axis=1).min(axis=1) <= NOT_CONVEX).all()
+        for own in _blocks(mesh.places(), hull)
+    ):
         return (Piece(mesh.corners[hull.vertices]),)
     return tuple(_covering(mesh.places(), _parts(mesh)))
+
+
+def _beyond(places: Float[np.ndarray, "m 3 3"], hull: ConvexHull) -> Float[np.ndarray, "m 3 f"]:
+    """How far corners of triangles lie beyond each plane of a hull [m]."""
+    found: Float[np.ndarray, "m 3 f"] = places @ hull.equations[:, :3].T + hull.equations[:, 3]
+    return found
+
+
+def _blocks(places: Float[np.ndarray, "m 3 3"], hull: ConvexHull) -> list[np.ndarray]:
+    """Triangles in groups so small that what is said of each and each plane fits into memory."""
+    count = 3 * len(places) * len(hull.equations) // _BLOCK + 1
+    return np.array_split(places, min(count, max(len(places), 1)))
 
 
 def _parts(mesh: Triangles) -> list[ConvexHull]:
@@ -135,7 +146,9 @@ def _covering(places: Float[np.ndarray, "m 3 3"], parts: list[ConvexHull]) -> li
     for halving in range(_HALVINGS + 1):
         beyond = np.stack(
             [
-                (places @ part.equations[:, :3].T + part.equations[:, 3]).max(axis=(1, 2))
+                np.concatenate(
+                    [_beyond(own, part).max(axis=(1, 2)) for own in _blocks(places, part)]
+                )
                 for part in parts
             ],
             axis=1,

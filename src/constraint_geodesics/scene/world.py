@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
 from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.names import require_names
 from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.urdf import quiet
 
@@ -119,8 +120,8 @@ class World:
     robot allows, links exempt from a shape, what carries a shape and what is said to touch it, and
     allowed pairs of names may touch; nothing else may.
 
-    Raises RobotError if PyBullet has not all of the robot's collision shapes, and ValueError if an
-    exempt link is not the robot's.
+    Raises RobotError if PyBullet has not all of the robot's collision shapes, and SceneError for
+    names that can't be.
     """
 
     def __init__(
@@ -170,24 +171,19 @@ class World:
         """Other shapes around the robot, other ones that it carries: what stays is left alone, and
         all does where this raises.
         """
-        wanted: dict[str, Shape | Attached] = {}
+        require_names(self._link_index, fixed, attached, allowed)
         everything: list[Shape | Attached] = [*fixed, *attached]
-        for one in everything:
-            if one.name in wanted:
-                raise ValueError(f"two shapes of the workcell are called {one.name!r}")
-            if one.name in self._link_index:
-                raise ValueError(
-                    f"workcell {one.name!r}: a link of {self.robot.name} has that name"
-                )
-            wanted[one.name] = one
+        wanted = {one.name: one for one in everything}
         pairs = [*map(frozenset, allowed)]
         for shape in (*fixed, *(one.shape for one in attached)):
-            self._require_links(shape.name, shape.exempt_links)
             pairs += [frozenset((shape.name, link)) for link in shape.exempt_links]
         for held in attached:
-            self._require_links(held.name, [held.link])
             pairs += [frozenset((held.name, other)) for other in (held.link, *held.touching)]
-        gone = {name for name, own in self._shapes.items() if wanted.get(name) != own.made}
+        gone = {
+            name
+            for name, own in self._shapes.items()
+            if wanted.get(name) is not own.made and wanted.get(name) != own.made
+        }
         news = {n: one for n, one in wanted.items() if n not in self._shapes or n in gone}
         made = self._made(news)  # all that can fail, before anything goes
         now = frozenset(pairs) | self._never
@@ -212,7 +208,7 @@ class World:
                 for name, one in news.items():
                     try:
                         made[name] = self._add(one)
-                    except self._bullet.error as error:
+                    except (self._bullet.error, SystemError) as error:
                         raise RobotError(f"{name!r}: PyBullet can't make it: {error}") from None
         except BaseException:
             for own in made.values():
@@ -387,10 +383,6 @@ class World:
                 elif body != self._body or contact[3] != _BASE:  # what carries the arm may touch
                     workcell = True
         return own, workcell
-
-    def _require_links(self, shape: str, links: Sequence[str]) -> None:
-        if unknown := [name for name in links if name not in self._link_index]:
-            raise ValueError(f"workcell {shape!r}: {unknown} are not links of {self.robot.name}")
 
 
 _BASE = -1

@@ -111,7 +111,8 @@ class Preparation:
             self._clearances.restore(before)
             raise
         self._clearance = self._clearances.model(self.checks.apart)
-        left = tuple(shape for shape in self.scene.workcell if shape in scene.workcell)
+        around = {shape.name: shape for shape in scene.workcell}
+        left = tuple(own for own in self.scene.workcell if own == around.get(own.name))
         held = tuple(one for one in self.scene.attached if one in scene.attached)
         if (left, held) != (self.scene.workcell, self.scene.attached):
             self.scene = replace(self.scene, workcell=left, attached=held)

@@ -1,0 +1,35 @@
+"""Names of shapes and links in a scene: what they may be, and what may be named."""
+
+from collections.abc import Collection, Sequence
+
+from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.shape import Shape
+
+
+class SceneError(ValueError):
+    """A change that a scene can't take; the message names the shape and what is wrong."""
+
+
+def require_names(
+    links: Collection[str],
+    workcell: Sequence[Shape],
+    attached: Sequence[Attached],
+    allowed: Collection[tuple[str, str]],
+) -> None:
+    """That every shape has a name of its own, which no link of the robot has, that links which are
+    named are the robot's, and that what may touch is there.  Raises SceneError.
+    """
+    shapes, names = (*workcell, *(one.shape for one in attached)), set[str]()
+    for shape in shapes:
+        if shape.name in links:
+            raise SceneError(f"{shape.name!r} is a link of the robot: give the shape another name")
+        if shape.name in names:
+            raise SceneError(f"two shapes are called {shape.name!r}: give one another name")
+        names.add(shape.name)
+    for link in (*(own for s in shapes for own in s.exempt_links), *(one.link for one in attached)):
+        if link not in links:
+            raise SceneError(f"no link is called {link!r}: {', '.join(links)}")
+    touching = (other for one in attached for other in one.touching)
+    for name in (*touching, *(end for pair in allowed for end in pair)):
+        if name not in links and name not in names:
+            raise SceneError(f"{name!r} is no link of the robot, nor a shape of the scene")
