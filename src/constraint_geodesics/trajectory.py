@@ -24,8 +24,8 @@ from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search.band import project, step_lengths
 from constraint_geodesics.search.space import space_of
 
-CONSTRAINT_LINE = "# constraint: "
-"""What the comment line of a trajectory's CSV begins with."""
+CONSTRAINT_LINE, VELOCITY_LINE = "# constraint: ", "# start_velocity: "
+"""What the comment lines of a trajectory's CSV begin with."""
 
 
 @dataclass(frozen=True)
