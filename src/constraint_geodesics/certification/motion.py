@@ -9,7 +9,6 @@ from jaxtyping import Float
 from constraint_geodesics.certification import kernels
 from constraint_geodesics.certification.certificate import Violation, malformed, real_array
 
-
 _SLACK = 1e-6
 """Relative, of the speed that the first line must have."""
 
