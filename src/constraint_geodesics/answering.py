@@ -88,9 +88,9 @@ class Answering:
         refused = refused_end(query, "start", self.certifier.collisions)
         refused = refused or refused_velocity(query, self.pace(query))
         if refused is not None:
-            return self._nothing(query, *refused)
+            return self.nothing(query, *refused)
         if query.start_velocity is None:
-            return self._found(query, goals, budget_s)
+            return self.found(query, goals, budget_s)
         return self._from_velocity(query, goals, budget_s)
 
     def _from_velocity(
@@ -100,11 +100,11 @@ class Answering:
         line and the graph can, a stop straight on and a path from there, and trees at last.
         """
         few = replace(query, parts=replace(query.parts, tree=False))
-        found = self._found(few, goals, budget_s)
+        found = self.found(few, goals, budget_s)
         if found.status != "solved":
             found = self._after_a_stop(query, goals, budget_s) or found
         if found.status != "solved" and query.parts.tree:
-            found = self._found(query, goals, budget_s)
+            found = self.found(query, goals, budget_s)
         return found
 
     def _after_a_stop(
@@ -113,7 +113,7 @@ class Answering:
         """Straight on to a stop, and from there to a goal; None where there is no such path."""
         assert query.start_velocity is not None
         pace, velocity = self.pace(query), query.start_velocity
-        straight = run_out(query.task, query.start, velocity, pace)
+        straight = run_out(query.task.open, query.start, velocity, pace)
         if straight is None:
             return None
         allowed = _CONTINUED * self.certifier.limits.violation_tolerance
@@ -121,9 +121,9 @@ class Answering:
         stop = shortest_stop(rows, velocity, pace)
         if stop is None or not self.certifier.collisions.is_clear(stop.joints):
             return None
-        return self.joined(query, stop.joints, goals, budget_s)
+        return self._joined(query, stop.joints, goals, budget_s)
 
-    def joined(
+    def _joined(
         self,
         query: Query,
         tail: Float[np.ndarray, "n D"],
@@ -134,7 +134,7 @@ class Answering:
         one trajectory; None where that is not certified.
         """
         resting = replace(query, start=tail[-1], start_velocity=None)
-        onward = self._found(resting, goals, budget_s)
+        onward = self.found(resting, goals, budget_s)
         if onward.status != "solved":
             return None
         whole = np.concatenate([tail, onward.joints[1:]])
@@ -142,16 +142,16 @@ class Answering:
         found = self.judged(query, whole, onward.source, end)
         return found if isinstance(found, Trajectory) else None
 
-    def _found(self, query: Query, goals: Sequence[Goal], budget_s: float | None) -> Trajectory:
+    def found(self, query: Query, goals: Sequence[Goal], budget_s: float | None) -> Trajectory:
         """The path to the nearest of some goals, or why there is none; the start is a sound one."""
         pursued, rest = self._pursued(query, goals)
         if not pursued:
             wanted = " or ".join(one.description for one in goals)
-            return self._nothing(query, "not_found", f"no configuration was found for {wanted}")
+            return self.nothing(query, "not_found", f"no configuration was found for {wanted}")
         regions = tuple(goal.region for goal in goals if goal.region is not None)
         query = replace(query, regions=regions)
         if pursued[0].distance <= COINCIDENT_RAD and query.start_velocity is None:
-            return self._standing(replace(query, goal=pursued[0].goal), pursued[0].region)
+            return self.standing(replace(query, goal=pursued[0].goal), pursued[0].region)
 
         def certify(one: Pursued, candidate: Candidate) -> tuple[Trajectory, float] | str:
             found = self._certified(query, candidate, one)
@@ -255,7 +255,7 @@ class Answering:
             )
             told = ", ".join(f"{count} {status}" for status, count in ends.most_common())
             line += f"; of {len(pursued)} configurations of the goal: {told}"
-        return self._nothing(query, end.status, line)
+        return self.nothing(query, end.status, line)
 
     def _improved(
         self, query: Query, path: Trajectory, pursued: Sequence[Pursued], budget_s: float
@@ -298,7 +298,10 @@ class Answering:
         """The candidate as a trajectory if it is certified, otherwise why it is not: its end is the
         configuration that was asked for, or any in the region.
         """
-        end = End(one.goal if one.room is None else None, one.region)
+        return self.begun(query, candidate, End(one.goal if one.room is None else None, one.region))
+
+    def begun(self, query: Query, candidate: Candidate, end: "End") -> Trajectory | str:
+        """The candidate as a trajectory if it is certified, otherwise why it is not."""
         if query.start_velocity is not None:
             return self._continued(query, candidate, end)
         for share in _TIGHTENED:
@@ -309,19 +312,16 @@ class Answering:
         return found.why if isinstance(found, Refused) else found
 
     def _continued(self, query: Query, candidate: Candidate, end: "End") -> Trajectory | str:
-        """The candidate, begun from the query's velocity: of the beginnings that can be passed the
-        one of shortest duration that is certified.
-        """
+        """The candidate, begun from the query's velocity: the first beginning that is certified."""
         assert query.start_velocity is not None
-        pace, velocity, drawn = self.pace(query), query.start_velocity, []
+        pace, velocity = self.pace(query), query.start_velocity
         allowed = _CONTINUED * self.certifier.limits.violation_tolerance
-        for own in run_outs(query.task, candidate, velocity, pace):
+        why = "no beginning goes on from the start's velocity"
+        for own in run_outs(query.task.open, candidate, velocity, pace):
             joints = rows_from(own, query.start, velocity, pace, allowed)
             times = pace.times(joints, velocity)
-            if times is not None:
-                drawn.append((times[-1], joints, times))
-        why = "no beginning goes on from the start's velocity"
-        for _, joints, times in sorted(drawn, key=lambda one: one[0]):
+            if times is None:
+                continue
             found = self.judged(query, joints, candidate.source, end, times)
             if isinstance(found, Trajectory):
                 return found
@@ -373,7 +373,7 @@ class Answering:
         about = self.asked(query), self._statistics(query, source)
         return Trajectory("solved", joints, times, line, *about, certificate, velocity)
 
-    def _standing(self, query: Query, region: Constraint | None) -> Trajectory:
+    def standing(self, query: Query, region: Constraint | None = None) -> Trajectory:
         """The path between ends that only rounding tells apart."""
         joints, times = np.stack([query.start, query.goal]), np.array([0.0, STANDING_S])
         constraint = query.task.manifold.constraint
@@ -383,11 +383,12 @@ class Answering:
         line = "the start is the goal"
         if certificate.violation is not None:
             line = f"{line}, and no path: {certificate.violation.message}"
-            return self._nothing(query, "not_found", line)
+            return self.nothing(query, "not_found", line)
         about = self.asked(query), self._statistics(query, "straight")
         return Trajectory("solved", joints, times, line, *about, certificate)
 
-    def _nothing(self, query: Query, status: Status, explanation: str) -> Trajectory:
+    def nothing(self, query: Query, status: Status, explanation: str) -> Trajectory:
+        """That there is no path, and why."""
         empty, about = np.empty((0, len(query.start))), self.asked(query)
         statistics = self._statistics(query, "")
         return Trajectory(status, empty, np.empty(0), explanation, about, statistics)
@@ -395,7 +396,7 @@ class Answering:
     def asked(self, query: Query) -> Asked:
         """What a query was asked under."""
         constraint, scene = query.task.manifold.constraint, self.certifier.scene
-        return Asked(constraint, query.name, scene, self.pace(query), query.regions)
+        return Asked(constraint, query.name, scene, self.pace(query), query.regions, query.scales)
 
     def _statistics(self, query: Query, source: str) -> Statistics:
         spent = time.perf_counter() - query.began

@@ -40,6 +40,7 @@ from constraint_geodesics.params import (
 )
 from constraint_geodesics.problem import PlannerError as PlannerError
 from constraint_geodesics.problem import end_refused
+from constraint_geodesics.replanning import Replanning
 from constraint_geodesics.robot.inverse_kinematics import Search, solutions, spread
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, rpy_of
 from constraint_geodesics.scene.arm import FOUND
@@ -298,6 +299,21 @@ class Planner:
             query = Query(task, name, q_start, q_start, began, parts, scales, moved)
             query = replace(query, start_velocity=moving)
             return self._answering.answer(query, goals, budget_s)
+
+    def replan(self, trajectory: Trajectory, at_s: float) -> Trajectory:
+        """A certified trajectory for an arm that is under way: from its state at a time [s] of its
+        trajectory on, in the scene as it is now, to the same last configuration.
+
+        What is left of the trajectory where that is still clear, else a path round what is new, of
+        status "solved".  Where none is found, the hardest stop on the path: "stopped" if that is
+        certified, else its waypoints come with the certificate that names what it breaks, under the
+        status "in_collision" where it meets something.  A trajectory that stopped may be replanned:
+        it goes on to the configuration that was wanted.
+        Raises PlannerError for a time beyond 0 and the duration, an answer without a path, or a
+        trajectory of another robot.
+        """
+        self._require_open()
+        return Replanning(self._answering, self._preparation).replan(trajectory, at_s)
 
     def plan_batch(
         self,

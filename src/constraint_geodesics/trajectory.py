@@ -4,8 +4,9 @@ not; and the CSV it is written as.
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,8 @@ from constraint_geodesics.problem import SATISFIED, PlannerError, Status
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search.band import project, step_lengths
-from constraint_geodesics.search.run_out import left_over, rows_from
+from constraint_geodesics.search.candidates import Candidate
+from constraint_geodesics.search.run_out import left_over, rows_from, run_out, run_outs
 from constraint_geodesics.search.space import space_of
 
 CONSTRAINT_LINE, VELOCITY_LINE = "# constraint: ", "# start_velocity: "
@@ -47,7 +49,8 @@ STANDING_S = 0.001
 class Asked:
     """What a query was asked under: the constraint with its reference, its name, and the scene;
     regions: those of its goals that are more than single configurations.  pace: the limits of
-    velocity and acceleration that its motion uses.
+    velocity and acceleration that its motion uses, of which scales are the shares.  wanted: the
+    configuration that a motion under way was to reach, if it is not its last.
     """
 
     constraint: Constraint
@@ -55,6 +58,8 @@ class Asked:
     scene: Scene = field(repr=False)
     pace: Pace = field(repr=False)
     regions: tuple[Constraint, ...] = ()
+    scales: tuple[float, float] = (1.0, 1.0)
+    wanted: Float[np.ndarray, "D"] | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -240,13 +245,13 @@ class Trajectory:
 
     def stop(self, at_s: float) -> "Trajectory":
         """The hardest stop on the path from its state at a time [s]: the shortest that the limits
-        of its pace allow, of status "stopped"; after the goal's last line it may be the goal.
+        of its pace allow, of status "stopped".
 
         Its lines are those of the path, so what was proven of them holds, in the scene that the
         path was certified in, and its certificate says so.  Where the velocity can't change so much
-        on what is left of a line, waypoints are drawn anew along the same curve: that is not
-        proven, and the certificate is None.  `planner.replan` certifies a stop in the scene as it
-        is now.
+        on what is left of a line, waypoints are drawn anew, along the same curve or close by: that
+        is not proven, and the certificate is None.  `planner.replan` certifies a stop in the scene
+        as it is now.
         Raises PlannerError without a path, for a time beyond 0 and the duration, or where the arm
         can't stop on the path any more.
         """
@@ -264,7 +269,9 @@ class Trajectory:
         about = replace(self.statistics, planning_time_s=spent, snapped_rad=0.0)
         about = replace(about, source="stop", looked_at=None)
         start = motion.start_velocity if motion.start_velocity.any() else None
-        found = motion.joints, motion.times, line, self.asked, about, known, start
+        wanted = self.joints[-1] if self.asked.wanted is None else self.asked.wanted
+        asked = replace(self.asked, wanted=wanted)
+        found = motion.joints, motion.times, line, asked, about, known, start
         return Trajectory("stopped", *found)
 
     @property
@@ -382,21 +389,30 @@ def stopping(
     motion: Motion, state: State, pace: Pace, manifold: ConstraintManifold
 ) -> tuple[Motion, bool] | None:
     """The shortest stop on a motion's way from one of its states, and whether all its lines are the
-    motion's; None where there is no stop before its end.
+    motion's; None where there is none.
+
+    A motion that uses its accelerations up may leave none to go on with on what is left of a line:
+    its waypoints are drawn anew then, its curve is begun straight, and at last it goes straight on.
     """
     if not state.velocity.any():
         place, rest = state.configuration, np.zeros_like(state.velocity)
         return Motion(np.stack([place, place]), np.array([0.0, STANDING_S]), rest), True
-    rows = ahead(motion.joints, state)
-    found = shortest_stop(rows, state.velocity, pace)
-    if found is not None or len(rows) < 2:
-        return None if found is None else (found, True)
-    curve = left_over(space_of(manifold), rows)
-    if curve is None:
-        return None
-    drawn = rows_from(curve, state.configuration, state.velocity, pace, REDRAWN)
-    found = shortest_stop(drawn, state.velocity, pace)
-    return None if found is None else (found, False)
+    rows, velocity = ahead(motion.joints, state), state.velocity
+    found = shortest_stop(rows, velocity, pace)
+    if found is not None:
+        return found, True
+    space = space_of(manifold)
+    curve = left_over(space, rows) if len(rows) > 1 else None
+    curves: Iterator[Candidate] = iter(())
+    if curve is not None:
+        curves = chain([curve], run_outs(space, curve, velocity, pace))
+    straight = run_out(space, state.configuration, velocity, pace)
+    for own in chain(curves, [] if straight is None else [straight]):
+        drawn = rows_from(own, state.configuration, velocity, pace, REDRAWN)
+        found = shortest_stop(drawn, velocity, pace)
+        if found is not None:
+            return found, False
+    return None
 
 
 def _duration(seconds: float) -> dict[str, int]:

@@ -10,6 +10,7 @@ that is found, are checked here for jumps, limits and what they touch.
 import heapq
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import count
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -96,19 +97,20 @@ def shortest_way(
     at_start: Joined,
     at_goal: Joined,
     space: Space | None = None,
+    most: int | None = None,
 ) -> Float[np.ndarray, "k D"] | None:
     """Corners of the shortest way over the graph, both ends included; None where the graph does not
     join them.
 
     space: the edges of a way that was found are looked at in it, since the
     graph may be of a workcell with less in it.  Those that fail are left out, and the search is
-    begun again [lazy shortest paths, Dellin and Srinivasa 2016].
+    begun again [lazy shortest paths, Dellin and Srinivasa 2016].  most: so often at most.
     """
     if not len(at_start.nodes) or not len(at_goal.nodes):
         return None
     begins, leads, lengths = roadmap.neighbours
     own, looked_at = lengths.copy(), np.zeros(len(lengths), bool)
-    while True:
+    for _ in count() if most is None else range(most):
         nodes = _a_star(
             roadmap.joints,
             begins,
@@ -124,6 +126,7 @@ def shortest_way(
             return None
         if space is None or _holds(space, roadmap.joints, begins, leads, own, looked_at, nodes):
             return np.concatenate([start[None], roadmap.joints[nodes], goal[None]])
+    return None
 
 
 def build_roadmap(space: Space, joints: Float[np.ndarray, "n D"], neighbours: int) -> Roadmap:

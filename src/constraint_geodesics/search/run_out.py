@@ -16,13 +16,15 @@ from constraint_geodesics.constraints.kernels import ManifoldArrays, violation_b
 from constraint_geodesics.geometry.braking import Pace
 from constraint_geodesics.problem import SATISFIED, Status
 from constraint_geodesics.search.band import PROJECTION, project, step_lengths
-from constraint_geodesics.search.candidates import Candidate, Task, rows_of
+from constraint_geodesics.search.candidates import Candidate, rows_of
 from constraint_geodesics.search.curve_kernels import curve_points, spline_through
 from constraint_geodesics.search.preparation import Query
 from constraint_geodesics.search.space import Space
 
-RUN_OUTS = (0.5, 1.0, 2.0, 4.0)
-"""Lengths of the curve that are replaced, as multiples of the braking distance."""
+RUN_OUTS = (1.0, 2.0, 0.5, 4.0)
+"""Lengths of the curve that are replaced, as multiples of the braking distance, in the order in
+which they are tried.
+"""
 ACROSS = 0.02
 """By how much a velocity may lead off the constraint [rad/s or m/s]: within the acceleration limits
 it is turned along it before that is seen.
@@ -35,7 +37,7 @@ _NEAR = 0.5
 """Share of the line after it, of a line that is too short to be one."""
 _OFF = 1e-6
 """What the arm is off the constraint [rad] that is not seen."""
-_FADING = 0.25
+_FADING = 0.05
 """Share of the accelerations that brings it back."""
 _FULL, _LEAST, _MOST_PIECES = 0.97, 0.04, 5
 """Share of the violation that is used up where an arm is off, the least that a line uses of it, and
@@ -52,7 +54,7 @@ def braking_distance(velocity: Float[np.ndarray, "D"], pace: Pace) -> float:
 
 
 def merged(
-    task: Task, candidate: Candidate, velocity: Float[np.ndarray, "D"], length: float
+    space: Space, candidate: Candidate, velocity: Float[np.ndarray, "D"], length: float
 ) -> Candidate | None:
     """The candidate with so much of its beginning [rad] replaced by a curve that leaves along a
     velocity; None where that does not keep the constraint and the limits.
@@ -63,11 +65,11 @@ def merged(
     back, on = max(at - 1, 0), min(at + 1, len(points) - 1)
     end = points[on] - points[back]
     blend = _cubic(points[0], velocity, points[at], end)
-    return _drawn(task.open, candidate, np.concatenate([blend, points[at + 1 :]]))
+    return _drawn(space, candidate, np.concatenate([blend, points[at + 1 :]]))
 
 
 def run_out(
-    task: Task, start: Float[np.ndarray, "D"], velocity: Float[np.ndarray, "D"], pace: Pace
+    space: Space, start: Float[np.ndarray, "D"], velocity: Float[np.ndarray, "D"], pace: Pace
 ) -> Candidate | None:
     """A curve straight on along a velocity, long enough to stop on it; None where it leaves the
     constraint or the limits.
@@ -76,11 +78,11 @@ def run_out(
     direction = velocity / np.linalg.norm(velocity)
     shares = np.linspace(0.0, 1.0, max(int(np.ceil(length / _STEP)), _FEWEST))
     points = start + length * shares[:, None] * direction
-    return _drawn(task.open, Candidate("straight", task.open, points, length, points), points)
+    return _drawn(space, Candidate("straight", space, points, length, points), points)
 
 
 def run_outs(
-    task: Task, candidate: Candidate, velocity: Float[np.ndarray, "D"], pace: Pace
+    space: Space, candidate: Candidate, velocity: Float[np.ndarray, "D"], pace: Pace
 ) -> Iterator[Candidate]:
     """The candidate with beginnings of several lengths that leave along a velocity."""
     distance, tried = braking_distance(velocity, pace), -1.0
@@ -89,7 +91,7 @@ def run_outs(
         if length == tried:
             continue
         tried = length
-        found = merged(task, candidate, velocity, length)
+        found = merged(space, candidate, velocity, length)
         if found is not None:
             yield found
 
