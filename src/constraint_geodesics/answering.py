@@ -11,9 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.certification.certifier import Certifier
+from constraint_geodesics.certification.certifier import Certificate, Certifier
 from constraint_geodesics.constraints.both import both
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
+from constraint_geodesics.geometry.braking import Pace, shortest_stop
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.goals.goal import Goal
@@ -24,12 +25,11 @@ from constraint_geodesics.search.candidates import BENDS, Answer, Candidate, con
 from constraint_geodesics.search.explanations import not_connected, refused_end
 from constraint_geodesics.search.preparation import Query
 from constraint_geodesics.search.pursuit import Pursued, shortest, slid
-from constraint_geodesics.trajectory import Asked, Statistics, Trajectory
+from constraint_geodesics.search.run_out import refused_velocity, rows_from, run_out, run_outs
+from constraint_geodesics.trajectory import STANDING_S, Asked, Statistics, Trajectory
 
 COINCIDENT_RAD = 1e-7
 """Ends that differ by less in every joint are one configuration."""
-STANDING_S = 0.001
-"""Duration of a path from a configuration to itself."""
 _NO_MORE = "no more curves"
 _WORTHWHILE = 1e-4
 """Share by which a curve must be shorter than the path so far to be certified."""
@@ -41,6 +41,8 @@ for closer ones.
 """
 _CLOSER = ("constraint_between_rows", "step")
 """What a certificate finds where waypoints lie too far apart."""
+_CONTINUED = 0.9
+"""The same for a path that is begun from a velocity: where it begins it may be off already."""
 _MEMBERS, _NEAREST, _SPREAD = 512, 8, 24
 """Of further configurations of a goal, the nearest: how many are looked at for collisions, of the
 free ones how many have curves led to them as the nearest, and how many of the others.
@@ -59,6 +61,21 @@ class _Rest(NamedTuple):
     room: ConstraintManifold | None
 
 
+class End(NamedTuple):
+    """Where a path must end: at a configuration, or in a region, or anywhere."""
+
+    goal: Float[np.ndarray, "D"] | None = None
+    region: Constraint | None = None
+
+
+class Refused(NamedTuple):
+    """Why waypoints are no path: the kind of it, a line, and the certificate if there is one."""
+
+    kind: str
+    why: str
+    certificate: Certificate | None = None
+
+
 @dataclass(frozen=True)
 class Answering:
     """Whom the curves come from, and who certifies them."""
@@ -69,16 +86,72 @@ class Answering:
     def answer(self, query: Query, goals: Sequence[Goal], budget_s: float | None) -> Trajectory:
         """The path of a query to the nearest of some goals, or why there is none."""
         refused = refused_end(query, "start", self.certifier.collisions)
+        refused = refused or refused_velocity(query, self.pace(query))
         if refused is not None:
-            return self._nothing(query, *refused)
+            return self.nothing(query, *refused)
+        if query.start_velocity is None:
+            return self.found(query, goals, budget_s)
+        return self._from_velocity(query, goals, budget_s)
+
+    def _from_velocity(
+        self, query: Query, goals: Sequence[Goal], budget_s: float | None
+    ) -> Trajectory:
+        """A path that begins in the direction of the query's velocity; where none of the straight
+        line and the graph can, a stop straight on and a path from there, and trees at last.
+        """
+        few = replace(query, parts=replace(query.parts, tree=False))
+        found = self.found(few, goals, budget_s)
+        if found.status != "solved":
+            found = self._after_a_stop(query, goals, budget_s) or found
+        if found.status != "solved" and query.parts.tree:
+            found = self.found(query, goals, budget_s)
+        return found
+
+    def _after_a_stop(
+        self, query: Query, goals: Sequence[Goal], budget_s: float | None
+    ) -> Trajectory | None:
+        """Straight on to a stop, and from there to a goal; None where there is no such path."""
+        assert query.start_velocity is not None
+        pace, velocity = self.pace(query), query.start_velocity
+        straight = run_out(query.task.open, query.start, velocity, pace)
+        if straight is None:
+            return None
+        allowed = _CONTINUED * self.certifier.limits.violation_tolerance
+        rows = rows_from(straight, query.start, velocity, pace, allowed)
+        stop = shortest_stop(rows, velocity, pace)
+        if stop is None or not self.certifier.collisions.is_clear(stop.joints):
+            return None
+        return self._joined(query, stop.joints, goals, budget_s)
+
+    def _joined(
+        self,
+        query: Query,
+        tail: Float[np.ndarray, "n D"],
+        goals: Sequence[Goal],
+        budget_s: float | None = None,
+    ) -> Trajectory | None:
+        """The waypoints of a stop from the query's velocity and a path from their end to a goal, as
+        one trajectory; None where that is not certified.
+        """
+        resting = replace(query, start=tail[-1], start_velocity=None)
+        onward = self.found(resting, goals, budget_s)
+        if onward.status != "solved":
+            return None
+        whole = np.concatenate([tail, onward.joints[1:]])
+        end = End(onward.joints[-1])
+        found = self.judged(query, whole, onward.source, end)
+        return found if isinstance(found, Trajectory) else None
+
+    def found(self, query: Query, goals: Sequence[Goal], budget_s: float | None) -> Trajectory:
+        """The path to the nearest of some goals, or why there is none; the start is a sound one."""
         pursued, rest = self._pursued(query, goals)
         if not pursued:
             wanted = " or ".join(one.description for one in goals)
-            return self._nothing(query, "not_found", f"no configuration was found for {wanted}")
+            return self.nothing(query, "not_found", f"no configuration was found for {wanted}")
         regions = tuple(goal.region for goal in goals if goal.region is not None)
         query = replace(query, regions=regions)
-        if pursued[0].distance <= COINCIDENT_RAD:
-            return self._standing(replace(query, goal=pursued[0].goal), pursued[0].region)
+        if pursued[0].distance <= COINCIDENT_RAD and query.start_velocity is None:
+            return self.standing(replace(query, goal=pursued[0].goal), pursued[0].region)
 
         def certify(one: Pursued, candidate: Candidate) -> tuple[Trajectory, float] | str:
             found = self._certified(query, candidate, one)
@@ -182,7 +255,7 @@ class Answering:
             )
             told = ", ".join(f"{count} {status}" for status, count in ends.most_common())
             line += f"; of {len(pursued)} configurations of the goal: {told}"
-        return self._nothing(query, end.status, line)
+        return self.nothing(query, end.status, line)
 
     def _improved(
         self, query: Query, path: Trajectory, pursued: Sequence[Pursued], budget_s: float
@@ -225,35 +298,82 @@ class Answering:
         """The candidate as a trajectory if it is certified, otherwise why it is not: its end is the
         configuration that was asked for, or any in the region.
         """
-        goal = one.goal if one.room is None else None
-        robot, constraint = self.certifier.scene.robot, query.task.manifold.constraint
-        limits = self.certifier.limits
+        return self.begun(query, candidate, End(one.goal if one.room is None else None, one.region))
+
+    def begun(self, query: Query, candidate: Candidate, end: "End") -> Trajectory | str:
+        """The candidate as a trajectory if it is certified, otherwise why it is not."""
+        if query.start_velocity is not None:
+            return self._continued(query, candidate, end)
+        for share in _TIGHTENED:
+            joints = rows_of(candidate, share * self.certifier.limits.violation_tolerance)
+            found = self.judged(query, joints, candidate.source, end)
+            if not (isinstance(found, Refused) and found.kind in _CLOSER):
+                break
+        return found.why if isinstance(found, Refused) else found
+
+    def _continued(self, query: Query, candidate: Candidate, end: "End") -> Trajectory | str:
+        """The candidate, begun from the query's velocity: the first beginning that is certified."""
+        assert query.start_velocity is not None
+        pace, velocity = self.pace(query), query.start_velocity
+        allowed = _CONTINUED * self.certifier.limits.violation_tolerance
+        why = "no beginning goes on from the start's velocity"
+        for own in run_outs(query.task.open, candidate, velocity, pace):
+            joints = rows_from(own, query.start, velocity, pace, allowed)
+            times = pace.times(joints, velocity)
+            if times is None:
+                continue
+            found = self.judged(query, joints, candidate.source, end, times)
+            if isinstance(found, Trajectory):
+                return found
+            why = found.why
+        return why
+
+    def pace(self, query: Query) -> Pace:
+        """The limits that a query's motion uses."""
+        robot, limits = self.certifier.scene.robot, self.certifier.limits
         assert limits.acceleration_rad_s2 is not None
         velocity = robot.velocity * query.scales[0]
-        acceleration = np.array(limits.acceleration_rad_s2) * query.scales[1]
-        for share in _TIGHTENED:
-            joints = rows_of(candidate, share * limits.violation_tolerance)
+        return Pace(velocity, np.array(limits.acceleration_rad_s2) * query.scales[1])
+
+    def judged(
+        self,
+        query: Query,
+        joints: Float[np.ndarray, "T D"],
+        source: str,
+        end: "End",
+        times: Float[np.ndarray, "T"] | None = None,
+    ) -> "Trajectory | Refused":
+        """Waypoints as a trajectory if they are certified, otherwise why they are not.  times: that
+        they have already.
+        """
+        constraint, velocity = query.task.manifold.constraint, query.start_velocity
+        if times is None:
+            pace = self.pace(query)
             try:
-                times = time_parametrisation(joints, velocity, acceleration)
+                times = time_parametrisation(joints, pace.velocity, pace.acceleration, velocity)
             except GeometryError as error:
-                return str(error)
-            certificate = self.certifier.certify(
-                joints, constraint, query.start, goal, times, region=one.region
-            )
-            if certificate.violation is None or certificate.violation.kind not in _CLOSER:
-                break
+                return Refused("times", str(error))
+        certificate = self.certifier.certify(
+            joints,
+            constraint,
+            query.start,
+            end.goal,
+            times,
+            region=end.region,
+            start_velocity=velocity,
+        )
         if certificate.violation is not None:
-            return certificate.violation.message
+            return Refused(certificate.violation.kind, certificate.violation.message, certificate)
         line = (
-            f"{certificate.length_rad:.3f} rad in {times[-1]:.2f} s from the {candidate.source} "
+            f"{certificate.length_rad:.3f} rad in {times[-1]:.2f} s from the {source} "
             f"proposal, at most {certificate.violation_bound:.1e} off {query.name}"
         )
         if constraint.caveat:
             line += f", {constraint.caveat}"
-        about = self._asked(query), self._statistics(query, candidate.source)
-        return Trajectory("solved", joints, times, line, *about, certificate)
+        about = self.asked(query), self._statistics(query, source)
+        return Trajectory("solved", joints, times, line, *about, certificate, velocity)
 
-    def _standing(self, query: Query, region: Constraint | None) -> Trajectory:
+    def standing(self, query: Query, region: Constraint | None = None) -> Trajectory:
         """The path between ends that only rounding tells apart."""
         joints, times = np.stack([query.start, query.goal]), np.array([0.0, STANDING_S])
         constraint = query.task.manifold.constraint
@@ -263,18 +383,20 @@ class Answering:
         line = "the start is the goal"
         if certificate.violation is not None:
             line = f"{line}, and no path: {certificate.violation.message}"
-            return self._nothing(query, "not_found", line)
-        about = self._asked(query), self._statistics(query, "straight")
+            return self.nothing(query, "not_found", line)
+        about = self.asked(query), self._statistics(query, "straight")
         return Trajectory("solved", joints, times, line, *about, certificate)
 
-    def _nothing(self, query: Query, status: Status, explanation: str) -> Trajectory:
-        empty, about = np.empty((0, len(query.start))), self._asked(query)
+    def nothing(self, query: Query, status: Status, explanation: str) -> Trajectory:
+        """That there is no path, and why."""
+        empty, about = np.empty((0, len(query.start))), self.asked(query)
         statistics = self._statistics(query, "")
         return Trajectory(status, empty, np.empty(0), explanation, about, statistics)
 
-    def _asked(self, query: Query) -> Asked:
+    def asked(self, query: Query) -> Asked:
+        """What a query was asked under."""
         constraint, scene = query.task.manifold.constraint, self.certifier.scene
-        return Asked(constraint, query.name, scene, query.regions)
+        return Asked(constraint, query.name, scene, self.pace(query), query.regions, query.scales)
 
     def _statistics(self, query: Query, source: str) -> Statistics:
         spent = time.perf_counter() - query.began

@@ -24,6 +24,7 @@ from constraint_geodesics.constraints.constraint import (
 )
 from constraint_geodesics.constraints.functions import values_batch
 from constraint_geodesics.constraints.projection import retract
+from constraint_geodesics.geometry.braking import Pace
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.identification import identify
 from constraint_geodesics.identification.vanishing import Sample
@@ -40,6 +41,7 @@ from constraint_geodesics.search.band import PROJECTION, project
 from constraint_geodesics.search.candidates import Task, refined, rows_of
 from constraint_geodesics.search.nearest import nearest_on
 from constraint_geodesics.search.roadmap import build_roadmap, join, points_along, shortest_way
+from constraint_geodesics.search.run_out import rows_from
 from constraint_geodesics.search.space import Space, space_of
 from constraint_geodesics.search.tree import tree_way
 from constraint_geodesics.search.ways_round import bent_round
@@ -117,6 +119,8 @@ def _band() -> None:
     assert found is not None
     rows_of(found, 1e-4)
     bent_round(task.open, task.clear, _ROWS.copy(), 1.0, PROJECTION)
+    pace = Pace(_scene().robot.velocity, np.full(_scene().robot.dof, 10.0))
+    rows_from(found, _ROWS[0] + 1e-5, _ROWS[1] - _ROWS[0], pace, 1e-4)
 
 
 def _roadmap() -> None:

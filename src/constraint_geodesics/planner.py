@@ -7,6 +7,7 @@ trajectory = planner.plan(start, goal, "level_cup")
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
@@ -24,6 +25,7 @@ from constraint_geodesics.constraints.constraint import (
     Pose,
     constraint_from,
 )
+from constraint_geodesics.geometry.braking import AT_REST
 from constraint_geodesics.goals.goal import ArrayLike, Wanted, checked_configuration
 from constraint_geodesics.goals.pose import MANY_SEEDS, POSE_JOINTS
 from constraint_geodesics.goals.wanted import as_goals
@@ -38,6 +40,7 @@ from constraint_geodesics.params import (
 )
 from constraint_geodesics.problem import PlannerError as PlannerError
 from constraint_geodesics.problem import end_refused
+from constraint_geodesics.replanning import Replanning
 from constraint_geodesics.robot.inverse_kinematics import Search, solutions, spread
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, rpy_of
 from constraint_geodesics.scene.arm import FOUND
@@ -48,7 +51,7 @@ from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.search.candidates import ALL_PARTS, Parts
 from constraint_geodesics.search.nearest import Projection, projection
 from constraint_geodesics.search.preparation import Preparation, Query
-from constraint_geodesics.trajectory import Trajectory, read_trajectory
+from constraint_geodesics.trajectory import Trajectory, read_start_velocity, read_trajectory
 
 SNAP_RAD, SNAP_M = 0.01, 0.001
 """Distances by which a start is moved on request, at most: of its turning joints, and of its
@@ -250,6 +253,7 @@ class Planner:
         velocity_scale: float = 1.0,
         acceleration_scale: float = 1.0,
         scene: Sequence[Shape] = (),
+        start_velocity: ArrayLike | None = None,
     ) -> Trajectory:
         """A short path from a start [rad] under a constraint: a name from params.yaml, or a
         Constraint, which without a reference holds its axes where the start has them.
@@ -265,9 +269,12 @@ class Planner:
         at most SNAP_RAD away, and SNAP_M for prismatic joints, and nothing is touched on the way;
         else such a start is refused.  velocity_scale, acceleration_scale: the shares of the limits
         that the motion uses, above 0 and at most 1.  scene: shapes for this query alone, beside
-        what is in `planner.scene`.
-        Raises PlannerError if an end has the wrong shape or is not finite, the name is unknown, or
-        the budget or a scale is none, SceneError for shapes that the scene can't take.
+        what is in `planner.scene`.  start_velocity: of an arm that moves at the start [rad/s, m/s
+        for prismatic joints]: the path begins in its direction, or stops straight on first; a
+        velocity beyond the scaled limits, or one that leads off the constraint, is refused.
+        Raises PlannerError if an end or the velocity has the wrong shape or is not finite, the name
+        is unknown, or the budget or a scale is none, SceneError for shapes that the scene can't
+        take.
         """
         self._require_open()
         given, name = self._named(constraint)
@@ -281,12 +288,32 @@ class Planner:
                 raise PlannerError(f"{which}_scale = {scale!r}: must be above 0 and at most 1")
         dof = self.scene.robot.dof
         q_start, goals = checked_configuration(start, dof, "start"), as_goals(goal, dof)
+        moving = None
+        if start_velocity is not None:
+            moving = checked_configuration(start_velocity, dof, "start_velocity")
+            moving = moving if np.linalg.norm(moving) > AT_REST else None
         with self.scene.including(scene):
             task, moved = self._preparation.task(self._held_at(given, q_start)), 0.0
             if snap:
                 q_start, moved = self._snapped(q_start, task.manifold)
             query = Query(task, name, q_start, q_start, began, parts, scales, moved)
+            query = replace(query, start_velocity=moving)
             return self._answering.answer(query, goals, budget_s)
+
+    def replan(self, trajectory: Trajectory, at_s: float) -> Trajectory:
+        """A certified trajectory for an arm that is under way: from its state at a time [s] of its
+        trajectory on, in the scene as it is now, to the same last configuration.
+
+        What is left of the trajectory where that is still clear, else a path round what is new, of
+        status "solved".  Where none is found, the hardest stop on the path: "stopped" if that is
+        certified, else its waypoints come with the certificate that names what it breaks, under the
+        status "in_collision" where it meets something.  A trajectory that stopped may be replanned:
+        it goes on to the configuration that was wanted.
+        Raises PlannerError for a time beyond 0 and the duration, an answer without a path, or a
+        trajectory of another robot.
+        """
+        self._require_open()
+        return Replanning(self._answering, self._preparation).replan(trajectory, at_s)
 
     def plan_batch(
         self,
@@ -334,7 +361,9 @@ class Planner:
             None if q is None else checked_configuration(q, self.robot.dof, name)
             for q, name in ((start, "start"), (goal, "goal"))
         )
-        return self._certifier.certify(joints, self._held_at(own, joints[0]), first, last, times)
+        moving = None if times is None else read_start_velocity(Path(file), self.robot.dof)
+        held = self._held_at(own, joints[0])
+        return self._certifier.certify(joints, held, first, last, times, start_velocity=moving)
 
     def _named(self, constraint: str | Constraint) -> tuple[Constraint, str]:
         if isinstance(constraint, Constraint):

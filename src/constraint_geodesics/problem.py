@@ -30,9 +30,11 @@ Status = Literal[
     "out_of_limits",
     "in_collision",
     "not_applicable",
+    "stopped",
 ]
 """How a query ended, for the planner and every baseline alike.  not_applicable: it cannot work on
-such a problem at all.  Where the status does not say it all, an explanation does.
+such a problem at all.  stopped: of a motion under way, that it stops on its path, certified, and
+goes no further.  Where the status does not say it all, an explanation does.
 """
 
 

@@ -3,8 +3,10 @@ not; and the CSV it is written as.
 """
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -12,32 +14,52 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.certification.certifier import Certificate
+from constraint_geodesics.certification.motion import MotionLimits, check_times
 from constraint_geodesics.constraints.constraint import (
     Constraint,
     ConstraintManifold,
     constraint_from_json,
 )
 from constraint_geodesics.extras import require
-from constraint_geodesics.problem import PlannerError, Status
+from constraint_geodesics.geometry.braking import (
+    Motion,
+    Pace,
+    State,
+    ahead,
+    shortest_stop,
+    state_at,
+)
+from constraint_geodesics.problem import SATISFIED, PlannerError, Status
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search.band import project, step_lengths
+from constraint_geodesics.search.candidates import Candidate
+from constraint_geodesics.search.run_out import left_over, rows_from, run_out, run_outs
 from constraint_geodesics.search.space import space_of
 
-CONSTRAINT_LINE = "# constraint: "
-"""What the comment line of a trajectory's CSV begins with."""
+CONSTRAINT_LINE, VELOCITY_LINE = "# constraint: ", "# start_velocity: "
+"""What the comment lines of a trajectory's CSV begin with."""
+REDRAWN = 0.9 * SATISFIED
+"""Violation [rad or m] that lines may use which are drawn anew on a path's way."""
+STANDING_S = 0.001
+"""Duration of a path from a configuration to itself."""
 
 
 @dataclass(frozen=True)
 class Asked:
     """What a query was asked under: the constraint with its reference, its name, and the scene;
-    regions: those of its goals that are more than single configurations.
+    regions: those of its goals that are more than single configurations.  pace: the limits of
+    velocity and acceleration that its motion uses, of which scales are the shares.  wanted: the
+    configuration that a motion under way was to reach, if it is not its last.
     """
 
     constraint: Constraint
     name: str
     scene: Scene = field(repr=False)
+    pace: Pace = field(repr=False)
     regions: tuple[Constraint, ...] = ()
+    scales: tuple[float, float] = (1.0, 1.0)
+    wanted: Float[np.ndarray, "D"] | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -61,10 +83,14 @@ class Statistics:
 class Trajectory:
     """A planner's answer; two of them are equal only if they are the same object.
 
-    status: "solved", or why there is no path.  joints (T, D) [rad]: waypoints, both ends exact,
-    straight lines between them keep the constraint to within `violation_bound_rad`; (0, D) without
-    a path.  times (T,) [s]: within the velocity and acceleration limits, at rest at both ends.
-    explanation: one line for people.  certificate: None without a path.
+    status: "solved", or why there is no path to the goal.  joints (T, D) [rad]: waypoints, both
+    ends exact, straight lines between them keep the constraint to within `violation_bound_rad`;
+    (0, D) without a path.  times (T,) [s]: within the velocity and acceleration limits, at rest at
+    the end, and at the start unless there is a `start_velocity` [rad/s, or m/s of prismatic
+    joints].  explanation: one line for people.  certificate: None without a path.
+
+    Of a motion under way an answer that is not "solved" has waypoints too: those of a stop, which
+    is certified where the status is "stopped" and else is not (`certificate.violation` says why).
     """
 
     status: Status
@@ -74,6 +100,7 @@ class Trajectory:
     asked: Asked
     statistics: Statistics
     certificate: Certificate | None = field(default=None, repr=False)
+    start_velocity: Float[np.ndarray, "D"] | None = field(default=None, repr=False)
 
     @property
     def goal(self) -> Float[np.ndarray, "D"] | None:
@@ -165,14 +192,14 @@ class Trajectory:
         return points[0] if np.ndim(s) == 0 else points
 
     def save(self, file: str | Path) -> None:
-        """Write it as CSV: a comment line with the constraint, then time_s and the joints [rad], a
-        line a waypoint.
+        """Write it as CSV: a comment line with the constraint, one with the velocity at the start
+        where it does not rest there, then time_s and the joints [rad], a line a waypoint.
 
         Raises PlannerError without a path.
         """
         self._require_path("save")
         names = self.scene.robot.joint_names
-        write_trajectory(Path(file), self.joints, self.times, self.constraint, names)
+        write_trajectory(Path(file), self._motion, self.constraint, names)
 
     def to_joint_trajectory(self) -> dict[str, Any]:
         """As ROS's trajectory_msgs/JointTrajectory: `joint_names`, and `points` with `positions`
@@ -180,11 +207,13 @@ class Trajectory:
         and `nanosec`.
 
         Accelerations are the certified differences at the waypoints; a velocity lies between those
-        of the lines before and after; both ends are at rest.  Raises PlannerError without a path.
+        of the lines before and after; the first is `start_velocity`, the last is 0.  Raises
+        PlannerError without a path.
         """
         self._require_path("use")
         steps, durations = np.diff(self.joints, axis=0), np.diff(self.times)[:, None]
-        speeds = np.pad(steps / durations, ((1, 1), (0, 0)))
+        first = self._motion.start_velocity
+        speeds = np.vstack([first, steps / durations, np.zeros_like(first)])
         lasting = np.pad(durations, ((1, 1), (0, 0)))
         both = lasting[:-1] + lasting[1:]
         accelerations = 2.0 * np.diff(speeds, axis=0) / both
@@ -202,6 +231,85 @@ class Trajectory:
                 for q, v, a, t in rows
             ],
         }
+
+    def state(self, at_s: float) -> State:
+        """Configuration [rad] and velocity [rad/s] at a time from 0 to the duration [s], and the
+        waypoint that comes next.
+
+        The place is on the straight line between two waypoints; the velocity is the line's in its
+        middle, and changes evenly from there to the middle of the next one, by the certified
+        acceleration between them.  Raises PlannerError without a path, or for another time.
+        """
+        self._require_path("use")
+        return state_at(self._motion, self._moment(at_s))
+
+    def stop(self, at_s: float) -> "Trajectory":
+        """The hardest stop on the path from its state at a time [s]: the shortest that the limits
+        of its pace allow, of status "stopped".
+
+        Its lines are those of the path, so what was proven of them holds, in the scene that the
+        path was certified in, and its certificate says so.  Where the velocity can't change so much
+        on what is left of a line, waypoints are drawn anew, along the same curve or close by: that
+        is not proven, and the certificate is None.  `planner.replan` certifies a stop in the scene
+        as it is now.
+        Raises PlannerError without a path, for a time beyond 0 and the duration, or where the arm
+        can't stop on the path any more.
+        """
+        self._require_path("stop on")
+        began, moment = time.perf_counter(), self._moment(at_s)
+        manifold = ConstraintManifold(self.scene.robot, self.constraint)
+        state = state_at(self._motion, moment)
+        stop = stopping(self._motion, state, self.asked.pace, manifold)
+        if stop is None:
+            raise PlannerError(f"at_s = {at_s}: the arm can't stop on the path any more")
+        motion, on_path = stop
+        line = f"a stop after {motion.times[-1]:.2f} s on the path"
+        known = self._inherited(motion) if on_path else None
+        spent = time.perf_counter() - began
+        about = replace(self.statistics, planning_time_s=spent, snapped_rad=0.0)
+        about = replace(about, source="stop", looked_at=None)
+        start = motion.start_velocity if motion.start_velocity.any() else None
+        wanted = self.joints[-1] if self.asked.wanted is None else self.asked.wanted
+        asked = replace(self.asked, wanted=wanted)
+        found = motion.joints, motion.times, line, asked, about, known, start
+        return Trajectory("stopped", *found)
+
+    @property
+    def _motion(self) -> Motion:
+        start = self.start_velocity
+        resting = np.zeros(self.joints.shape[1])
+        return Motion(self.joints, self.times, resting if start is None else start)
+
+    def _moment(self, at_s: float) -> float:
+        try:
+            moment = float(at_s)
+        except (TypeError, ValueError):
+            moment = np.nan
+        if not 0.0 <= moment <= self.times[-1]:
+            raise PlannerError(f"at_s = {at_s!r}: must be a time from 0 to {self.times[-1]:.6g} s")
+        return moment
+
+    def _inherited(self, motion: Motion) -> Certificate | None:
+        """The certificate of a motion on lines of the path: what was proven of all of them, and its
+        times looked at anew.
+        """
+        if self.certificate is None:
+            return None
+        steps, start = step_lengths(motion.joints), motion.start_velocity
+        acceleration = tuple(self.asked.pace.acceleration.tolist())
+        limits = MotionLimits(self.asked.pace.velocity, acceleration, start)
+        broken, duration = check_times(motion.joints, motion.times, limits)
+        return replace(
+            self.certificate,
+            violation=self.certificate.violation or next(broken, None),
+            length_rad=float(steps.sum()),
+            max_step_rad=float(steps.max()),
+            goal_violation=np.nan,
+            duration_s=duration,
+            time_s=0.0,
+            collision_time_s=0.0,
+            start_velocity=tuple(start.tolist()) if start.any() else None,
+        )
 
     def record(self, file: str | Path, frames: int = 100, demonstrations: Any = None) -> None:
         """Write a Rerun recording: the motion, what of a goal's region and configurations was
@@ -267,7 +375,7 @@ class Trajectory:
         } | {name: float(x) if np.isfinite(x) else None for name, x in numbers.items()}
 
     def _require_path(self, use: str) -> None:
-        if self.status != "solved":
+        if not len(self.joints):
             raise PlannerError(f"there is no path to {use}: {self.explanation}")
 
     def _markdown(self) -> str:
@@ -275,6 +383,36 @@ class Trajectory:
             f"**planned path**, constraint `{self.constraint_name}`\n\n- {self.explanation}\n"
             f"- duration {self.times[-1]:.2f} s\n- proposal: {self.source}"
         )
+
+
+def stopping(
+    motion: Motion, state: State, pace: Pace, manifold: ConstraintManifold
+) -> tuple[Motion, bool] | None:
+    """The shortest stop on a motion's way from one of its states, and whether all its lines are the
+    motion's; None where there is none.
+
+    A motion that uses its accelerations up may leave none to go on with on what is left of a line:
+    its waypoints are drawn anew then, its curve is begun straight, and at last it goes straight on.
+    """
+    if not state.velocity.any():
+        place, rest = state.configuration, np.zeros_like(state.velocity)
+        return Motion(np.stack([place, place]), np.array([0.0, STANDING_S]), rest), True
+    rows, velocity = ahead(motion.joints, state), state.velocity
+    found = shortest_stop(rows, velocity, pace)
+    if found is not None:
+        return found, True
+    space = space_of(manifold)
+    curve = left_over(space, rows) if len(rows) > 1 else None
+    curves: Iterator[Candidate] = iter(())
+    if curve is not None:
+        curves = chain([curve], run_outs(space, curve, velocity, pace))
+    straight = run_out(space, state.configuration, velocity, pace)
+    for own in chain(curves, [] if straight is None else [straight]):
+        drawn = rows_from(own, state.configuration, velocity, pace, REDRAWN)
+        found = shortest_stop(drawn, velocity, pace)
+        if found is not None:
+            return found, False
+    return None
 
 
 def _duration(seconds: float) -> dict[str, int]:
@@ -294,17 +432,16 @@ def _shares(s: Any) -> Float[np.ndarray, "n"]:
 
 
 def write_trajectory(
-    file: Path,
-    joints: Float[np.ndarray, "T D"],
-    times: Float[np.ndarray, "T"],
-    constraint: Constraint,
-    names: Sequence[str],
+    file: Path, motion: Motion, constraint: Constraint, names: Sequence[str]
 ) -> None:
-    """Write waypoints and times as CSV, the constraint in a comment line before the header; numbers
-    to the last bit.
+    """Write waypoints and times as CSV, the constraint in a comment line before the header, and the
+    velocity at the first waypoint unless it rests; numbers to the last bit.
     """
-    lines = [f"{CONSTRAINT_LINE}{json.dumps(constraint.to_json())}", ",".join(("time_s", *names))]
-    for t, row in zip(times, joints, strict=True):
+    lines = [f"{CONSTRAINT_LINE}{json.dumps(constraint.to_json())}"]
+    if motion.start_velocity.any():
+        lines.append(f"{VELOCITY_LINE}{json.dumps(motion.start_velocity.tolist())}")
+    lines.append(",".join(("time_s", *names)))
+    for t, row in zip(motion.times, motion.joints, strict=True):
         lines.append(",".join(repr(float(x)) for x in (t, *row)))
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text("\n".join(lines) + "\n")
@@ -336,6 +473,26 @@ def read_trajectory(
     array = np.array([_numbers(file, number, cells, len(header)) for number, cells in table[1:]])
     timed = header[0] == "time_s"
     return array[:, int(timed) :], array[:, 0] if timed else None, constraint
+
+
+def read_start_velocity(file: Path, dof: int) -> Float[np.ndarray, "D"] | None:
+    """The velocity at the first waypoint [rad/s] that a trajectory's CSV names; None if it names
+    none.
+
+    Raises PlannerError naming the line if it is none.
+    """
+    for number, line in enumerate(file.read_text("utf-8-sig").splitlines(), 1):
+        if not line.strip().startswith(VELOCITY_LINE):
+            continue
+        text = line.strip().removeprefix(VELOCITY_LINE)
+        try:
+            found = np.array(json.loads(text), float)
+        except (TypeError, ValueError):
+            found = np.empty(0)
+        if found.shape != (dof,) or not np.isfinite(found).all():
+            raise PlannerError(f"{file}, line {number}: not a velocity of {dof} joints: {text}")
+        return found
+    return None
 
 
 def _header(file: Path, cells: Sequence[str], names: Sequence[str] | None) -> list[str]:

@@ -677,6 +677,70 @@ def test_acceleration_is_that_of_the_equation(scene: Scene, good: Question) -> N
         assert (violation.kind, violation.row) == ("acceleration", np.argmax(rows[:, joint]))
 
 
+def under_way(good: Question, row: int) -> tuple[Question, np.ndarray]:
+    """The good path, nearly as fast as is allowed, from one of its rows on, and the velocity of the
+    line before it.
+    """
+    lines = np.diff(good.joints, axis=0) / np.diff(good.times)[:, None]
+    around = np.diff(good.times)[1:] + np.diff(good.times)[:-1]
+    most = 2.0 * np.abs(np.diff(lines, axis=0)) / around[:, None] / LIMITS.acceleration_rad_s2
+    good = replace(good, times=good.times * 1.001 * np.sqrt(most.max()))
+    line = (good.joints[row] - good.joints[row - 1]) / (good.times[row] - good.times[row - 1])
+    rest = good.times[row:] - good.times[row]
+    return replace(good, joints=good.joints[row:], times=rest, start=good.joints[row]), line
+
+
+def test_a_motion_under_way_is_certified_from_its_velocity_alone(certifier, good) -> None:
+    """The change at the first row is held against the first line's half, as at any other row."""
+    rest, line = under_way(good, len(good.joints) // 2)
+    resting = rest.put_to(certifier).violation
+    assert (resting.kind, resting.row) == ("acceleration", 0)
+
+    def certified(velocity: np.ndarray):
+        return certifier.certify(
+            rest.joints, good.constraint, rest.start, good.goal, rest.times, start_velocity=velocity
+        )
+
+    certificate = certified(line)
+    assert certificate.valid, certificate.violation
+    np.testing.assert_array_equal(certificate.start_velocity, line)
+    assert certificate.summary()["start_velocity"] == tuple(line)
+    leaving = (rest.joints[1] - rest.joints[0]) / rest.times[1]
+    room = 0.5 * rest.times[1] * np.array(LIMITS.acceleration_rad_s2)
+    for joint in range(6):
+        for sign in (-1.0, 1.0):
+            for share, valid in ((0.999, True), (1.001, False)):
+                away = leaving.copy()
+                away[joint] += sign * share * room[joint]
+                found = certified(away)
+                assert found.valid == valid, found.violation
+                if not valid:
+                    assert (found.violation.kind, found.violation.row) == ("acceleration", 0)
+                    ratio = found.violation.value / found.violation.limit
+                    np.testing.assert_allclose(ratio, 1.001, rtol=1e-6)
+    assert good.put_to(certifier).start_velocity is None
+
+
+def test_a_start_faster_than_the_robot_or_than_the_line_is_long_is_refused(
+    certifier, scene, good
+) -> None:
+    rest, line = under_way(good, len(good.joints) // 2)
+    fast = line * (1.01 * (scene.robot.velocity / np.abs(line)).min())
+    about = (rest.joints, good.constraint, rest.start, good.goal)
+    violation = certifier.certify(*about, rest.times, start_velocity=fast).violation
+    assert (violation.kind, violation.row) == ("velocity", 0)
+    # on a line that lasts for seconds a stop looks gentle: the arm would run past its end
+    slow = np.concatenate([[0.0], rest.times[1:] + 10.0])
+    violation = certifier.certify(*about, slow, start_velocity=line).violation
+    assert (violation.kind, violation.row) == ("start_velocity", 0)
+    assert "run past the line's end" in violation.message
+    for wrong, message in ((line[:5], "6 joint values"), (line * np.nan, "must be finite")):
+        with pytest.raises(CertificationError, match=message):
+            certifier.certify(*about, rest.times, start_velocity=wrong)
+    with pytest.raises(CertificationError, match="goes with times"):
+        certifier.certify(*about, start_velocity=line)
+
+
 def test_collisions_are_looked_at_where_they_are_asked_for(certifier, scene, good) -> None:
     assert not through_the_table(good, scene).put_to(certifier).valid
     assert through_the_table(good, scene).put_to(certifier, collisions=False).valid

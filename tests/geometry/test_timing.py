@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from constraint_geodesics.geometry.errors import StartVelocityError
 from constraint_geodesics.geometry.manifold import GeometryError, NonFiniteError
 from constraint_geodesics.geometry.timing import COINCIDENT, time_parametrisation
 
@@ -208,6 +209,109 @@ def test_the_duration_hardly_depends_on_the_rows_or_on_the_direction(seed):
     assert backwards == pytest.approx(duration, rel=0.01)
 
 
+# Moving at the first row
+
+
+def moving_differences(
+    joints: np.ndarray, times: np.ndarray, start: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `differences`, with a velocity before the first row."""
+    velocities, accelerations = differences(joints, times)
+    accelerations[0] = (velocities[0] - start) / (0.5 * (times[1] - times[0]))
+    return velocities, accelerations
+
+
+def assert_continues(joints, times, start, velocity, acceleration):
+    velocities, accelerations = moving_differences(joints, times, start)
+    assert times[0] == 0.0
+    assert (np.diff(times) > 0).all()
+    assert (np.abs(velocities) <= velocity).all()
+    assert (np.abs(accelerations) <= acceleration).all()
+    assert 2.0 * np.linalg.norm(velocities[0]) >= np.linalg.norm(start)
+
+
+def test_any_start_that_can_go_on_keeps_the_limits():
+    """And of starts along the path at a pace that the path is passed at from rest, most can."""
+    rng, done = np.random.default_rng(1), 0
+    for _ in range(2000):
+        rows, dim = rng.integers(2, 60), rng.integers(1, 7)
+        steps = rng.normal(size=(rows - 1, dim)) * 10 ** rng.uniform(-3, 0, (rows - 1, 1))
+        joints = np.cumsum(np.r_[np.zeros((1, dim)), steps], axis=0)
+        velocity, acceleration = 10 ** rng.uniform(-2, 2, (2, dim))
+        rested = time_parametrisation(joints, velocity, acceleration)
+        start = steps[0] / rested[1] * rng.uniform(0.0, 2.0, dim)
+        try:
+            times = time_parametrisation(joints, velocity, acceleration, start)
+        except StartVelocityError:
+            continue
+        done += 1
+        assert_continues(joints, times, start, velocity, acceleration)
+    assert done > 1500
+
+
+@law
+def test_a_start_at_rest_is_none_at_all(data):
+    joints = draw_broken_line(data)
+    limits = draw_limits(data, joints.shape[1])
+    times = time_parametrisation(joints, *limits)
+    resting = time_parametrisation(joints, *limits, np.zeros(joints.shape[1]))
+    np.testing.assert_array_equal(resting, times)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("share", [0.1, 0.37, 0.5, 0.81])
+def test_the_rest_of_a_motion_takes_the_rest_of_its_time(seed, share):
+    """From any row, with the velocity between those of the lines before and after, it goes on."""
+    joints = smooth_curve(seed, 301)
+    times = time_parametrisation(joints, VELOCITY, ACCELERATION)
+    row = int(share * 300)
+    before, after = np.diff(times)[row - 1 : row + 1]
+    lines = np.diff(joints, axis=0)[row - 1 : row + 1] / np.array([[before], [after]])
+    start = (lines[0] * after + lines[1] * before) / (before + after)
+    most = ACCELERATION * (1 + 1e-5)  # the motion uses its limits up: rounding needs some room
+    rest = time_parametrisation(joints[row:], VELOCITY, most, start)
+    assert_continues(joints[row:], rest, start, VELOCITY, most)
+    assert rest[-1] == pytest.approx(times[-1] - times[row], rel=0.01)
+
+
+@law
+def test_a_straight_line_from_a_velocity_takes_the_known_time(data):
+    """Up to the velocity's limit, or as far as there is time for, and down to rest."""
+    dim = data.draw(st.integers(1, 7))
+    direction = data.draw(arrays(np.float64, dim, elements=st.floats(0.1, 3.0)))
+    velocity, acceleration = draw_limits(data, dim)
+    most, gain = (velocity / direction).min(), (acceleration / direction).min()
+    top = min(most, np.sqrt(2.0 * gain))  # what stops within the line's length, 1
+    speed = data.draw(st.floats(0.0, 0.98)) * top
+    joints = np.linspace(0.0, 1.0, 400)[:, None] * direction
+    times = time_parametrisation(joints, velocity, acceleration, speed * direction)
+    assert_continues(joints, times, speed * direction, velocity, acceleration)
+    peak = min(most, np.sqrt(gain + 0.5 * speed**2))
+    held = 1.0 - (2.0 * peak**2 - speed**2) / (2.0 * gain)
+    expected = (peak - speed) / gain + held / peak + peak / gain
+    assert 0.99 < times[-1] / expected < 1.005
+
+
+@pytest.mark.parametrize("rows", [2, 3, 50, 400])
+def test_a_line_too_short_to_stop_on_is_refused(rows):
+    """A speed of 1 needs ½ / A = 0.25 to stop."""
+    for length, stops in ((0.2501, True), (0.2499, False)):
+        joints = np.linspace(0.0, length, rows)[:, None]
+        if stops:
+            times = time_parametrisation(joints, np.ones(1), 2.0 * np.ones(1), np.ones(1))
+            assert times[-1] == pytest.approx(0.5, rel=0.05)
+        else:
+            with pytest.raises(StartVelocityError, match=r"at most, 0.5 rad/s are needed"):
+                time_parametrisation(joints, np.ones(1), 2.0 * np.ones(1), np.ones(1))
+
+
+def test_a_line_that_turns_away_is_refused():
+    joints = np.linspace([0.0, 0.0], [0.0, 1.0], 20)
+    for start in ([1.0, 0.0], [1.0, 1.0], [0.0, -1.0]):
+        with pytest.raises(StartVelocityError, match="start_velocity = "):
+            time_parametrisation(joints, 2 * np.ones(2), 4 * np.ones(2), np.array(start))
+
+
 # Invariance
 
 
@@ -286,6 +390,15 @@ ROWS = np.array([[0.0, 0.0], [0.1, 0.2], [0.3, 0.3]])
 def test_misuse_is_named(joints, velocity, acceleration, message):
     with pytest.raises(GeometryError, match=message):
         time_parametrisation(joints, np.array(velocity), np.array(acceleration))
+
+
+def test_a_start_velocity_that_is_none_is_named():
+    for start, message in (
+        (np.ones(3), r"shape \(3,\): must be \(2,\)"),
+        (np.array([0.0, np.nan]), r"\[1\] = nan"),
+    ):
+        with pytest.raises(GeometryError, match="start_velocity.*" + message):
+            time_parametrisation(ROWS, np.ones(2), np.ones(2), start)
 
 
 def test_a_row_that_is_not_finite_is_named():

@@ -85,7 +85,8 @@ class Certificate:
     bodies, and which pairs of them were left out.
     largest_pose_difference: of all links from PyBullet's [rad or m]; nan without PyBullet.
     duration_s: nan without times.  time_s: what certification took, of which collision_time_s for
-    collisions.
+    collisions.  start_velocity: that the path was certified to go on from at its first row [rad/s];
+    None for rest.
     """
 
     violation: Violation | None
@@ -106,6 +107,7 @@ class Certificate:
     duration_s: float
     time_s: float
     collision_time_s: float
+    start_velocity: tuple[float, ...] | None = None
 
     @property
     def valid(self) -> bool:

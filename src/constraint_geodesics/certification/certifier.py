@@ -144,20 +144,23 @@ class Certifier:
         times: Float[np.ndarray, "T"] | None = None,
         collisions: bool = True,
         region: Constraint | None = None,
+        start_velocity: Float[np.ndarray, "D"] | None = None,
     ) -> Certificate:
         """Check a path [rad], with its times [s] if it has them, and report the first promise it
         breaks.  collisions: whether they are looked at.  region: what the last row must keep, as a
-        constraint with a reference.
+        constraint with a reference.  start_velocity: at the first row [rad/s], by default 0; the
+        first line must go on from it within the accelerations, at half of its speed at least.
 
         A constraint without a reference is held relative to the tool's pose at `start`, or else at
         the first row.
         The order: the array itself, ends, the goal's region, joint limits, steps, constraint at the
         rows and between them, times, velocity and acceleration, pose, collisions.  Once one promise
         is broken no later one is looked at; what is cheap to measure is measured all the same.
-        Raises CertificationError if `start` or `goal` has the wrong shape, or the reference is no
-        pose.
+        Raises CertificationError if `start` or `goal` has the wrong shape, the start's velocity is
+        none or comes without times, or the reference is no pose.
         """
         began = time.perf_counter()
+        moving = self._moving(start_velocity, times)
         ends = self._end(start, "start"), self._end(goal, "goal")
         rows, violation = self._as_rows(joints)
         if rows is None:
@@ -171,7 +174,7 @@ class Certifier:
         with np.errstate(over="ignore", invalid="ignore"):
             kept = how_kept(Asked(self._chain, rows, constraint, first, self.limits))
             beyond = np.nan if region is None else self._beyond(region, rows[-1])
-        limits = MotionLimits(self._velocity, self.limits.acceleration_rad_s2)
+        limits = MotionLimits(self._velocity, self.limits.acceleration_rad_s2, moving)
         clock, duration = check_times(rows, times, limits)
         path = _Path(rows, steps, margins, length, longest, least, beyond, kept)
         violation = next(chain(self._broken(path, *ends), clock), self._wrong_pose)
@@ -189,6 +192,7 @@ class Certifier:
             duration_s=duration,
             time_s=now - began,
             collision_time_s=now - asked,
+            start_velocity=tuple(moving.tolist()) if moving.any() else None,
         )
 
     def _broken(
@@ -227,6 +231,17 @@ class Certifier:
         if end is None or end.shape != (self._dof,):
             raise CertificationError(f"{name} = {wanted}: {self._dof} joint values are needed")
         return end
+
+    def _moving(self, velocity: Any, times: Any) -> np.ndarray:
+        """The velocity at the first row (D,), 0 for none."""
+        if velocity is None:
+            return np.zeros(self._dof)
+        if times is None:
+            raise CertificationError("start_velocity goes with times: there are none")
+        found = self._end(velocity, "start_velocity")
+        if found is None or not np.isfinite(found).all():
+            raise CertificationError(f"start_velocity = {velocity}: must be finite")
+        return found
 
     def _missed(
         self, kind: str, rows: np.ndarray, row: int, end: np.ndarray | None

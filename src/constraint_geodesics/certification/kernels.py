@@ -174,16 +174,17 @@ def too_fast(rows, times, most):
 
 
 @njit(**LEAF)
-def too_sudden(rows, times, most):
+def too_sudden(rows, times, most, start):
     """The first row and joint whose acceleration passes `most` (D,), and that acceleration; −1, 0,
-    0 for none.  Before the first row and after the last one the arm rests.
+    0 for none.  Before the first row the arm has the velocity `start` (D,), after the last one it
+    rests.
     """
     last = times.shape[0] - 1
     for i in range(last + 1):
         before = times[i] - times[i - 1] if i > 0 else 0.0
         after = times[i + 1] - times[i] if i < last else 0.0
         for j in range(rows.shape[1]):
-            arriving = (rows[i, j] - rows[i - 1, j]) / before if i > 0 else 0.0
+            arriving = (rows[i, j] - rows[i - 1, j]) / before if i > 0 else start[j]
             leaving = (rows[i + 1, j] - rows[i, j]) / after if i < last else 0.0
             value = abs((leaving - arriving) / (0.5 * (before + after)))
             if not value <= most[j] * (1.0 + _ACCELERATION_SLACK):

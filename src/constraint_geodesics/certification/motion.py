@@ -9,12 +9,16 @@ from jaxtyping import Float
 from constraint_geodesics.certification import kernels
 from constraint_geodesics.certification.certificate import Violation, malformed, real_array
 
+_SLACK = 1e-6
+"""Relative, of the speed that the first line must have."""
+
 
 class MotionLimits(NamedTuple):
-    """Of each joint [rad/s, rad/s²]; None: not demanded."""
+    """Of each joint [rad/s, rad/s²]; None: not demanded.  start: the velocity at the first row."""
 
     velocity: Float[np.ndarray, "D"]
     acceleration: tuple[float, ...] | None
+    start: Float[np.ndarray, "D"]
 
 
 def check_times(
@@ -49,11 +53,33 @@ def _wrong(rows: np.ndarray, times: np.ndarray, limits: MotionLimits) -> Iterato
     found = kernels.too_fast(rows, times, limits.velocity)
     if found[0] >= 0:
         yield _too_much("velocity", "on the line from row", "rad/s", limits.velocity, found)
+    yield from _begun(rows, times, limits)
     if limits.acceleration is not None:
         most = np.asarray(limits.acceleration, float)
-        found = kernels.too_sudden(rows, times, most)
+        found = kernels.too_sudden(rows, times, most, limits.start)
         if found[0] >= 0:
             yield _too_much("acceleration", "at row", "rad/s²", most, found)
+
+
+def _begun(rows: np.ndarray, times: np.ndarray, limits: MotionLimits) -> Iterator[Violation]:
+    """What is wrong with the velocity at the first row: it passes the limits, or the first line is
+    so slow that at constant acceleration the arm would overshoot its end and come back.
+    """
+    if not limits.start.any():
+        return
+    over = np.abs(limits.start) - limits.velocity * (1.0 + _SLACK)
+    if (over > 0.0).any():
+        joint = int(np.argmax(over))
+        found = 0, joint, float(abs(limits.start[joint]))
+        yield _too_much("velocity", "at row", "rad/s", limits.velocity, found)
+    speed = float(np.linalg.norm(rows[1] - rows[0]) / (times[1] - times[0]))
+    least = 0.5 * float(np.linalg.norm(limits.start))
+    if not speed >= least * (1.0 - _SLACK):
+        text = (
+            f"row 0 is passed at {2.0 * least:.6g} rad/s and the line from it at {speed:.6g} rad/s:"
+            " the arm would run past the line's end, half of the speed is needed"
+        )
+        yield Violation("start_velocity", 0, speed, least, text)
 
 
 def _too_much(

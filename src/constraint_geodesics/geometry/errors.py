@@ -38,3 +38,9 @@ class OutsideError(GeometryError):
             f"{self.what}{place} = {list(self.point)}: lies outside the manifold or in a "
             f"blocked cell"
         )
+
+
+class StartVelocityError(GeometryError):
+    """A motion can't go on along these rows from the velocity that it has: they turn away from it,
+    or end before it can stop.
+    """

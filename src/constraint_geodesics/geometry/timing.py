@@ -17,6 +17,11 @@ steps is
 
 Two neighbours that keep |a_i| ≤ A keep it at any common slower pace, so the speeds of a step from
 which the goal can be reached are an interval that begins at 0.
+
+A motion that has the velocity v at its first row keeps |u_0 w_0 - v| ≤ ½ A Δt_0 there, with w_0 ≥
+½ |v|: at constant acceleration a slower first step would end in a motion back.  For each joint that
+leaves out an open interval of w_0 at most, so what is allowed is the largest speed below which none
+of them lies.
 """
 
 import math
@@ -27,7 +32,7 @@ from jaxtyping import Float
 from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
-from constraint_geodesics.geometry.errors import GeometryError, NonFiniteError
+from constraint_geodesics.geometry.errors import GeometryError, NonFiniteError, StartVelocityError
 
 COINCIDENT = 1e-9
 """Rows closer than this share of the path's length coincide."""
@@ -38,6 +43,10 @@ limit.
 _ROUNDING = 1e-11
 """Relative excess that counts as rounding while a speed is sought; the stretch at the end takes it
 off.
+"""
+_STRETCHES = (1e-8, 1e-6, 1e-4)
+"""Relative changes of the first velocity that are provided for: the stretch at the end makes one;
+the next is taken where that does not do.
 """
 _NUDGE = 1e-3
 """Relative change of a ratio of speeds that shows the side of the better ratios."""
@@ -58,9 +67,10 @@ def time_parametrisation(
     joints: Float[np.ndarray, "T D"],
     velocity: Float[np.ndarray, "D"],
     acceleration: Float[np.ndarray, "D"],
+    start_velocity: Float[np.ndarray, "D"] | None = None,
 ) -> Float[np.ndarray, "T"]:
-    """Strictly rising times [s] of a path's rows [rad], from 0, at rest at both ends and near
-    time-optimal.
+    """Strictly rising times [s] of a path's rows [rad], from 0, at rest at the end and near
+    time-optimal; by default at rest at the start, too.
 
     velocity, acceleration: limits of each joint [rad/s, rad/s²], positive; a velocity limit may be
     infinite. With Δt_i = t_{i+1} - t_i and v_i = Δq_i / Δt_i the result keeps |v_i| ≤ velocity and,
@@ -68,9 +78,12 @@ def time_parametrisation(
     and after the last one both the speed and the time step are 0.  Beyond these differences nothing
     is promised: between two rows the joints are taken to move straight, so the rows must be close
     enough together for that.
+    start_velocity: at the first row [rad/s], in place of that speed 0 before it; the first step is
+    at least half as fast.
     Raises GeometryError on a wrong shape, fewer than two rows, a limit that is not positive, or two
     neighbouring rows that coincide (an arm would have to stop there, for no time at all; drop one),
-    NonFiniteError on a row that is not finite.
+    NonFiniteError on a row or a velocity that is not finite, StartVelocityError where the rows do
+    not let a motion with the start's velocity go on.
     """
     q = np.asarray(joints, dtype=np.float64, order="C")
     if q.ndim != 2 or len(q) < 2 or q.shape[1] == 0:
@@ -83,10 +96,11 @@ def time_parametrisation(
     ]
     if not all(map(math.isfinite, limits[1].tolist())):
         raise GeometryError(f"acceleration = {limits[1].tolist()}: must be finite")
+    moving = _start_velocity(start_velocity, q.shape[1])
     times, spacing = np.empty(len(q)), np.empty(len(q) - 1)
     total, _, least = write_steps(q, spacing)
     if math.isfinite(total) and least > COINCIDENT * total:
-        _times(q, spacing, *limits, times)
+        _write_times(q, spacing, limits, moving, times)
         return times
     if not np.isfinite(q).all():
         row, joint = np.argwhere(~np.isfinite(q))[0]
@@ -95,6 +109,37 @@ def time_parametrisation(
     raise GeometryError(
         f"joints[{row}] and joints[{row + 1}] coincide: neighbouring rows must differ"
     )
+
+
+def _write_times(
+    q: np.ndarray,
+    spacing: np.ndarray,
+    limits: list[np.ndarray],
+    start: np.ndarray,
+    times: np.ndarray,
+) -> None:
+    fastest = slowest = 0.0
+    for stretch in _STRETCHES:
+        done, fastest, slowest = _times(q, spacing, *limits, start, stretch, times)
+        if done:
+            return
+    raise StartVelocityError(
+        f"start_velocity = {start.tolist()}: the first step can be passed at {fastest:.3g} rad/s "
+        f"at most, {slowest:.3g} rad/s are needed"
+    )
+
+
+def _start_velocity(velocity: np.ndarray | None, dim: int) -> np.ndarray:
+    """(D,), 0 for none."""
+    if velocity is None:
+        return np.zeros(dim)
+    values = np.asarray(velocity, dtype=np.float64, order="C")
+    if values.shape != (dim,):
+        raise GeometryError(f"start_velocity has shape {values.shape}: must be ({dim},)")
+    if not np.isfinite(values).all():
+        joint = int(np.argmin(np.isfinite(values)))
+        raise NonFiniteError("start_velocity", (joint,), float(values[joint]))
+    return values
 
 
 def _limit(limit: np.ndarray, dim: int, what: str) -> np.ndarray:
@@ -125,8 +170,13 @@ def write_steps(q, steps):
 
 
 @njit(**COMPILE)
-def _times(q, spacing, velocity, acceleration, times):
-    """Writes the times (T,) of the rows q (T, D) with the given distances (T-1,)."""
+def _times(q, spacing, velocity, acceleration, start, stretch, times):
+    """Writes the times (T,) of the rows q (T, D) with the given distances (T-1,), the first row
+    passed with the velocity `start` (D,).
+
+    stretch: relative change of the first step's velocity that is provided for.  Returns whether
+    there are such times, and the largest and smallest speed that the first step may have.
+    """
     steps = spacing.shape[0]
     directions = np.empty((steps, q.shape[1]))
     fastest = np.empty(steps)
@@ -135,7 +185,15 @@ def _times(q, spacing, velocity, acceleration, times):
         for j in range(q.shape[1]):
             directions[i, j] = (q[i + 1, j] - q[i, j]) / spacing[i]
             fastest[i] = min(fastest[i], velocity[j] / abs(directions[i, j]))
-    for i in (0, steps - 1):  # from rest and to rest: the acceleration at an end is 2 |u| w² / s
+    slowest = 0.0
+    for j in range(q.shape[1]):
+        slowest += start[j] ** 2
+    moving, slowest = slowest > 0.0, 0.5 * np.sqrt(slowest)
+    first = _Step(directions[0], spacing[0], fastest[0])
+    if moving:
+        fastest[0] = _fastest_from(start, first, acceleration)
+    # from rest and to rest: the acceleration at an end is 2 |u| w² / s
+    for i in (steps - 1 if moving else 0, steps - 1):
         for j in range(q.shape[1]):
             fastest[i] = min(
                 fastest[i], np.sqrt(0.5 * acceleration[j] * spacing[i] / abs(directions[i, j]))
@@ -143,6 +201,11 @@ def _times(q, spacing, velocity, acceleration, times):
     ratios = np.empty(steps)
     _controllable(directions, spacing, acceleration, fastest, ratios)
     speed = fastest[0]
+    if moving:
+        first = _Step(directions[0], spacing[0], fastest[0])
+        speed = _fastest_after(start, first, acceleration, stretch)
+        if not speed >= slowest * (1.0 + stretch):
+            return False, speed, slowest
     times[0] = 0.0
     times[1] = spacing[0] / speed
     for i in range(1, steps):
@@ -157,12 +220,67 @@ def _times(q, spacing, velocity, acceleration, times):
     # where a step takes a tiny share of the time, rounding makes its acceleration so uncertain that
     # once is not enough
     margin = MARGIN
-    used = _used(q, times, velocity, acceleration)
+    used = _used(q, times, velocity, acceleration, moving)
     while used > 1.0 - 0.5 * MARGIN:
         for i in range(1, steps + 1):
             times[i] *= used * (1.0 + margin)
         margin *= 2.0
-        used = _used(q, times, velocity, acceleration)
+        used = _used(q, times, velocity, acceleration, moving)
+    speed = spacing[0] / times[1]
+    kept = not moving or (speed >= slowest and _is_kept(q, times, start, acceleration))
+    return kept, speed, slowest
+
+
+@njit(**LEAF)
+def _fastest_from(start, step, acceleration):
+    """Largest speed of the first step, up to its own, with which no joint is faster than it can get
+    from its velocity: u w² - v w ≤ ½ A s, for u, v and -u, -v.
+    """
+    speed = step.speed
+    for j in range(acceleration.shape[0]):
+        u, v = abs(step.direction[j]), start[j]
+        if step.direction[j] < 0.0:
+            v = -v
+        room = 0.5 * acceleration[j] * step.length
+        # the stable one of two forms of the root; with u = 0 either sign of v counts
+        if u == 0.0:
+            v = -abs(v)
+        root = np.sqrt(v * v + 4.0 * u * room)
+        most = 0.5 * (v + root) / u if v > 0.0 else 2.0 * room / max(root - v, 1e-300)
+        speed = min(speed, most)
+    return speed
+
+
+@njit(**LEAF)
+def _fastest_after(start, step, acceleration, stretch):
+    """Largest speed of the first step, up to its own, with which no joint is slower than it can get
+    from its velocity, either: u w² - v w ≥ -½ A s holds outside of an open interval of w.
+    """
+    speed, lowered = step.speed, True
+    while lowered:
+        lowered = False
+        for j in range(acceleration.shape[0]):
+            u, v = abs(step.direction[j]), start[j] * (1.0 + stretch)
+            if step.direction[j] < 0.0:
+                v = -v
+            room = 0.5 * acceleration[j] * step.length
+            if v <= 0.0 or v * speed - u * speed * speed <= room:
+                continue
+            square = v * v - 4.0 * u * room
+            speed = min(2.0 * room / (v + np.sqrt(max(square, 0.0))), speed * (1.0 - _ROUNDING))
+            lowered = True
+    return speed
+
+
+@njit(**LEAF)
+def _is_kept(q, times, start, acceleration):
+    """Whether the acceleration at the first row keeps its limit."""
+    dt = times[1] - times[0]
+    for j in range(q.shape[1]):
+        change = (q[1, j] - q[0, j]) / dt - start[j]
+        if not 2.0 * abs(change) <= acceleration[j] * dt:
+            return False
+    return True
 
 
 @njit(**LEAF)
@@ -264,8 +382,10 @@ def _fastest_next_to(known, step, acceleration):
 
 
 @njit(**LEAF)
-def _used(q, times, velocity, acceleration):
-    """Factor by which times may shrink, or must grow if above 1, to keep the limits everywhere."""
+def _used(q, times, velocity, acceleration, moving):
+    """Factor by which times may shrink, or must grow if above 1, to keep the limits everywhere but
+    at a first row that is passed moving.
+    """
     worst = 0.0
     last = q.shape[0] - 1
     for j in range(q.shape[1]):
@@ -274,8 +394,8 @@ def _used(q, times, velocity, acceleration):
             dt = times[i + 1] - times[i] if i < last else 0.0
             v = (q[i + 1, j] - q[i, j]) / dt if i < last else 0.0
             worst = max(worst, abs(v) / velocity[j])
-            worst = max(
-                worst, np.sqrt(2.0 * abs(v - v_before) / ((dt + dt_before) * acceleration[j]))
-            )
+            if i > 0 or not moving:
+                square = 2.0 * abs(v - v_before) / ((dt + dt_before) * acceleration[j])
+                worst = max(worst, np.sqrt(square))
             v_before, dt_before = v, dt
     return worst

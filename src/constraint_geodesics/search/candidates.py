@@ -21,13 +21,12 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.problem import Status
 from constraint_geodesics.scene.clearance import ClearanceModel, path_stays_clear
 from constraint_geodesics.search.band import PROJECTION, BandSettings
-from constraint_geodesics.search.curve_kernels import relaxed_curve, rows_along
+from constraint_geodesics.search.curve_kernels import relaxed_curve
 from constraint_geodesics.search.roadmap import (
     Joined,
     Roadmap,
     join,
     nearest,
-    points_along,
     resample,
     shortest_way,
 )
@@ -154,7 +153,7 @@ def candidates(
     yield None
     answer, known = Answer("not_found"), list[Candidate]()
     if blocked is not None and parts.refinement:
-        known = _round(task, blocked)
+        known = round_it(task, blocked.source, blocked.nodes)
         enough = ALMOST * float(np.linalg.norm(goal - start))
         if not parts.graph or any(one.length <= enough for one in known):
             yield from _shortest_first(known)
@@ -176,12 +175,12 @@ def candidates(
     yield answer
 
 
-def _round(task: Task, blocked: Candidate) -> list[Candidate]:
-    """The ways round what a straight start leads through, to either side of it."""
+def round_it(task: Task, source: Source, nodes: Float[np.ndarray, "n D"]) -> list[Candidate]:
+    """The ways round what a line of nodes leads through, to either side of it."""
     found = list[Candidate]()
     for side in SIDES:
-        nodes = bent_round(task.open, task.clear, blocked.nodes, side, PROJECTION)
-        pushed = None if nodes is None else _pushed(task, blocked.source, nodes, task.settings)
+        bent = bent_round(task.open, task.clear, nodes, side, PROJECTION)
+        pushed = None if bent is None else _pushed(task, source, bent, task.settings)
         if pushed is not None:
             found.append(pushed)
     return found
@@ -243,7 +242,7 @@ def _over_graph(
         if corners is None:
             answer = connection(task, start, goal)
             corners = _joined_way(task, roadmap, start, goal, answer)
-    over = iter(()) if corners is None else _along(task, "graph", corners, refine, clear)
+    over = iter(()) if corners is None else along(task, "graph", corners, refine, clear)
     first = next(over, None)
     yield from _shortest_first(others if first is None else (*others, first))
     yield from over
@@ -288,10 +287,10 @@ def _over_tree(
 ) -> Iterator[Candidate]:
     corners = tree_way(task.clear, start, goal, seed, settings)
     if corners is not None:
-        yield from _along(task, "tree", corners, refine, clear=True)
+        yield from along(task, "tree", corners, refine, clear=True)
 
 
-def _along(
+def along(
     task: Task, source: Source, corners: Float[np.ndarray, "k D"], refine: bool, clear: bool
 ) -> Iterator[Candidate]:
     """The relaxed way over a graph or tree, with more nodes where fewer jump; where there is
@@ -308,7 +307,7 @@ def _along(
         if found is not None and _is_clear(task, found.points):
             yield found
     if refine:
-        points = points_along(task.clear, corners)
+        points = pointsalong(task.clear, corners)
         found = _pushed(task, source, points, task.settings)
         if found is None:
             found = _relaxed(task, source, points, task.settings, clear=True, guarded=True)
@@ -420,7 +419,7 @@ def rows_of(candidate: Candidate, violation: float) -> Float[np.ndarray, "T D"]:
     """Rows along the candidate so close that straight joint lines between them leave the constraint
     by less than `violation` [rad or m] halfway.
     """
-    rows: np.ndarray = rows_along(
+    rows: np.ndarray = rowsalong(
         candidate.space, candidate.points, ROW_SAFETY * violation, PROJECTION
     )
     return rows

@@ -48,7 +48,7 @@ class Query:
     """One query while it is planned.  goal: one configuration of it.  began: on
     `time.perf_counter`.  scales: the shares of the velocity and acceleration limits that are used.
     snapped_rad: how far the start was moved.  looked_at: the goal's configurations, the nearest
-    first.  regions: of the goals that have one.
+    first.  regions: of the goals that have one.  start_velocity: [rad/s]; None at rest.
     """
 
     task: Task
@@ -61,6 +61,7 @@ class Query:
     snapped_rad: float = 0.0
     looked_at: Float[np.ndarray, "n D"] | None = None
     regions: tuple[Constraint, ...] = ()
+    start_velocity: Float[np.ndarray, "D"] | None = None
 
 
 class _Apart:

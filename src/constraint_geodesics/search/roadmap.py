@@ -10,6 +10,7 @@ that is found, are checked here for jumps, limits and what they touch.
 import heapq
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import count
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -104,6 +105,7 @@ def shortest_way(
     at_start: Joined,
     at_goal: Joined,
     space: Space | None = None,
+    most: int | None = None,
 ) -> Float[np.ndarray, "k D"] | None:
     """Corners of the shortest way over the graph, both ends included; None where the graph does not
     join them.
@@ -111,14 +113,14 @@ def shortest_way(
     space: the edges of a way that was found are looked at in it, those to its ends as well, since
     nothing may be known of them, and the graph may be of a workcell with less in it.  Those that
     fail are left out, and the search is begun again [lazy shortest paths, Dellin and Srinivasa
-    2016].
+    2016].  most: so often at most.
     """
     if not len(at_start.nodes) or not len(at_goal.nodes):
         return None
     begins, leads, lengths = roadmap.neighbours
     own, looked_at = lengths.copy(), np.zeros(len(lengths), bool)
     ends = _End(start, at_start), _End(goal, at_goal)
-    while True:
+    for _ in count() if most is None else range(most):
         nodes = _a_star(
             roadmap.joints,
             begins,
@@ -138,6 +140,7 @@ def shortest_way(
             and _holds(space, roadmap.joints, begins, leads, own, looked_at, nodes)
         ):
             return np.concatenate([start[None], roadmap.joints[nodes], goal[None]])
+    return None
 
 
 class _End:

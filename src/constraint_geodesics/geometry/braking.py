@@ -1,0 +1,118 @@
+"""A timed path while it is passed: where the arm is and how fast, and how it stops on the path.
+
+Between the middles of two lines the velocity changes evenly, by the acceleration at the row between
+them; it is 0 at the end, and what it is said to be at the start.  So it never changes faster than
+the limits allow, and at a row it lies between those of the lines before and after.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.geometry.errors import GeometryError
+from constraint_geodesics.geometry.timing import time_parametrisation
+
+AT_A_ROW = 1e-7
+"""A place so near to a row [rad] is that row."""
+AT_REST = 1e-9
+"""What is no faster [rad/s] rests."""
+ROOM = 5e-7
+"""Relative acceleration beyond the limits that a motion may use that goes on: it used them up
+before, to the last bit, and so must stop or go on with them but for rounding.  The certificate
+allows twice as much.
+"""
+_FRACTIONS = 7
+"""Bisections of the line on which a motion stops."""
+
+
+class State(NamedTuple):
+    """Of a motion.  configuration, velocity (D,) [rad, rad/s]; row: the next row of the path."""
+
+    configuration: Float[np.ndarray, "D"]
+    velocity: Float[np.ndarray, "D"]
+    row: int
+
+
+class Motion(NamedTuple):
+    """Rows (T, D) [rad] and their times (T,) [s], from a velocity (D,) at the first, to rest."""
+
+    joints: Float[np.ndarray, "T D"]
+    times: Float[np.ndarray, "T"]
+    start_velocity: Float[np.ndarray, "D"]
+
+
+class Pace(NamedTuple):
+    """The limits that a motion uses, of each joint [rad/s, rad/s²]."""
+
+    velocity: Float[np.ndarray, "D"]
+    acceleration: Float[np.ndarray, "D"]
+
+    def times(
+        self, joints: Float[np.ndarray, "T D"], start_velocity: Float[np.ndarray, "D"]
+    ) -> Float[np.ndarray, "T"] | None:
+        """Of rows, from a velocity; None where the motion can't go on along them."""
+        room = 1.0 + ROOM if start_velocity.any() else 1.0
+        try:
+            return time_parametrisation(
+                joints, self.velocity, room * self.acceleration, start_velocity
+            )
+        except GeometryError:
+            return None
+
+
+def state_at(motion: Motion, at_s: float) -> State:
+    """Where a motion is at a time [s] from 0 to its duration, and how fast."""
+    joints, times, start = motion
+    row = int(np.clip(np.searchsorted(times, at_s, side="right"), 1, len(times) - 1))
+    share = (at_s - times[row - 1]) / (times[row] - times[row - 1])
+    place = (1.0 - share) * joints[row - 1] + share * joints[row]
+    if np.linalg.norm(joints[row] - place) <= AT_A_ROW:
+        place, row = joints[row], row + 1
+    elif np.linalg.norm(joints[row - 1] - place) <= AT_A_ROW:
+        place = joints[row - 1]
+    middles = np.concatenate([[0.0], 0.5 * (times[1:] + times[:-1]), times[-1:]])
+    lines = np.diff(joints, axis=0) / np.diff(times)[:, None]
+    velocities = np.vstack([start, lines, np.zeros_like(start)])
+    velocity = np.array([np.interp(at_s, middles, column) for column in velocities.T])
+    if np.linalg.norm(velocity) <= AT_REST:
+        velocity = np.zeros_like(start)
+    return State(place, velocity, row)
+
+
+def ahead(joints: Float[np.ndarray, "T D"], state: State) -> Float[np.ndarray, "n D"]:
+    """What is left of a path's rows, from the state on."""
+    return np.vstack([state.configuration, joints[state.row :]])
+
+
+def shortest_stop(
+    rows: Float[np.ndarray, "n D"], velocity: Float[np.ndarray, "D"], pace: Pace
+) -> Motion | None:
+    """The motion from a velocity at the first row that stops the earliest on the way along rows;
+    None where it can't before their end.
+    """
+    if len(rows) < 2 or pace.times(rows, velocity) is None:
+        return None
+    short, last = 0, len(rows) - 1  # it stops by row `last`, and not by row `short`
+    while last - short > 1:
+        middle = (short + last) // 2
+        if pace.times(rows[: middle + 1], velocity) is None:
+            short = middle
+        else:
+            last = middle
+    low, high = 0.0, 1.0
+    for _ in range(_FRACTIONS):
+        share = 0.5 * (low + high)
+        found = pace.times(_ending(rows, last, share), velocity)
+        low, high = (share, high) if found is None else (low, share)
+    ended = _ending(rows, last, high)
+    times = pace.times(ended, velocity)
+    return None if times is None else Motion(ended, times, velocity)
+
+
+def _ending(rows: np.ndarray, last: int, share: float) -> np.ndarray:
+    """The rows up to a share of the line before row `last`."""
+    if share == 1.0:
+        return rows[: last + 1]
+    end = (1.0 - share) * rows[last - 1] + share * rows[last]
+    return np.vstack([rows[:last], end])

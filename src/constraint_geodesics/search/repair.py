@@ -1,0 +1,56 @@
+"""A path that something new is in the way of: its curve pushed clear as a band, and to either side
+of what it meets.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from constraint_geodesics.search.candidates import Candidate, Task, along, refined, round_it
+from constraint_geodesics.search.roadmap import nearest, resample, shortest_way
+
+_MOST_WAYS = 60
+"""Ways over the graph that are looked at."""
+
+
+def pushed(task: Task, nodes: Float[np.ndarray, "n D"]) -> Candidate | None:
+    """The curve through nodes, relaxed clear of what may meet; None where it is not sound."""
+    return refined(task, "bend", nodes, clear=True)
+
+
+def repaired(task: Task, rows: Float[np.ndarray, "T D"]) -> Iterator[Candidate]:
+    """Sound curves near a path: pushed clear from where it is; then from either side."""
+    nodes = resample(rows, task.settings.segments + 1)
+    found = pushed(task, nodes)
+    if found is not None:
+        yield found
+    yield from round_it(task, "bend", nodes)
+
+
+def over_graph(
+    task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]
+) -> Candidate | None:
+    """The way over the constraint's graph, relaxed; None where there is none, or none is found
+    soon: where something cuts the goal off, the search would look at every edge.
+    """
+    roadmap = task.roadmap()
+    if roadmap is None:
+        return None
+    ends = nearest(roadmap, start), nearest(roadmap, goal)
+    corners = shortest_way(roadmap, start, goal, *ends, task.clear, most=_MOST_WAYS)
+    return None if corners is None else next(along(task, "graph", corners, True, True), None)
+
+
+def onward(
+    task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]
+) -> Iterator[Candidate]:
+    """Curves from where an arm rests that take little time to find: the straight line pushed clear,
+    and the way over the graph.
+    """
+    line = pushed(task, resample(np.stack([start, goal]), task.settings.segments + 1))
+    if line is not None:
+        yield line
+    way = over_graph(task, start, goal)
+    if way is not None:
+        yield way

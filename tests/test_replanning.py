@@ -1,0 +1,325 @@
+"""The planner of an arm that moves: from a velocity, to a stop, and round what is new."""
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from constraint_geodesics import Planner, Sphere, Trajectory
+from constraint_geodesics.geometry.braking import State
+from constraint_geodesics.planner import PlannerError
+from constraint_geodesics.trajectory import read_start_velocity
+from tests.planner_fixtures import packaged_planner, pairs_of
+
+NAME = "level_cup"
+DENSE_S = 0.002
+
+
+@cache
+def planned(count: int) -> list[Trajectory]:
+    paths = [packaged_planner().plan(a, b, NAME) for a, b in pairs_of(NAME, count, 11)]
+    return [path for path in paths if path.status == "solved"]
+
+
+def assert_goes_on(answer: Trajectory, path: Trajectory, at_s: float) -> None:
+    """Certified anew from the state of the path at a time, its velocities and accelerations within
+    the limits as they are written down here.
+    """
+    planner, state = packaged_planner(), path.state(at_s)
+    np.testing.assert_array_equal(answer.joints[0], state.configuration)
+    moving = answer.start_velocity
+    np.testing.assert_array_equal(np.zeros(6) if moving is None else moving, state.velocity)
+    goal = path.joints[-1] if answer.status == "solved" else None
+    about = (answer.joints, path.constraint, state.configuration, goal, answer.times)
+    certificate = planner._certifier.certify(*about, start_velocity=moving)
+    assert certificate.valid, certificate.violation
+    assert answer.certificate is not None
+    assert answer.certificate.valid
+    dt = np.diff(answer.times)[:, None]
+    lines = np.diff(answer.joints, axis=0) / dt
+    lasting = np.concatenate([[[0.0]], dt, [[0.0]]])
+    speeds = np.vstack([state.velocity, lines, np.zeros(6)])
+    accelerations = np.diff(speeds, axis=0) / (0.5 * (lasting[1:] + lasting[:-1]))
+    assert (np.abs(lines) <= planner.robot.velocity * (1 + 1e-9)).all()
+    assert (
+        np.abs(accelerations)
+        <= np.array(planner._certifier.limits.acceleration_rad_s2) * (1 + 1e-6)
+    ).all()
+
+
+def on_the_way(path: Trajectory, at_s: float, rng: np.random.Generator) -> Sphere | None:
+    """A sphere that the rest of a path runs into after the arm could stop, clear of its goal."""
+    planner, stop = packaged_planner(), path.stop(at_s)
+    checks, earliest = planner._certifier.collisions, at_s + 1.05 * stop.times[-1]
+    for _ in range(20 if earliest < path.times[-1] else 0):
+        place = path.state(rng.uniform(earliest, path.times[-1])).configuration
+        middle = planner.robot.skeleton(place)[3:][rng.integers(5)]
+        ball = Sphere("sudden", tuple(middle), rng.uniform(0.05, 0.08))
+        planner.scene.add(ball)
+        try:
+            clear = checks.is_free(path.joints[-1]) and checks.is_clear(stop.joints)
+            if clear and not checks.is_clear(path.joints):
+                return ball
+        finally:
+            planner.scene.remove("sudden")
+    return None
+
+
+def touched(answer: Trajectory, planner: Planner) -> int:
+    """Configurations of the motion, every few ms, that a fresh world finds in touch."""
+    at = np.arange(0.0, answer.times[-1], DENSE_S)
+    rows = np.stack([np.interp(at, answer.times, q) for q in answer.joints.T], axis=1)
+    with planner.scene.world() as world:
+        return int((~world.free(np.vstack([rows, answer.joints]))).sum())
+
+
+# From a velocity
+
+
+@pytest.mark.parametrize("name", ["level_cup", "free", "slide", "level_cup_relaxed"])
+def test_a_path_goes_on_from_where_another_one_is(name):
+    """To its own goal it takes no longer than the rest of the path, and to others it gets, too."""
+    planner, rng, longer = packaged_planner(), np.random.default_rng(0), []
+    pairs = pairs_of(name, 8, 5)
+    for k, (start, goal) in enumerate(pairs):
+        path = planner.plan(start, goal, name)
+        if path.status != "solved":
+            continue
+        at = rng.uniform(0.1, 0.9) * path.times[-1]
+        state = path.state(at)
+        same = planner.plan(state.configuration, goal, name, start_velocity=state.velocity)
+        assert same.status == "solved", same.explanation
+        longer.append(same.times[-1] / (path.times[-1] - at))
+        other = pairs[k - 1][1]
+        turned = planner.plan(state.configuration, other, name, start_velocity=state.velocity)
+        for answer, end in ((same, goal), (turned, other)):
+            if answer.status == "solved":
+                np.testing.assert_array_equal(answer.start_velocity, state.velocity)
+                certificate = planner._certifier.certify(
+                    answer.joints,
+                    answer.constraint,
+                    state.configuration,
+                    end,
+                    answer.times,
+                    start_velocity=state.velocity,
+                )
+                assert certificate.valid, certificate.violation
+    assert len(longer) >= 5
+    assert np.median(longer) < 1.02
+
+
+def test_a_start_at_rest_is_planned_as_without_a_velocity():
+    planner = packaged_planner()
+    for start, goal in pairs_of(NAME, 5, 2):
+        path = planner.plan(start, goal, NAME)
+        resting = planner.plan(start, goal, NAME, start_velocity=np.zeros(6))
+        np.testing.assert_array_equal(resting.joints, path.joints)
+        np.testing.assert_array_equal(resting.times, path.times)
+        assert resting.start_velocity is None
+        assert path.start_velocity is None
+
+
+def test_velocities_that_no_path_begins_with_are_refused():
+    planner, path = packaged_planner(), planned(10)[0]
+    state, goal = path.state(0.5 * path.times[-1]), path.joints[-1]
+
+    def asked(velocity, scale=1.0, start=state.configuration):
+        return planner.plan(start, goal, NAME, start_velocity=velocity, velocity_scale=scale)
+
+    fast = asked(state.velocity, scale=0.01)
+    assert fast.status == "out_of_limits"
+    assert "is its limit" in fast.explanation
+    normal = planner.plan(state.configuration, goal, NAME)
+    jacobian = (
+        packaged_planner()
+        ._preparation.task(normal.constraint)
+        .manifold.jacobian(state.configuration)
+    )
+    off = asked(state.velocity + 0.1 * jacobian[3])
+    assert off.status == "start_violates"
+    assert "leads off level_cup at" in off.explanation
+    free = planner.constraints["free"]
+    close = np.clip(state.configuration, planner.robot.lower, planner.robot.upper)
+    close[0] = planner.robot.upper[0] - 0.01
+    out = planner.plan(close, goal, free, start_velocity=[1.0, 0, 0, 0, 0, 0])
+    assert out.status == "out_of_limits", out.explanation
+    assert "can't stop within 0.01" in out.explanation
+    for wrong, message in (([1.0] * 5, "start_velocity has shape"), ([np.nan] * 6, "not finite")):
+        with pytest.raises(PlannerError, match=message):
+            asked(wrong)
+
+
+# State and stop
+
+
+def test_a_state_is_that_of_the_trajectory_as_it_is_sent():
+    """At a waypoint the velocity is that of the ROS message, and between them it changes evenly."""
+    path = planned(10)[0]
+    points = path.to_joint_trajectory()["points"]
+    for k in range(0, len(points), 7):
+        state = path.state(path.times[k])
+        np.testing.assert_array_equal(state.configuration, path.joints[k])
+        np.testing.assert_allclose(state.velocity, points[k]["velocities"], atol=1e-9)
+    at = np.linspace(0.0, path.times[-1], 4000)
+    velocities = np.array([path.state(t).velocity for t in at])
+    most = np.abs(np.diff(velocities, axis=0)).max() / (at[1] - at[0])
+    assert most <= max(packaged_planner()._certifier.limits.acceleration_rad_s2) * (1 + 1e-6)
+    for wrong in (-1e-9, path.times[-1] + 1e-9, np.nan, "soon"):
+        with pytest.raises(PlannerError, match="at_s = .*must be a time from 0 to"):
+            path.state(wrong)
+
+
+def test_a_stop_is_on_the_path_and_as_short_as_the_limits_allow():
+    planner, rng, proven = packaged_planner(), np.random.default_rng(0), 0
+    for path in planned(10):
+        for share in rng.uniform(0.02, 0.98, 6):
+            at = share * path.times[-1]
+            stop, state = path.stop(at), path.state(at)
+            assert stop.status == "stopped"
+            assert_goes_on(stop if stop.certificate else certified(stop), path, at)
+            if stop.certificate is None:
+                continue
+            proven += 1
+            assert (stop.joints[1:-1] == path.joints[state.row :][: len(stop.joints) - 2]).all()
+            assert too_short(stop, path, state)
+    assert proven >= 30
+    ended = planned(10)[0]
+    still = ended.stop(ended.times[-1])
+    assert still.certificate is not None
+    np.testing.assert_array_equal(still.joints, ended.joints[[-1, -1]])
+    assert planner.replan(ended, ended.times[-1]).status == "solved"
+
+
+def too_short(stop: Trajectory, path: Trajectory, state: State) -> bool:
+    """Whether no stop ends on a line of the path a little earlier."""
+    if not state.velocity.any():
+        return True
+    row = state.row + len(stop.joints) - 2
+    before = path.joints[row - 1] if row > state.row else state.configuration
+    line, used = path.joints[row] - before, stop.joints[-1] - stop.joints[-2]
+    share = np.linalg.norm(used) / np.linalg.norm(line) - 0.02
+    ends = [] if share <= 0.0 else [before + share * line]
+    rows = np.vstack([stop.joints[:-1], *ends])
+    return len(rows) < 2 or path.asked.pace.times(rows, state.velocity) is None
+
+
+def certified(stop: Trajectory) -> Trajectory:
+    """With a certificate of the scene as it is, in place of none."""
+    found = packaged_planner()._certifier.certify(
+        stop.joints, stop.constraint, times=stop.times, start_velocity=stop.start_velocity
+    )
+    return replace(stop, certificate=found)
+
+
+def test_files_and_messages_say_how_a_motion_begins(tmp_path):
+    planner, path = packaged_planner(), planned(10)[0]
+    rest = planner.replan(path, 0.4 * path.times[-1])
+    rest.save(tmp_path / "rest.csv")
+    np.testing.assert_array_equal(
+        read_start_velocity(tmp_path / "rest.csv", 6), rest.start_velocity
+    )
+    certificate = planner.check(tmp_path / "rest.csv")
+    assert certificate.valid, certificate.violation
+    np.testing.assert_array_equal(certificate.start_velocity, rest.start_velocity)
+    text = (tmp_path / "rest.csv").read_text()
+    resting = "".join(line for line in text.splitlines(True) if "start_velocity" not in line)
+    (tmp_path / "resting.csv").write_text(resting)
+    assert planner.check(tmp_path / "resting.csv").violation.kind == "acceleration"
+    (tmp_path / "wrong.csv").write_text("# start_velocity: [1, 2]\n" + resting)
+    with pytest.raises(PlannerError, match=r"wrong.csv, line 1: not a velocity of 6 joints"):
+        planner.check(tmp_path / "wrong.csv")
+    point = rest.to_joint_trajectory()["points"][0]
+    np.testing.assert_allclose(point["velocities"], rest.start_velocity)
+    json.dumps(rest.certificate.summary())
+
+
+# Replanning
+
+
+def test_what_is_left_is_the_answer_where_nothing_changed():
+    planner, rng = packaged_planner(), np.random.default_rng(1)
+    for path in planned(10):
+        for share in rng.uniform(0.0, 1.0, 4):
+            at = share * path.times[-1]
+            rest = planner.replan(path, at)
+            assert rest.status == "solved", rest.explanation
+            assert_goes_on(rest, path, at)
+            left, line = path.times[-1] - at, np.diff(path.times).max()
+            assert rest.times[-1] <= 1.02 * left + line
+
+
+def test_it_goes_round_what_appears_or_stops():
+    """Every answer is certified from the state of the arm; a fresh world finds no touch on some."""
+    planner, rng, ends, looked_at = packaged_planner(), np.random.default_rng(3), [], 0
+    for path in planned(40):
+        at = 0.25 * path.times[-1]
+        ball = on_the_way(path, at, rng)
+        if ball is None:
+            continue
+        planner.scene.add(ball)
+        try:
+            answer = planner.replan(path, at)
+            assert answer.status in ("solved", "stopped"), answer.explanation
+            assert answer.scene == planner.scene.now
+            assert_goes_on(answer, path, at)
+            ends.append(answer.status)
+            if looked_at < 6:
+                assert touched(answer, planner) == 0
+                looked_at += 1
+        finally:
+            planner.scene.remove("sudden")
+        if answer.status == "stopped":  # what was wanted is reached once the way is free
+            onward = planner.replan(answer, answer.times[-1])
+            assert onward.status == "solved", onward.explanation
+            np.testing.assert_array_equal(onward.joints[-1], path.joints[-1])
+    assert len(ends) >= 15
+    assert np.mean([end == "solved" for end in ends]) > 0.8
+
+
+def test_a_stop_that_touches_something_says_so_and_is_there():
+    """A sphere right ahead: the hardest stop comes with what it breaks, and can be sent."""
+    planner, seen = packaged_planner(), 0
+    for path in planned(40):
+        at = 0.5 * path.times[-1]
+        stop = path.stop(at)
+        if len(stop.joints) < 6:
+            continue
+        middle = planner.robot.skeleton(stop.joints[-1])[-1]
+        planner.scene.add(Sphere("sudden", tuple(middle), 0.05))
+        try:
+            free = planner._certifier.collisions.is_free(path.state(at).configuration)
+            answer = planner.replan(path, at) if free else None
+        finally:
+            planner.scene.remove("sudden")
+        if answer is None or answer.status in ("solved", "stopped"):
+            continue
+        seen += 1
+        assert answer.status == "in_collision"
+        assert answer.certificate is not None
+        assert answer.certificate.violation.kind in ("workcell_collision", "clearance")
+        assert answer.certificate.violation.message in answer.explanation
+        np.testing.assert_array_equal(answer.start_velocity, path.state(at).velocity)
+        assert len(answer.to_joint_trajectory()["points"]) == len(answer.joints) > 2
+        if seen == 3:
+            break
+    assert seen == 3
+
+
+def test_scales_stay_and_other_robots_are_refused():
+    planner = packaged_planner()
+    start, goal = pairs_of(NAME, 1, 11)[0]
+    slow = planner.plan(start, goal, NAME, velocity_scale=0.3, acceleration_scale=0.4)
+    rest = planner.replan(slow, 0.5 * slow.times[-1])
+    assert rest.status == "solved"
+    lines = np.diff(rest.joints, axis=0) / np.diff(rest.times)[:, None]
+    assert (np.abs(lines) <= 0.3 * planner.robot.velocity * (1 + 1e-9)).all()
+    for wrong in (-0.1, slow.times[-1] + 0.1, np.inf):
+        with pytest.raises(PlannerError, match="at_s = .*must be a time from 0 to"):
+            planner.replan(slow, wrong)
+    with (
+        Planner.from_urdf("kuka_iiwa/model.urdf", "lbr_iiwa_link_7") as other,
+        pytest.raises(PlannerError, match="of another robot"),
+    ):
+        other.replan(slow, 0.0)
