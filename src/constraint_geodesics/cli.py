@@ -169,7 +169,9 @@ def bench(
         help="A file of problems instead: MotionBenchMaker's as JSON, or a folder of MoveIt's "
         "planning scenes and requests. docs/problems.md.",
     ),
-    every: int = typer.Option(1, help="Of --problems each scene's first, and so on.", min=1),
+    every: int = typer.Option(
+        1, help="Which of each scene's --problems: 1 all, 10 each tenth.", min=1
+    ),
     tilted: int = typer.Option(
         0, help="Queries with a held tilt, drawn in each scene of --problems.", min=0
     ),

@@ -141,6 +141,7 @@ def test_all_planners_answer_in_every_scene_and_are_judged_twice(rows) -> None:
         assert row["ends"] == ""
         # every 5 mrad, the rows themselves among them
         assert row["looked_at"] >= row["length_rad"] / 0.005
+        assert 0.0 < row["core_share"] < 1.2
     found = figures(table_of(rows, lambda name: 10.0))
     assert {name: set(scenes) for name, scenes in found.items()} == {
         "free": {"posts", "crate", "all"},
@@ -238,6 +239,7 @@ def row_of(planner: str, query: int, **own) -> dict:
         "looked_at": 400,
         "iterations": 1,
         "peak_memory_mb": 0.0,
+        "core_share": 0.5,
         "reason": "",
         **own,
     }

@@ -13,7 +13,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -204,7 +204,8 @@ def _answered(batch: QueryBatch, query: Query, jobs: Sequence[_Job]) -> Iterator
         grown_by: dict[tuple[str, int], float] = {}
         for job in jobs:
             baseline = job.baseline
-            found, grown = _asked(batch, job, planners[baseline.name], problem)
+            with _core_share() as share:
+                found, grown = _asked(batch, job, planners[baseline.name], problem)
             grown = max(grown, grown_by.get((baseline.after, job.seed), 0.0))
             grown_by[baseline.name, job.seed] = grown
             measures = measure_path(
@@ -225,9 +226,20 @@ def _answered(batch: QueryBatch, query: Query, jobs: Sequence[_Job]) -> Iterator
                 "peak_memory_mb": grown,
                 "scene_s": made_s.get(baseline.name, 0.0) + prepared_s,
                 "recording": recording,
+                "core_share": share[0],
                 **look(answer),
             }
             yield _row(job, found, measures, more)
+
+
+@contextmanager
+def _core_share() -> Iterator[list[float]]:
+    """The share of a core that this process has within: on a busy machine times are longer by as
+    much.
+    """
+    found, began, used = [math.nan], time.perf_counter(), time.process_time()
+    yield found
+    found[0] = (time.process_time() - used) / (time.perf_counter() - began)
 
 
 def _watched(batch: QueryBatch, query: Query, scene: Scene) -> AbstractContextManager[Look]:

@@ -73,7 +73,7 @@ def _cylinder(name: str, at: Placement, half_m: float, rng: np.random.Generator,
 
 
 def _mesh(name: str, at: Placement, half_m: float, _: np.random.Generator, file: Path) -> Shape:
-    return Mesh(name, file, at, scale=half_m)
+    return Mesh(name, file, at, scale=round(half_m, 2))  # a size is divided into parts once
 
 
 def _cloud(name: str, at: Placement, half_m: float, rng: np.random.Generator, _: Path) -> Shape:

@@ -56,10 +56,11 @@ DENSE_RAD = 0.005
 COLUMNS = (
     *("scene", "constraint", "query", "planner", "settings", "status", "valid", "touches"),
     *("ends", "limit_s", "time_s", "scene_s", "length_rad", "best_known_rad", "looked_at"),
-    *("iterations", "peak_memory_mb", "reason"),
+    *("iterations", "peak_memory_mb", "core_share", "reason"),
 )
 """Of the table.  valid: the certifier's word; touches: PyBullet's, on the path; ends: what is wrong
-with the ends, if anything; looked_at: configurations that PyBullet was asked about.
+with the ends, if anything; looked_at: configurations that PyBullet was asked about; core_share: of
+a core that the process had meanwhile.
 """
 _PREPARED: set[tuple[Any, ...]] = set()
 """Arms and constraints whose roadmaps this process has."""
@@ -253,7 +254,7 @@ def table_of(rows: Sequence[Mapping[str, Any]], limit: Callable[[str], float]) -
     """
     table = pd.DataFrame(rows)
     table["limit_s"] = table["constraint"].map(limit)
-    numbers = ["time_s", "scene_s", "length_rad", "peak_memory_mb"]
+    numbers = ["time_s", "scene_s", "length_rad", "peak_memory_mb", "core_share"]
     table[numbers] = table[numbers].astype(float)
     assert not table.duplicated(list(KEY)).any()
     sound = table["valid"] & ~table["touches"]
@@ -294,7 +295,7 @@ def figures_of(rows: pd.DataFrame) -> dict[str, Any]:
     limit.  time: of what is solved [ms]; time_all: of what is solvable, a failure as the whole
     limit.  ratio: of the length to the best known.  wrongly_certified: paths that the certifier
     takes and PyBullet does not.  refused: paths that a planner answers and the certifier refuses.
-    ready_ms: preparation for the scene, in the median.
+    ready_ms: preparation for the scene; core_share: what the process had of a core; in the median.
     """
     within = rows[rows["ends"] == ""]
     solved, solvable = within[within["solved"]], within[within["solvable"]]
@@ -313,6 +314,7 @@ def figures_of(rows: pd.DataFrame) -> dict[str, Any]:
         "wrongly_certified": int((rows["valid"] & rows["touches"]).sum()),
         "refused": int(((within["status"] == "solved") & ~within["valid"]).sum()),
         "ready_ms": _number(1e3 * within["scene_s"].median()),
+        "core_share": _number(within["core_share"].median()),
     }
 
 
