@@ -36,8 +36,8 @@ def main(params: Params, layout: Layout) -> None:
     table = answered(asked, of, "problems")
     each = "" if own.every == 1 else f", of each scene one in {own.every}"
     about = [
-        f"the problems of {file.name} (SHA-256 {digest(file)}…){each}; {own.limit_s:g} s for a query, "
-        f"{own.held_limit_s:g} s with a held tilt",
+        f"the problems of {file.name} (SHA-256 {digest(file)}…){each}",
+        f"{own.limit_s:g} s for a query, {own.held_limit_s:g} s with a held tilt",
         *held_beyond(problems),
     ]
     title = "Problems of MotionBenchMaker"
