@@ -95,6 +95,7 @@ def test_the_benchmarks_summary_is_json(geodesics, tmp_path) -> None:
         name: parameters["constraints"][name] for name in ("free", "level_cup")
     }
     parameters["geodesics"]["illustrated_constraints"] = ["level_cup"]
+    parameters["clutter"]["constraints"] = ["free"]
     parameters["studies"]["constraint"] = "level_cup"
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(parameters))
     shutil.copy(ROOT / "requirements.lock", tmp_path)

@@ -3,6 +3,7 @@
 import atexit
 import gc
 import json
+import math
 import os
 import sys
 import time
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from constraint_geodesics import cli_identify, cli_planning, completion
+from constraint_geodesics.cli_problems import ProblemOptions, bench_problems
 from constraint_geodesics.errors import ParamsError
 from constraint_geodesics.extras import MissingExtraError, require
 from constraint_geodesics.pipeline.layout import Layout
@@ -162,12 +164,44 @@ def bench(
     ),
     longest: float = typer.Option(2.0, help="Leave out planners with more seconds a query."),
     out: Path = typer.Option(Path(".geodesics/bench"), help="Folder of rows, table and summary."),
+    problems: Path | None = typer.Option(
+        None,
+        help="A file of problems instead: MotionBenchMaker's as JSON, or a folder of MoveIt's "
+        "planning scenes and requests. docs/problems.md.",
+    ),
+    every: int = typer.Option(
+        1, help="Which of each scene's --problems: 1 all, 10 each tenth.", min=1
+    ),
+    tilted: int = typer.Option(
+        0, help="Queries with a held tilt, drawn in each scene of --problems.", min=0
+    ),
+    time_limit: float | None = typer.Option(
+        None, help="Seconds of every query of --problems; by default those of params.yaml."
+    ),
+    urdf: cli_planning.Urdf = None,
+    tool_link: cli_planning.ToolLink = None,
+    srdf: cli_planning.Srdf = None,
+    hold: cli_planning.Hold = None,
     as_json: bool = JSON,
 ) -> None:
-    """Hold planners against each other on a few of the benchmark's queries; what is done is not
-    done again.
+    """Hold planners against each other on a few of the benchmark's queries, or on the problems of a
+    file; what is done is not done again.
     """
     require("bench")
+    if problems is not None:
+        if constraint:
+            line = "--problems goes without --constraint: its file says what is held"
+            raise SystemExit(complain(ValueError(line), WRONG_USAGE))
+        if time_limit is not None and not 0.0 < time_limit < math.inf:
+            line = f"--time-limit {time_limit:g}: must be a positive number of seconds"
+            raise SystemExit(complain(ValueError(line), WRONG_USAGE))
+        arm = (urdf, tool_link, srdf, hold)
+        asked = (problems, planner, every, tilted, time_limit)
+        bench_problems(ProblemOptions(*asked, *arm, out, as_json))
+        return
+    if any((urdf, tool_link, srdf, hold, tilted, time_limit is not None)) or every != 1:
+        line = "--every, --tilted, --time-limit, --urdf, … go with --problems alone"
+        raise SystemExit(complain(ValueError(line), WRONG_USAGE))
     from constraint_geodesics.benchmark.entries import answered, committed_run, fewer
     from constraint_geodesics.benchmark.row import write_table
     from constraint_geodesics.benchmark.statistics import all_constraints, benchmark_summary

@@ -111,8 +111,8 @@ class Arm(NamedTuple):
         if self.tool_link is None:
             raise PlannerError(f"which link carries the tool? `geodesics robot {self.urdf}`")
         tool = None if self.tool_pose is None else _pose(self.tool_pose, "--tool-pose")
-        held = dict(map(_held, self.hold or []))
-        return Planner.from_urdf(self.urdf, self.tool_link, self.srdf, tool, hold=held)
+        values = dict(map(held, self.hold or []))
+        return Planner.from_urdf(self.urdf, self.tool_link, self.srdf, tool, hold=values)
 
 
 class Ends(NamedTuple):
@@ -423,9 +423,11 @@ def show_robot(
             lines = [f"{link}: carried by {count} joints" for link, count in ends.items()]
             lines += ["choose one of these links, or any other: --tool-link"]
         else:
-            held = dict(map(_held, hold or []))
+            values = dict(map(held, hold or []))
             touching = FOUND if srdf is None else str(srdf)
-            params = RobotParams(urdf=str(file), tool_link=tool_link, hold=held, may_touch=touching)
+            params = RobotParams(
+                urdf=str(file), tool_link=tool_link, hold=values, may_touch=touching
+            )
             understood = understand(params)
             about, lines = understood.summary(), list(understood.lines())
     except RobotError as error:
@@ -495,7 +497,8 @@ def _joints(text: str, option: str) -> list[float]:
         ) from None
 
 
-def _held(text: str) -> tuple[str, float]:
+def held(text: str) -> tuple[str, float]:
+    """A joint and its value [rad or m], of --hold.  Raises RobotError."""
     from constraint_geodesics.robot.kinematics import RobotError
 
     name, _, text_of = text.partition("=")

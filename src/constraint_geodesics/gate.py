@@ -94,6 +94,11 @@ def _planner_problems(params: Params) -> Iterator[str]:
             registry.settings_of(name, planner)
         except BaselineError as error:
             yield str(error)
+    for name, planner in params.problems.planners.items():
+        try:
+            registry.settings_of(name, planner)
+        except BaselineError as error:
+            yield str(error).replace("benchmark.", "problems.", 1)
     for name in bench.compared.planners:
         if name in bench.planners and bench.planners[name].kind not in TABLE_I:
             yield (

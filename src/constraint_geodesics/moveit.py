@@ -150,6 +150,39 @@ def read_moveit_request(
     return MoveitRequest(start, goals, constraint, *scales)
 
 
+def joints_named(scene_file: Path, request_file: Path) -> dict[str, float]:
+    """Values of joints [rad or m] that a planning scene and a request name, the request's before
+    the scene's, whether they are planned or not.  Raises MoveitError, one line.
+    """
+    found = dict[str, float]()
+    for file, entry in ((scene_file, "robot_state"), (request_file, "start_state")):
+        raw = _read(file)
+        try:
+            found |= _joint_state(_entry(_entry(raw, entry, {}), "joint_state", {}), entry)
+        except MoveitError as error:
+            raise MoveitError(f"{file}: {error}") from None
+        except (AttributeError, TypeError, ValueError) as error:
+            raise MoveitError(f"{file}: {entry}: no state of joints: {_said(error)}") from None
+    return found
+
+
+def robot_named(scene_file: Path) -> str | None:
+    """The name that a planning scene has for its robot."""
+    name = _read(scene_file).get("robot_model_name")
+    return None if name is None else str(name)
+
+
+def shape_of_record(raw: Mapping[str, Any], where: str) -> Shape:
+    """A primitive with a pose of its own in the base frame: a name, type and dimensions as in
+    MoveIt, position [m] and orientation_xyzw.  where: the entry, for errors.  Raises MoveitError.
+    """
+    try:
+        pose = _pose({"position": raw["position"], "orientation": raw["orientation_xyzw"]})
+    except MoveitError as error:
+        raise MoveitError(f"{where}: {error}") from None
+    return _primitive(raw, str(raw["name"]), Placement.of_matrix(pose), where)
+
+
 def _read(file: Path) -> dict[str, Any]:
     try:
         raw = read_yaml(file)

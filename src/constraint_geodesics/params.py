@@ -546,6 +546,33 @@ class BenchmarkParams(_Record):
         return self
 
 
+class ProblemsParams(_Record):
+    """Problems from a file, and queries with a held tilt in their scenes.  every: which of each
+    scene's problems are asked, 1 all of them.  tilted: queries of each scene.  limit_s: of one
+    query; held_limit_s: of one under a constraint.
+    """
+
+    file: str
+    every: Count
+    tilted: Annotated[int, Field(ge=0)]
+    seed: Seed
+    limit_s: Positive
+    held_limit_s: Positive
+    planners: Annotated[dict[str, BaselineParams], Field(min_length=1)]
+
+
+class ClutterParams(_Record):
+    """Queries of the pipeline's arm among random shapes: so many scenes of each kind, and queries
+    of each kind and constraint.
+    """
+
+    scenes: Count
+    queries: Count
+    seed: Seed
+    limit_s: Positive
+    constraints: Annotated[tuple[Name, ...], Field(min_length=1)]
+
+
 class PathDiffusionParams(_Record):
     """The diffusion model of paths, a baseline: how many of the planner's paths it learns from,
     how large it is, and how long it is trained.
@@ -640,6 +667,8 @@ class Params(_Record):
     sweep: SweepParams
     execution: ExecutionParams
     benchmark: BenchmarkParams
+    problems: ProblemsParams
+    clutter: ClutterParams
     judge: JudgeParams
     recording: RecordingParams
     tracking: TrackingParams
@@ -670,6 +699,11 @@ class Params(_Record):
             raise ValueError(
                 f"unseen={sorted(again)}: these are among the constraints that are trained on"
             )
+        for name in self.clutter.constraints:
+            if name not in self.constraints:
+                raise ValueError(
+                    f"clutter.constraints={name!r}: must be one of {sorted(self.constraints)}"
+                )
         geodesics, charts = self.geodesics, self.compare_charts
         for study, name, taken in (
             ("compare_manifolds.vae", self.compare_manifolds.vae, self.manifolds),

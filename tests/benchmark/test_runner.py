@@ -168,6 +168,57 @@ def test_paths_are_handed_to_the_recorder_with_their_verdict(batch) -> None:
     assert named == {"band": "band.rrd", "liar": "liar.rrd", "broken": ""}
 
 
+@contextmanager
+def counting(query, scene):
+    """Numbers the answers to one query, those without a path among them."""
+    count = 0
+
+    def look(answer):
+        nonlocal count
+        count += 1
+        return {"answer": count, "rows": len(answer.joints), "shapes": len(scene.workcell)}
+
+    yield look
+
+
+def test_what_is_said_of_every_answer_stands_in_its_row(batch) -> None:
+    run_batch(replace(batch, watch=counting))
+    rows = [row for row in batch_rows(batch) if row["query"] == 2]
+    assert [row["answer"] for row in rows] == [1, 2, 3, 4]
+    assert {row["planner"]: row["rows"] == 0 for row in rows} == {
+        "band": False,
+        "liar": False,
+        "broken": True,
+    }
+    around = len(batch.scene.workcell)
+    assert {row["shapes"] for row in rows} == {around + 1}, "the query's own sphere among them"
+
+
+@dataclass(frozen=True)
+class Telling:
+    """Says whom it may ask about configurations."""
+
+    name: str = "telling"
+
+    def plan(self, problem, seed):
+        word = type(problem.is_free.__self__).__name__
+        return Solution("not_found", np.empty((0, 6)), 0.0, 1, word)
+
+
+@contextmanager
+def telling(names, scene, constraint, manifold):
+    yield {"band": Telling()}, {"band": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("asked", "word"), [("pybullet", "World"), ("certifier", "CollisionCheck")]
+)
+def test_planners_ask_whom_the_batch_names(batch, asked, word) -> None:
+    one = replace(batch, queries=batch.queries[:1], baselines=ASKED[:1], build=telling, asked=asked)
+    run_batch(one)
+    assert [row["reason"] for row in batch_rows(one)] == [word]
+
+
 def key(row):
     return [str(row[name]) for name in ("planner", "query", "seed")]
 

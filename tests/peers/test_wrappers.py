@@ -1,4 +1,6 @@
-"""Restarts keep the shortest, end in time, and ask no more where no seed changes the answer."""
+"""Restarts keep the shortest, end in time, and ask no more where no seed changes the answer; a
+path that is not sound is no answer.
+"""
 
 from dataclasses import dataclass, field
 
@@ -6,7 +8,7 @@ import numpy as np
 import pytest
 from tests.planner_fixtures import manifold_of, packaged_planner, pairs_of
 
-from constraint_geodesics.peers.wrappers import Restarted
+from constraint_geodesics.peers.wrappers import Restarted, UntilSound
 from constraint_geodesics.problem import PlanningProblem, Solution
 
 
@@ -18,13 +20,15 @@ class Listed:
     status: str = "solved"
     seeds: list[int] = field(default_factory=list)
     name: str = "listed"
+    each_s: float = 0.0
 
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         length = self.lengths[len(self.seeds) % len(self.lengths)]
         self.seeds.append(seed)
         if np.isnan(length):
-            return Solution("not_found", np.empty((0, 6)), 0.0, 1)
-        return Solution(self.status, np.array([[0.0] * 6, [length] + [0.0] * 5]), 0.0, 1)  # type: ignore[arg-type]
+            return Solution("not_found", np.empty((0, 6)), self.each_s, 1)
+        joints = np.array([[0.0] * 6, [length] + [0.0] * 5])
+        return Solution(self.status, joints, self.each_s, 1)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -58,4 +62,31 @@ def test_what_no_seed_changes_is_asked_once(problem, status) -> None:
 def test_one_attempt_is_made_however_short_the_time(problem) -> None:
     inner = Listed((2.0,))
     assert Restarted(inner, 1e-9).plan(problem, 0).joints[1, 0] == 2.0
+    assert len(inner.seeds) == 1
+
+
+def shorter_than(length: float):
+    return lambda problem, joints: bool(joints[-1, 0] < length)
+
+
+def test_the_first_sound_path_is_the_answer_with_the_time_of_all_attempts(problem) -> None:
+    inner = Listed((5.0, 3.0, 1.0, 0.5), each_s=0.25)
+    found = UntilSound(inner, shorter_than(2.0), 10.0).plan(problem, 2)
+    assert (found.status, found.joints[-1, 0]) == ("solved", 1.0)
+    assert inner.seeds == [200_000, 200_001, 200_002]
+    assert found.iterations == 3
+    assert 0.75 <= found.time_s < 1.0
+
+
+def test_there_is_no_answer_once_the_time_for_sound_paths_is_over(problem) -> None:
+    inner = Listed((5.0,), each_s=0.25)
+    found = UntilSound(inner, shorter_than(2.0), 0.6).plan(problem, 0)
+    assert (found.status, len(found.joints), len(inner.seeds)) == ("not_found", 0, 3)
+    assert "none of 3 paths is sound" in found.explanation
+
+
+@pytest.mark.parametrize("status", ["not_found", "in_collision"])
+def test_what_is_no_path_is_not_asked_again(problem, status) -> None:
+    inner = Listed((np.nan,)) if status == "not_found" else Listed((1.0,), status)
+    assert UntilSound(inner, shorter_than(0.5), 5.0).plan(problem, 0).status == status
     assert len(inner.seeds) == 1

@@ -2,8 +2,11 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from gzip import GzipFile
+from io import TextIOWrapper
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 import pandas as pd
@@ -73,10 +76,16 @@ def _completed(table: pd.DataFrame) -> pd.DataFrame:
 
 def write_table(table: pd.DataFrame, file: Path, about: Mapping[str, str]) -> None:
     """Write the rows as CSV, with a comment line for each entry of `about` (commit, lock file,
-    processor) before.
+    processor) before; gzipped where the file is called so, the same bytes for the same rows.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
-    with file.open("w") as lines:
+    with ExitStack() as opened:
+        if file.suffix == ".gz":
+            raw = opened.enter_context(file.open("wb"))
+            packed = opened.enter_context(GzipFile("", "wb", fileobj=raw, mtime=0))
+            lines: TextIO = opened.enter_context(TextIOWrapper(packed, encoding="utf-8"))
+        else:
+            lines = opened.enter_context(file.open("w"))
         lines.writelines(f"# {name}: {' '.join(value.split())}\n" for name, value in about.items())
         table.to_csv(lines, index=False, float_format="%.12g")
 

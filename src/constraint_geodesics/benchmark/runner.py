@@ -13,10 +13,10 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -83,12 +83,20 @@ Recorder = Callable[[Answer], str]
 """Keeps some of the paths; the recording's file, or "" where there is none.  Picklable."""
 
 
+Look = Callable[[Answer], Mapping[str, Any]]
+"""Says more of an answer, with a path or without one, as columns of its row."""
+Watch = Callable[[Query, Scene], AbstractContextManager[Look]]
+"""Looks at all answers to a query, in whatever it opens for that.  Picklable."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class QueryBatch:
     """Some queries of one constraint and scene, with the planners that answer them; picklable.
 
     file: where the rows are kept, one JSON record a line.  record: called with every path that
-    there is.  learned: manifolds on which the paths' lengths are measured as well.
+    there is.  learned: manifolds on which the paths' lengths are measured as well.  asked: whose
+    word planners have on single configurations: PyBullet's, or the certifier's check, compiled,
+    which asks PyBullet where bodies all but touch.  watch: what more is said of answers.
     """
 
     scene: Scene
@@ -100,6 +108,8 @@ class QueryBatch:
     file: Path
     learned: Mapping[str, "LearnedManifold"] = field(default_factory=dict)
     record: Recorder | None = None
+    asked: Literal["pybullet", "certifier"] = "pybullet"
+    watch: Watch | None = None
 
     @property
     def fingerprints(self) -> dict[str, str]:
@@ -183,16 +193,19 @@ def _answered(batch: QueryBatch, query: Query, jobs: Sequence[_Job]) -> Iterator
         Certifier(scene, judge_limits(batch.judge)) as certifier,
         scene.world() as world,
         batch.build(names, scene, query.constraint, manifold) as (planners, made_s),
+        _watched(batch, query, scene) as look,
     ):
         began = time.perf_counter()
         clearance = clearance_model(scene, certifier.collisions.apart)
         clearance_s = time.perf_counter() - began
-        known = world.is_free, clearance, certifier.collisions.is_clear
+        is_free = {"pybullet": world.is_free, "certifier": certifier.collisions.is_free}
+        known = is_free[batch.asked], clearance, certifier.collisions.is_clear
         problem = PlanningProblem(query.start, query.goal, manifold, *known)
         grown_by: dict[tuple[str, int], float] = {}
         for job in jobs:
             baseline = job.baseline
-            found, grown = _asked(batch, job, planners[baseline.name], problem)
+            with _core_share() as share:
+                found, grown = _asked(batch, job, planners[baseline.name], problem)
             grown = max(grown, grown_by.get((baseline.after, job.seed), 0.0))
             grown_by[baseline.name, job.seed] = grown
             measures = measure_path(
@@ -204,19 +217,37 @@ def _answered(batch: QueryBatch, query: Query, jobs: Sequence[_Job]) -> Iterator
                 certifier,
                 batch.judge.spacing_rad,
             )
+            answer = Answer(query, baseline.name, job.seed, found.joints, measures, scene, manifold)
             recording = ""
             if batch.record is not None and len(found.joints) > 1:
-                answer = Answer(
-                    query, baseline.name, job.seed, found.joints, measures, scene, manifold
-                )
                 recording = batch.record(answer)
             prepared_s = clearance_s if baseline.uses_clearance else 0.0
             more = {
                 "peak_memory_mb": grown,
                 "scene_s": made_s.get(baseline.name, 0.0) + prepared_s,
                 "recording": recording,
+                "core_share": share[0],
+                **look(answer),
             }
             yield _row(job, found, measures, more)
+
+
+@contextmanager
+def _core_share() -> Iterator[list[float]]:
+    """The share of a core that this process has within: on a busy machine times are longer by as
+    much.
+    """
+    found, began, used = [math.nan], time.perf_counter(), time.process_time()
+    yield found
+    found[0] = (time.process_time() - used) / (time.perf_counter() - began)
+
+
+def _watched(batch: QueryBatch, query: Query, scene: Scene) -> AbstractContextManager[Look]:
+    return nullcontext(_nothing_more) if batch.watch is None else batch.watch(query, scene)
+
+
+def _nothing_more(_answer: Answer) -> Mapping[str, Any]:
+    return {}
 
 
 def _asked(

@@ -101,20 +101,29 @@ class BaselineBuilder:
             context = Context(
                 scene, constraint, manifold, self.params, Layout(self.root), opened, {}
             )
-            first = {own.bare for own in settings.values() if own.band and own.restarts_s is None}
-            remembered: dict[BaselineSettings, PathPlanner] = {}
-            made: dict[str, PathPlanner] = {}
-            took: dict[str, float] = {}
-            for name, own in settings.items():
-                began = time.perf_counter()
-                if own.bare in first and own.bare not in remembered:
-                    remembered[own.bare] = Remembered(_made(name, own, context))
-                inner = remembered.get(own.bare) or _made(name, own, context)
-                banded = BandAfter(inner) if own.band else inner
-                limit = own.restarts_s
-                made[name] = banded if limit is None else Restarted(banded, limit)
-                took[name] = time.perf_counter() - began
-            yield made, took
+            yield made_together(settings, context)
+
+
+def made_together(
+    settings: Mapping[str, BaselineSettings], context: Context
+) -> tuple[dict[str, PathPlanner], dict[str, float]]:
+    """Planners by name, and the seconds that making each one took: one with a band after it
+    shortens the very paths of the one without.  Raises BaselineError if one can't be made.
+    """
+    first = {own.bare for own in settings.values() if own.band and own.restarts_s is None}
+    remembered: dict[BaselineSettings, PathPlanner] = {}
+    made: dict[str, PathPlanner] = {}
+    took: dict[str, float] = {}
+    for name, own in settings.items():
+        began = time.perf_counter()
+        if own.bare in first and own.bare not in remembered:
+            remembered[own.bare] = Remembered(_made(name, own, context))
+        inner = remembered.get(own.bare) or _made(name, own, context)
+        banded = BandAfter(inner) if own.band else inner
+        limit = own.restarts_s
+        made[name] = banded if limit is None else Restarted(banded, limit)
+        took[name] = time.perf_counter() - began
+    return made, took
 
 
 def _made(name: str, settings: BaselineSettings, context: Context) -> PathPlanner:

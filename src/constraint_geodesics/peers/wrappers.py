@@ -1,9 +1,11 @@
-"""What turns a baseline into another one: a band after its paths, restarts, and a memory."""
+"""What turns a baseline into another one: a band after its paths, restarts, attempts until a path
+is sound, and a memory.
+"""
 
 import time
 from collections import deque
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -61,6 +63,43 @@ class Restarted:
                 or spent * (attempts + 1) / attempts > self.budget_s
             ):
                 return Solution(best.status, best.joints, spent, iterations, best.explanation)
+
+
+@dataclass(frozen=True)
+class UntilSound:
+    """A planner that is asked again with another seed while its path is not sound, for `budget_s`
+    [s] in all: one that looks at single configurations may touch something between them.
+
+    An attempt that has begun is not interrupted.
+    """
+
+    inner: PathPlanner
+    is_sound: Callable[[PlanningProblem, Float[np.ndarray, "T D"]], bool]
+    budget_s: float
+
+    @property
+    def name(self) -> str:
+        """The planner's."""
+        return self.inner.name
+
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
+        """The first sound path, the looks at paths within its time; "not_found" where the time is
+        over, any other answer as it is.
+        """
+        spent_s, attempts, iterations = 0.0, 0, 0
+        while spent_s < self.budget_s:
+            answer = self.inner.plan(problem, SEEDS * seed + attempts)
+            attempts += 1
+            iterations += answer.iterations
+            began = time.perf_counter()
+            sound = answer.status != "solved" or self.is_sound(problem, answer.joints)
+            # a remembered answer holds its own time
+            spent_s += answer.time_s + time.perf_counter() - began
+            if sound:
+                return replace(answer, time_s=spent_s, iterations=iterations)
+        nothing = np.empty((0, len(problem.start)))
+        line = f"none of {attempts} paths is sound"
+        return Solution("not_found", nothing, spent_s, iterations, line)
 
 
 def _length(answer: Solution) -> float:

@@ -91,6 +91,16 @@ class Layout:
         return self.root / "data" / "arm_rows"
 
     @property
+    def problem_rows(self) -> Path:
+        """Folder of the rows on problems from files, a file a scene (JSON lines)."""
+        return self.root / "data" / "problem_rows"
+
+    @property
+    def clutter_rows(self) -> Path:
+        """Folder of the rows among random shapes, a file a scene and constraint (JSON lines)."""
+        return self.root / "data" / "clutter_rows"
+
+    @property
     def benchmark_table(self) -> Path:
         """The benchmark's rows, all together (CSV)."""
         return self.root / "reports" / "benchmark.csv"

@@ -1,0 +1,279 @@
+"""Planning problems as others write them, to hold planners against each other on:
+MotionBenchMaker's as one file of JSON, and MoveIt's planning scenes with their motion requests.
+
+MotionBenchMaker [Chamzas et al. 2022] gives MoveIt's messages; one file of JSON holds the same:
+
+{"robot": "panda", "joints": ["panda_joint1", …],
+ "scenes": {"box": [{"start": [rad], "goal": [rad], "held": {"panda_finger_joint1": 0.04},
+   "shapes": [{"name": "lid", "type": "box", "dimensions": [x, y, z], "position": [x, y, z],
+               "orientation_xyzw": [x, y, z, w]}]}]}}
+
+Dimensions are MoveIt's: a box's edge lengths, a cylinder's length along z and its radius, a
+sphere's radius [m]; poses are in the base frame.  In place of "robot" stand "urdf" and "tool_link".
+"""
+
+import gzip
+import json
+import re
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from constraint_geodesics.benchmark.arm_source import ArmSource, UrdfArm, opened
+from constraint_geodesics.constraints.constraint import Constraint
+from constraint_geodesics.fields import Finite
+from constraint_geodesics.moveit import (
+    MoveitError,
+    add_moveit_scene,
+    joints_named,
+    read_moveit_request,
+    robot_named,
+    shape_of_record,
+)
+from constraint_geodesics.params import one_line
+from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
+from constraint_geodesics.scene.mesh import Mesh
+from constraint_geodesics.scene.point_cloud import PointCloud
+from constraint_geodesics.scene.scene import Scene, SceneError
+from constraint_geodesics.scene.shape import Shape
+
+NOTHING_HELD = Constraint((0,) * 6)
+FREE = "free"
+"""Name of the constraint that holds nothing."""
+OF_REQUEST = "held orientation"
+"""Name of what MoveIt's requests hold."""
+ROBOTS = {"panda": ("franka_panda/panda.urdf", "panda_hand")}
+"""URDF in pybullet_data and tool link, by the names that files have for robots."""
+_GZIP = b"\x1f\x8b"
+_YAML = (".yaml", ".yml")
+
+
+class ProblemFileError(ValueError):
+    """A file of problems can't be used; the message is one line with the file and the entry."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Two ends [rad] of an arm in a scene of its own, and what is held on the way.
+
+    group: the scene's kind, which results are told apart by; number: which of its problems it is.
+    """
+
+    group: str
+    number: int
+    arm: ArmSource
+    scene: Scene
+    start: Float[np.ndarray, "D"]
+    goal: Float[np.ndarray, "D"]
+    constraint: Constraint = NOTHING_HELD
+    constraint_name: str = FREE
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class _ShapeRecord(_Record):
+    name: Annotated[str, Field(min_length=1)]
+    type: str
+    dimensions: Annotated[list[Finite], Field(min_length=1)]
+    position: Annotated[list[Finite], Field(min_length=3, max_length=3)]
+    orientation_xyzw: Annotated[list[Finite], Field(min_length=4, max_length=4)]
+
+
+class _ProblemRecord(_Record):
+    start: list[Finite]
+    goal: list[Finite]
+    held: dict[str, Finite] = {}
+    shapes: list[_ShapeRecord]
+
+
+class _FileRecord(_Record):
+    robot: str | None = None
+    urdf: str | None = None
+    tool_link: str | None = None
+    joints: Annotated[list[str], Field(min_length=1)]
+    scenes: Annotated[dict[str, list[_ProblemRecord]], Field(min_length=1)]
+
+
+def read_problems(file: Path, given: UrdfArm | None = None) -> list[Problem]:
+    """The problems of a file of JSON, gzipped or not; of a planning scene of MoveIt, whose request
+    lies beside it; or of all of those in a folder and its folders, each of which is a group.
+
+    given: the arm, where the file is not to say it; values of its own of held joints come before
+    the file's.  Raises ProblemFileError, one line, for what can't be used.
+    """
+    if file.is_dir() or file.suffix.lower() in _YAML:
+        return _moveit_problems(file, given)
+    return list(_record_problems(file, _read(file), given))
+
+
+def every(problems: Sequence[Problem], step: int) -> list[Problem]:
+    """Each step-th problem of each group, the first one on."""
+    found = []
+    for _, own in groupby(problems, key=lambda problem: problem.group):
+        found += list(own)[::step]
+    return found
+
+
+def _read(file: Path) -> _FileRecord:
+    try:
+        content = file.read_bytes()
+        text = gzip.decompress(content) if content.startswith(_GZIP) else content
+        return _FileRecord.model_validate(json.loads(text))
+    except OSError as error:
+        if isinstance(error, gzip.BadGzipFile):
+            raise ProblemFileError(f"{file}: gzipped, and damaged: {error}") from None
+        raise ProblemFileError(f"{file}: {error.strerror}") from None
+    except (EOFError, zlib.error) as error:
+        raise ProblemFileError(f"{file}: gzipped, and damaged: {error}") from None
+    except ValidationError as error:
+        raise ProblemFileError(f"{file}: {one_line(error)}") from None
+    except (UnicodeError, RecursionError, ValueError) as error:
+        what = " ".join(str(error).split())
+        raise ProblemFileError(f"{file}: neither JSON nor MoveIt's YAML: {what}") from None
+
+
+def _record_problems(file: Path, record: _FileRecord, given: UrdfArm | None) -> Iterator[Problem]:
+    try:
+        arm = given or _arm_named(record)
+        for group, problems in record.scenes.items():
+            for number, own in enumerate(problems):
+                where = f"scenes.{group}[{number}]"
+                held = {**own.held, **dict(arm.held)}
+                with_held = replace(arm, held=tuple(sorted(held.items())))
+                robot, order = _robot(with_held, tuple(record.joints))
+                start, goal = (
+                    _configuration(getattr(own, end), order, f"{where}.{end}")
+                    for end in ("start", "goal")
+                )
+                scene = Scene(robot).adding(
+                    *(
+                        shape_of_record(raw.model_dump(), f"{where}.shapes[{k}]")
+                        for k, raw in enumerate(own.shapes)
+                    )
+                )
+                yield Problem(group, number, with_held, scene, start, goal)
+    except ProblemFileError as error:
+        raise ProblemFileError(f"{file}: {error}") from None
+    except (MoveitError, RobotError, SceneError) as error:
+        raise ProblemFileError(f"{file}: {error}") from None
+
+
+def _arm_named(record: _FileRecord) -> UrdfArm:
+    if record.urdf is not None and record.tool_link is not None:
+        return UrdfArm(record.urdf, record.tool_link)
+    return arm_of(record.robot, "robot")
+
+
+def arm_of(robot: str | None, where: str) -> UrdfArm:
+    """The arm that a file means by a robot's name."""
+    if robot not in ROBOTS:
+        known = ", ".join(ROBOTS)
+        raise ProblemFileError(
+            f"{where}={robot!r}: known are {known}: say which with --urdf and --tool-link"
+        )
+    return UrdfArm(*ROBOTS[robot])
+
+
+def _robot(arm: UrdfArm, joints: tuple[str, ...]) -> tuple[SerialRobot, list[int]]:
+    """The arm's robot, and where its joints stand among these names."""
+    names = arm.joint_names
+    if set(names) != set(joints) or len(joints) != len(names):
+        raise ProblemFileError(
+            f"joints={list(joints)}: those of {arm.urdf} to {arm.tool_link} are {', '.join(names)}"
+        )
+    return opened(arm).robot, [joints.index(name) for name in names]
+
+
+def _configuration(
+    values: Sequence[float], order: Sequence[int], where: str
+) -> Float[np.ndarray, "D"]:
+    if len(values) != len(order):
+        raise ProblemFileError(f"{where}: {len(values)} numbers for {len(order)} joints")
+    return np.array(values, float)[list(order)]
+
+
+def _moveit_problems(path: Path, given: UrdfArm | None) -> list[Problem]:
+    found = []
+    numbers: dict[str, int] = {}
+    for scene, request in _pairs(path):
+        group = scene.parent.resolve().name
+        digits = re.findall(r"\d+", scene.stem)
+        number = int(digits[-1]) if digits else numbers.get(group, 0)
+        numbers[group] = number + 1
+        found.append(_moveit_problem(scene, request, given, group, number))
+    return found
+
+
+def _pairs(path: Path) -> list[tuple[Path, Path]]:
+    """Planning scenes with their requests, by their names."""
+    found = []
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    for scene in files:
+        if scene.suffix.lower() not in _YAML or "scene" not in scene.stem:
+            continue
+        request = scene.with_name(scene.name.replace("scene", "request"))
+        if not request.is_file():
+            raise ProblemFileError(f"{scene}: has no request beside it: {request.name}")
+        found.append((scene, request))
+    if not found:
+        what = "must be scene….yaml with request….yaml beside it"
+        raise ProblemFileError(f"{path}: has no planning scenes of MoveIt: {what}")
+    return found
+
+
+def _moveit_problem(
+    scene_file: Path, request_file: Path, given: UrdfArm | None, group: str, number: int
+) -> Problem:
+    try:
+        joints = joints_named(scene_file, request_file)
+        arm = given or arm_of(robot_named(scene_file), f"{scene_file}: robot_model_name")
+        held = {name: joints[name] for name in arm.others if name in joints}
+        arm = replace(arm, held=tuple(sorted({**held, **dict(arm.held)}.items())))
+        planner = opened(arm)
+        empty = Scene(planner.robot)
+        planner.scene.become(empty)  # whatever was asked before
+        try:
+            state = add_moveit_scene(scene_file, planner.scene)
+            request = read_moveit_request(request_file, planner, state)
+            scene = planner.scene.now
+        finally:
+            planner.scene.become(empty)
+    except (MoveitError, RobotError, SceneError) as error:
+        raise ProblemFileError(str(error)) from None
+    goal = request.goals[0]
+    if len(request.goals) > 1 or not isinstance(goal, list):
+        what = "goal_constraints: must be one set of joint values, which all planners go to"
+        raise ProblemFileError(f"{request_file}: {what}")
+    name = FREE if request.constraint.is_free else OF_REQUEST
+    ends = np.array(request.start, float), np.array(goal, float)
+    return Problem(group, number, arm, scene, *ends, request.constraint, name)
+
+
+def _content(shape: Shape) -> bytes:
+    """What is no part of a shape's text."""
+    if isinstance(shape, PointCloud):
+        return shape.points_m.array.tobytes()
+    return Path(shape.file).read_bytes() if isinstance(shape, Mesh) else b""
+
+
+def told(problem: Problem) -> Mapping[str, Any]:
+    """All that an answer to a problem depends on, but the arm's files, for a fingerprint."""
+    scene = problem.scene
+    return {
+        "arm": repr(problem.arm),
+        "shapes": [repr(shape) for shape in scene.workcell],
+        "contents": [_content(shape) for shape in scene.workcell],
+        "attached": [repr(one) for one in scene.attached],
+        "allowed": sorted(map(list, scene.allowed)),
+        "ends": [problem.start.tolist(), problem.goal.tolist()],
+        "constraint": repr(problem.constraint),
+    }

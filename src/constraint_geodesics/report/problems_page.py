@@ -1,0 +1,91 @@
+"""Problems in scenes of their own, all planners side by side, as Markdown: reports/problems.md and
+reports/clutter.md.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from constraint_geodesics.benchmark.row import write_table
+from constraint_geodesics.report.cells import fixed, markdown_table
+from constraint_geodesics.studies.problem_runs import figures
+
+Figures = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]
+"""By constraint, scene or "all", and planner."""
+HEADER = (
+    *("scene", "planner", "solved of what any solves", "time [ms], median", "p95"),
+    *("failures too, p95", "length / best known, median", "p95", "wrongly certified"),
+)
+NOTE = (
+    "solved: a certified path that PyBullet finds free at configurations 5 mrad apart, within the "
+    "limit; of the problems that any planner here solves. Times end with the first certified path, "
+    "projection, simplification, band and failed attempts in them; for the limit where there is "
+    'none in "failures too". Best known: the shortest such path that any planner here found. '
+    "Wrongly certified: paths that the certificate takes and PyBullet does not"
+)
+
+
+def write_problem_report(
+    folder: Path,
+    name: str,
+    title: str,
+    about: Sequence[str],
+    table: pd.DataFrame,
+    run: Mapping[str, str],
+) -> None:
+    """Write the rows, gzipped, their figures and the tables: name.csv.gz, name.json, name.md.
+
+    about: sentences to know before the tables.  run: where the rows are from.
+    """
+    found = figures(table)
+    write_table(table, folder / f"{name}.csv.gz", run)
+    told = {"about": list(about), "figures": found}
+    (folder / f"{name}.json").write_text(json.dumps(told, indent=1) + "\n")
+    (folder / f"{name}.md").write_text(problems_markdown(title, about, found))
+
+
+def problems_markdown(title: str, about: Sequence[str], found: Figures) -> str:
+    """All tables, those of all scenes together first.  about: sentences to know before."""
+    parts = [f"# {title}", " ".join(f"{line[0].upper()}{line[1:]}." for line in (*about, NOTE))]
+    parts += ["## All scenes", totals_markdown(found)]
+    for constraint, scenes in found.items():
+        rows = [row for scene, own in scenes.items() if scene != "all" for row in _rows(scene, own)]
+        parts += [f"## Scene by scene: {constraint}", markdown_table([HEADER, *rows])]
+    return "\n\n".join(parts) + "\n"
+
+
+def totals_markdown(found: Figures) -> str:
+    """One table of all scenes together, a part for each constraint."""
+    header = ("constraint", *HEADER[1:])
+    rows = [row for name, scenes in found.items() for row in _rows(name, scenes["all"])]
+    text = markdown_table([header, *rows])
+    apart = [
+        f"{name}: {own['apart']} of {own['problems']} problems have ends that touch something or "
+        "are out of limits, and count nowhere."
+        for name, scenes in found.items()
+        if (own := next(iter(scenes["all"].values())))["apart"]
+    ]
+    shares = [own["core_share"] for scenes in found.values() for own in scenes["all"].values()]
+    had = [share for share in shares if share is not None]
+    busy = [f"Planners had {min(had):.0%} to {max(had):.0%} of a core in the median."] * bool(had)
+    return "\n\n".join([text, *apart, *busy])
+
+
+def _rows(first: str, planners: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
+    return [
+        [
+            first,
+            name,
+            f"{own['solved']} of {own['solvable']}",
+            fixed(own["time_ms_median"], 1),
+            fixed(own["time_ms_p95"], 1),
+            fixed(own["time_all_ms_p95"], 1),
+            fixed(own["ratio_median"], 3),
+            fixed(own["ratio_p95"], 3),
+            str(own["wrongly_certified"]),
+        ]
+        for name, own in planners.items()
+    ]

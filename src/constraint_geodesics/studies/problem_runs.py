@@ -1,0 +1,327 @@
+"""The planner and its baselines on problems in scenes of their own: one batch a scene, one row an
+answer, and the figures of the rows.
+
+All are asked the same problems, one after another in one process on one thread, and judged alike:
+by the certifier, and by PyBullet at configurations DENSE_RAD apart on every path that is answered,
+in a world of its own.  The baselines have the certifier's compiled check for single configurations,
+and are asked again with another seed until the certifier takes their path, as the planner does
+before it answers; all of that is in their time.  A path counts that is there within the limit.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from constraint_geodesics.benchmark.arm_source import ArmSource, opened
+from constraint_geodesics.benchmark.judge import judge_limits
+from constraint_geodesics.benchmark.problem_files import Problem, told
+from constraint_geodesics.benchmark.queries import Query
+from constraint_geodesics.benchmark.row import KEY
+from constraint_geodesics.benchmark.runner import (
+    Answer,
+    Baseline,
+    Look,
+    QueryBatch,
+    batch_rows,
+    fingerprint,
+    rows_to_do,
+    run_batch,
+)
+from constraint_geodesics.certification.certifier import Certifier
+from constraint_geodesics.constraints.constraint import ConstraintManifold
+from constraint_geodesics.learning.lift import densify
+from constraint_geodesics.params import BaselineParams, Params
+from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings, Context
+from constraint_geodesics.peers.ompl_settings import OmplSettings
+from constraint_geodesics.peers.registry import after, kind_of, made_together, settings_of
+from constraint_geodesics.peers.wrappers import UntilSound
+from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import machine
+from constraint_geodesics.problem import PathPlanner, PlanningProblem
+from constraint_geodesics.scene.scene import Scene
+
+MEASURED_BY = ("studies.problem_runs", "studies.problems", "studies.clutter")
+"""The modules that draw, ask and judge: every row depends on what they import."""
+DENSE_RAD = 0.005
+"""Distance of the configurations of an answered path at which PyBullet is asked."""
+COLUMNS = (
+    *("scene", "constraint", "query", "planner", "settings", "status", "valid", "touches"),
+    *("ends", "limit_s", "time_s", "scene_s", "length_rad", "best_known_rad", "looked_at"),
+    *("iterations", "peak_memory_mb", "core_share", "reason"),
+)
+"""Of the table.  valid: the certifier's word; touches: PyBullet's, on the path; ends: what is wrong
+with the ends, if anything; looked_at: configurations that PyBullet was asked about; core_share: of
+a core that the process had meanwhile.
+"""
+_PREPARED: set[tuple[Any, ...]] = set()
+"""Arms and constraints whose roadmaps this process has."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Who is asked.  planners: by name, as `benchmark.planners` of params.yaml has them.  limits_s:
+    of a constraint by name; limit_s: of any other [s].  rows: the folder of kept rows.  code: a
+    digest of the code that the rows depend on.
+    """
+
+    params: Params
+    planners: Mapping[str, BaselineParams]
+    limit_s: float
+    limits_s: Mapping[str, float]
+    rows: Path
+    code: str
+
+    def limit(self, constraint: str) -> float:
+        """Of a query under a constraint [s]."""
+        return self.limits_s.get(constraint, self.limit_s)
+
+
+@dataclass(frozen=True)
+class ProblemBuilder:
+    """Makes planners for one scene after another of an arm whose planner stays open; picklable."""
+
+    params: Params
+    planners: Mapping[str, BaselineParams]
+    arm: ArmSource
+    limit_s: float
+
+    @contextmanager
+    def __call__(
+        self, names: Sequence[str], scene: Scene, constraint: str, manifold: ConstraintManifold
+    ) -> Iterator[tuple[Mapping[str, PathPlanner], Mapping[str, float]]]:
+        """The planners of these names, and the seconds that each took to be ready for the scene:
+        for the planner the change of its scene.  Its roadmap, which knows no scene, is made before.
+        """
+        settings = {name: settings_of(name, self.planners[name]) for name in names}
+        planner = opened(self.arm)
+        began = time.perf_counter()
+        wanted, now = replace(scene, robot=planner.robot), planner.scene.now  # it came by pickle
+        if (now.workcell, now.attached, now.allowed) != (
+            wanted.workcell,
+            wanted.attached,
+            wanted.allowed,
+        ):
+            planner.scene.become(wanted)
+        changed_s = time.perf_counter() - began
+        prepared = self.arm, manifold.constraint.key
+        if prepared not in _PREPARED:
+            planner.prepare(manifold.constraint)
+            _PREPARED.add(prepared)
+        with ExitStack() as stack, Certifier(scene, judge_limits(self.params.judge)) as certifier:
+            shared: dict[str, Any] = {"planner": planner}
+            context = Context(scene, constraint, manifold, self.params, Layout(), stack, shared)
+            made, took = made_together(settings, context)
+            sound = partial(_is_certified, certifier)
+            yield (
+                {
+                    name: UntilSound(own, sound, self.limit_s) if settings[name].random else own
+                    for name, own in made.items()
+                },
+                {name: s + changed_s * settings[name].uses_bundle for name, s in took.items()},
+            )
+
+
+def _is_certified(
+    certifier: Certifier, problem: PlanningProblem, joints: Float[np.ndarray, "T D"]
+) -> bool:
+    constraint = problem.manifold.constraint
+    return certifier.certify(joints, constraint, problem.start, problem.goal).valid
+
+
+@contextmanager
+def watched(query: Query, scene: Scene) -> Iterator[Look]:
+    """What PyBullet says of the ends, and of every path, in a world of its own."""
+    with scene.world() as world:
+        ends = []
+        for name, q in (("start", query.start), ("goal", query.goal)):
+            if scene.robot.limit_distance(q) < 0.0:
+                ends.append(f"{name} is out of limits")
+            elif not world.is_free(q):
+                ends.append(f"{name} touches")
+
+        def look(answer: Answer) -> Mapping[str, Any]:
+            found = {"ends": ", ".join(ends), "touches": False, "looked_at": 0}
+            if len(answer.joints) < 2 or not np.isfinite(answer.joints).all():
+                return found
+            dense = densify(answer.joints, DENSE_RAD)
+            touches = world.first_collision(dense) is not None
+            return found | {"touches": touches, "looked_at": len(dense)}
+
+        yield look
+
+
+def limited(entry: BaselineParams, limit_s: float) -> BaselineParams:
+    """A planner that stops at the limit, where it can be told, and its entry does not say when."""
+    can_stop = issubclass(kind_of(entry.kind), OmplSettings) and "budget_s" not in entry.settings
+    more = {"budget_s": limit_s} if can_stop else {}
+    return BaselineParams.model_validate(entry.model_dump() | more)
+
+
+def batches(problems: Sequence[Problem], asked: Asked) -> list[QueryBatch]:
+    """The problems in batches: those that follow each other in one scene under one constraint.
+
+    Raises BaselineError for a planner that is made of what was trained for another arm.
+    """
+    return [_batch(own, asked) for own in _together(problems)]
+
+
+def _together(problems: Sequence[Problem]) -> Iterator[list[Problem]]:
+    own = list[Problem]()
+    for problem in problems:
+        if own and not (
+            own[0].scene is problem.scene and own[0].constraint_name == problem.constraint_name
+        ):
+            yield own
+            own = []
+        own.append(problem)
+    if own:
+        yield own
+
+
+def _batch(problems: Sequence[Problem], asked: Asked) -> QueryBatch:
+    first, params = problems[0], asked.params
+    name = first.constraint_name
+    limit_s, robot = asked.limit(name), first.scene.robot
+    planners = {own: limited(entry, limit_s) for own, entry in asked.planners.items()}
+    settings = {own: settings_of(own, entry) for own, entry in planners.items()}
+    parts = [
+        asked.code,
+        machine(),
+        params.judge.model_dump(),
+        robot.urdf.read_bytes(),
+        limit_s,
+        *(told(problem) for problem in problems),
+    ]
+    return QueryBatch(
+        scene=first.scene,
+        manifold=ConstraintManifold(robot, first.constraint),
+        queries=tuple(Query(name, own.group, own.number, own.start, own.goal) for own in problems),
+        baselines=tuple(
+            _baseline(own, entry.kind, settings, parts) for own, entry in planners.items()
+        ),
+        build=ProblemBuilder(params, planners, first.arm, limit_s),
+        judge=params.judge,
+        file=asked.rows / f"{_plain(name)}-{_plain(first.group)}-{first.number}.jsonl",
+        asked="certifier",
+        watch=watched,
+    )
+
+
+def _plain(name: str) -> str:
+    return "".join(letter if letter.isalnum() else "_" for letter in name)
+
+
+def _baseline(
+    name: str, kind: str, settings: Mapping[str, BaselineSettings], parts: Sequence[Any]
+) -> Baseline:
+    own = settings[name]
+    if own.trained:
+        raise BaselineError(f"{name!r} is made of what the pipeline trained: it has no such arm")
+    about = [kind, own.model_dump(mode="json")]
+    return Baseline(
+        name=name,
+        seeds=(0,),
+        fingerprint=fingerprint(*about, *parts),
+        kind=kind,
+        settings=fingerprint(*about)[:8],
+        after=after(name, settings),
+        uses_clearance=own.uses_clearance or own.band,
+    )
+
+
+def answered(problems: Sequence[Problem], asked: Asked, description: str) -> pd.DataFrame:
+    """The table of all rows, after those that are not there yet have been made.  description: names
+    the work where its progress is shown.  Raises BaselineError as `batches`.
+    """
+    own = batches(problems, asked)
+    left = [batch for batch in own if rows_to_do(batch)]
+    parallel_map(run_batch, left, asked.params.compute, description=description)
+    return table_of([row for batch in own for row in batch_rows(batch)], asked.limit)
+
+
+def table_of(rows: Sequence[Mapping[str, Any]], limit: Callable[[str], float]) -> pd.DataFrame:
+    """All rows, in the order of problems.  limit: of a constraint [s].  best_known_rad: the
+    shortest certified path that PyBullet finds free, in whatever time.
+    """
+    table = pd.DataFrame(rows)
+    table["limit_s"] = table["constraint"].map(limit)
+    numbers = ["time_s", "scene_s", "length_rad", "peak_memory_mb", "core_share"]
+    table[numbers] = table[numbers].astype(float)
+    assert not table.duplicated(list(KEY)).any()
+    sound = table["valid"] & ~table["touches"]
+    best = table["length_rad"].where(sound).groupby([table[k] for k in _ASKED])
+    table["best_known_rad"] = best.transform("min")
+    return table[list(COLUMNS)]
+
+
+_ASKED = ["scene", "constraint", "query"]
+"""What tells one problem from another."""
+
+
+def figures(table: pd.DataFrame) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
+    """By constraint and scene, and of all its scenes together ("all"), the figures of each planner
+    by name.
+    """
+    found: dict[str, dict[str, dict[str, dict[str, Any]]]] = {}
+    counted = table.assign(
+        solved=table["valid"] & ~table["touches"] & (table["time_s"] <= table["limit_s"])
+    )
+    counted["solvable"] = counted.groupby(_ASKED)["solved"].transform("any")
+    for constraint, own in counted.groupby("constraint", sort=False):
+        scenes = {str(scene): rows for scene, rows in own.groupby("scene", sort=False)}
+        found[str(constraint)] = {
+            scene: {
+                str(name): figures_of(each) for name, each in rows.groupby("planner", sort=False)
+            }
+            for scene, rows in {**scenes, "all": own}.items()
+        }
+    return found
+
+
+def figures_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """Of one planner's rows, with the columns `solved` and `solvable`.
+
+    apart: problems whose ends touch something or are out of limits; they count nowhere else.
+    solvable: of the others, those that any planner solves.  late: paths that are sound, after the
+    limit.  time: of what is solved [ms]; time_all: of what is solvable, a failure as the whole
+    limit.  ratio: of the length to the best known.  wrongly_certified: paths that the certifier
+    takes and PyBullet does not.  refused: paths that a planner answers and the certifier refuses.
+    ready_ms: preparation for the scene; core_share: what the process had of a core; in the median.
+    """
+    within = rows[rows["ends"] == ""]
+    solved, solvable = within[within["solved"]], within[within["solvable"]]
+    whole = (1e3 * solvable["limit_s"]).where(~solvable["solved"], 1e3 * solvable["time_s"])
+    sound = within["valid"] & ~within["touches"]
+    return {
+        "problems": len(rows),
+        "apart": len(rows) - len(within),
+        "solvable": len(solvable),
+        "solved": len(solved),
+        "share": len(solved) / len(solvable) if len(solvable) else None,
+        "late": int((sound & ~within["solved"]).sum()),
+        **_quantiles("time_ms", 1e3 * solved["time_s"]),
+        **_quantiles("time_all_ms", whole),
+        **_quantiles("ratio", solved["length_rad"] / solved["best_known_rad"]),
+        "wrongly_certified": int((rows["valid"] & rows["touches"]).sum()),
+        "refused": int(((within["status"] == "solved") & ~within["valid"]).sum()),
+        "ready_ms": _number(1e3 * within["scene_s"].median()),
+        "core_share": _number(within["core_share"].median()),
+    }
+
+
+def _quantiles(name: str, values: pd.Series) -> dict[str, float | None]:
+    found = {"median": values.median(), "p95": values.quantile(0.95)}
+    return {f"{name}_{which}": _number(value) for which, value in found.items()}
+
+
+def _number(value: Any) -> float | None:
+    return round(float(value), 6) if np.isfinite(value) else None

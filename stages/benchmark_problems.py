@@ -1,0 +1,63 @@
+"""Stage: the planner and its baselines on a file of problems, and on queries with a held tilt in
+their scenes; goes on where an earlier run of it stopped.
+"""
+
+import sys
+
+from constraint_geodesics.benchmark.arm_source import UrdfArm
+from constraint_geodesics.benchmark.entries import code_digest
+from constraint_geodesics.benchmark.problem_files import Problem, every, read_problems
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.code import digest
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import run_header
+from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.report.problems_page import write_problem_report
+from constraint_geodesics.studies.problem_runs import MEASURED_BY, Asked, answered
+from constraint_geodesics.studies.problems import TILTED, tilted
+
+
+def main(params: Params, layout: Layout) -> None:
+    """Write data/problem_rows/ as answers come, then reports/problems.csv.gz, .json and .md."""
+    own, file = params.problems, layout.root / params.problems.file
+    if not file.is_file():
+        what = "the problems are not in this repository; docs/problems.md says where they are from"
+        raise FileNotFoundError(f"{file}: missing: {what}")
+    problems = read_problems(file)
+    asked = every(problems, own.every) + tilted(problems, own.tilted, own.seed)
+    of = Asked(
+        params,
+        own.planners,
+        own.limit_s,
+        {TILTED: own.held_limit_s},
+        layout.problem_rows,
+        code_digest(*MEASURED_BY),
+    )
+    table = answered(asked, of, "problems")
+    each = "" if own.every == 1 else f", of each scene one in {own.every}"
+    about = [
+        f"the problems of {file.name} (SHA-256 {digest(file)}…){each}",
+        f"{own.limit_s:g} s for a query, {own.held_limit_s:g} s with a held tilt",
+        *held_beyond(problems),
+    ]
+    title = "Problems of MotionBenchMaker"
+    write_problem_report(
+        layout.root / "reports", "problems", title, about, table, run_header(layout.root)
+    )
+
+
+def held_beyond(problems: list[Problem]) -> list[str]:
+    """Joints that stand where the URDF does not let them, a sentence each."""
+    arms = {own.arm for own in problems if isinstance(own.arm, UrdfArm)}
+    return sorted(
+        {
+            f"as the file has it, {name} is held at {dict(arm.held)[name]:g}: the URDF's limits "
+            f"are {limits}"
+            for arm in arms
+            for name, limits in arm.beyond_limits.items()
+        }
+    )
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])
