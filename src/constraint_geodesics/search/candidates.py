@@ -21,12 +21,13 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.problem import Status
 from constraint_geodesics.scene.clearance import ClearanceModel, path_stays_clear
 from constraint_geodesics.search.band import PROJECTION, BandSettings
-from constraint_geodesics.search.curve_kernels import relaxed_curve
+from constraint_geodesics.search.curve_kernels import relaxed_curve, rows_along
 from constraint_geodesics.search.roadmap import (
     Joined,
     Roadmap,
     join,
     nearest,
+    points_along,
     resample,
     shortest_way,
 )
@@ -307,7 +308,7 @@ def along(
         if found is not None and _is_clear(task, found.points):
             yield found
     if refine:
-        points = pointsalong(task.clear, corners)
+        points = points_along(task.clear, corners)
         found = _pushed(task, source, points, task.settings)
         if found is None:
             found = _relaxed(task, source, points, task.settings, clear=True, guarded=True)
@@ -419,7 +420,7 @@ def rows_of(candidate: Candidate, violation: float) -> Float[np.ndarray, "T D"]:
     """Rows along the candidate so close that straight joint lines between them leave the constraint
     by less than `violation` [rad or m] halfway.
     """
-    rows: np.ndarray = rowsalong(
+    rows: np.ndarray = rows_along(
         candidate.space, candidate.points, ROW_SAFETY * violation, PROJECTION
     )
     return rows
