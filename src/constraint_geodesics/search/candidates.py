@@ -154,9 +154,12 @@ def candidates(
     yield None
     answer, known = Answer("not_found"), list[Candidate]()
     if blocked is not None and parts.refinement:
-        known = round_it(task, blocked.source, blocked.nodes)
         enough = ALMOST * float(np.linalg.norm(goal - start))
-        if not parts.graph or any(one.length <= enough for one in known):
+        for one in round_it(task, blocked.source, blocked.nodes):
+            known.append(one)
+            if one.length <= enough:
+                break
+        if not parts.graph or (known and known[-1].length <= enough):
             yield from _shortest_first(known)
             known = []
     if parts.graph:
@@ -176,15 +179,13 @@ def candidates(
     yield answer
 
 
-def round_it(task: Task, source: Source, nodes: Float[np.ndarray, "n D"]) -> list[Candidate]:
-    """The ways round what a line of nodes leads through, to either side of it."""
-    found = list[Candidate]()
+def round_it(task: Task, source: Source, nodes: Float[np.ndarray, "n D"]) -> Iterator[Candidate]:
+    """The ways round what a line of nodes leads through, to one side of it and to the other."""
     for side in SIDES:
         bent = bent_round(task.open, task.clear, nodes, side, PROJECTION)
         pushed = None if bent is None else _pushed(task, source, bent, task.settings)
         if pushed is not None:
-            found.append(pushed)
-    return found
+            yield pushed
 
 
 def _shortest_first(found: Iterable[Candidate]) -> Iterator[Candidate]:

@@ -42,7 +42,7 @@ class TreeSettings:
     step_rad: float = 0.15
     iterations: int = 400
     nodes: int = 3000
-    shortcuts: int = 60
+    shortcuts: int = 30
 
 
 def tree_way(
