@@ -26,7 +26,7 @@ from constraint_geodesics.search.explanations import not_connected, refused_end
 from constraint_geodesics.search.preparation import Query
 from constraint_geodesics.search.pursuit import Pursued, shortest, slid
 from constraint_geodesics.search.run_out import refused_velocity, rows_from, run_out, run_outs
-from constraint_geodesics.trajectory import STANDING_S, Asked, Statistics, Trajectory
+from constraint_geodesics.trajectory import STANDING_S, Asked, Statistics, Trajectory, Way
 
 COINCIDENT_RAD = 1e-7
 """Ends that differ by less in every joint are one configuration."""
@@ -178,7 +178,9 @@ class Answering:
             line += f", the shortest found to any of {len(pursued)} configurations"
         if query.snapped_rad:
             line += f", from a start moved by {query.snapped_rad:.2g} rad"
-        return replace(path, explanation=line, statistics=self._statistics(query, path.source))
+        statistics = self._statistics(query, path.source)
+        statistics = replace(statistics, ways=path.statistics.ways)
+        return replace(path, explanation=line, statistics=statistics)
 
     def _pursued(self, query: Query, goals: Iterable[Goal]) -> tuple[list[Pursued], list[_Rest]]:
         """The goals' configurations, the nearest first, and what more there are."""
@@ -309,7 +311,7 @@ class Answering:
             found = self.judged(query, joints, candidate.source, end)
             if not (isinstance(found, Refused) and found.kind in _CLOSER):
                 break
-        return found.why if isinstance(found, Refused) else found
+        return found.why if isinstance(found, Refused) else _beside_others(found, candidate.others)
 
     def _continued(self, query: Query, candidate: Candidate, end: "End") -> Trajectory | str:
         """The candidate, begun from the query's velocity: the first beginning that is certified."""
@@ -401,6 +403,16 @@ class Answering:
     def _statistics(self, query: Query, source: str) -> Statistics:
         spent = time.perf_counter() - query.began
         return Statistics(spent, self.method.name, source, query.snapped_rad, query.looked_at)
+
+
+def _beside_others(path: Trajectory, others: Sequence[Candidate]) -> Trajectory:
+    """The path with the other ways that were found with it."""
+    if not others:
+        return path
+    ways = tuple(Way(one.source, one.length, one.points) for one in others)
+    told = ", ".join(f"{way.source} {way.length_rad:.3f}" for way in ways)
+    line = f"{path.explanation}, the shortest of {len(ways) + 1} ways round (others: {told} rad)"
+    return replace(path, explanation=line, statistics=replace(path.statistics, ways=ways))
 
 
 def _by_turns(

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -62,6 +62,16 @@ class Asked:
     wanted: Float[np.ndarray, "D"] | None = field(default=None, repr=False)
 
 
+class Way(NamedTuple):
+    """A curve that was found with the answer's and is longer: the proposal that it came from, its
+    length [rad] and points (T, D) on it.  It is certified for nothing.
+    """
+
+    source: str
+    length_rad: float
+    points: Float[np.ndarray, "T D"]
+
+
 @dataclass(frozen=True)
 class Statistics:
     """How an answer came about.
@@ -69,7 +79,7 @@ class Statistics:
     planning_time_s: everything, the certificate included.  method: of the planner.  source: the
     proposal that the waypoints came from, "" without a path.  snapped_rad: how far the start was
     moved on request.  looked_at: the goal's configurations [rad], the nearest first; None where
-    the query was refused before.
+    the query was refused before.  ways: others that were found round something, the shortest first.
     """
 
     planning_time_s: float
@@ -77,6 +87,7 @@ class Statistics:
     source: str = ""
     snapped_rad: float = 0.0
     looked_at: Float[np.ndarray, "n D"] | None = field(default=None, repr=False)
+    ways: tuple[Way, ...] = field(default=(), repr=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,10 +323,11 @@ class Trajectory:
         )
 
     def record(self, file: str | Path, frames: int = 100, demonstrations: Any = None) -> None:
-        """Write a Rerun recording: the motion, what of a goal's region and configurations was
-        looked at, and demonstrations, as `identify` takes them, with what of the constraint lies
-        near them.  Raises PlannerError without a path, MissingExtraError without the extra
-        `record`, DemonstrationError for demonstrations that can't be read.
+        """Write a Rerun recording: the motion, other ways that were found, in grey, what of a
+        goal's region and configurations was looked at, and demonstrations, as `identify` takes
+        them, with what of the constraint lies near them.  Raises PlannerError without a path,
+        MissingExtraError without the extra `record`, DemonstrationError for demonstrations that
+        can't be read.
         """
         require("record")
         from constraint_geodesics.identification.demonstrations import demonstrations_from
@@ -334,6 +346,7 @@ class Trajectory:
         record = PathRecord(
             "planner", name, 0, 0, self.joints, text, goal=goal, demonstrations=shown
         )
+        record = replace(record, ways=tuple(way.points for way in self.statistics.ways))
         manifold = ConstraintManifold(self.scene.robot, self.constraint)
         around, carried = self.scene.workcell, self.scene.attached
         record_path(Path(file), record, manifold, around, frames=frames, attached=carried)

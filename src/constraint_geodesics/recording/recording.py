@@ -106,6 +106,8 @@ class PathRecord:
     """What was asked to reach, where it is more than the last configuration."""
     demonstrations: Sequence[Float[np.ndarray, "T D"]] = ()
     """What the constraint was found in [rad or m], if it was."""
+    ways: Sequence[Float[np.ndarray, "T D"]] = ()
+    """Others that were found [rad or m]."""
     meshes: bool = True
     """Whether the file holds the meshes of robot and bodies, to be opened anywhere; without them it
     is a tenth as large and names the URDFs that `geodesics replay` adds them from.
@@ -184,6 +186,7 @@ def record_path(
     chunks = [
         *scene_chunks(robot, workcell, sampled, meshes=path.meshes, attached=attached),
         *tool_chunks(sampled, rgb(palette.planner_colour(path.planner))),
+        *_way_chunks(robot, path.ways),
         *(static(*drawing) for drawing in goal_drawings(robot, path.goal)),
         *(
             static(*drawing)
@@ -408,6 +411,14 @@ def _package_path(urdf: Path) -> Iterator[None]:
             del os.environ[name]
         else:
             os.environ[name] = before
+
+
+def _way_chunks(robot: SerialRobot, ways: Sequence[Float[np.ndarray, "T D"]]) -> Iterator[Chunk]:
+    """The tool's lines on other ways, in grey."""
+    if ways:
+        lines = [robot.forward(points)[0] for points in ways]
+        grey = rgb(palette.GREY)
+        yield static("tool/ways", rr.LineStrips3D(lines, colors=[grey], radii=[_WIDTH]))
 
 
 def tool_chunks(sampled: Frames, colour: tuple[int, int, int]) -> Iterator[Chunk]:

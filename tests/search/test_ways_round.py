@@ -1,0 +1,90 @@
+"""Lines bent round a sphere, and answers that name the ways that were found round it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.planner_fixtures import nodes_of, packaged_planner
+from tests.recording.files import column
+
+from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.search.band import PROJECTION, project
+from constraint_geodesics.search.ways_round import SIDES, bent_round
+from constraint_geodesics.trajectory import Trajectory
+
+
+def queries(name: str, count: int) -> list[tuple[np.ndarray, np.ndarray, Sphere, Trajectory]]:
+    """Ends, a sphere that the shortest path without it runs into, and that path."""
+    planner, rng = packaged_planner(), np.random.default_rng(2)
+    nodes, _ = nodes_of(name)
+    found = list[tuple[np.ndarray, np.ndarray, Sphere, Trajectory]]()
+    while len(found) < count:
+        start, goal = nodes[rng.integers(len(nodes), size=2)]
+        path = planner.plan(start, goal, name)
+        if path.status != "solved" or path.source != "straight" or path.length_rad < 1.0:
+            continue
+        tool = planner.robot.forward(path.at(rng.uniform(0.3, 0.7)))[0]
+        ball = Sphere("ball", tuple(tool.tolist()), 0.06)
+        with planner.scene.including([ball]):
+            free = planner._certifier.collisions
+            if free.free(np.stack([start, goal])).all() and not free.is_clear(path.joints):
+                found.append((start, goal, ball, path))
+    return found
+
+
+@pytest.mark.parametrize("name", ["free", "level_cup"])
+def test_a_line_is_bent_out_of_a_sphere_to_either_side(name: str) -> None:
+    planner, sides = packaged_planner(), 0
+    for start, goal, ball, _ in queries(name, 12):
+        share = np.linspace(0.0, 1.0, 17)[:, None]
+        line = (1.0 - share) * start + share * goal
+        with planner.scene.including([ball]):
+            task = planner._preparation.task(planner.constraints[name])
+            project(task.open, line[1:-1])
+            if task.clearance.clearance(planner.robot, line).min() > 0.0:
+                continue  # under a constraint the line itself may lead elsewhere
+            deepest = int(task.clearance.clearance(planner.robot, line[1:-1]).argmin()) + 1
+            bent = [bent_round(task.open, task.clear, line, side, PROJECTION) for side in SIDES]
+            for nodes in bent:
+                if nodes is None:
+                    continue
+                sides += 1
+                np.testing.assert_array_equal(nodes[[0, -1]], line[[0, -1]])
+                margin = task.settings.clearance_m - 1e-6
+                assert task.clearance.clearance(planner.robot, nodes[deepest]) >= margin
+                assert task.manifold.violation(nodes[deepest]) <= 1e-8
+            if all(nodes is not None for nodes in bent):
+                moved = [nodes[deepest] - line[deepest] for nodes in bent]
+                assert moved[0] @ moved[1] < 0.0
+    assert sides >= 8
+
+
+def test_nothing_is_bent_where_nothing_is_near() -> None:
+    planner = packaged_planner()
+    task = planner._preparation.task(planner.constraints["free"])
+    start, _, _, path = queries("free", 1)[0]
+    line = np.ascontiguousarray(path.joints[:9])
+    for side in SIDES:
+        assert bent_round(task.open, task.clear, line, side, PROJECTION) is None
+    assert start.tobytes() == line[0].tobytes()
+
+
+def test_an_answer_names_the_other_ways_and_a_recording_draws_them(tmp_path: Path) -> None:
+    planner, named = packaged_planner(), 0
+    for start, goal, ball, _ in queries("level_cup", 12):
+        path = planner.plan(start, goal, "level_cup", scene=[ball])
+        if path.status != "solved":
+            continue
+        lengths = [way.length_rad for way in path.statistics.ways]
+        assert lengths == sorted(lengths)
+        assert ("ways round" in path.explanation) == bool(lengths)
+        for way in path.statistics.ways:
+            assert way.length_rad > path.length_rad * (1.0 - 1e-3)
+            np.testing.assert_allclose(way.points[[0, -1]], [start, goal], atol=1e-12)
+            assert f"{way.source} {way.length_rad:.3f}" in path.explanation
+        if lengths:
+            path.record(tmp_path / "path.rrd", frames=5)
+            strips = column(tmp_path / "path.rrd", "/tool/ways", "LineStrips3D:strips")[0]
+            assert len(strips) == len(lengths)
+            named += 1
+    assert named >= 3
