@@ -1,0 +1,237 @@
+"""What a change of the scene costs, and what the planner answers to it: a sphere on the way, a cup
+that is carried, a sphere that comes up while the arm moves.
+"""
+
+import itertools
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from constraint_geodesics.constraints.constraint import Pose
+from constraint_geodesics.planner import Planner
+from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.cylinder import Cylinder
+from constraint_geodesics.scene.shape import Placement
+from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.studies.problem_runs import DENSE_RAD
+from constraint_geodesics.trajectory import Trajectory
+
+RADII_M, MIDDLE = (0.05, 0.08), (0.3, 0.7)
+"""Of a sphere, and the share of the path without it at which the arm meets it."""
+OFF_M = 0.03
+"""Standard deviation by which it is beside the tool."""
+SHORTEST_RAD = 1.0
+"""Of the paths that a sphere is put on."""
+BUDGETS_S = (None, 0.03, 0.1, 0.5)
+"""None: the first answer; the last is the reference for lengths."""
+CUP_M = (0.12, 0.04)
+"""Height and radius of the cup."""
+SUDDEN = 0.25
+"""Share of the motion at which a sphere comes up."""
+TRIES = 20
+
+Rows = Iterator[dict[str, Any]]
+
+
+def pairs(planner: Planner, name: str, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Ends from the constraint's roadmap, without end."""
+    nodes, rng = planner.nodes(name), np.random.default_rng(seed)
+    while True:
+        start, goal = nodes[rng.integers(len(nodes), size=2)]
+        yield start, goal
+
+
+def touches(path: Trajectory) -> bool:
+    """Whether PyBullet, in a world of its own, finds anything in touch on a path, asked every
+    DENSE_RAD.
+    """
+    if path.status != "solved":
+        return False
+    with path.scene.world() as world:
+        return not world.free(_dense(path.joints)).all()
+
+
+def _dense(joints: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "n D"]:
+    rows = [joints[:1]]
+    for first, last in itertools.pairwise(joints):
+        count = max(int(np.ceil(np.linalg.norm(last - first) / DENSE_RAD)), 1)
+        rows.append(first + np.arange(1, count + 1)[:, None] / count * (last - first))
+    return np.concatenate(rows)
+
+
+def _row(path: Trajectory, **about: Any) -> dict[str, Any]:
+    solved = path.status == "solved"
+    return about | {
+        "status": path.status,
+        "source": path.source,
+        "ms": 1e3 * path.planning_time_s,
+        "length_rad": path.length_rad if solved else np.nan,
+        "touches": touches(path),
+    }
+
+
+def beside_a_sphere(planner: Planner, name: str, count: int, seed: int) -> Rows:
+    """Queries whose path without it runs into a sphere, ends clear of it, with each budget."""
+    rng, number = np.random.default_rng(seed + 1), 0
+    for start, goal in pairs(planner, name, seed):
+        if number == count:
+            return
+        path = planner.plan(start, goal, name)
+        if path.status != "solved" or path.length_rad < SHORTEST_RAD:
+            continue
+        tool, _ = planner.robot.forward(path.at(rng.uniform(*MIDDLE)))
+        place = tuple((tool + OFF_M * rng.normal(size=3)).tolist())
+        ball = Sphere("ball", place, rng.uniform(*RADII_M))
+        if not _meets(ball, path, np.stack([start, goal])):
+            continue
+        for budget in BUDGETS_S:
+            found = planner.plan(start, goal, name, scene=[ball], budget_s=budget)
+            about = {"constraint": name, "query": number, "budget_ms": 1e3 * (budget or 0.0)}
+            yield _row(found, **about)
+        number += 1
+
+
+def _meets(ball: Sphere, path: Trajectory, free: np.ndarray) -> bool:
+    """Whether a path runs into a ball that certain configurations are free of, by PyBullet."""
+    around = path.scene.adding(ball)
+    with around.world() as world:
+        return bool(world.free(free).all()) and not world.free(_dense(path.joints)).all()
+
+
+def loaded(planner: Planner, name: str, count: int, seed: int) -> Rows:
+    """Queries with a cup attached to the tool."""
+    height, radius = CUP_M
+    pose = Placement((0.0, 0.0, 0.5 * height))
+    planner.scene.attach(Cylinder("cup", pose, height, radius), link=planner.robot.tool_link)
+    try:
+        for number, (start, goal) in enumerate(pairs(planner, name, seed)):
+            if number == count:
+                return
+            yield _row(planner.plan(start, goal, name), constraint=name, query=number)
+    finally:
+        planner.scene.detach("cup")
+
+
+def sudden(planner: Planner, name: str, count: int, seed: int) -> Rows:
+    """Motions in whose way a sphere comes up, beyond where the arm could stop."""
+    rng, number = np.random.default_rng(seed + 1), 0
+    for start, goal in pairs(planner, name, seed):
+        if number == count:
+            return
+        path = planner.plan(start, goal, name)
+        if path.status != "solved" or path.length_rad < SHORTEST_RAD:
+            continue
+        at_s = SUDDEN * float(path.times[-1])
+        ball = _in_the_way(planner, path, at_s, rng)
+        if ball is None:
+            continue
+        planner.scene.add(ball)
+        began = time.perf_counter()
+        answer = planner.replan(path, at_s)
+        spent = 1e3 * (time.perf_counter() - began)
+        valid = answer.certificate is not None and answer.certificate.valid
+        row = _row(answer, constraint=name, query=number, certified=valid)
+        planner.scene.remove("sudden")
+        yield row | {"ms": spent}
+        number += 1
+
+
+def _in_the_way(
+    planner: Planner, path: Trajectory, at_s: float, rng: np.random.Generator
+) -> Sphere | None:
+    """A sphere on a link's end that the rest of a path runs into, clear of stop and goal."""
+    stop = path.stop(at_s)
+    earliest = at_s + 1.05 * float(stop.times[-1])
+    for _ in range(TRIES if earliest < path.times[-1] else 0):
+        place = path.state(rng.uniform(earliest, float(path.times[-1]))).configuration
+        ends = planner.robot.skeleton(place)[3:]
+        middle = tuple(ends[rng.integers(len(ends))].tolist())
+        ball = Sphere("sudden", middle, rng.uniform(*RADII_M))
+        if _meets(ball, path, np.vstack([stop.joints, path.joints[-1:]])):
+            return ball
+    return None
+
+
+def changes(planner: Planner, others: int, count: int, seed: int) -> Rows:
+    """Milliseconds of each kind of change among other shapes."""
+    rng = np.random.default_rng(seed)
+    for k in range(others):
+        place = tuple((rng.uniform((0.4, -0.9, 0.1), (0.9, 0.9, 1.0))).tolist())
+        planner.scene.add(Box(f"other {k}", place, (0.02, 0.02, 0.02)))
+    try:
+        for number in range(count):
+            for kind, spent in _changed(planner, rng):
+                yield {"change": kind, "among": others, "query": number, "ms": spent}
+    finally:
+        planner.scene.remove(*(f"other {k}" for k in range(others)))
+
+
+def _changed(planner: Planner, rng: np.random.Generator) -> Iterator[tuple[str, float]]:
+    scene, link = planner.scene, planner.robot.tool_link
+    crate = Box("crate", (0.6, 0.4, 0.2), (0.1, 0.1, 0.1))
+    elsewhere = Pose(rng.uniform((0.4, -0.9, 0.1), (0.9, 0.9, 1.0)), np.eye(3))
+    cup = Cylinder("cup", Placement((0.0, 0.0, 0.06)), *CUP_M)
+    steps: Sequence[tuple[str, Callable[[], object]]] = (
+        ("add", lambda: scene.add(crate)),
+        ("move", lambda: scene.move("crate", elsewhere)),
+        ("remove", lambda: scene.remove("crate")),
+        ("attach", lambda: scene.attach(cup, link=link)),
+        ("detach", lambda: scene.detach("cup")),
+    )
+    for kind, change in steps:
+        began = time.perf_counter()
+        change()
+        yield kind, 1e3 * (time.perf_counter() - began)
+
+
+def sphere_figures(rows: pd.DataFrame) -> dict[str, Any]:
+    """By constraint and together: what is solved of what any budget solves, times, and lengths over
+    the shortest of all budgets.
+    """
+    best = rows.groupby(["constraint", "query"]).length_rad.transform("min")
+    never = rows[best.isna()].drop_duplicates(["constraint", "query"])
+    rows = rows.assign(ratio=rows.length_rad / best)[best.notna()]
+    groups = [("all", rows), *rows.groupby("constraint", sort=False)]
+    found = {str(name): _by_budget(own) for name, own in groups}
+    return found | {"solved with no budget": len(never)}
+
+
+def _by_budget(rows: pd.DataFrame) -> dict[str, Any]:
+    found = {}
+    for budget, own in rows.groupby("budget_ms"):
+        solved = own[own.status == "solved"]
+        found["first answer" if budget == 0.0 else f"{budget:.0f} ms"] = {
+            "queries": len(own),
+            "solved": len(solved),
+            "touching": int(own.touches.sum()),
+            "ms_median": _quantile(solved.ms, 0.5),
+            "ms_p95": _quantile(solved.ms, 0.95),
+            "ratio_median": _quantile(solved.ratio, 0.5),
+            "ratio_p95": _quantile(solved.ratio, 0.95),
+        }
+    return found
+
+
+def answer_figures(rows: pd.DataFrame) -> dict[str, Any]:
+    """How many of each status, times of all, and how many touch something."""
+    return {
+        "queries": len(rows),
+        "statuses": {str(k): int(n) for k, n in rows.status.value_counts().items()},
+        "touching": int(rows.touches.sum()),
+        "ms_median": _quantile(rows.ms, 0.5),
+        "ms_p95": _quantile(rows.ms, 0.95),
+    }
+
+
+def change_figures(rows: pd.DataFrame) -> dict[str, Any]:
+    """Medians [ms] by how many other shapes there are, and the kind of change."""
+    medians = rows.groupby(["among", "change"]).ms.median().unstack()
+    return {str(among): row.to_dict() for among, row in medians.iterrows()}
+
+
+def _quantile(values: pd.Series, share: float) -> float | None:
+    return float(values.quantile(share)) if len(values) else None

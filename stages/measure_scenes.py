@@ -1,0 +1,55 @@
+"""Stage: what changes of a scene cost and what the planner answers to them: spheres on the way, a
+cup that is carried, spheres that come up while the arm moves.
+"""
+
+import json
+import sys
+
+import pandas as pd
+
+from constraint_geodesics.benchmark.row import write_table
+from constraint_geodesics.bundle import read_bundle
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import machine, run_header
+from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.planner import Planner
+from constraint_geodesics.studies import changing_scenes as study
+
+SEED, SPHERES, CUPS, SUDDEN, CHANGES = 0, 100, 200, 100, 20
+LOADED = "level_cup"
+AMONG = (1, 100)
+
+
+def main(params: Params, layout: Layout) -> None:
+    """Write reports/scenes.csv.gz and reports/scenes.json."""
+    with Planner(read_bundle(layout.planner), str(layout.planner)) as planner:
+        for name in params.constraints:
+            planner.prepare(name)
+        tables = {
+            "changes": [row for n in AMONG for row in study.changes(planner, n, CHANGES, SEED)],
+            "cup": list(study.loaded(planner, LOADED, CUPS, SEED)),
+            "sudden": list(study.sudden(planner, LOADED, SUDDEN, SEED)),
+            "sphere": [
+                row
+                for name in params.constraints
+                for row in study.beside_a_sphere(planner, name, SPHERES, SEED)
+            ],
+        }
+    frames = {name: pd.DataFrame(rows) for name, rows in tables.items()}
+    found = {
+        "machine": machine(),
+        "changes_ms": study.change_figures(frames["changes"]),
+        "cup_carried": study.answer_figures(frames["cup"]),
+        "sudden_spheres": study.answer_figures(frames["sudden"])
+        | {"certified": int(frames["sudden"].certified.sum())},
+        "beside_a_sphere": study.sphere_figures(frames["sphere"]),
+    }
+    rows = pd.concat([frame.assign(study=name) for name, frame in frames.items()])
+    reports = layout.root / "reports"
+    write_table(rows, reports / "scenes.csv.gz", run_header(layout.root))
+    (reports / "scenes.json").write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])

@@ -1,0 +1,69 @@
+"""The study of scenes that change, small, on the real planner; its figures on known rows."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from tests.planner_fixtures import packaged_planner
+
+from constraint_geodesics.studies import changing_scenes as study
+
+NAME = "level_cup"
+
+
+def test_every_sphere_is_on_the_way_and_no_answer_touches_it() -> None:
+    planner, before = packaged_planner(), packaged_planner().scene.now
+    rows = pd.DataFrame(study.beside_a_sphere(planner, NAME, 2, seed=3))
+    assert len(rows) == 2 * len(study.BUDGETS_S)
+    assert set(rows.status) == {"solved"}
+    assert not rows.touches.any()
+    assert planner.scene.now == before
+
+
+def test_the_cup_is_carried_while_it_is_asked_and_gone_after() -> None:
+    planner, before = packaged_planner(), packaged_planner().scene.now
+    rows = study.loaded(planner, NAME, 3, seed=3)
+    first = next(rows)
+    assert "cup" in planner.scene.now.names
+    table = pd.DataFrame([first, *rows])
+    assert planner.scene.now == before
+    assert len(table) == 3
+    assert not table.touches.any()
+
+
+def test_a_motion_is_answered_when_a_sphere_comes_up() -> None:
+    planner, before = packaged_planner(), packaged_planner().scene.now
+    rows = pd.DataFrame(study.sudden(planner, NAME, 2, seed=3))
+    assert set(rows.status) <= {"solved", "stopped"}
+    assert rows.certified.all()
+    assert planner.scene.now == before
+
+
+def test_changes_of_each_kind_are_timed_and_taken_back() -> None:
+    planner, before = packaged_planner(), packaged_planner().scene.now
+    found = study.change_figures(pd.DataFrame(study.changes(planner, 2, 2, seed=3)))
+    assert set(found["2"]) == {"add", "move", "remove", "attach", "detach"}
+    assert min(found["2"].values()) > 0.0
+    assert planner.scene.now == before
+
+
+def test_lengths_are_over_the_best_and_what_nobody_solves_is_counted_apart() -> None:
+    lengths = {(0, 0.0): 2.2, (0, 30.0): 2.0, (1, 0.0): 3.0, (1, 30.0): np.nan, (2, 0.0): np.nan}
+    rows = pd.DataFrame(
+        {
+            "constraint": NAME,
+            "query": query,
+            "budget_ms": budget,
+            "status": "not_found" if np.isnan(length) else "solved",
+            "ms": 5.0,
+            "length_rad": length,
+            "touches": False,
+        }
+        for (query, budget), length in lengths.items()
+    )
+    found = study.sphere_figures(rows)
+    assert found["solved with no budget"] == 1
+    first, more = found[NAME]["first answer"], found[NAME]["30 ms"]
+    assert (first["queries"], first["solved"], more["solved"]) == (2, 2, 1)
+    assert first["ratio_median"] == pytest.approx(1.05)
+    assert more["ratio_p95"] == pytest.approx(1.0)
+    assert found["all"] == found[NAME]
