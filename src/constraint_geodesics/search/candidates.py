@@ -404,12 +404,14 @@ def _relaxed(
     the constraint or the limits, or jump.
     """
     around = task.clear if clear else task.open
+    # what is not relaxed is projected out of what it overlaps
+    space = task.open if settings.iterations else around
     sound, relaxed, points, length, iterations = relaxed_curve(
-        task.open, around, np.ascontiguousarray(nodes), settings.steps(guarded, wider), PROJECTION
+        space, around, np.ascontiguousarray(nodes), settings.steps(guarded, wider), PROJECTION
     )
     if not sound:
         return None
-    return Candidate(source, task.open, points, length, relaxed, iterations, clear)
+    return Candidate(source, space, points, length, relaxed, iterations, clear)
 
 
 def _is_clear(task: Task, points: Float[np.ndarray, "n D"]) -> bool:
