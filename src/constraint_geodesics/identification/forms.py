@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.constraints.polynomial import Relation
 from constraint_geodesics.constraints.tool_features import FEATURES
@@ -149,14 +150,17 @@ def _axis_sides(x: Numbers) -> tuple[Relation, ...]:
 
 
 def _orientation_start(sample: Sample) -> Numbers:
+    """R₀ as a vector of its axis and angle [rad]: of nine numbers, those of mirrored frames would
+    fit as well.
+    """
     left, _, right = np.linalg.svd(sample.rotation.mean(axis=0))
-    return (left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right).ravel()
+    mean = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return Rotation.from_matrix(mean).as_rotvec()
 
 
 def _orientation_relations(x: Numbers) -> tuple[Relation, ...]:
     """vee(R₀ᵀR − RᵀR₀)/2 = 0."""
-    left, _, right = np.linalg.svd(x.reshape(3, 3))
-    held, found = left @ right, []
+    held, found = Rotation.from_rotvec(x).as_matrix(), []
     for i, j in ((2, 1), (0, 2), (1, 0)):
         linear = np.zeros(FEATURES)
         linear[3 + 3 * j : 6 + 3 * j] += 0.5 * held[:, i]
@@ -167,9 +171,8 @@ def _orientation_relations(x: Numbers) -> tuple[Relation, ...]:
 
 def _orientation_sides(x: Numbers) -> tuple[Relation, ...]:
     """(3 − tr R₀ᵀR)/4 = (1 − cos θ)/2 ≤ 1/2: within 90°, for half turns have the same zeros."""
-    left, _, right = np.linalg.svd(x.reshape(3, 3))
     linear = np.zeros(FEATURES)
-    linear[3:] = -0.25 * (left @ right).T.ravel()
+    linear[3:] = -0.25 * Rotation.from_rotvec(x).as_matrix().T.ravel()
     words = _orientation_relations(x)[0].name
     return (Relation(words, "rad", 0.75, linear, None, 0.5),)
 
