@@ -362,15 +362,14 @@ def _pushed(
     """The curve through a band that is pushed clear of what may meet; where it clips something
     between the places that are looked at, with a wider margin, and then with more nodes too.
     """
-    for wider in MARGINS:
+    unrefined = settings.iterations < task.settings.iterations
+    for wider in MARGINS[:1] if unrefined else MARGINS:
         found = _relaxed(task, source, nodes, settings, clear=True, wider=wider)
         if found is None:
             return None
         if _is_clear(task, found.points):
             return found
-        if settings.iterations < task.settings.iterations:
-            return None
-        nodes = found.nodes if wider == 1.0 else _halved(found.nodes)
+        nodes = found.nodes if wider == MARGINS[0] else _halved(found.nodes)
         settings = replace(settings, iterations=AGAIN)
     return None
 
