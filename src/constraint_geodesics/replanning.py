@@ -18,7 +18,6 @@ from constraint_geodesics.answering import Answering, End, Refused
 from constraint_geodesics.geometry.braking import Motion, State, ahead
 from constraint_geodesics.goals.goal import ConfigurationGoal
 from constraint_geodesics.problem import PlannerError, Status
-from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.search.candidates import rows_of
 from constraint_geodesics.search.preparation import Preparation, Query
 from constraint_geodesics.search.repair import onward, over_graph, repaired
@@ -47,7 +46,7 @@ class Replanning:
         began = time.perf_counter()
         state = trajectory.state(at_s)
         robot = self.answering.certifier.scene.robot
-        if not _same(robot, trajectory.scene.robot):
+        if not robot.moves_like(trajectory.scene.robot):
             raise PlannerError(f"the trajectory is of another robot than {robot.name}")
         query = self._query(trajectory, state, began)
         rest = _Rest(trajectory, state)
@@ -66,12 +65,12 @@ class Replanning:
         return self._timed(query, self._stopped(query, stop, refused))
 
     def _query(self, trajectory: Trajectory, state: State, began: float) -> Query:
-        asked, wanted = trajectory.asked, trajectory.asked.wanted
+        asked = trajectory.asked
         return Query(
             self.preparation.task(asked.constraint),
             asked.name,
             state.configuration,
-            trajectory.joints[-1] if wanted is None else wanted,
+            trajectory.wanted,
             began,
             scales=asked.scales,
             regions=asked.regions,
@@ -100,7 +99,7 @@ class Replanning:
     def _stop(self, query: Query, rest: "_Rest") -> Motion | None:
         """The hardest stop on the way."""
         pace, manifold = self.answering.pace(query), query.task.manifold
-        found = stopping(rest.motion, rest.state, pace, manifold)
+        found = stopping(rest.trajectory.motion, rest.state, pace, manifold)
         return None if found is None else found[0]
 
     def _others(
@@ -167,14 +166,6 @@ class _Rest:
     trajectory: Trajectory
     state: State
 
-    @property
-    def motion(self) -> Motion:
-        """The whole of it."""
-        own = self.trajectory
-        resting = np.zeros(own.joints.shape[1])
-        start = resting if own.start_velocity is None else own.start_velocity
-        return Motion(own.joints, own.times, start)
-
     def rows(self, query: Query) -> Iterator[Float[np.ndarray, "n D"]]:
         """Its waypoints, and others on the same curve."""
         rows = ahead(self.trajectory.joints, self.state)
@@ -185,12 +176,3 @@ class _Rest:
         if curve is not None:
             pace = self.trajectory.asked.pace
             yield rows_from(curve, self.state.configuration, self.state.velocity, pace, REDRAWN)
-
-
-def _same(own: SerialRobot, other: SerialRobot) -> bool:
-    """Whether two robots move alike."""
-    if own is other:
-        return True
-    names = own.joint_names == other.joint_names and own.tool_link == other.tool_link
-    limits = np.array_equal([own.lower, own.upper], [other.lower, other.upper]) if names else False
-    return limits and all(map(np.array_equal, own.chain, other.chain))

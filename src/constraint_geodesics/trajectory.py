@@ -210,7 +210,7 @@ class Trajectory:
         """
         self._require_path("save")
         names = self.scene.robot.joint_names
-        write_trajectory(Path(file), self._motion, self.constraint, names)
+        write_trajectory(Path(file), self.motion, self.constraint, names)
 
     def to_joint_trajectory(self) -> dict[str, Any]:
         """As ROS's trajectory_msgs/JointTrajectory: `joint_names`, and `points` with `positions`
@@ -223,7 +223,7 @@ class Trajectory:
         """
         self._require_path("use")
         steps, durations = np.diff(self.joints, axis=0), np.diff(self.times)[:, None]
-        first = self._motion.start_velocity
+        first = self.motion.start_velocity
         speeds = np.vstack([first, steps / durations, np.zeros_like(first)])
         lasting = np.pad(durations, ((1, 1), (0, 0)))
         both = lasting[:-1] + lasting[1:]
@@ -252,7 +252,7 @@ class Trajectory:
         acceleration between them.  Raises PlannerError without a path, or for another time.
         """
         self._require_path("use")
-        return state_at(self._motion, self._moment(at_s))
+        return state_at(self.motion, self._moment(at_s))
 
     def stop(self, at_s: float) -> "Trajectory":
         """The hardest stop on the path from its state at a time [s]: the shortest that the limits
@@ -269,8 +269,8 @@ class Trajectory:
         self._require_path("stop on")
         began, moment = time.perf_counter(), self._moment(at_s)
         manifold = ConstraintManifold(self.scene.robot, self.constraint)
-        state = state_at(self._motion, moment)
-        stop = stopping(self._motion, state, self.asked.pace, manifold)
+        state = state_at(self.motion, moment)
+        stop = stopping(self.motion, state, self.asked.pace, manifold)
         if stop is None:
             raise PlannerError(f"at_s = {at_s}: the arm can't stop on the path any more")
         motion, on_path = stop
@@ -280,13 +280,18 @@ class Trajectory:
         about = replace(self.statistics, planning_time_s=spent, snapped_rad=0.0)
         about = replace(about, source="stop", looked_at=None)
         start = motion.start_velocity if motion.start_velocity.any() else None
-        wanted = self.joints[-1] if self.asked.wanted is None else self.asked.wanted
-        asked = replace(self.asked, wanted=wanted)
+        asked = replace(self.asked, wanted=self.wanted)
         found = motion.joints, motion.times, line, asked, about, known, start
         return Trajectory("stopped", *found)
 
     @property
-    def _motion(self) -> Motion:
+    def wanted(self) -> Float[np.ndarray, "D"]:
+        """The configuration that a motion is to reach [rad]: its last unless it stops before."""
+        return self.joints[-1] if self.asked.wanted is None else self.asked.wanted
+
+    @property
+    def motion(self) -> Motion:
+        """Waypoints and times, and the velocity at the first."""
         start = self.start_velocity
         resting = np.zeros(self.joints.shape[1])
         return Motion(self.joints, self.times, resting if start is None else start)

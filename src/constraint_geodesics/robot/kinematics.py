@@ -56,6 +56,19 @@ class SerialRobot:
         """Number of joints D."""
         return len(self.joint_names)
 
+    def moves_like(self, other: "SerialRobot") -> bool:
+        """Whether another robot has the same joints and limits, and its tool is where this one's
+        is.
+        """
+        if self is other:
+            return True
+        names = (self.joint_names, self.tool_link) == (other.joint_names, other.tool_link)
+        return (
+            names
+            and np.array_equal([self.lower, self.upper], [other.lower, other.upper])
+            and all(map(np.array_equal, self.chain, other.chain))
+        )
+
     def forward(
         self, q: Float[np.ndarray, "*batch D"]
     ) -> tuple[Float[np.ndarray, "*batch 3"], Float[np.ndarray, "*batch 3 3"]]:

@@ -135,8 +135,5 @@ class PlanningScene:
 
 def _are_same(first: SerialRobot, second: SerialRobot) -> bool:
     """Whether all is the same that a scene takes of a robot."""
-    return first is second or (
-        (first.urdf, first.tool_link, first.joint_names, first.allowed)
-        == (second.urdf, second.tool_link, second.joint_names, second.allowed)
-        and np.array_equal([first.lower, first.upper], [second.lower, second.upper])
-    )
+    files = (first.urdf, first.allowed) == (second.urdf, second.allowed)
+    return files and first.moves_like(second)

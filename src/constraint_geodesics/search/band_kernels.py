@@ -30,9 +30,16 @@ from constraint_geodesics.constraints.kernels import (
 )
 from constraint_geodesics.constraints.projection import normal_matrix
 from constraint_geodesics.robot.kernels import LANES
-from constraint_geodesics.scene.clearance import Contacts, new_contacts, stays_clear
+from constraint_geodesics.scene.clearance import Contacts, new_contacts
 from constraint_geodesics.search.push_kernels import Push, new_push, penalise
-from constraint_geodesics.search.space import NEAR, Workspace, look_at, project_all, workspace
+from constraint_geodesics.search.space import (
+    NEAR,
+    Workspace,
+    is_free,
+    look_at,
+    project_all,
+    workspace,
+)
 
 _DIFFERENCE = 1e-5
 _SMALLEST_PIVOT = 1e-12
@@ -489,12 +496,7 @@ def _new_band(around, nodes):
     )
 
 
-@njit(**LEAF)
-def _is_clear(around, first, second, contacts):
-    return stays_clear(around.chain, around.clearance, first, second, contacts)
-
-
-@njit(**LEAF)
+@njit(inline="always", **LEAF)
 def _hold_back(around, nodes, band):
     """Leave nodes where they were, `nodes`, if a line that touched nothing would from or to where
     they would be, `band.trial`; tells which lines touch something still.
@@ -506,7 +508,7 @@ def _hold_back(around, nodes, band):
     while i < n:
         # the line between two nodes that are held is one of before, whatever it touches
         both = held[i] and held[i + 1]
-        clear = not both and _is_clear(around, trial[i], trial[i + 1], band.contacts)
+        clear = not both and is_free(around, trial[i], trial[i + 1], band)
         band.still[i] = band.blocked[i] and not clear
         if both or clear or band.blocked[i]:
             i += 1
@@ -632,7 +634,7 @@ def relax_band(space, around, nodes, settings):
     value = _valued(around, margin, nodes, band.push, band.contacts)
     if guarded:
         for i in range(n):
-            band.blocked[i] = not _is_clear(around, nodes[i], nodes[i + 1], band.contacts)
+            band.blocked[i] = not is_free(around, nodes[i], nodes[i + 1], band)
     for _ in range(most):
         used += 1
         _linearise_band(space, nodes, band, work)

@@ -2,22 +2,21 @@
 that is carried, a sphere that comes up while the arm moves.
 """
 
-import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
 
 from constraint_geodesics.constraints.constraint import Pose
+from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.shape import Placement
 from constraint_geodesics.scene.sphere import Sphere
-from constraint_geodesics.studies.problem_runs import DENSE_RAD
+from constraint_geodesics.studies.problem_runs import DENSE_RAD, quantiles
 from constraint_geodesics.trajectory import Trajectory
 
 RADII_M, MIDDLE = (0.05, 0.08), (0.3, 0.7)
@@ -45,6 +44,14 @@ def pairs(planner: Planner, name: str, seed: int) -> Iterator[tuple[np.ndarray, 
         yield start, goal
 
 
+def _long_paths(planner: Planner, name: str, seed: int) -> Iterator[Trajectory]:
+    """Those between such ends that something can be put on."""
+    for start, goal in pairs(planner, name, seed):
+        path = planner.plan(start, goal, name)
+        if path.status == "solved" and path.length_rad >= SHORTEST_RAD:
+            yield path
+
+
 def touches(path: Trajectory) -> bool:
     """Whether PyBullet, in a world of its own, finds anything in touch on a path, asked every
     DENSE_RAD.
@@ -52,15 +59,7 @@ def touches(path: Trajectory) -> bool:
     if path.status != "solved":
         return False
     with path.scene.world() as world:
-        return not world.free(_dense(path.joints)).all()
-
-
-def _dense(joints: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "n D"]:
-    rows = [joints[:1]]
-    for first, last in itertools.pairwise(joints):
-        count = max(int(np.ceil(np.linalg.norm(last - first) / DENSE_RAD)), 1)
-        rows.append(first + np.arange(1, count + 1)[:, None] / count * (last - first))
-    return np.concatenate(rows)
+        return world.first_collision(densify(path.joints, DENSE_RAD)) is not None
 
 
 def _row(path: Trajectory, **about: Any) -> dict[str, Any]:
@@ -77,12 +76,10 @@ def _row(path: Trajectory, **about: Any) -> dict[str, Any]:
 def beside_a_sphere(planner: Planner, name: str, count: int, seed: int) -> Rows:
     """Queries whose path without it runs into a sphere, ends clear of it, with each budget."""
     rng, number = np.random.default_rng(seed + 1), 0
-    for start, goal in pairs(planner, name, seed):
+    for path in _long_paths(planner, name, seed):
         if number == count:
             return
-        path = planner.plan(start, goal, name)
-        if path.status != "solved" or path.length_rad < SHORTEST_RAD:
-            continue
+        start, goal = path.joints[[0, -1]]
         tool, _ = planner.robot.forward(path.at(rng.uniform(*MIDDLE)))
         place = tuple((tool + OFF_M * rng.normal(size=3)).tolist())
         ball = Sphere("ball", place, rng.uniform(*RADII_M))
@@ -99,7 +96,8 @@ def _meets(ball: Sphere, path: Trajectory, free: np.ndarray) -> bool:
     """Whether a path runs into a ball that certain configurations are free of, by PyBullet."""
     around = path.scene.adding(ball)
     with around.world() as world:
-        return bool(world.free(free).all()) and not world.free(_dense(path.joints)).all()
+        touched = world.first_collision(densify(path.joints, DENSE_RAD)) is not None
+        return bool(world.free(free).all()) and touched
 
 
 def loaded(planner: Planner, name: str, count: int, seed: int) -> Rows:
@@ -119,12 +117,9 @@ def loaded(planner: Planner, name: str, count: int, seed: int) -> Rows:
 def sudden(planner: Planner, name: str, count: int, seed: int) -> Rows:
     """Motions in whose way a sphere comes up, beyond where the arm could stop."""
     rng, number = np.random.default_rng(seed + 1), 0
-    for start, goal in pairs(planner, name, seed):
+    for path in _long_paths(planner, name, seed):
         if number == count:
             return
-        path = planner.plan(start, goal, name)
-        if path.status != "solved" or path.length_rad < SHORTEST_RAD:
-            continue
         at_s = SUDDEN * float(path.times[-1])
         ball = _in_the_way(planner, path, at_s, rng)
         if ball is None:
@@ -208,10 +203,8 @@ def _by_budget(rows: pd.DataFrame) -> dict[str, Any]:
             "queries": len(own),
             "solved": len(solved),
             "touching": int(own.touches.sum()),
-            "ms_median": _quantile(solved.ms, 0.5),
-            "ms_p95": _quantile(solved.ms, 0.95),
-            "ratio_median": _quantile(solved.ratio, 0.5),
-            "ratio_p95": _quantile(solved.ratio, 0.95),
+            **quantiles("ms", solved.ms),
+            **quantiles("ratio", solved.ratio),
         }
     return found
 
@@ -222,8 +215,7 @@ def answer_figures(rows: pd.DataFrame) -> dict[str, Any]:
         "queries": len(rows),
         "statuses": {str(k): int(n) for k, n in rows.status.value_counts().items()},
         "touching": int(rows.touches.sum()),
-        "ms_median": _quantile(rows.ms, 0.5),
-        "ms_p95": _quantile(rows.ms, 0.95),
+        **quantiles("ms", rows.ms),
     }
 
 
@@ -231,7 +223,3 @@ def change_figures(rows: pd.DataFrame) -> dict[str, Any]:
     """Medians [ms] by how many other shapes there are, and the kind of change."""
     medians = rows.groupby(["among", "change"]).ms.median().unstack()
     return {str(among): row.to_dict() for among, row in medians.iterrows()}
-
-
-def _quantile(values: pd.Series, share: float) -> float | None:
-    return float(values.quantile(share)) if len(values) else None

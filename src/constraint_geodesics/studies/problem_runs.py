@@ -308,9 +308,9 @@ def figures_of(rows: pd.DataFrame) -> dict[str, Any]:
         "solved": len(solved),
         "share": len(solved) / len(solvable) if len(solvable) else None,
         "late": int((sound & ~within["solved"]).sum()),
-        **_quantiles("time_ms", 1e3 * solved["time_s"]),
-        **_quantiles("time_all_ms", whole),
-        **_quantiles("ratio", solved["length_rad"] / solved["best_known_rad"]),
+        **quantiles("time_ms", 1e3 * solved["time_s"]),
+        **quantiles("time_all_ms", whole),
+        **quantiles("ratio", solved["length_rad"] / solved["best_known_rad"]),
         "wrongly_certified": int((rows["valid"] & rows["touches"]).sum()),
         "refused": int(((within["status"] == "solved") & ~within["valid"]).sum()),
         "ready_ms": _number(1e3 * within["scene_s"].median()),
@@ -318,7 +318,8 @@ def figures_of(rows: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def _quantiles(name: str, values: pd.Series) -> dict[str, float | None]:
+def quantiles(name: str, values: pd.Series) -> dict[str, float | None]:
+    """Median and 95th percentile under that name; None of no values."""
     found = {"median": values.median(), "p95": values.quantile(0.95)}
     return {f"{name}_{which}": _number(value) for which, value in found.items()}
 
