@@ -200,6 +200,14 @@ def test_large_arrays_arrive_writable() -> None:
     assert parallel_map(overwrite, items, TWO) == [1.0, 1.0]
 
 
+def test_workers_are_where_the_caller_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("before", "now"):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)
+        parallel_map(touch, [Path("0"), Path("1")], TWO)
+        assert {file.name for file in (tmp_path / name).iterdir()} == {"0", "1"}
+
+
 def test_the_failing_item_is_named_in_one_line(dask: ComputeParams) -> None:
     for settings in (ONE, TWO, dask):
         with pytest.raises(ComputeError) as caught:

@@ -108,9 +108,10 @@ class _Task(Generic[Item, Result]):
         set_torch_threads(1)
         return self(index, item)
 
-    def below(self, parent: int, index: int, item: Item) -> tuple[int, Result]:
-        """In a worker on this machine."""
+    def below(self, parent: int, folder: str, index: int, item: Item) -> tuple[int, Result]:
+        """In a worker on this machine, which may be left from work in another folder."""
         _end_after(parent)
+        os.chdir(folder)
         return self.in_worker(index, item)
 
 
@@ -150,7 +151,8 @@ def _on_loky(
     task: _Task[Item, Result], items: Sequence[Item], workers: int
 ) -> Generator[tuple[int, Result], None, None]:
     calls = (
-        joblib.delayed(task.below)(os.getpid(), index, item) for index, item in enumerate(items)
+        joblib.delayed(task.below)(os.getpid(), os.getcwd(), index, item)
+        for index, item in enumerate(items)
     )
     # max_nbytes=None: joblib would hand large arrays over read-only, which the other backends don't
     with joblib.parallel_config(
