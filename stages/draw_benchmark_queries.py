@@ -44,7 +44,7 @@ def main(params: Params, layout: Layout) -> None:
 
 def draw(params: Params, layout: Layout, constraint: str) -> None:
     """Spheres stand on the shortest path that some planners find."""
-    settings, scene = params.benchmark, Scene.from_params(params)
+    settings, scene = params.benchmark, Scene.from_params(params, constraint)
     manifold = constraint_manifold(scene.robot, params.all_constraints[constraint])
     build = BaselineBuilder(params, layout.root)
     with (

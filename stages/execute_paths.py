@@ -29,7 +29,7 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     """Write reports/execute_paths/<constraint>.csv and .json, and the executions to
     record.
     """
-    scene, settings = Scene.from_params(params), params.execution
+    scene, settings = Scene.from_params(params, constraint), params.execution
     manifold, cup = (
         constraint_manifold(scene.robot, params.constraints[constraint]),
         CupSettings(spheres=settings.spheres),
@@ -43,6 +43,7 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
         found = tipping_queries(scene, manifold, constraint, settings)
         carrying = Carrying(constraint, scene, manifold, params.planner.acceleration_rad_s2, cup)
         with Planner(read_bundle(layout.planner), str(layout.planner)) as planner:
+            planner.scene.become(scene)
             plan = partial(planner.plan, constraint=constraint)
             table, executed = execute_queries(plan, carrying, found.queries)
         files = []

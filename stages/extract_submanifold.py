@@ -26,7 +26,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     """Write data/submanifolds/<manifold>-<constraint>/ and its figures."""
     item = f"{manifold}-{constraint}"
     sources = [layout.joints("free"), layout.joints(constraint)]
-    scene = Scene.from_params(params)
+    scene = Scene.from_params(params, constraint)
     constrained = constraint_manifold(scene.robot, params.constraints[constraint])
     about = subject_of(params, constraint=constraint, manifold=manifold)
     with (

@@ -27,7 +27,7 @@ STAGE = "label_joints"
 
 def main(params: Params, layout: Layout, constraint: str) -> None:
     """Write data/joints/<constraint>/ and its data card."""
-    scene = Scene.from_params(params)
+    scene = Scene.from_params(params, constraint)
     manifold = constraint_manifold(scene.robot, params.constraints[constraint])
     labels = params.labels
     rows = labels.free_rows if constraint == "free" else labels.constrained_rows

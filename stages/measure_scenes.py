@@ -14,6 +14,7 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine, run_header
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.planner import Planner
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies import changing_scenes as study
 
 SEED, SPHERES, CUPS, SUDDEN, CHANGES = 0, 100, 200, 100, 20
@@ -23,12 +24,13 @@ AMONG = (1, 100)
 
 def main(params: Params, layout: Layout) -> None:
     """Write reports/scenes.csv.gz and reports/scenes.json."""
+    carrying = Scene.from_params(params, LOADED)
     with Planner(read_bundle(layout.planner), str(layout.planner)) as planner:
         for name in params.constraints:
             planner.prepare(name)
         tables = {
             "changes": [row for n in AMONG for row in study.changes(planner, n, CHANGES, SEED)],
-            "cup": list(study.loaded(planner, LOADED, CUPS, SEED)),
+            "cup": list(study.loaded(planner, carrying, LOADED, CUPS, SEED)),
             "sudden": list(study.sudden(planner, LOADED, SUDDEN, SEED)),
             "sphere": [
                 row

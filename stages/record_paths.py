@@ -51,11 +51,11 @@ def record_table(table: Recordable) -> None:
     else:
         file = layout.report("benchmark_planners", constraint, "csv")
         folder = layout.benchmark(constraint)
-    rows, scene = named_rows(file), Scene.from_params(params)
+    rows, scene = named_rows(file), Scene.from_params(params, constraint)
     recorder = RowRecorder(
         constraint,
         constraint_manifold(scene.robot, params.constraints[constraint]),
-        scene.workcell,
+        scene,
         LearnedManifold.load(layout.manifold(manifold)),
         load_submanifold(layout.submanifold(manifold, constraint)),
         params.recording.frames,

@@ -39,7 +39,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         f"{manifold}-{constraint}",
         [layout.joints(constraint), layout.queries(constraint)],
     )
-    scene = Scene.from_params(params)
+    scene = Scene.from_params(params, constraint)
     constrained = constraint_manifold(scene.robot, params.constraints[constraint])
     learned, joints = (
         LearnedManifold.load(layout.manifold(manifold)),

@@ -15,6 +15,7 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE, ITEM = "train_path_diffusion", "paths"
@@ -25,7 +26,10 @@ def main(params: Params, layout: Layout) -> None:
     settings, bundle = params.path_diffusion, read_bundle(layout.planner)
     work = Work(STAGE, ITEM, settings, [layout.planner], subject_of(params))
     with tracked_stage(work, params.tracking.experiment, layout.root) as run:
-        tasks = [PathTask(bundle, name, settings) for name in params.constraints]
+        tasks = [
+            PathTask(bundle, Scene.from_params(params, name), name, settings)
+            for name in params.constraints
+        ]
         parts = parallel_map(planned_examples, tasks, params.compute, description="planned paths")
         trained = train_path_diffusion(Examples.joined(parts), settings, run.metric_logger())
         trained.model.save(layout.path_diffusion)

@@ -27,27 +27,16 @@ STAGE = "train_policies"
 
 def main(params: Params, layout: Layout) -> None:
     """Write data/policies/<chart>/, learning curves and figures."""
-    scene, settings, chart = (
-        Scene.from_params(params),
-        params.policy_settings(),
-        params.policies.chart,
-    )
+    robot = Scene.from_params(params).robot
+    settings, chart = params.policy_settings(), params.policies.chart
     sources = [layout.joints(name) for name in params.constraints]
-    space = chart_named(chart, layout.manifold(chart), scene.robot)
-    problem = training_problem(
-        params,
-        scene,
-        [
-            policy_problem(
-                params,
-                space,
-                scene,
-                constraint_manifold(scene.robot, constraint),
-                read_joints(layout.joints(name)).free_joints,
-            )
-            for name, constraint in params.constraints.items()
-        ],
-    )
+    space = chart_named(chart, layout.manifold(chart), robot)
+    asked = []
+    for name, constraint in params.constraints.items():
+        scene, manifold = Scene.from_params(params, name), constraint_manifold(robot, constraint)
+        joints = read_joints(layout.joints(name)).free_joints
+        asked.append((scene, policy_problem(params, space, scene, manifold, joints)))
+    problem = training_problem(params, asked)
     about = subject_of(params, manifold=chart, reward=settings.reward)
     with tracked_stage(
         Work(STAGE, chart, settings.of_training("length_degree"), sources, about),

@@ -34,6 +34,7 @@ def shapes(raw: dict[str, Any]) -> dict[str, Any]:
 
 PIPE = {"kind": "capsule", "from_m": [0, 0, 1], "to_m": [1, 0, 1], "radius_m": 0.1}
 BAD: list[tuple[Change, tuple[str, ...]]] = [
+    (lambda p: p["carried"].update(constraints=["cup"]), ("carried.constraints='cup'", "slide")),
     (lambda p: p.update(speed=1), ("speed=1", "no such parameter")),
     (lambda p: p["labels"].update(free_row=5), ("labels.free_row=5", "no such parameter")),
     (lambda p: p["labels"].update(free_rows="60"), ("labels.free_rows='60'", "integer")),
@@ -110,6 +111,11 @@ REFUSED: list[tuple[Change, tuple[str, ...]]] = [
     ),
     (lambda p: shapes(p).update(door=DOOR), ("workcell", "nowhere.urdf")),
     (lambda p: shapes(p)["table"].update(exempt_links=["arm"]), ("workcell", "arm")),
+    (lambda p: p["carried"]["shapes"].update(door=DOOR), ("carried", "nowhere.urdf")),
+    (
+        lambda p: p["carried"]["shapes"].update(link5=p["workcell"]["shapes"]["table"]),
+        ("carried", "link5"),
+    ),
     (
         lambda p: p["manifolds"]["paper"].update(latent_dim=7),
         ("manifolds.paper.latent_dim=7", "at most 6"),

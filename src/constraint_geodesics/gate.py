@@ -30,24 +30,25 @@ def check_params(params: Params) -> None:
 
 
 def _check_robot(params: Params) -> None:
-    """URDF, tool link, joints, limits and collision shapes; then the workcell's bodies and the
-    links they name.
+    """URDF, tool link, joints, limits and collision shapes; then the bodies of the workcell, and
+    those that are carried, and the links they name.
     """
-    robot = params.robot
+    robot, carried = params.robot, params.carried
     try:
         read_pieces(robot_from(robot).urdf)
     except ParseError as error:
         raise ParamsError(f"robot.urdf: {find_urdf(robot.urdf)}: no URDF: {error}") from None
     except (ValueError, OSError) as error:
         raise ParamsError(f"robot: {error}") from None
-    try:
-        scene = Scene.from_params(params)
-        for shape in scene.workcell:
-            shape.pieces()
-        with scene.world():
-            pass
-    except (ValueError, OSError, RuntimeError) as error:
-        raise ParamsError(f"workcell: {error}") from None
+    for entry, constraint in (("workcell", ""), ("carried", next(iter(carried.constraints), ""))):
+        try:
+            scene = Scene.from_params(params, constraint)
+            for shape in (*scene.workcell, *(one.shape for one in scene.attached)):
+                shape.pieces()
+            with scene.world():
+                pass
+        except (ValueError, OSError, RuntimeError) as error:
+            raise ParamsError(f"{entry}: {error}") from None
 
 
 def _problems(params: Params) -> Iterator[str]:

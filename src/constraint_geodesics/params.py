@@ -76,12 +76,26 @@ class WorkcellParams(_Record):
         """Each shape with its name."""
         if not isinstance(raw, dict):
             return raw
-        found = dict(raw.get("shapes") or {})
-        for name, shape in found.items():
-            if isinstance(shape, dict):  # lists become tuples here, as JSON's strict mode has them
-                given = {k: tuple(v) if isinstance(v, list) else v for k, v in shape.items()}
-                found[name] = given | {"name": name}
-        return raw | {"shapes": found}
+        found = {
+            name: shape | {"name": name} if isinstance(shape, dict) else shape
+            for name, shape in (raw.get("shapes") or {}).items()
+        }
+        return _tuples(raw | {"shapes": found})
+
+
+def _tuples(value: Any) -> Any:
+    """With tuples for lists, as the strict mode of JSON has them."""
+    if isinstance(value, dict):
+        return {name: _tuples(own) for name, own in value.items()}
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+class CarriedParams(WorkcellParams):
+    """What the arm carries in the tasks of some constraints: shapes by name, in the frame of its
+    tool link, which may touch them.
+    """
+
+    constraints: tuple[Name, ...] = ()
 
 
 class ComputeParams(_Record):
@@ -652,6 +666,7 @@ class Params(_Record):
     compute: ComputeParams
     labels: LabelParams
     constraints: Annotated[dict[Name, ConstraintParams], Field(min_length=1)]
+    carried: CarriedParams = CarriedParams()
     manifolds: Annotated[dict[Name, ManifoldParams], Field(min_length=1)]
     submanifold: SubmanifoldParams
     geodesics: GeodesicParams
@@ -699,28 +714,25 @@ class Params(_Record):
             raise ValueError(
                 f"unseen={sorted(again)}: these are among the constraints that are trained on"
             )
-        for name in self.clutter.constraints:
-            if name not in self.constraints:
-                raise ValueError(
-                    f"clutter.constraints={name!r}: must be one of {sorted(self.constraints)}"
-                )
-        geodesics, charts = self.geodesics, self.compare_charts
+        geodesics, charts, constraints = self.geodesics, self.compare_charts, self.constraints
         for study, name, taken in (
             ("compare_manifolds.vae", self.compare_manifolds.vae, self.manifolds),
             ("compare_charts.vae", charts.vae, self.manifolds),
             ("demonstrations.learned.vae", self.demonstrations.learned.vae, self.manifolds),
-            ("compare_charts.constraint", charts.constraint, self.constraints),
+            ("compare_charts.constraint", charts.constraint, constraints),
         ):
             if name not in taken:
                 raise ValueError(f"{study}={name!r}: must be one of {sorted(taken)}")
         for entry, names, known in (
-            ("searched", geodesics.searched, self.manifolds),
-            ("illustrated", geodesics.illustrated, self.manifolds),
-            ("illustrated_constraints", geodesics.illustrated_constraints, self.constraints),
+            ("geodesics.searched", geodesics.searched, self.manifolds),
+            ("geodesics.illustrated", geodesics.illustrated, self.manifolds),
+            ("geodesics.illustrated_constraints", geodesics.illustrated_constraints, constraints),
+            ("clutter.constraints", self.clutter.constraints, constraints),
+            ("carried.constraints", self.carried.constraints, self.all_constraints),
         ):
             for name in names:
                 if name not in known:
-                    raise ValueError(f"geodesics.{entry}={name!r}: must be one of {sorted(known)}")
+                    raise ValueError(f"{entry}={name!r}: must be one of {sorted(known)}")
         return self
 
 

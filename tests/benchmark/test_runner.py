@@ -28,6 +28,7 @@ from constraint_geodesics.benchmark.runner import (
 from constraint_geodesics.params import load_params
 from constraint_geodesics.peers.straight_band import StraightBand
 from constraint_geodesics.problem import Solution
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere
 
 PARAMS = load_params(Path(__file__).parents[2] / "params.yaml")
@@ -288,3 +289,5 @@ def test_the_committed_queries_are_those_of_the_parameters() -> None:
         queries = read_queries(file)
         assert {query.constraint for query in queries} == {file.stem}
         assert [query.number for query in queries] == list(range(2 * PARAMS.benchmark.queries))
+        with Scene.from_params(PARAMS, file.stem).world() as world:  # with what is carried
+            assert world.free(np.array([[q.start, q.goal] for q in queries]).reshape(-1, 6)).all()

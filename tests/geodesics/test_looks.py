@@ -105,7 +105,7 @@ def test_figures_alone_cost_the_same(problem, looked) -> None:
 
 
 def test_spheres_are_on_the_way_of_their_pairs(problem, scene) -> None:
-    found = with_spheres(problem, scene.workcell, 3, (0.06, 0.1), np.random.default_rng(2))
+    found = with_spheres(problem, scene, 3, (0.06, 0.1), np.random.default_rng(2))
     assert len(found) == 3
     robot = problem.manifold.robot
     for member in found:

@@ -142,7 +142,8 @@ def test_the_network_sees_what_is_held_at_which_pose() -> None:
 
 
 def test_planned_examples_are_there_and_back() -> None:
-    found = planned_examples(PathTask(packaged_bundle(), "level_cup", SMALL))
+    scene = packaged_planner().scene.now
+    found = planned_examples(PathTask(packaged_bundle(), scene, "level_cup", SMALL))
     assert found.seen.shape == (2, found.paths.shape[1], SEEN)
     assert 1 <= found.paths.shape[1] <= SMALL.queries
     odd = np.array([1.0, -1.0, 1.0, -1.0])[:, None]  # of sin(kπ(1 − t))

@@ -12,8 +12,9 @@ from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.params import Params
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.studies.cup import CupSettings, Execution, execute
+from constraint_geodesics.studies.cup import CupSettings, Execution, _cup_in_tool, execute
 
 UP_IN_TOOL = np.array([0.0, 1.0, 0.0])
 """Direction of a level cup's opening in the tool frame of the side grasp."""
@@ -36,6 +37,23 @@ def turned(start: np.ndarray, joint: int, angle: float, rows: int = 300) -> np.n
 
 def timed(robot: SerialRobot, path: np.ndarray, acceleration: float = 4.0) -> np.ndarray:
     return time_parametrisation(path, robot.velocity, np.full(robot.dof, acceleration))
+
+
+def test_the_cup_that_is_carried_encloses_the_one_of_the_simulation(params: Params) -> None:
+    """Its walls' corners, in the tool's frame; the bottom is in them."""
+    (held,) = Scene.from_params(params, "level_cup").attached
+    assert held.link == params.robot.tool_link
+    assert isinstance(held.shape, Cylinder)
+    settings = CupSettings()
+    position, turn = _cup_in_tool(UP_IN_TOOL, settings)
+    up = Rotation.from_quat(turn).as_matrix()[:, 2]
+    half = 0.5 * held.shape.length_m
+    outer = (settings.inner_radius_m + settings.wall_m) / np.cos(np.pi / settings.walls)
+    inside = held.shape.at.matrix[:3]
+    assert np.allclose(inside[:, 3], position)
+    assert abs(up @ inside[:, 2]) == pytest.approx(1.0)
+    assert (half, held.shape.radius_m) >= (0.5 * settings.height_m, outer)
+    assert not Scene.from_params(params, "tool_down").attached
 
 
 def run(

@@ -110,12 +110,12 @@ def batches_of(run: Run) -> list[QueryBatch]:
     """
     params, settings = run.params, run.params.benchmark
     learned = {name: LearnedManifold.load(run.layout.manifold(name)) for name in run.learned}
-    scene, build = Scene.from_params(params), BaselineBuilder(params, run.layout.root)
+    build = BaselineBuilder(params, run.layout.root)
     shared, found = _shared_parts(run), list[tuple[int, QueryBatch]]()
     for (constraint, name), own in _by_case(run.queries).items():
-        described = params.all_constraints[constraint]
+        described, scene = params.all_constraints[constraint], Scene.from_params(params, constraint)
         ends = [[q.number, *q.start.tolist(), *q.goal.tolist(), repr(q.obstacle)] for q in own]
-        parts = [*shared, described.model_dump(), ends]
+        parts = [*shared, described.model_dump(), repr(scene.attached), ends]
         for first in range(0, min(settings.queries, len(own)), settings.batch):
             baselines = _baselines(run, constraint, first, parts)
             if not baselines:

@@ -5,7 +5,7 @@ They are drawn once and kept in git (data/benchmark_queries/), so that they hang
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +51,7 @@ class Query:
         """The workcell with this query's obstacle."""
         if self.obstacle is None:
             return scene
-        return replace(scene, workcell=(*scene.workcell, self.obstacle))
+        return scene.adding(self.obstacle)
 
 
 def write_queries(queries: Sequence[Query], file: Path) -> None:
@@ -132,7 +132,7 @@ def _between(scene: Scene, joints: Float[np.ndarray, "T D"], radius_m: float) ->
     half = joints[int(np.searchsorted(passed, 0.5 * passed[-1]))]
     x, y, z = map(float, scene.robot.forward(half)[0])
     ball = Sphere(KEEP_OUT, (x, y, z), radius_m)
-    with Scene(scene.robot, (*scene.workcell, ball)).world() as world:
+    with scene.adding(ball).world() as world:
         ends_free = world.is_free(joints[0]) and world.is_free(joints[-1])
         return ball if ends_free and world.first_collision(joints) is not None else None
 

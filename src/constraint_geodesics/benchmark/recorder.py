@@ -64,8 +64,9 @@ class PathRecorder:
             meshes=False,
         )
         file = (self.folder / query.constraint / name).resolve()
-        workcell, root = answer.scene.workcell, self.root.resolve()
-        record_path(file, record, answer.manifold, workcell, frames=self.frames)
+        around, carried = answer.scene.workcell, answer.scene.attached
+        record_path(file, record, answer.manifold, around, frames=self.frames, attached=carried)
+        root = self.root.resolve()
         return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.as_posix()
 
 

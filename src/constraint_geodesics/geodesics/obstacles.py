@@ -1,6 +1,5 @@
 """Spheres on the way of curves: what policies learn to go round, and what they are asked to."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,6 @@ from constraint_geodesics.geodesics.learned_problem import LearnedProblem
 from constraint_geodesics.geodesics.problem import Ends
 from constraint_geodesics.scene.clearance import ClearanceModel, clearance_model
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.sphere import Sphere
 
 NAME = "keep_out"
@@ -26,7 +24,7 @@ counts.
 
 def with_spheres(
     problem: LearnedProblem,
-    workcell: Sequence[Shape],
+    scene: Scene,
     count: int,
     radii_m: tuple[float, float],
     rng: np.random.Generator,
@@ -47,7 +45,7 @@ def with_spheres(
         node = int(rng.integers(points // 4, points - points // 4))
         x, y, z = map(float, robot.forward(curves[row, node])[0])
         sphere = Sphere(NAME, (x, y, z), float(rng.uniform(*radii_m)))
-        clearance = clearance_model(Scene(robot, (*workcell, sphere)))
+        clearance = clearance_model(scene.adding(sphere))
         on_way = met_by(problem, clearance, curves)
         if on_way.sum() >= FEWEST_PAIRS:
             pairs = np.stack([ends.q_start[on_way], ends.q_goal[on_way]], axis=1)

@@ -20,6 +20,7 @@ from constraint_geodesics.learning.path_diffusion import (
 )
 from constraint_geodesics.params import PathDiffusionParams
 from constraint_geodesics.planner import Planner
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search.candidates import ALL_PARTS
 from constraint_geodesics.search.roadmap import resample
 
@@ -41,9 +42,10 @@ LEAST_SCALE = 1e-3
 
 @dataclass(frozen=True)
 class PathTask:
-    """Paths of one constraint to plan, by its name in the bundle; picklable."""
+    """Paths of one constraint to plan in its scene, by its name in the bundle; picklable."""
 
     bundle: Bundle
+    scene: Scene
     constraint: str
     settings: PathDiffusionParams
 
@@ -80,8 +82,8 @@ def planned_examples(task: PathTask) -> Examples:
     settings, name = task.settings, task.constraint
     with Planner(task.bundle, "for training") as planner:
         manifold = ConstraintManifold(planner.robot, planner.constraints[name])
-        scene, seed = planner.scene.now, settings.query_seed
-        ends = draw_queries(scene, manifold, name, settings.queries, seed)
+        planner.scene.become(task.scene)
+        ends = draw_queries(task.scene, manifold, name, settings.queries, settings.query_seed)
         parts, found = replace(ALL_PARTS, tree=False), []
         for start, goal in zip(ends.starts, ends.goals, strict=True):
             path = planner.plan(start, goal, name, parts=parts)

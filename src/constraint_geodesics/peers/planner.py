@@ -91,6 +91,8 @@ def _opened(context: Context, method: str) -> Planner:
     bundle = replace(context.bundle, workcell=within)
     found = open_method(method, context.layout.planner, bundle)
     planner = context.opened.enter_context(Planner(bundle, "the pipeline's outputs", found))
+    if context.scene.attached:
+        planner.scene.become(context.scene)
     constraint = context.manifold.constraint
     planner.prepare(constraint)
     nodes, trees = planner.nodes(constraint), Parts(straight=False, graph=False)

@@ -13,7 +13,7 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import GridSubmanifold, Submanifold
 from constraint_geodesics.recording.recording import LatentView, PathRecord, record_path
-from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.scene import Scene
 
 PRINCIPAL = ("first principal axis", "second principal axis")
 GRID_POINTS = 80
@@ -26,7 +26,7 @@ class RowRecorder:
 
     constraint: str
     manifold: ConstraintManifold
-    workcell: Sequence[Shape]
+    scene: Scene
     learned: LearnedManifold
     submanifold: Submanifold
     frames: int
@@ -43,7 +43,8 @@ class RowRecorder:
             latent, allowed = self._latent_view(joints), self.tolerance
             path = PathRecord(*key, joints, text, latent, tolerance=allowed, meshes=False)
             file = Path(row["recording"])
-            record_path(file, path, self.manifold, self.workcell, frames=self.frames)
+            around, carried = self.scene.workcell, self.scene.attached
+            record_path(file, path, self.manifold, around, frames=self.frames, attached=carried)
 
     def _latent_view(self, joints: Float[np.ndarray, "T D"]) -> LatentView:
         """The sub-manifold and the encoded path in the latent plane, or in two principal axes."""

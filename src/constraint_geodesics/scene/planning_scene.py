@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -129,6 +130,7 @@ class PlanningScene:
         """Take all of another scene of the same robot."""
         if not _are_same(scene.robot, self.robot):
             raise SceneError(f"a scene of another robot: this one is {self.robot.name}")
+        scene = replace(scene, robot=self.robot)  # it may have come by pickle
         self._follow(scene)
         self._now = scene
 

@@ -29,9 +29,15 @@ class Scene:
     allowed: frozenset[tuple[str, str]] = frozenset()
 
     @classmethod
-    def from_params(cls, params: Params) -> "Scene":
-        """Raises RobotError if a URDF, link or limit does not exist."""
-        return cls(robot_from(params.robot), workcell_from(params.workcell))
+    def from_params(cls, params: Params, constraint: str = "") -> "Scene":
+        """constraint: name of the one in whose task the arm carries something, if it does.  Raises
+        RobotError if a URDF, link or limit does not exist.
+        """
+        scene = cls(robot_from(params.robot), workcell_from(params.workcell))
+        if constraint in params.carried.constraints:
+            for shape in workcell_from(params.carried):
+                scene = scene.attaching(Attached(shape, params.robot.tool_link))
+        return scene
 
     def world(self) -> World:
         """A fresh PyBullet world; close it, or use it as a context manager."""

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from constraint_geodesics.constraints.constraint import Pose
+from constraint_geodesics.constraints.constraint import ConstraintManifold, Pose
+from constraint_geodesics.learning.dataset import draw_queries
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.cylinder import Cylinder
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.shape import Placement
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.studies.problem_runs import DENSE_RAD, quantiles
@@ -27,8 +29,6 @@ SHORTEST_RAD = 1.0
 """Of the paths that a sphere is put on."""
 BUDGETS_S = (None, 0.03, 0.1, 0.5)
 """None: the first answer; the last is the reference for lengths."""
-CUP_M = (0.12, 0.04)
-"""Height and radius of the cup."""
 SUDDEN = 0.25
 """Share of the motion at which a sphere comes up."""
 TRIES = 20
@@ -100,18 +100,16 @@ def _meets(ball: Sphere, path: Trajectory, free: np.ndarray) -> bool:
         return bool(world.free(free).all()) and touched
 
 
-def loaded(planner: Planner, name: str, count: int, seed: int) -> Rows:
-    """Queries with a cup attached to the tool."""
-    height, radius = CUP_M
-    pose = Placement((0.0, 0.0, 0.5 * height))
-    planner.scene.attach(Cylinder("cup", pose, height, radius), link=planner.robot.tool_link)
+def loaded(planner: Planner, scene: Scene, name: str, count: int, seed: int) -> Rows:
+    """Queries in a scene in which the arm carries something, between ends that are free with it."""
+    before, manifold = planner.scene.now, ConstraintManifold(scene.robot, planner.constraints[name])
+    ends = draw_queries(scene, manifold, name, count, seed)
+    planner.scene.become(scene)
     try:
-        for number, (start, goal) in enumerate(pairs(planner, name, seed)):
-            if number == count:
-                return
-            yield _row(planner.plan(start, goal, name), constraint=name, query=number)
+        for number, pair in enumerate(zip(ends.starts, ends.goals, strict=True)):
+            yield _row(planner.plan(*pair, name), constraint=name, query=number)
     finally:
-        planner.scene.detach("cup")
+        planner.scene.become(before)
 
 
 def sudden(planner: Planner, name: str, count: int, seed: int) -> Rows:
@@ -169,7 +167,7 @@ def _changed(planner: Planner, rng: np.random.Generator) -> Iterator[tuple[str, 
     scene, link = planner.scene, planner.robot.tool_link
     crate = Box("crate", (0.6, 0.4, 0.2), (0.1, 0.1, 0.1))
     elsewhere = Pose(rng.uniform((0.4, -0.9, 0.1), (0.9, 0.9, 1.0)), np.eye(3))
-    cup = Cylinder("cup", Placement((0.0, 0.0, 0.06)), *CUP_M)
+    cup = Cylinder("cup", Placement((0.0, 0.0, 0.075), (-0.5 * np.pi, 0.0, 0.0)), 0.1, 0.037)
     steps: Sequence[tuple[str, Callable[[], object]]] = (
         ("add", lambda: scene.add(crate)),
         ("move", lambda: scene.move("crate", elsewhere)),

@@ -88,7 +88,7 @@ def measure(task: ChartTask) -> list[dict[str, Any]]:
 def _search_rows(task: ChartTask) -> list[dict[str, Any]]:
     """A policy trained in the chart, and a descent that is given the same time, on the queries."""
     params, own = task.params, task.settings
-    scene = Scene.from_params(params)
+    scene = Scene.from_params(params, own.constraint)
     manifold = constraint_manifold(scene.robot, params.constraints[own.constraint])
     joints = read_joints(task.layout.joints(own.constraint)).free_joints
     began = time.process_time()

@@ -3,7 +3,7 @@ at the tool, which stays level or spills.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -32,8 +32,9 @@ class CupSettings:
 
     The cup is a bottom and a ring of `walls` upright boxes, `wall_m` thick.  It sits where a
     gripper would be, its nearest point `gap_m` in front of the tool link's origin along the tool's
-    z axis, and it touches the spheres only: the path was planned without it.  Spheres that have
-    left it touch everything.  More of them than fit fall out.
+    z axis, and it touches the spheres only: what the arm carries in the scene is around it, and the
+    path was planned with that.  Spheres that have left it touch everything.  More of them than fit
+    fall out.
     seed: of the places the spheres are dropped from.  settle_s: the rest before the path, in which
     they settle, and behind it, before they are counted.
     """
@@ -107,7 +108,7 @@ def execute(
     """
     settings = settings or CupSettings()
     cup = _cup_in_tool(cup_axis_in_tool / np.linalg.norm(cup_axis_in_tool), settings)
-    with scene.world() as world:
+    with replace(scene, attached=()).world() as world:
         simulation = _Simulation(physics(world), joints[0], cup, settings)
         return _follow(simulation, joints, times - times[0], settings)
 

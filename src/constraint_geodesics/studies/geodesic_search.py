@@ -243,18 +243,17 @@ def policy_problem(
     return LearnedProblem(*space, clearance=clearance)
 
 
-def training_problem(
-    params: Params, scene: Scene, problems: Sequence[LearnedProblem]
-) -> ProblemSet:
-    """All constraints as one problem, each alone and with spheres on the way, as it is measured
-    while training.
+def training_problem(params: Params, asked: Sequence[tuple[Scene, LearnedProblem]]) -> ProblemSet:
+    """All constraints as one problem, each in its scene, alone and with spheres on the way, as it
+    is measured while training.
     """
     settings, rng = params.policies.obstacles, np.random.default_rng(OBSTACLES_SEED)
-    problems = [replace(own, degree=params.policies.training_length_degree) for own in problems]
+    degree = params.policies.training_length_degree
+    problems = [replace(own, degree=degree) for _, own in asked]
     around = [
         member
-        for problem in problems
-        for member in with_spheres(problem, scene.workcell, settings.count, settings.radii_m, rng)
+        for (scene, _), problem in zip(asked, problems, strict=True)
+        for member in with_spheres(problem, scene, settings.count, settings.radii_m, rng)
     ]
     alone = np.full(len(problems), (1.0 - settings.share) / len(problems))
     beset = np.full(len(around), settings.share / max(len(around), 1))

@@ -104,13 +104,8 @@ class ProblemBuilder:
         settings = {name: settings_of(name, self.planners[name]) for name in names}
         planner = opened(self.arm)
         began = time.perf_counter()
-        wanted, now = replace(scene, robot=planner.robot), planner.scene.now  # it came by pickle
-        if (now.workcell, now.attached, now.allowed) != (
-            wanted.workcell,
-            wanted.attached,
-            wanted.allowed,
-        ):
-            planner.scene.become(wanted)
+        if replace(scene, robot=planner.robot) != planner.scene.now:  # it came by pickle
+            planner.scene.become(scene)
         changed_s = time.perf_counter() - began
         prepared = self.arm, manifold.constraint.key
         if prepared not in _PREPARED:

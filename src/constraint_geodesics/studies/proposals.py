@@ -307,7 +307,7 @@ def run_policies(task: PolicyTask) -> pd.DataFrame:
     check).
     """
     params, settings = task.params, task.params.policy_settings()
-    scene, constraint = Scene.from_params(params), params.all_constraints[task.name]
+    scene, constraint = Scene.from_params(params, task.name), params.all_constraints[task.name]
     manifold = constraint_manifold(scene.robot, constraint)
     seed = (*seed_of(task.name, params.studies.seed), 2)
     past = draw_free(ShardTask(scene, manifold, PAST_ROWS, seed))
@@ -372,7 +372,7 @@ def _query_rows(
     peers: Mapping[str, PathPlanner],
 ) -> tuple[list[dict[str, Any]], list[Answer]]:
     """One query's rows, and the answers that are curves of the family."""
-    scene = query.in_scene(Scene.from_params(params))
+    scene = query.in_scene(Scene.from_params(params, query.constraint))
     manifold, ends = problem.manifold, problem.ends(query.start[None], query.goal[None])
     with Certifier(scene, judge_limits(params.judge)) as certifier, scene.world() as world:
         clearance = clearance_model(scene, certifier.collisions.apart)

@@ -265,7 +265,9 @@ def _family(params: Params, layout: Layout, constraint: str) -> str:
 
 def _shared(params: Params, layout: Layout) -> list[Any]:
     """What all configurations depend on: robot, scene, constraints, data, code."""
-    described = params.model_dump(mode="json", include={"robot", "workcell", "constraints"})
+    described = params.model_dump(
+        mode="json", include={"robot", "workcell", "carried", "constraints"}
+    )
     return [described, _contents(tuple(_inputs(params, layout)))]
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.benchmark.judge import judge_limits
+from constraint_geodesics.certification.certificate import Limits
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.geodesics.learned_problem import LearnedProblem, ProblemSet
@@ -72,7 +73,7 @@ def training_settings(params: Params) -> GeodesicParams:
 
 def optimum_lengths(task: OptimumTask) -> list[float]:
     """The family's shortest length of each query [rad], nan where no feasible curve was found."""
-    problem, ends = _queries(task.params, task.layout, task.constraint)
+    _, problem, ends = _queries(task.params, task.layout, task.constraint)
     straight = np.zeros((len(ends), 1, problem.curve.coefficients))
     lengths: list[float] = family_optimum(problem, ends, straight).length.tolist()
     return lengths
@@ -85,13 +86,13 @@ def train_and_judge(task: SweepTask) -> Record:
     where not), optimum_rad (of the family), time_ms (with the check).
     """
     params, layout, settings = task.params, task.layout, training_settings(task.params)
-    pace = Pace()
+    pace, limits = Pace(), judge_limits(params.judge)
     with task.run as run:
         problem = _training(params, layout)
         trained = train_policy(problem, settings, task.seed, task.scratch, pace.also(run.log))
         answer = by_policy(trained.mean, settings, task.seed)
         judged = {
-            name: _judged(answer, params, *_queries(params, layout, name))
+            name: _judged(answer, limits, *_queries(params, layout, name))
             | {"optimum_rad": list(task.optimum[name])}
             for name in judged_constraints(params)
         }
@@ -122,9 +123,11 @@ class Pace:
         return (last - first) / (ended - began)
 
 
-def _judged(answer: Method, params: Params, problem: LearnedProblem, ends: Ends) -> Record:
+def _judged(
+    answer: Method, limits: Limits, scene: Scene, problem: LearnedProblem, ends: Ends
+) -> Record:
     feasible, lengths, times = list[bool](), list[float](), list[float]()
-    with Certifier(Scene.from_params(params), judge_limits(params.judge)) as certifier:
+    with Certifier(scene, limits) as certifier:
         for query in range(len(ends)):
             asked = Asked(problem, ends[np.array([query])], query, certifier)
             if not query:
@@ -136,21 +139,21 @@ def _judged(answer: Method, params: Params, problem: LearnedProblem, ends: Ends)
     return {"feasible": feasible, "length_rad": lengths, "time_ms": times}
 
 
-def _queries(params: Params, layout: Layout, constraint: str) -> tuple[LearnedProblem, Ends]:
-    """One constraint's problem, and the queries that the sweep judges by."""
-    scene, sweep = Scene.from_params(params), params.sweep
-    problem = _alone(params, layout, scene, constraint)
+def _queries(params: Params, layout: Layout, constraint: str) -> tuple[Scene, LearnedProblem, Ends]:
+    """One constraint's scene and problem, and the queries that the sweep judges by."""
+    sweep = params.sweep
+    scene, problem = _alone(params, layout, constraint)
     name, manifold = constraint, problem.manifold
     queries = draw_queries(scene, manifold, name, sweep.queries, sweep.query_seed)
-    return problem, problem.ends(queries.starts, queries.goals)
+    return scene, problem, problem.ends(queries.starts, queries.goals)
 
 
-def _alone(params: Params, layout: Layout, scene: Scene, constraint: str) -> LearnedProblem:
-    name = params.policies.chart
+def _alone(params: Params, layout: Layout, constraint: str) -> tuple[Scene, LearnedProblem]:
+    scene, name = Scene.from_params(params, constraint), params.policies.chart
     chart = chart_named(name, layout.manifold(name), scene.robot)
     manifold = constraint_manifold(scene.robot, params.constraints[constraint])
     joints = read_joints(layout.joints(constraint)).free_joints
-    return policy_problem(params, chart, scene, manifold, joints)
+    return scene, policy_problem(params, chart, scene, manifold, joints)
 
 
 _KEPT: dict[str, ProblemSet] = {}
@@ -161,19 +164,13 @@ def _training(params: Params, layout: Layout) -> ProblemSet:
     """What policies train on; the same for configurations that differ in nothing it depends on."""
     own = params.policies
     trained = own.model_dump(exclude={"reward", "ppo", "seeds", "steps"})
-    described = params.model_dump(include={"robot", "workcell", "constraints"})
+    described = params.model_dump(include={"robot", "workcell", "carried", "constraints"})
     files = [layout.joints(name).stat() for name in params.constraints]
     data = [(file.st_mtime_ns, file.st_size) for file in files]
     key = str((layout.root, params.geodesics.degree, trained, described, data))
     if key not in _KEPT:
-        scene = Scene.from_params(params)
-        # one chart for all: members of a set share it
-        first, *others = params.constraints
-        problem = _alone(params, layout, scene, first)
-        alone = [problem]
-        for name in others:
-            member = _alone(params, layout, scene, name)
-            alone.append(replace(member, chart=problem.chart, clearance=problem.clearance))
+        alone = [_alone(params, layout, name) for name in params.constraints]
+        chart = alone[0][1].chart  # one for all: members of a set share it
         _KEPT.clear()
-        _KEPT[key] = training_problem(params, scene, alone)
+        _KEPT[key] = training_problem(params, [(s, replace(p, chart=chart)) for s, p in alone])
     return _KEPT[key]
