@@ -57,9 +57,10 @@ _START, _GOAL, _NOW, _INK = (
     rgb(colour) for colour in (palette.START, palette.GOAL, palette.BLUE, palette.BLACK)
 )
 _BOX, _OUTSIDE, _PAPER = (150, 150, 150), (200, 200, 200), (255, 255, 255)
+_CARRIED = rgb(palette.SKY)
 _PALETTE = tuple(rgb(colour) for colour in palette.SERIES)
-_WIDTH, _POINT, _END = (rr.Radius.ui_points(size) for size in (2.0, 5.0, 7.0))
-"""Of lines, moving points and a path's ends, in points of the screen."""
+_WIDTH, _THIN, _POINT, _END = (rr.Radius.ui_points(size) for size in (2.0, 0.8, 5.0, 7.0))
+"""Of lines, of those of other ways, moving points and a path's ends, in points of the screen."""
 _OLD_ID = re.compile(
     r"(?P<constraint>.+)-query(?P<query>\d+)-(?P<planner>.+?)"
     r"(-seed(?P<seed>\d+)|-(?P<executed>executed))$"
@@ -357,7 +358,8 @@ def _robot_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
 def _shape_chunks(shape: Shape, entity: str, frame: str) -> Iterator[Chunk]:
     """A shape at its place in a frame: the base's, or that of the link that carries it."""
     placed = shape.urdf_model()
-    style = {"colors": [_BOX], "fill_mode": "solid", "labels": [shape.name], "show_labels": False}
+    colour = _BOX if frame == ROOT_FRAME else _CARRIED
+    style = {"colors": [colour], "fill_mode": "solid", "labels": [shape.name], "show_labels": False}
     archetype = shape.drawn(rr, style)
     if archetype is not None:
         yield static(entity, archetype)
@@ -414,11 +416,11 @@ def _package_path(urdf: Path) -> Iterator[None]:
 
 
 def _way_chunks(robot: SerialRobot, ways: Sequence[Float[np.ndarray, "T D"]]) -> Iterator[Chunk]:
-    """The tool's lines on other ways, in grey."""
+    """The tool's lines on other ways, thin and grey."""
     if ways:
         lines = [robot.forward(points)[0] for points in ways]
         grey = rgb(palette.GREY)
-        yield static("tool/ways", rr.LineStrips3D(lines, colors=[grey], radii=[_WIDTH]))
+        yield static("tool/ways", rr.LineStrips3D(lines, colors=[grey], radii=[_THIN]))
 
 
 def tool_chunks(sampled: Frames, colour: tuple[int, int, int]) -> Iterator[Chunk]:
