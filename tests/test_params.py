@@ -34,6 +34,31 @@ def shapes(raw: dict[str, Any]) -> dict[str, Any]:
 
 PIPE = {"kind": "capsule", "from_m": [0, 0, 1], "to_m": [1, 0, 1], "radius_m": 0.1}
 BAD: list[tuple[Change, tuple[str, ...]]] = [
+    (
+        lambda p: p["constraints"]["level_cup_relaxed"].update(tolerance=[0, 0, 0, 4.0, 0.1, 0]),
+        ("level_cup_relaxed", "tolerance[3]=4.0", "at most π"),
+    ),
+    (
+        lambda p: p["unseen"]["shelf"].update(tolerance=[0, 0, 1e300, 0, 0, 0]),
+        ("unseen.shelf.tolerance", "1e+300"),
+    ),
+    (lambda p: p["labels"].update(free_rows=10**12), ("labels.free_rows=1000000000000",)),
+    (lambda p: p["policies"].update(steps=10**12), ("policies.steps=1000000000000",)),
+    (lambda p: p["planner"].update(acceleration_rad_s2=1e300), ("acceleration_rad_s2=1e+300",)),
+    (lambda p: p["planner"].update(clearance_m=5.0), ("planner.clearance_m=5.0",)),
+    (lambda p: p["manifolds"]["paper"].update(hidden=[10**6]), ("paper.hidden", "65536")),
+    (lambda p: p["manifolds"]["paper"].update(learning_rate=2.0), ("paper.learning_rate=2.0",)),
+    (lambda p: p["geodesics"].update(seeds=[0, 0]), ("geodesics.seeds", "must differ")),
+    (lambda p: p["geodesics"].update(seeds=[99]), ("geodesics.seeds=[99]", "policies.seeds")),
+    (
+        lambda p: p["policies"]["obstacles"].update(radii_m=[0.12, 0.05]),
+        ("policies.obstacles", "radii_m=[0.12, 0.05]"),
+    ),
+    (lambda p: p["compute"].update(workers=10**6), ("compute.workers=1000000",)),
+    (lambda p: p["compute"].update(dask_address="nowhere"), ("dask_address='nowhere'", "tcp://")),
+    (lambda p: p["tracking"].update(experiment=" "), ("tracking.experiment",)),
+    (lambda p: p["recording"].update(frames=10**9), ("recording.frames",)),
+    (lambda p: p["compare_charts"].update(dims=[99]), ("compare_charts.dims", "64")),
     (lambda p: p["carried"].update(constraints=["cup"]), ("carried.constraints='cup'", "slide")),
     (lambda p: p.update(speed=1), ("speed=1", "no such parameter")),
     (lambda p: p["labels"].update(free_row=5), ("labels.free_row=5", "no such parameter")),
@@ -99,8 +124,29 @@ def test_a_bad_parameter_is_named_in_one_line(
         assert part in message
 
 
+FUNCTIONS = {"kind": "functions", "description": "own", "factory": "nowhere:f"}
 DOOR = {"kind": "urdf", "urdf": "nowhere.urdf"}
 REFUSED: list[tuple[Change, tuple[str, ...]]] = [
+    (
+        lambda p: p["constraints"]["slide"]["reference"].update(position_m=[9.0, 0.0, 0.2]),
+        ("constraints: slide", "[9.0, 0.0, 0.2]", "1.2 m away"),
+    ),
+    (
+        lambda p: p["constraints"]["slide"]["reference"].update(position_m=[0.0, 0.0, 1.15]),
+        ("constraints: slide", "satisfy the constraint"),
+    ),
+    (lambda p: p["constraints"].update(own=FUNCTIONS), ("constraints: own", "nowhere:f")),
+    (
+        lambda p: shapes(p)["table"].update(centre_m=[0, 0, 0.3]),
+        ("constraints: ", "free of collision"),
+    ),
+    (lambda p: p["demonstrations"].update(tasks=["tea"]), ("demonstrations.tasks='tea'", "cup")),
+    (
+        lambda p: p["robot"].update(limits_rad={"joint1": [1.0, -1.0]}),
+        ("joint1", "[1.0, -1.0]", "a lower one"),
+    ),
+    (lambda p: p["robot"].update(hold={"joint9": 0.0}), ("robot", "joint9")),
+    (lambda p: p["robot"].update(may_touch="no.srdf"), ("robot", "no.srdf")),
     (lambda p: p["robot"].update(urdf="no/arm.urdf"), ("robot", "no/arm.urdf", "no such URDF")),
     (lambda p: p["robot"].update(urdf="params.yaml"), ("robot.urdf", "params.yaml", "no URDF")),
     (lambda p: p["robot"].update(tool_link="hand"), ("robot", "there is no link 'hand'")),

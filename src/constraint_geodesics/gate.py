@@ -8,6 +8,10 @@ import math
 from collections.abc import Iterator
 from xml.etree.ElementTree import ParseError
 
+import numpy as np
+
+from constraint_geodesics.constraints.constraint import constraint_manifold
+from constraint_geodesics.learning.dataset import draw_queries
 from constraint_geodesics.learning.learned_manifold import JOINT_SPACE
 from constraint_geodesics.params import Params, ParamsError
 from constraint_geodesics.peers import registry
@@ -15,6 +19,7 @@ from constraint_geodesics.peers.baseline import BaselineError
 from constraint_geodesics.scene.pieces import read_pieces
 from constraint_geodesics.scene.scene import Scene, robot_from
 from constraint_geodesics.scene.urdf import find_urdf
+from constraint_geodesics.studies.hidden_tasks import TASKS
 
 TABLE_I = ("prm", "rrt_star", "birrt")
 """Kinds of baselines that the result table has rows of."""
@@ -25,6 +30,7 @@ def check_params(params: Params) -> None:
     which a stage would fail.
     """
     _check_robot(params)
+    _check_constraints(params)
     for problem in _problems(params):
         raise ParamsError(problem)
 
@@ -51,6 +57,27 @@ def _check_robot(params: Params) -> None:
             raise ParamsError(f"{entry}: {error}") from None
 
 
+def _check_constraints(params: Params) -> None:
+    """That the reference is where the tool can be near, and that the arm can be at two
+    configurations of each, within its limits and clear of all.
+    """
+    robot = robot_from(params.robot)
+    somewhere = robot.forward(robot.sample(2000, np.random.default_rng(0)))[0]
+    reach = 1.2 * float(np.linalg.norm(somewhere, axis=1).max())
+    for name, described in params.all_constraints.items():
+        reference = getattr(described, "reference", None)
+        if reference is not None and np.linalg.norm(reference.position_m) > reach:
+            raise ParamsError(
+                f"constraints: {name}: reference.position_m={list(reference.position_m)}: the tool "
+                f"gets about {reach:.2g} m away from the base"
+            )
+        scene = Scene.from_params(params, name)
+        try:
+            draw_queries(scene, constraint_manifold(scene.robot, described), name, 1, 0)
+        except (ValueError, OSError, RuntimeError, ImportError) as error:
+            raise ParamsError(f"constraints: {name}: {' '.join(str(error).split())}") from None
+
+
 def _problems(params: Params) -> Iterator[str]:
     joints, execution = robot_from(params.robot).dof, params.execution
     for name, manifold in params.manifolds.items():
@@ -59,6 +86,9 @@ def _problems(params: Params) -> Iterator[str]:
                 f"manifolds.{name}.latent_dim={manifold.latent_dim}: must be at most {joints}, the "
                 f"robot's joints"
             )
+    for name in params.demonstrations.tasks:
+        if name not in TASKS:
+            yield f"demonstrations.tasks={name!r}: must be one of {', '.join(TASKS)}"
     for name in params.geodesics.searched:
         if not params.manifolds[name].retract:
             yield (

@@ -1,6 +1,8 @@
 """params.yaml as typed, frozen records: every field is checked before a stage does any work."""
 
 import json
+import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,14 +20,19 @@ from pydantic import (
 from constraint_geodesics.errors import ParamsError as ParamsError
 from constraint_geodesics.fields import (
     Bit,
+    ChartDim,
     Count,
     Finite,
     Name,
     NonNegative,
     Positive,
+    Rate,
+    Rows,
     Seed,
+    Seeds,
     Share,
     Vector3,
+    Width,
 )
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.shapes import AnyShape
@@ -98,25 +105,31 @@ class CarriedParams(WorkcellParams):
     constraints: tuple[Name, ...] = ()
 
 
+_ADDRESS = re.compile(r"[a-z]+://[A-Za-z0-9_.:\[\]-]+:[0-9]{1,5}")
+
+
 class ComputeParams(_Record):
     """Where parallel work runs."""
 
     backend: Literal["loky", "dask"]
-    workers: Annotated[int, Field(ge=0)]
+    workers: Annotated[int, Field(ge=0, le=1024)]
     dask_address: str | None = None
 
     @model_validator(mode="after")
     def _address_given(self) -> "ComputeParams":
         if self.backend == "dask" and not self.dask_address:
             raise ValueError("dask_address is missing: backend 'dask' needs a scheduler's address")
+        if self.dask_address and not _ADDRESS.fullmatch(self.dask_address):
+            what = "must be an address with a port, as tcp://127.0.0.1:8786"
+            raise ValueError(f"dask_address={self.dask_address!r}: {what}")
         return self
 
 
 class LabelParams(_Record):
     """How many configurations are drawn and labelled, and how many start and goal pairs."""
 
-    free_rows: Count
-    constrained_rows: Count
+    free_rows: Rows
+    constrained_rows: Rows
     shard_rows: Count
     seed: Seed
     queries: Count
@@ -157,6 +170,8 @@ class PoseConstraintParams(_Record):
         for i, (held, tolerance) in enumerate(zip(self.axes, self.tolerance, strict=True)):
             if tolerance and not held:
                 raise ValueError(f"tolerance[{i}]={tolerance}: must be 0 where the axis is free")
+            if i >= 3 and tolerance > math.pi:
+                raise ValueError(f"tolerance[{i}]={tolerance}: must be at most π rad")
         if any(self.axes) and self.reference is None:
             raise ValueError(
                 "reference=null: a pose is needed to sample configurations that hold an axis"
@@ -213,12 +228,12 @@ class ManifoldParams(_Record):
 
     latent_dim: Count
     retract: bool
-    hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
+    hidden: Annotated[tuple[Width, ...], Field(min_length=1)]
     beta: NonNegative
     epochs: Count
     patience: Count
     batch_size: Count
-    learning_rate: Positive
+    learning_rate: Rate
     variance_centres: Count
     variance_epochs: Count
     sigma_max_rad: Positive
@@ -232,12 +247,12 @@ class GplvmParams(_Record):
     """
 
     latent_dim: Count
-    hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
+    hidden: Annotated[tuple[Width, ...], Field(min_length=1)]
     inducing: Count
     noise: Positive
     steps: Count
     batch_size: Count
-    learning_rate: Positive
+    learning_rate: Rate
     centres: Annotated[int, Field(ge=2)]
 
 
@@ -247,11 +262,11 @@ class GanParams(_Record):
     """
 
     latent_dim: Count
-    hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
+    hidden: Annotated[tuple[Width, ...], Field(min_length=1)]
     steps: Count
     critic_steps: Count
     batch_size: Count
-    learning_rate: Positive
+    learning_rate: Rate
     penalty: Positive
     average: Share
     encoder_steps: Count
@@ -263,7 +278,7 @@ class CompareManifoldsParams(_Record):
     """
 
     vae: Name
-    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    seeds: Seeds
     split_seed: Seed
     held_out: Count
     samples: Count
@@ -279,7 +294,7 @@ class HoleParams(_Record):
     """
 
     around: WorkcellParams
-    dims: Annotated[tuple[Count, ...], Field(min_length=1)]
+    dims: Annotated[tuple[ChartDim, ...], Field(min_length=1)]
     pairs: Count
 
 
@@ -290,8 +305,8 @@ class CompareChartsParams(_Record):
 
     vae: Name
     constraint: Name
-    dims: Annotated[tuple[Count, ...], Field(min_length=1)]
-    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    dims: Annotated[tuple[ChartDim, ...], Field(min_length=1)]
+    seeds: Seeds
     epochs: Count
     steps: Count
     queries: Count
@@ -320,7 +335,7 @@ class DemonstrationsParams(_Record):
     """
 
     tasks: Annotated[tuple[str, ...], Field(min_length=1)]
-    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    seeds: Seeds
     pairs: Count
     peer_pairs: Count
     learned: LearnedDemonstrationsParams
@@ -366,9 +381,9 @@ class RewardParams(_Record):
 class PpoParams(_Record):
     """Proximal policy optimisation."""
 
-    hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
-    learning_rate: Positive
-    learning_rate_end: Positive
+    hidden: Annotated[tuple[Width, ...], Field(min_length=1)]
+    learning_rate: Rate
+    learning_rate_end: Rate
     gamma: Annotated[float, Field(gt=0, le=1)]
     gae_lambda: Annotated[float, Field(gt=0, le=1)]
     rollout_steps: Annotated[int, Field(ge=2)]
@@ -389,11 +404,17 @@ class ObstacleParams(_Record):
     radii_m: tuple[Positive, Positive]
     share: Share
 
+    @model_validator(mode="after")
+    def _ordered(self) -> "ObstacleParams":
+        if self.radii_m[0] > self.radii_m[1]:
+            raise ValueError(f"radii_m={list(self.radii_m)}: the first must not be larger")
+        return self
+
 
 class PolicyParams(_Record):
     """Policies whose curves are retracted; what is not here is as in `geodesics`."""
 
-    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    seeds: Seeds
     chart: Name
     steps: Count
     training_length_degree: Annotated[int, Field(ge=4, multiple_of=4)]
@@ -426,7 +447,7 @@ class PolicyParams(_Record):
 class GeodesicParams(_Record):
     """Policy search of geodesics."""
 
-    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    seeds: Seeds
     searched: Annotated[tuple[Name, ...], Field(min_length=1)]
     illustrated: tuple[Name, ...]
     illustrated_constraints: tuple[Name, ...]
@@ -492,7 +513,7 @@ class PlannerParams(_Record):
     iterations: Count = 30
     accuracy: Positive = 1e-5
     largest_step_rad: Positive = 0.5
-    clearance_m: NonNegative = 0.006
+    clearance_m: Annotated[float, Field(ge=0, le=1)] = 0.006
     clearance_share: Annotated[float, Field(gt=0, le=1)] | None = None
     acceleration_rad_s2: Positive = 10.0
     acceleration_m_s2: Positive = 1.0
@@ -601,7 +622,7 @@ class PathDiffusionParams(_Record):
     blocks: Count
     steps: Count
     batch_size: Count
-    learning_rate: Positive
+    learning_rate: Rate
     held_out: Share
     seed: Seed
 
@@ -619,7 +640,7 @@ class SweepParams(_Record):
     each in place of `policies.steps`, and queries that nothing else uses.
     """
 
-    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    seeds: Seeds
     steps: Count
     queries: Count
     query_seed: Seed
@@ -649,13 +670,13 @@ class RecordingParams(_Record):
     """Which paths are recorded for replay."""
 
     queries: Count
-    frames: Annotated[int, Field(ge=2)]
+    frames: Annotated[int, Field(ge=2, le=10_000)]
 
 
 class TrackingParams(_Record):
     """MLflow."""
 
-    experiment: Annotated[str, Field(min_length=1)]
+    experiment: Annotated[str, Field(pattern=r"\S")]
 
 
 class Params(_Record):
@@ -708,6 +729,11 @@ class Params(_Record):
             raise ValueError(
                 f"studies.constraint={self.studies.constraint!r}: must be one of "
                 f"{sorted(self.constraints)}"
+            )
+        if missing := set(self.geodesics.seeds) - set(self.policies.seeds):
+            raise ValueError(
+                f"geodesics.seeds={sorted(missing)}: must be among policies.seeds, whose policies "
+                f"search"
             )
         again = set(self.unseen) & set(self.constraints)
         if again:

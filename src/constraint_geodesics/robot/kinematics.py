@@ -262,6 +262,7 @@ def _tightened(
 ) -> tuple[float, float]:
     if not own[0] <= wanted[0] < wanted[1] <= own[1]:
         raise RobotError(
-            f"limits of {name!r}: {list(wanted)} do not lie within the URDF's {list(own)}"
+            f"limits of {name!r}: {list(wanted)} must be a lower one and a higher one within the "
+            f"URDF's {list(own)}"
         )
     return wanted
