@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.interpolate import BPoly
 
 from constraint_geodesics import Planner, Sphere, Trajectory
 from constraint_geodesics.geometry.braking import State
@@ -166,6 +167,11 @@ def test_a_state_is_that_of_the_trajectory_as_it_is_sent():
     velocities = np.array([path.state(t).velocity for t in at])
     most = np.abs(np.diff(velocities, axis=0)).max() / (at[1] - at[0])
     assert most <= max(packaged_planner()._certifier.limits.acceleration_rad_s2) * (1 + 1e-6)
+    # a controller that follows the message by splines, as ROS's does, is there as well
+    given = [[p[k] for p in points] for k in ("positions", "velocities", "accelerations")]
+    spline = BPoly.from_derivatives(path.times, np.array(given).transpose(1, 0, 2))
+    places = np.array([path.state(t).configuration for t in at])
+    assert np.abs(spline(at) - places).max() < 1e-3
     for wrong in (-1e-9, path.times[-1] + 1e-9, np.nan, "soon"):
         with pytest.raises(PlannerError, match="at_s = .*must be a time from 0 to"):
             path.state(wrong)

@@ -247,9 +247,10 @@ class Trajectory:
         """Configuration [rad] and velocity [rad/s] at a time from 0 to the duration [s], and the
         waypoint that comes next.
 
-        The place is on the straight line between two waypoints; the velocity is the line's in its
-        middle, and changes evenly from there to the middle of the next one, by the certified
-        acceleration between them.  Raises PlannerError without a path, or for another time.
+        The velocity is that of a line in its middle, and changes evenly from there to the middle of
+        the next one, by the certified acceleration between them.  The place is on the straight line
+        between two waypoints, as far along as this velocity leads.  Raises PlannerError without a
+        path, or for another time.
         """
         self._require_path("use")
         return state_at(self.motion, self._moment(at_s))

@@ -690,6 +690,57 @@ def under_way(good: Question, row: int) -> tuple[Question, np.ndarray]:
     return replace(good, joints=good.joints[row:], times=rest, start=good.joints[row]), line
 
 
+def test_a_velocity_at_the_start_must_lead_along_the_path(certifier, good) -> None:
+    """Slowly, so that the accelerations allow any direction."""
+    there, aside = np.eye(6)[4], np.eye(6)[3]
+    rows, times = good.joints[0] + 0.05 * np.arange(9)[:, None] * there, 0.5 * np.arange(9)
+    for velocity, words in (
+        (0.15 * there, ""),
+        (0.1 * there + 0.03 * aside, ""),
+        (-0.15 * there, "runs back"),
+        (0.1 * there + 0.05 * aside, "beside the line"),
+        (0.25 * there, "run past the line's end"),
+    ):
+        found = certifier.certify(
+            rows, FREE, times=times, collisions=False, start_velocity=velocity
+        )
+        assert found.valid == (not words), found.violation
+        if words:
+            assert found.violation.kind == "start_velocity"
+            assert words in found.violation.message
+
+
+def test_a_velocity_at_the_start_must_not_lead_off_the_constraint(certifier, good) -> None:
+    row = int(np.argmax(np.linalg.norm(np.diff(good.joints, axis=0), axis=1)))
+    rows, slow = good.joints[row:], 20.0 * (good.times[row:] - good.times[row])
+    line = (rows[1] - rows[0]) / slow[1]
+    for turned, valid in ((0.0, True), (0.9, False)):
+        velocity = line + turned * np.linalg.norm(line) * np.eye(6)[3]  # tilts the tool
+        found = certifier.certify(
+            rows, good.constraint, rows[0], good.goal, slow, start_velocity=velocity
+        )
+        assert found.valid == valid, found.violation
+        if not valid:
+            assert "leads off the constraint" in found.violation.message
+
+
+def test_a_joint_that_moves_must_stop_before_its_limit(certifier, good) -> None:
+    """At rest a path may begin on a limit."""
+    there, out, upper = np.eye(6)[4], np.eye(6)[5], certifier.scene.robot.upper[5]
+    start = np.where(out == 1.0, upper - 1e-4, good.joints[0])
+    rows, times = start + 0.02 * np.arange(9)[:, None] * there, 0.1 * np.arange(9)
+    room = np.sqrt(2.0 * LIMITS.acceleration_rad_s2[5] * 1e-4)
+    for share, valid in ((0.0, True), (0.99, True), (1.01, False)):
+        velocity = 0.2 * there + share * room * out
+        found = certifier.certify(
+            rows, FREE, times=times, collisions=False, start_velocity=velocity
+        )
+        assert found.valid == valid, found.violation
+        if not valid:
+            assert found.violation.kind == "joint_limits"
+            assert "needs" in found.violation.message
+
+
 def test_a_motion_under_way_is_certified_from_its_velocity_alone(certifier, good) -> None:
     """The change at the first row is held against the first line's half, as at any other row."""
     rest, line = under_way(good, len(good.joints) // 2)

@@ -39,6 +39,10 @@ from constraint_geodesics.scene.scene import Scene
 
 __all__ = ["Certificate", "CertificationError", "Certifier", "Limits", "Violation"]
 
+_SOON_S = (1e-4, 1e-3)
+"""After which a velocity at the start is looked at for where it leads."""
+_LEFT = 1e-3
+"""By how much the arm may leave the constraint [rad or m] while it turns into the first line."""
 _POSES = 24
 """Configurations at which the kinematics are compared with PyBullet's."""
 
@@ -149,7 +153,9 @@ class Certifier:
         """Check a path [rad], with its times [s] if it has them, and report the first promise it
         breaks.  collisions: whether they are looked at.  region: what the last row must keep, as a
         constraint with a reference.  start_velocity: at the first row [rad/s], by default 0; the
-        first line must go on from it within the accelerations, at half of its speed at least.
+        first line must go on from it within the accelerations, in its direction and at half of its
+        speed at least, it must not lead off the constraint, and where accelerations are demanded
+        they must stop each joint before its limit.
 
         A constraint without a reference is held relative to the tool's pose at `start`, or else at
         the first row.
@@ -173,11 +179,12 @@ class Certifier:
         first = rows[0] if ends[0] is None else ends[0]
         with np.errstate(over="ignore", invalid="ignore"):
             kept = how_kept(Asked(self._chain, rows, constraint, first, self.limits))
-            beyond = np.nan if region is None else self._beyond(region, rows[-1])
+            beyond = np.nan if region is None else self._off(rows[-1], region, rows[-1])
         limits = MotionLimits(self._velocity, self.limits.acceleration_rad_s2, moving)
         clock, duration = check_times(rows, times, limits)
         path = _Path(rows, steps, margins, length, longest, least, beyond, kept)
-        violation = next(chain(self._broken(path, *ends), clock), self._wrong_pose)
+        begun = self._begun(path, constraint, first, moving, times)
+        violation = next(chain(self._broken(path, *ends), clock, begun), self._wrong_pose)
         asked, apart = time.perf_counter(), Separation(violation)
         if violation is None and collisions:
             apart = self.collisions.along(rows)
@@ -243,6 +250,49 @@ class Certifier:
             raise CertificationError(f"start_velocity = {velocity}: must be finite")
         return found
 
+    def _begun(
+        self,
+        path: _Path,
+        constraint: Constraint,
+        first: np.ndarray,
+        velocity: np.ndarray,
+        times: Any,
+    ) -> Iterator[Violation]:
+        """Where the velocity at the first row leads: beyond a joint limit, or off the constraint.
+        The times are sound.
+        """
+        if not velocity.any():
+            return
+        q, most, (lower, upper) = path.rows[0], self.limits.acceleration_rad_s2, self._limits
+        if most is not None:
+            room = np.where(velocity > 0.0, upper - q, q - lower)
+            needed = velocity**2 / (2.0 * np.asarray(most))
+            beyond = np.where(velocity == 0.0, 0.0, needed - room)
+            if beyond.max() > (allowed := self.limits.limit_tolerance_rad):
+                joint = int(np.argmax(beyond))
+                text = (
+                    f"joint {joint} of row 0 moves at {velocity[joint]:.4g} rad/s and needs "
+                    f"{needed[joint]:.4g} rad to stop, its limit is {room[joint]:.4g} rad away"
+                )
+                yield Violation("joint_limits", 0, float(beyond[joint]), allowed, text)
+        with np.errstate(over="ignore", invalid="ignore"):
+            off = [self._off(q + soon * velocity, constraint, first) for soon in (0.0, *_SOON_S)]
+        for soon, found in zip(_SOON_S, off[1:], strict=True):
+            bent = 0.5 * (soon * float(np.abs(velocity).sum())) ** 2  # what curvature may add
+            rate = (found - off[0] - bent) / soon
+            left = 0.25 * rate * float(times[1] - times[0])  # it turns until the line's middle
+            if not left <= _LEFT:
+                text = (
+                    f"the velocity at row 0 leads off the constraint at {rate:.3g} rad/s or m/s: "
+                    f"it is left by {left:.3g} before the line is followed, {_LEFT:.3g} is allowed"
+                )
+                yield Violation("start_velocity", 0, left, _LEFT, text)
+
+    def _off(self, q: np.ndarray, constraint: Constraint, first: np.ndarray) -> float:
+        """How far a configuration is off a constraint [rad or m]."""
+        asked = Asked(self._chain, np.stack([q, q]), constraint, first, self.limits)
+        return max(how_kept(asked).attained.values())
+
     def _missed(
         self, kind: str, rows: np.ndarray, row: int, end: np.ndarray | None
     ) -> Violation | None:
@@ -257,11 +307,6 @@ class Certifier:
             f"{kind.split('_')[0]}"
         )
         return Violation(kind, row, value, allowed, f"{which}, {allowed:.3g} rad is allowed")
-
-    def _beyond(self, region: Constraint, end: np.ndarray) -> float:
-        """How far a configuration is beyond a region [rad or m]."""
-        rows = np.stack([end, end])
-        return max(how_kept(Asked(self._chain, rows, region, end, self.limits)).attained.values())
 
     def _beside(self, path: _Path) -> Violation | None:
         allowed, row = self.limits.violation_tolerance, len(path.rows) - 1

@@ -11,6 +11,8 @@ from constraint_geodesics.certification.certificate import Violation, malformed,
 
 _SLACK = 1e-6
 """Relative, of the speed that the first line must have."""
+_ASIDE_RAD = 5e-3
+"""By how much an arm may leave the first line while it turns into it from its velocity."""
 
 
 class MotionLimits(NamedTuple):
@@ -63,7 +65,8 @@ def _wrong(rows: np.ndarray, times: np.ndarray, limits: MotionLimits) -> Iterato
 
 def _begun(rows: np.ndarray, times: np.ndarray, limits: MotionLimits) -> Iterator[Violation]:
     """What is wrong with the velocity at the first row: it passes the limits, or the first line is
-    so slow that at constant acceleration the arm would overshoot its end and come back.
+    so slow that at constant acceleration the arm would overshoot its end and come back, or leads
+    elsewhere, so that the arm leaves it while it turns.
     """
     if not limits.start.any():
         return
@@ -80,6 +83,15 @@ def _begun(rows: np.ndarray, times: np.ndarray, limits: MotionLimits) -> Iterato
             " the arm would run past the line's end, half of the speed is needed"
         )
         yield Violation("start_velocity", 0, speed, least, text)
+    line = (rows[1] - rows[0]) / float(np.linalg.norm(rows[1] - rows[0]))
+    along = float(limits.start @ line)
+    across = float(np.linalg.norm(limits.start - along * line))
+    # from it to the line's own velocity in its middle, evenly
+    aside = 0.25 * across * float(times[1] - times[0])
+    if along < 0.0 or aside > _ASIDE_RAD:
+        what = "runs back before" if along < 0.0 else f"is {aside:.3g} rad beside the line when"
+        text = f"the arm {what} it goes along the line from row 0, {_ASIDE_RAD:.3g} rad is allowed"
+        yield Violation("start_velocity", 0, aside, _ASIDE_RAD, text)
 
 
 def _too_much(

@@ -2,7 +2,8 @@
 
 Between the middles of two lines the velocity changes evenly, by the acceleration at the row between
 them; it is 0 at the end, and what it is said to be at the start.  So it never changes faster than
-the limits allow, and at a row it lies between those of the lines before and after.
+the limits allow, and at a row it lies between those of the lines before and after.  The place is
+on the line, as far along as this velocity leads.
 """
 
 from typing import NamedTuple
@@ -65,19 +66,37 @@ def state_at(motion: Motion, at_s: float) -> State:
     """Where a motion is at a time [s] from 0 to its duration, and how fast."""
     joints, times, start = motion
     row = int(np.clip(np.searchsorted(times, at_s, side="right"), 1, len(times) - 1))
-    share = (at_s - times[row - 1]) / (times[row] - times[row - 1])
+    middles = np.concatenate([[0.0], 0.5 * (times[1:] + times[:-1]), times[-1:]])
+    lines = np.diff(joints, axis=0) / np.diff(times)[:, None]
+    velocities = np.vstack([start, lines, np.zeros_like(start)])
+
+    def velocity_at(moment: float) -> Float[np.ndarray, "D"]:
+        return np.array([np.interp(moment, middles, column) for column in velocities.T])
+
+    line, velocity = joints[row] - joints[row - 1], velocity_at(at_s)
+    marks = times[row - 1], middles[row], times[row]
+    speeds = np.array([float(velocity_at(mark) @ line) for mark in marks])
+    share = _passed(at_s, np.array(marks), speeds)
     place = (1.0 - share) * joints[row - 1] + share * joints[row]
     if np.linalg.norm(joints[row] - place) <= AT_A_ROW:
         place, row = joints[row], row + 1
     elif np.linalg.norm(joints[row - 1] - place) <= AT_A_ROW:
         place = joints[row - 1]
-    middles = np.concatenate([[0.0], 0.5 * (times[1:] + times[:-1]), times[-1:]])
-    lines = np.diff(joints, axis=0) / np.diff(times)[:, None]
-    velocities = np.vstack([start, lines, np.zeros_like(start)])
-    velocity = np.array([np.interp(at_s, middles, column) for column in velocities.T])
     if np.linalg.norm(velocity) <= AT_REST:
         velocity = np.zeros_like(start)
     return State(place, velocity, row)
+
+
+def _passed(at_s: float, marks: Float[np.ndarray, "3"], speeds: Float[np.ndarray, "3"]) -> float:
+    """The share of a line that is passed at a time, by speeds along it at its beginning, middle and
+    end that change evenly between them; at a sharp corner some may be negative, there it waits.
+    """
+    speeds = np.maximum(speeds, 0.0)
+    halves = 0.5 * (speeds[1:] + speeds[:-1]) * np.diff(marks)
+    half = int(at_s >= marks[1])
+    now = float(np.interp(at_s, marks, speeds))
+    within = 0.5 * (speeds[half] + now) * (at_s - marks[half])
+    return float((halves[:half].sum() + within) / halves.sum())
 
 
 def ahead(joints: Float[np.ndarray, "T D"], state: State) -> Float[np.ndarray, "n D"]:
