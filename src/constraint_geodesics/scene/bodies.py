@@ -197,7 +197,8 @@ def _made_own(name: str, pieces: tuple[Piece, ...], dof: int) -> _Own:
 
 def _are_same(first: Sequence[Piece], second: Sequence[Piece]) -> bool:
     return len(first) == len(second) and all(
-        np.array_equal(a.corners, b.corners) and a.rounding == b.rounding
+        np.array_equal(a.corners, b.corners)
+        and (a.rounding, a.hollow_m) == (b.rounding, b.hollow_m)
         for a, b in zip(first, second, strict=True)
     )
 
