@@ -95,7 +95,7 @@ def test_a_path_is_planned_and_its_files_are_written(command, query, tmp_path) -
     assert out.startswith("solved: ")
     assert out.count("\n") == 1
     assert err.strip() == f"planner: {bundle.PACKAGED}"
-    joints, times, constraint = read_trajectory(csv)
+    joints, times, constraint, _ = read_trajectory(csv)
     own = packaged_planner().plan(*pairs_of("level_cup", 1, seed=1)[0], "level_cup")
     assert joints.tobytes() == own.joints.tobytes()
     assert times.tobytes() == own.times.tobytes()

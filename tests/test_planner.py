@@ -612,7 +612,7 @@ def test_a_saved_path_is_read_to_the_last_bit(tmp_path) -> None:
     for name in NAMES:
         path = solved(name)[0]
         path.save(tmp_path / "new" / f"{name}.csv")
-        joints, times, constraint = read_trajectory(tmp_path / "new" / f"{name}.csv")
+        joints, times, constraint, _ = read_trajectory(tmp_path / "new" / f"{name}.csv")
         assert joints.tobytes() == path.joints.tobytes()
         assert times.tobytes() == path.times.tobytes()
         assert (constraint.axes, constraint.tolerance) == (
@@ -658,7 +658,7 @@ def test_a_path_of_somebody_else_may_lack_times_and_constraint(tmp_path) -> None
     path, lines = solved("level_cup")[0], lines_of(tmp_path)
     bare = tmp_path / "bare.csv"
     bare.write_text("\r\n".join(line.split(",", 1)[1] for line in lines[1:]) + "\r\n\r\n")
-    joints, times, constraint = read_trajectory(bare)
+    joints, times, constraint, _ = read_trajectory(bare)
     assert joints.tobytes() == path.joints.tobytes()
     assert times is None
     assert constraint is None

@@ -11,7 +11,7 @@ from scipy.interpolate import BPoly
 from constraint_geodesics import Planner, Sphere, Trajectory
 from constraint_geodesics.geometry.braking import State
 from constraint_geodesics.planner import PlannerError
-from constraint_geodesics.trajectory import read_start_velocity
+from constraint_geodesics.trajectory import read_trajectory
 from tests.planner_fixtures import packaged_planner, pairs_of
 
 NAME = "level_cup"
@@ -223,9 +223,8 @@ def test_files_and_messages_say_how_a_motion_begins(tmp_path):
     planner, path = packaged_planner(), planned(10)[0]
     rest = planner.replan(path, 0.4 * path.times[-1])
     rest.save(tmp_path / "rest.csv")
-    np.testing.assert_array_equal(
-        read_start_velocity(tmp_path / "rest.csv", 6), rest.start_velocity
-    )
+    read = read_trajectory(tmp_path / "rest.csv")
+    np.testing.assert_array_equal(read.start_velocity, rest.start_velocity)
     certificate = planner.check(tmp_path / "rest.csv")
     assert certificate.valid, certificate.violation
     np.testing.assert_array_equal(certificate.start_velocity, rest.start_velocity)

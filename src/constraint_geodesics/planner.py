@@ -51,7 +51,7 @@ from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.search.candidates import ALL_PARTS, Parts
 from constraint_geodesics.search.nearest import Projection, projection
 from constraint_geodesics.search.preparation import Preparation, Query
-from constraint_geodesics.trajectory import Trajectory, read_start_velocity, read_trajectory
+from constraint_geodesics.trajectory import Trajectory, read_trajectory
 
 SNAP_RAD, SNAP_M = 0.01, 0.001
 """Distances by which a start is moved on request, at most: of its turning joints, and of its
@@ -352,7 +352,8 @@ class Planner:
         Raises PlannerError if the file can't be read, or neither names a constraint that exists.
         """
         self._require_open()
-        joints, times, own = read_trajectory(Path(file), self.robot.joint_names, self.robot)
+        names = self.robot.joint_names
+        joints, times, own, moving = read_trajectory(Path(file), names, self.robot)
         if constraint is not None:
             own, _ = self._named(constraint)
         if own is None:
@@ -361,8 +362,7 @@ class Planner:
             None if q is None else checked_configuration(q, self.robot.dof, name)
             for q, name in ((start, "start"), (goal, "goal"))
         )
-        moving = None if times is None else read_start_velocity(Path(file), self.robot.dof)
-        held = self._held_at(own, joints[0])
+        held, moving = self._held_at(own, joints[0]), None if times is None else moving
         return self._certifier.certify(joints, held, first, last, times, start_velocity=moving)
 
     def _named(self, constraint: str | Constraint) -> tuple[Constraint, str]:

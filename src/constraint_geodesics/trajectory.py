@@ -466,12 +466,23 @@ def write_trajectory(
     file.write_text("\n".join(lines) + "\n")
 
 
+class Read(NamedTuple):
+    """What a CSV says of a path: waypoints [rad], and what it has of times [s], a constraint and
+    the velocity at the first waypoint [rad/s].
+    """
+
+    joints: Float[np.ndarray, "T D"]
+    times: Float[np.ndarray, "T"] | None
+    constraint: Constraint | None
+    start_velocity: Float[np.ndarray, "D"] | None
+
+
 def read_trajectory(
     file: Path, names: Sequence[str] | None = None, robot: SerialRobot | None = None
-) -> tuple[Float[np.ndarray, "T D"], Float[np.ndarray, "T"] | None, Constraint | None]:
-    """Waypoints from CSV: lines of joints [rad] under their names, with a column time_s and a
-    constraint's comment line if there are any.  names: of the joints, which the columns must have
-    in this order.  robot: for the kinds of constraints that need one.
+) -> Read:
+    """A path from CSV: lines of joints [rad] under their names, with a column time_s and comment
+    lines of a constraint and a velocity if there are any.  names: of the joints, which the columns
+    must have in this order.  robot: for the kinds of constraints that need one.
 
     Raises PlannerError naming the file and the line that can't be read.
     """
@@ -480,10 +491,12 @@ def read_trajectory(
     except (OSError, UnicodeDecodeError) as error:
         raise PlannerError(f"{file}: can't be read: {error}") from None
     lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
-    constraint, table = None, []
+    constraint, moving, table = None, None, []
     for number, line in lines:
         if line.startswith(CONSTRAINT_LINE):
             constraint = _constraint_of(file, number, line.removeprefix(CONSTRAINT_LINE), robot)
+        elif line.startswith(VELOCITY_LINE):
+            moving = number, line.removeprefix(VELOCITY_LINE)
         elif line and not line.startswith("#"):
             table.append((number, line.split(",")))
     if len(table) < 2:
@@ -491,27 +504,19 @@ def read_trajectory(
     header = _header(file, table[0][1], names)
     array = np.array([_numbers(file, number, cells, len(header)) for number, cells in table[1:]])
     timed = header[0] == "time_s"
-    return array[:, int(timed) :], array[:, 0] if timed else None, constraint
+    joints, times = array[:, int(timed) :], array[:, 0] if timed else None
+    start = None if moving is None else _velocity_of(file, *moving, joints.shape[1])
+    return Read(joints, times, constraint, start)
 
 
-def read_start_velocity(file: Path, dof: int) -> Float[np.ndarray, "D"] | None:
-    """The velocity at the first waypoint [rad/s] that a trajectory's CSV names; None if it names
-    none.
-
-    Raises PlannerError naming the line if it is none.
-    """
-    for number, line in enumerate(file.read_text("utf-8-sig").splitlines(), 1):
-        if not line.strip().startswith(VELOCITY_LINE):
-            continue
-        text = line.strip().removeprefix(VELOCITY_LINE)
-        try:
-            found = np.array(json.loads(text), float)
-        except (TypeError, ValueError):
-            found = np.empty(0)
-        if found.shape != (dof,) or not np.isfinite(found).all():
-            raise PlannerError(f"{file}, line {number}: not a velocity of {dof} joints: {text}")
-        return found
-    return None
+def _velocity_of(file: Path, number: int, text: str, dof: int) -> Float[np.ndarray, "D"]:
+    try:
+        found = np.array(json.loads(text), float)
+    except (TypeError, ValueError):
+        found = np.empty(0)
+    if found.shape != (dof,) or not np.isfinite(found).all():
+        raise PlannerError(f"{file}, line {number}: not a velocity of {dof} joints: {text}")
+    return found
 
 
 def _header(file: Path, cells: Sequence[str], names: Sequence[str] | None) -> list[str]:

@@ -188,6 +188,7 @@ def test_it_shares_with_the_search_the_bodies_and_their_distance_alone() -> None
         "constraint_geodesics.scene.pieces": {"NOT_CONVEX", "Piece", "prism"},
     }
     of_convex_kernels = {
+        "BALL",
         "REACH",
         "ROUNDING",
         "FRAME",

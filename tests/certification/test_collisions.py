@@ -143,7 +143,7 @@ def furthest(arrays: kernels.Bodies, node: int, direction: np.ndarray) -> tuple[
     corners, waiting = {first}, [first]
     while waiting:
         at = waiting.pop()
-        beside = {int(k) for k in hulls[at + 4 : at + 4 + int(hulls[at + 3])]}
+        beside = {at + int(k) for k in hulls[at + 4 : at + 4 + int(hulls[at + 3])]}
         waiting += beside - corners
         corners |= beside
     true = max(float(hulls[k : k + 3] @ direction) for k in corners)
@@ -189,6 +189,30 @@ def test_corners_that_all_but_coincide_hide_nothing(tmp_path: Path, scene: Scene
                 found, true = furthest(arrays, len(arrays.nodes) - 1, direction)
                 truth = ((corners + np.ones(3)) @ direction).max()
                 np.testing.assert_allclose((found, true), truth, atol=1e-6)
+
+
+def test_what_one_frame_carries_is_left_out_only_where_it_is_apart(scene: Scene) -> None:
+    """Boxes and balls at any distance of a link: the balls around them say no more than is so."""
+    rng, left_out, near = np.random.default_rng(5), 0, 0
+    carried = []
+    for k, place in enumerate(rng.uniform(-0.1, 0.1, (40, 3)).tolist()):
+        shape: Shape = Sphere(f"ball {k}", tuple(place), 0.03)
+        if k % 2:
+            shape = Box(f"box {k}", tuple(place), (0.1, 0.02, 0.05), rpy_rad=(0.3 * k, 0.2, 0.1))
+        carried.append(Attached(shape, "link6" if k % 3 else "link5"))
+    with Certifier(replace(scene, attached=tuple(carried))) as certifier:
+        check, own = certifier.collisions, certifier.collisions.collider
+        looked_at, every = own.rigid(MARGIN_M), own.rigid(np.inf)
+        for row, pair in every.items():
+            apart = check._near(row, np.zeros(6))
+            frames = {own.bodies[key].frame for key in pair}
+            assert len(frames) == 1
+            if row not in looked_at:
+                left_out += 1
+                assert apart >= MARGIN_M
+            near += apart < MARGIN_M
+    assert left_out > 100
+    assert near > 20
 
 
 # The proof along a path.

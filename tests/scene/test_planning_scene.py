@@ -499,3 +499,37 @@ def test_what_pybullet_breaks_down_at_is_refused_by_its_name(planner: Planner) -
         planner.scene.add(CRATE, _Refused("odd", (0.5, 0.0, 1.0), 0.05))
     assert planner.scene.now is before
     in_step(planner)
+
+
+def test_a_mesh_that_comes_again_is_no_further_shape_of_pybullets(
+    planner: Planner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which frees none: one moved, two of the same, one of which goes, and another content."""
+    bullet, made = planner._certifier._world._bullet, list[object]()
+    create = bullet.createCollisionShape
+
+    def counted(**geometry: object) -> object:
+        made.append(geometry)
+        return create(**geometry)
+
+    monkeypatch.setattr(bullet, "createCollisionShape", counted)
+    file, scene = cube(tmp_path / "own.obj", 0.05), planner.scene
+    cloud = np.random.default_rng(7).uniform(-0.1, 0.1, (50, 3))
+    mesh = Mesh("one", file, Placement((0.4, 0.2, 0.6)))
+    scene.add(mesh, replace(mesh, name="other"), PointCloud("seen", cloud, 0.02))
+    for k in range(4):
+        scene.move("one", Placement((0.4, -0.2, 0.5 + 0.1 * k)))
+        scene.move("seen", Placement((0.3, 0.1 * k, 0.8)))
+    scene.remove("seen", "one")
+    assert len(made) == 2
+    in_step(planner)
+    scene.add(PointCloud("seen", cloud, 0.02), mesh, replace(mesh, name="large", scale=2.0))
+    assert len(made) == 3
+    cube(file, 0.1)
+    for k, name in enumerate(("one", "other", "large")):
+        scene.move(name, Placement((0.4, 0.3 * k, 0.7)))
+    scene.add(PointCloud("more", cloud, 0.03), PointCloud("fewer", cloud[1:], 0.02))
+    assert len(made) == 7
+    q = planner.robot.sample(300, np.random.default_rng(8))
+    with scene.world() as world:
+        np.testing.assert_array_equal(planner._certifier._world.free(q), world.free(q))

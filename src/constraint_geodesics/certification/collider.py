@@ -6,10 +6,11 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from constraint_geodesics.certification import collision_kernels as kernels
 from constraint_geodesics.certification.chain import Chain, rotated
+from constraint_geodesics.scene import convex_kernels as convex
 from constraint_geodesics.scene.bodies import Body, BodyTable, Pair
 from constraint_geodesics.scene.pieces import NOT_CONVEX, Piece, prism
 from constraint_geodesics.scene.scene import Scene
@@ -57,8 +58,8 @@ class Collider:
         before = self.bodies
         self._table.change(scene)
         bodies = self.bodies
-        same = {key for key, body in before.items() if bodies.get(key) is body}
-        self._apart = frozenset(pair for pair in self._apart if same.issuperset(pair))
+        others = {key for key, body in before.items() if bodies.get(key) is not body}
+        self._apart = frozenset(pair for pair in self._apart if others.isdisjoint(pair))
         self._arrange()
 
     @property
@@ -98,19 +99,30 @@ class Collider:
     def _arrange(self) -> None:
         table, frames = self._table, self._table.frames
         is_rigid = frames[:, 0] == frames[:, 1]
-        self._keys, rigid = list(table.bodies), table.ends[is_rigid]
-        self._moving = table.ends[~is_rigid & ~table.named(self._apart)]
-        self.rigid = self._named(rigid)
-        arrays = table.arrays(np.concatenate([self._moving, rigid]))
-        self.arrays = kernels.Bodies(self._chain, *arrays, len(self._moving))
+        moving = table.ends[~is_rigid & ~table.named(self._apart)]
+        self._keys, self._ends = list(table.bodies), np.concatenate([moving, table.ends[is_rigid]])
+        self.arrays = kernels.Bodies(self._chain, *table.arrays(self._ends), len(moving))
 
     @property
     def moving(self) -> list[Pair]:
         """Pairs that may meet while the arm moves."""
-        return self._named(self._moving)
+        return [self._named(row) for row in range(self.arrays.top)]
 
-    def _named(self, ends: Int[np.ndarray, "n 2"]) -> list[Pair]:
-        return [(self._keys[a], self._keys[b]) for a, b in ends.tolist()]
+    def rigid(self, within: float) -> dict[int, Pair]:
+        """Pairs that never move relative to each other, by their rows of `arrays.pairs`, without
+        those that the balls around them say are further apart than so much [m].
+        """
+        nodes, top = self.arrays.nodes, self.arrays.top
+        ends = self.arrays.pairs[top : len(self._ends), :2].astype(int)
+        # two bodies that one frame carries, in which both balls are
+        balls = nodes[ends, convex.BALL : convex.BALL + 4]
+        away = np.linalg.norm(balls[:, 0, :3] - balls[:, 1, :3], axis=1)
+        near = away - balls[:, :, 3].sum(axis=1) <= within
+        return {row: self._named(row) for row in (top + np.flatnonzero(near)).tolist()}
+
+    def _named(self, row: int) -> Pair:
+        first, second = self._ends[row].tolist()
+        return self._keys[first], self._keys[second]
 
     def pair(self, row: float) -> tuple[Body, Body]:
         """The bodies of a row of `arrays.pairs`."""
@@ -119,8 +131,8 @@ class Collider:
         own = int(row)
         if own >= self.arrays.top:
             own = int(np.flatnonzero((tops[:, 2] <= own) & (own < tops[:, 3]))[0])
-        first, second = self._moving[own]
-        return self.bodies[self._keys[first]], self.bodies[self._keys[second]]
+        first, second = self._named(own)
+        return self.bodies[first], self.bodies[second]
 
     def covered(self) -> list[str]:
         """Bodies whose meshes are not convex, so that their hulls cover more than them."""

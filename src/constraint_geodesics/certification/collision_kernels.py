@@ -51,11 +51,9 @@ _DEEPEST = 64
 class Bodies(NamedTuple):
     """What may meet, on a chain as chain.py describes it.
 
-    hulls (H,): of each corner of a piece x, y, z [m] in the frame that carries it, the number of
-    corners beside it and where they are in `hulls`; nodes (N, REACH + D) and pairs (P, PAIR): the
-    columns of convex_kernels.py, those of a pair begin with two nodes, that of the lower frame
-    first, and the range of the pairs of their pieces, which is empty for pieces.  The first `top`
-    pairs are of bodies.
+    hulls (H,), nodes (N, REACH + D) and pairs (P, PAIR): those of convex_kernels.py.  The columns
+    of a pair begin with two nodes, that of the lower frame first, and the range of the pairs of
+    their pieces, which is empty for pieces.  The first `top` pairs are of bodies.
     """
 
     chain: Any

@@ -247,17 +247,17 @@ class CollisionCheck:
         it was found then.
         """
         before, self._rigid = self._rigid, {}
-        for k, pair in enumerate(self.collider.rigid):
+        for row, pair in self.collider.rigid(MARGIN_M).items():
             bodies = self.collider.bodies[pair[0]], self.collider.bodies[pair[1]]
             known = before.get(pair)
             if known is None or known[0] is not bodies[0] or known[1] is not bodies[1]:
-                known = *bodies, self._touch_always(k, *bodies, dof)
+                known = *bodies, self._touch_always(row, *bodies, dof)
             self._rigid[pair] = known
         return next((found for *_, found in self._rigid.values() if found is not None), None)
 
-    def _touch_always(self, k: int, first: Body, second: Body, dof: int) -> _Contact | None:
+    def _touch_always(self, row: int, first: Body, second: Body, dof: int) -> _Contact | None:
         zeros = np.zeros(dof)
-        near = self._near(self.collider.arrays.top + k, zeros)
+        near = self._near(row, zeros)
         if near >= MARGIN_M:
             return None
         if self._world is None:

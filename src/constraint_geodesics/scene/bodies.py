@@ -92,12 +92,10 @@ def links_of(
 
 def touching(robot: SerialRobot, scene: Scene) -> frozenset[frozenset[str]]:
     """Pairs of names that may touch: of links, of shapes and links, of shapes."""
-    pairs = [*robot.allowed, *scene.allowed]
-    for shape in (*scene.workcell, *(one.shape for one in scene.attached)):
-        pairs += [(shape.name, link) for link in shape.exempt_links]
-    for one in scene.attached:
-        pairs += [(one.name, other) for other in one.touching]
-    return frozenset(map(frozenset, pairs))
+    shapes = (*scene.workcell, *(one.shape for one in scene.attached))
+    exempt = [(shape.name, link) for shape in shapes for link in shape.exempt_links]
+    said = [(one.name, other) for one in scene.attached for other in one.touching]
+    return frozenset(map(frozenset, [*robot.allowed, *scene.allowed, *exempt, *said]))
 
 
 def may_meet(first: Body, second: Body, allowed: Collection[frozenset[str]]) -> bool:
@@ -117,49 +115,39 @@ def may_meet(first: Body, second: Body, allowed: Collection[frozenset[str]]) -> 
 
 class _Block(NamedTuple):
     """A body as the kernels take it, on its own: nodes (n, REACH + D), that of the whole first
-    where it has more than one piece, its hulls, where among these its corners are and where what
-    leads to others of them.
+    where it has more than one piece, its hulls, and where among these its corners are.
     """
 
     nodes: np.ndarray
     hulls: np.ndarray
     corners: np.ndarray
-    links: np.ndarray
-
-    @property
-    def pieces(self) -> int:
-        """How many there are."""
-        return max(len(self.nodes) - 1, 1)
 
     def at(self, pose: Float[np.ndarray, "4 4"], frame: int) -> "_Block":
         """The same elsewhere, carried by another frame."""
         nodes, hulls, turn = self.nodes.copy(), self.hulls.copy(), pose[:3, :3]
         ball, own = slice(kernels.BALL, kernels.BALL + 3), slice(kernels.BOX + 3, kernels.PLACE)
-        nodes[:, kernels.FRAME] = frame
         nodes[:, ball] = nodes[:, ball] @ turn.T + pose[:3, 3]
         nodes[:, own] = (turn @ nodes[:, own].reshape(-1, 3, 3)).reshape(-1, 9)
         # a box is looked at by its turn in the base frame, which one that moves has not for good
         nodes[(nodes[:, kernels.BOX] < 0.0) | (frame > 0), kernels.BOX : kernels.PLACE] = -1.0
         at = self.corners[:, None] + np.arange(3)
         hulls[at] = hulls[at] @ turn.T + pose[:3, 3]
-        return self._replace(nodes=nodes, hulls=hulls)
+        return _Block(nodes, hulls, self.corners)
 
 
 def block_of(pieces: Sequence[Piece], dof: int) -> _Block:
     """Pieces as the kernels take them, carried by the base."""
-    rows, hulls = list[np.ndarray](), list[float]()
-    places, leading = list[int](), list[int]()
+    rows, hulls, places, size = list[np.ndarray](), list[np.ndarray](), list[np.ndarray](), 0
     for piece in pieces:
         row = np.zeros(kernels.REACH + dof)
-        corners, beside = _with_neighbours(piece.corners)
-        begins = len(hulls) + np.cumsum([0, *(4 + len(own) for own in beside)])
-        for corner, own in zip(corners, beside, strict=True):
-            places.append(len(hulls))
-            leading += range(len(hulls) + 4, len(hulls) + 4 + len(own))
-            hulls += [*corner, len(own), *begins[own]]
+        hull, own_places = _hull(np.ascontiguousarray(piece.corners, float).tobytes())
+        corners = hull[own_places[:, None] + np.arange(3)]
         centre = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
         radius = np.linalg.norm(corners - centre, axis=1).max() + piece.rounding
-        row[[kernels.ROUNDING, kernels.CORNER]] = piece.rounding, begins[0]
+        row[kernels.ROUNDING], row[kernels.CORNER] = piece.rounding, size
+        hulls.append(hull)
+        places.append(own_places + size)
+        size += len(hull)
         row[kernels.BALL : kernels.BOX] = (*centre, radius * (1.0 + 1e-9))
         row[kernels.BOX : kernels.PLACE] = -1.0
         if piece.box is not None:
@@ -175,23 +163,60 @@ def block_of(pieces: Sequence[Piece], dof: int) -> _Block:
         away = np.linalg.norm(own[:, ball] - whole[ball], axis=1)
         whole[size] = (away + own[:, size]).max()
         rows.insert(0, whole)
-    nodes = np.array(rows).reshape(-1, kernels.REACH + dof)
-    return _Block(nodes, np.array(hulls), np.array(places, int), np.array(leading, int))
+    return _Block(np.array(rows), np.concatenate(hulls), np.concatenate(places))
 
 
 class _Own(NamedTuple):
-    """A shape in its own frame, its pieces there, and these as the kernels take them."""
+    """A shape's pieces in its own frame, and these as the kernels take them."""
 
-    shape: Shape
     pieces: tuple[Piece, ...]
     block: _Block
 
 
+def _own_of(shape: Shape, dof: int, known: _Own | None) -> _Own:
+    """known: of the same shape before, which a file with the same in it leaves as it is."""
+    at_origin = shape.placed(Placement())
+    if not shape.reads_files:
+        return _kept_own(at_origin, dof)
+    pieces = at_origin.pieces()
+    if known is not None and _are_same(pieces, known.pieces):
+        return known
+    return _made_own(shape.name, pieces, dof)
+
+
+@lru_cache(maxsize=64)  # certificate and search ask the same, one after the other
+def _kept_own(at_origin: Shape, dof: int) -> _Own:
+    return _made_own(at_origin.name, at_origin.pieces(), dof)
+
+
+def _made_own(name: str, pieces: tuple[Piece, ...], dof: int) -> _Own:
+    if not pieces:
+        raise RobotError(f"{name!r} has no collision shape: nothing could touch it")
+    return _Own(pieces, block_of(pieces, dof))
+
+
 def _are_same(first: Sequence[Piece], second: Sequence[Piece]) -> bool:
     return len(first) == len(second) and all(
-        np.array_equal(a.corners, b.corners) and a.rounding == b.rounding
+        np.array_equal(a.corners, b.corners)
+        and (a.rounding, a.hollow_m) == (b.rounding, b.hollow_m)
         for a, b in zip(first, second, strict=True)
     )
+
+
+class _Now(NamedTuple):
+    """All that changes of a table; a change makes another one and writes into none.
+
+    places: of the bodies among each other.  shapes: what was made into the bodies that are no
+    links, and what is known of it in its own frame.
+    """
+
+    scene: Scene
+    allowed: frozenset[frozenset[str]]
+    bodies: dict[BodyKey, Body]
+    places: dict[BodyKey, int]
+    blocks: dict[BodyKey, _Block]
+    shapes: dict[str, tuple[Shape | Attached, _Own]]
+    ends: Int[np.ndarray, "P 2"]
 
 
 class BodyTable:
@@ -206,16 +231,13 @@ class BodyTable:
         self._dof, self._reach = scene.robot.dof, reach
         links, self.links = links_of(scene.robot, frames)
         self._robot = {body.key: body for body in links}
-        self._blocks = {
-            key: self._reaching(block_of(body.pieces, self._dof), body)
-            for key, body in self._robot.items()
-        }
-        self._own = dict[str, _Own]()
-        self.scene = Scene(scene.robot)
-        self.bodies = dict(self._robot)
-        self._allowed = touching(scene.robot, self.scene)
-        self._made = dict[str, Shape | Attached]()
-        self.ends = self._pairs(self.bodies, self._allowed, self._robot)
+        blocks = {key: block_of(body.pieces, self._dof) for key, body in self._robot.items()}
+        for key, body in self._robot.items():
+            self._carry(blocks[key], body)
+        bare = Scene(scene.robot)
+        allowed, places = touching(bare.robot, bare), _places(self._robot)
+        ends = _pairs(self._robot, places, list(self._robot), allowed, places)
+        self._now = _Now(bare, allowed, self._robot, places, blocks, {}, ends)
         self.change(scene)
 
     def change(self, scene: Scene) -> None:
@@ -223,40 +245,51 @@ class BodyTable:
         before.  Nothing has changed where it raises RobotError, or SceneError for names.
         """
         require_names(self.links, scene.workcell, scene.attached, scene.allowed)
-        bodies, own, made = dict(self._robot), dict[str, _Own](), dict[str, Shape | Attached]()
-        blocks = {key: self._blocks[key] for key in self._robot}
-        news = set[BodyKey]()
         everything: list[Shape | Attached] = [*scene.workcell, *scene.attached]
-        for one in everything:
-            key, before = BodyKey(one.name, True), self._made.get(one.name)
-            made[one.name] = one
-            if before is one or before == one:
-                own[one.name] = self._own[one.name]
-                bodies[key], blocks[key] = self.bodies[key], self._blocks[key]
+        before, wanted = self._now, {one.name: one for one in everything}
+        bodies, blocks, shapes = dict(before.bodies), dict(before.blocks), dict(before.shapes)
+        for name in before.shapes.keys() - wanted.keys():
+            key = BodyKey(name, True)
+            del bodies[key], blocks[key], shapes[name]
+        news = set[BodyKey]()
+        for name, one in wanted.items():
+            made, own = before.shapes.get(name, (None, None))
+            if made is one or made == one:
                 continue
-            own[one.name] = self._own_of(one.shape if isinstance(one, Attached) else one)
-            bodies[key], blocks[key] = self._placed(one, own[one.name])
+            own = _own_of(one.shape if isinstance(one, Attached) else one, self._dof, own)
+            key, shapes[name] = BodyKey(name, True), (one, own)
+            bodies[key], blocks[key] = self._placed(one, own)
             news.add(key)
         allowed = touching(scene.robot, scene)
-        if allowed != self._allowed:  # of what is named there all pairs are looked at again
-            named = set().union(*(allowed ^ self._allowed))
+        if allowed != before.allowed:  # of what is named there all pairs are looked at again
+            named = set().union(*(allowed ^ before.allowed))
             news |= {key for key in bodies if key.name in named}
-        place = {key: i for i, key in enumerate(bodies) if key not in news}
-        moved = np.array([place.get(key, -1) for key in self.bodies], int)[self.ends]
-        ends = np.concatenate([moved[(moved >= 0).all(axis=1)], self._pairs(bodies, allowed, news)])
-        self.scene, self._allowed, self.bodies, self._blocks = scene, allowed, bodies, blocks
-        self._own, self._made, self.ends = own, made, ends
+        places = _places(bodies)
+        stay = [-1 if key in news else places.get(key, -1) for key in before.bodies]
+        ends = np.array(stay, int)[before.ends]
+        moving = [*self._robot, *(BodyKey(one.name, True) for one in scene.attached)]
+        more = _pairs(bodies, places, moving, allowed, news)
+        ends = np.concatenate([ends[(ends >= 0).all(axis=1)], more])
+        self._now = _Now(scene, allowed, bodies, places, blocks, shapes, ends)
 
     @property
     def state(self) -> tuple[Any, ...]:
         """All that changes, to be taken back by `restore`; nothing is read again for that."""
-        kept = self.scene, self._allowed, self.bodies, self._blocks
-        return *kept, self._own, self._made, self.ends
+        return self._now
 
     def restore(self, state: tuple[Any, ...]) -> None:
         """Be as before."""
-        self.scene, self._allowed, self.bodies, self._blocks = state[:4]
-        self._own, self._made, self.ends = state[4:]
+        self._now = _Now(*state)
+
+    @property
+    def bodies(self) -> dict[BodyKey, Body]:
+        """All of them."""
+        return self._now.bodies
+
+    @property
+    def ends(self) -> Int[np.ndarray, "P 2"]:
+        """The pairs."""
+        return self._now.ends
 
     @property
     def frames(self) -> Int[np.ndarray, "P 2"]:
@@ -265,62 +298,25 @@ class BodyTable:
 
     def named(self, pairs: Collection[Pair]) -> Bool[np.ndarray, "P"]:
         """Which pairs are among those."""
-        place, count = {key: i for i, key in enumerate(self.bodies)}, len(self.bodies)
+        place, count = self._now.places, len(self.bodies)
         known = [place[a] * count + place[b] for a, b in pairs if a in place and b in place]
-        return np.isin(self.ends[:, 0] * count + self.ends[:, 1], known)
+        found = np.zeros(count * count, bool)
+        found[known] = True
+        return found[self.ends[:, 0] * count + self.ends[:, 1]]
 
     def arrays(self, ends: Int[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Hulls (H,), nodes (N, REACH + D) and pairs (P, PAIR) of these pairs of bodies, behind
         which those of their pieces are.
         """
-        blocks = list(self._blocks.values()) or [block_of([], self._dof)]
-        counts = np.array([len(block.nodes) for block in blocks])
-        sizes = np.array([len(block.hulls) for block in blocks])
-        begins, offsets = np.cumsum(counts) - counts, np.cumsum(sizes) - sizes
-        nodes = np.concatenate([block.nodes for block in blocks])
-        nodes[:, kernels.CORNER] += np.repeat(offsets, counts)
-        hulls = np.concatenate([block.hulls for block in blocks])
-        links = np.array([len(block.links) for block in blocks])
-        shifts = np.repeat(offsets, links)
-        hulls[np.concatenate([block.links for block in blocks]) + shifts] += shifts
-        pieces = np.array([block.pieces for block in blocks])
-        return hulls, nodes, _pair_table(ends, begins, pieces, nodes)
-
-    @staticmethod
-    def _pairs(
-        bodies: Mapping[BodyKey, Body],
-        allowed: Collection[frozenset[str]],
-        news: Collection[BodyKey],
-    ) -> Int[np.ndarray, "n 2"]:
-        """Pairs that may meet of which one is new, that of the lower frame first."""
-        around = [(i, body) for i, body in enumerate(bodies.values()) if body.is_fixed]
-        others = [(i, body) for i, body in enumerate(bodies.values()) if not body.is_fixed]
-        found = list[tuple[int, int]]()
-        for place, key in enumerate(bodies):
-            if key not in news:
-                continue
-            own = bodies[key]
-            for other, body in others if own.is_fixed else (*others, *around):
-                if other == place or (other < place and body.key in news):
-                    continue
-                a, b = (place, own), (other, body)
-                first, second = (a, b) if _order(*a) < _order(*b) else (b, a)
-                if may_meet(first[1], second[1], allowed):
-                    found.append((first[0], second[0]))
-        return np.array(found, int).reshape(-1, 2)
-
-    def _own_of(self, shape: Shape) -> _Own:
-        """As it was before where it has only moved, and a file has the same in it."""
-        at_origin, known = shape.placed(Placement()), self._own.get(shape.name)
-        same = known is not None and known.shape == at_origin
-        if same and known is not None and not known.shape.reads_files:
-            return known
-        pieces = at_origin.pieces()
-        if same and known is not None and _are_same(pieces, known.pieces):
-            return known
-        if not pieces:
-            raise RobotError(f"{shape.name!r} has no collision shape: nothing could touch it")
-        return _Own(at_origin, pieces, block_of(pieces, self._dof))
+        blocks = list(self._now.blocks.values())
+        counts = np.array([len(block.nodes) for block in blocks], int)
+        sizes = np.array([len(block.hulls) for block in blocks], int)
+        none = np.empty((0, kernels.REACH + self._dof))
+        nodes = np.concatenate([none, *(block.nodes for block in blocks)])
+        nodes[:, kernels.CORNER] += np.repeat(np.cumsum(sizes) - sizes, counts)
+        hulls = np.concatenate([np.empty(0), *(block.hulls for block in blocks)])
+        begins = np.cumsum(counts) - counts
+        return hulls, nodes, kernels.pair_table(ends, begins, counts, nodes)
 
     def _placed(self, one: Shape | Attached, own: _Own) -> tuple[Body, _Block]:
         shape = one.shape if isinstance(one, Attached) else one
@@ -330,18 +326,46 @@ class BodyTable:
             pose, frame, carrier = link.pose @ pose, link.frame, one.link
         there = tuple(piece.at(pose) for piece in own.pieces)
         body = Body(shape.name, frame, there, shape=shape, carrier=carrier)
-        return body, self._reaching(own.block.at(pose, frame), body)
+        block = own.block.at(pose, frame)
+        self._carry(block, body)
+        return body, block
 
-    def _reaching(self, block: _Block, body: Body) -> _Block:
-        """With how far its points get from each axis, carried by its frame."""
-        nodes = block.nodes.copy()
+    def _carry(self, block: _Block, body: Body) -> None:
+        """Write which frame carries a body, and how far its points get from each axis."""
+        nodes = block.nodes
         nodes[:, kernels.FRAME] = body.frame
         if body.frame > 0:
             reaches = np.array([self._reach(piece, body.frame) for piece in body.pieces])
-            if len(nodes) > 1:
-                reaches = np.concatenate([reaches.max(axis=0)[None], reaches])
-            nodes[:, kernels.REACH :] = reaches
-        return block._replace(nodes=nodes)
+            nodes[-len(reaches) :, kernels.REACH :] = reaches
+            nodes[0, kernels.REACH :] = reaches.max(axis=0)
+
+
+def _places(bodies: Mapping[BodyKey, Body]) -> dict[BodyKey, int]:
+    return {key: place for place, key in enumerate(bodies)}
+
+
+def _pairs(
+    bodies: Mapping[BodyKey, Body],
+    places: Mapping[BodyKey, int],
+    moving: Collection[BodyKey],
+    allowed: Collection[frozenset[str]],
+    news: Collection[BodyKey],
+) -> Int[np.ndarray, "n 2"]:
+    """Pairs that may meet of which one is new, that of the lower frame first.  moving: bodies that
+    are no shapes around the arm.
+    """
+    found, done = list[tuple[int, int]](), set[BodyKey]()
+    for key in news:
+        own, place = bodies[key], places[key]
+        done.add(key)
+        for other in moving if own.is_fixed else bodies:
+            if other in done:
+                continue
+            a, b = (place, own), (places[other], bodies[other])
+            first, second = (a, b) if _order(*a) < _order(*b) else (b, a)
+            if may_meet(first[1], second[1], allowed):
+                found.append((first[0], second[0]))
+    return np.array(found, int).reshape(-1, 2)
 
 
 def _order(place: int, body: Body) -> tuple[int, bool, int]:
@@ -349,44 +373,27 @@ def _order(place: int, body: Body) -> tuple[int, bool, int]:
     return body.frame, body.shape is None, place
 
 
-def _pair_table(
-    ends: Int[np.ndarray, "n 2"],
-    begins: Int[np.ndarray, "B"],
-    pieces: Int[np.ndarray, "B"],
-    nodes: np.ndarray,
-) -> Float[np.ndarray, "P 9"]:
-    """Rows of pairs of bodies, and behind them those of their pieces."""
-    counts = pieces[ends]
-    whole = (counts == 1).all(axis=1)
-    several = np.where(whole, 0, counts.prod(axis=1))
-    last = len(ends) + np.cumsum(several)
-    rows = np.zeros((len(ends) + several.sum(), kernels.PAIR))
-    rows[: len(ends), :2] = begins[ends]
-    rows[: len(ends), 2] = np.where(whole, 0, last - several)
-    rows[: len(ends), 3] = np.where(whole, 0, last)
-    which = np.repeat(np.arange(len(ends)), several)
-    inner = np.arange(len(which)) - np.repeat(last - several - len(ends), several)
-    first, second = inner // counts[which, 1], inner % counts[which, 1]
-    # the whole of a body of several pieces is its first node
-    rows[len(ends) :, 0] = begins[ends[which, 0]] + first + (counts[which, 0] > 1)
-    rows[len(ends) :, 1] = begins[ends[which, 1]] + second + (counts[which, 1] > 1)
-    corners = nodes[rows[:, :2].astype(int), kernels.CORNER]
-    rows[:, kernels.CORNERS : kernels.CORNERS + 2] = corners
-    return rows
+@lru_cache(maxsize=4096)  # certificate and search ask the same, and so does every further scene
+def _hull(data: bytes) -> tuple[Float[np.ndarray, "H"], Int[np.ndarray, "m"]]:
+    """A convex hull of points (n, 3) as the kernels take it, and where its corners are in that."""
+    points = np.frombuffer(data).reshape(-1, 3)
+    corners, beside, counts = _with_neighbours(points)
+    begins = np.cumsum(4 + counts) - counts - 4
+    hull = np.zeros(4 * len(corners) + len(beside))
+    leads = np.ones(len(hull), bool)
+    leads[begins[:, None] + np.arange(4)] = False
+    hull[begins[:, None] + np.arange(3)], hull[begins + 3] = corners, counts
+    hull[leads] = begins[beside] - np.repeat(begins, counts)
+    return hull, begins
 
 
 def _with_neighbours(
     points: Float[np.ndarray, "n 3"],
-) -> tuple[Float[np.ndarray, "m 3"], list[Int[np.ndarray, "k"]]]:
-    """Corners of a convex hull, and for each those beside it: that share a face, or all others
-    where a way along edges might end before the corner that lies furthest out.
+) -> tuple[Float[np.ndarray, "m 3"], Int[np.ndarray, "E"], Int[np.ndarray, "m"]]:
+    """Corners of a convex hull, those beside each, one corner's after the other's, and how many
+    they are: that share a face, or all others where a way along edges might end before the corner
+    that lies furthest out.
     """
-    return _hull(np.ascontiguousarray(points, float).tobytes())
-
-
-@lru_cache(maxsize=4096)  # certificate and search ask the same, and so does every further scene
-def _hull(data: bytes) -> tuple[Float[np.ndarray, "m 3"], list[Int[np.ndarray, "k"]]]:
-    points = np.frombuffer(data).reshape(-1, 3)
     if len(points) >= _MIXED:
         with contextlib.suppress(QhullError):  # flat
             hull = ConvexHull(points)
@@ -397,9 +404,9 @@ def _hull(data: bytes) -> tuple[Float[np.ndarray, "m 3"], list[Int[np.ndarray, "
             starts = np.searchsorted(edges[:, 0], range(len(corners)))
             own = points[corners]
             if _leads_furthest(own, edges[:, 1], starts, hull.equations[:, :3]):
-                return own, np.split(edges[:, 1], starts[1:])
-    others = np.arange(len(points))
-    return points, [np.delete(others, i) for i in others]
+                return own, edges[:, 1], np.diff(starts, append=len(edges))
+    first, second = np.nonzero(~np.eye(len(points), dtype=bool))
+    return points, second, np.bincount(first, minlength=len(points))
 
 
 def _leads_furthest(

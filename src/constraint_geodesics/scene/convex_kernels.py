@@ -7,6 +7,8 @@ hulls from below; the vectors that Gilbert, Johnson and Keerthi's method (1988) 
 the distance itself.  A proof needs the gap alone, however the vector was found.
 
 Frames (F, 12): position [m], then rotation by rows.
+Hulls (H,): of each corner x, y, z [m] in its frame, the number of corners beside it, and how much
+further on each of these is, so that a hull is the same wherever it stands among others.
 """
 
 import numpy as np
@@ -74,10 +76,9 @@ def furthest(hulls, corner, x, y, z):
     most = x * hulls[corner] + y * hulls[corner + 1] + z * hulls[corner + 2]
     rises = True
     while rises:
-        rises = False
-        beside = corner + 4
-        for e in range(beside, beside + int(hulls[corner + 3])):
-            k = int(hulls[e])
+        rises, here = False, corner
+        for e in range(here + 4, here + 4 + int(hulls[here + 3])):
+            k = here + int(hulls[e])
             value = x * hulls[k] + y * hulls[k + 1] + z * hulls[k + 2]
             if value > most:
                 most, corner, rises = value, k, True
@@ -275,6 +276,34 @@ def roughly_apart(nodes, a, b):
     u, v, w = u - nodes[a, BOX], v - nodes[a, BOX + 1], w - nodes[a, BOX + 2]
     u, v, w = max(u, 0.0), max(v, 0.0), max(w, 0.0)
     return np.sqrt(u * u + v * v + w * w) - nodes[a, ROUNDING] - nodes[b, BALL + 3]
+
+
+@njit(**COMPILE)
+def pair_table(ends, begins, counts, nodes):
+    """Rows (P, PAIR) of pairs of bodies (n, 2), and behind them those of their pieces.  begins,
+    counts: of each body's nodes, of which the first is the whole's where it has several pieces.
+    """
+    last = ends.shape[0]
+    for body in range(ends.shape[0]):
+        a, b = counts[ends[body, 0]], counts[ends[body, 1]]
+        if a > 1 or b > 1:
+            last += max(a - 1, 1) * max(b - 1, 1)
+    rows, last = np.zeros((last, PAIR)), ends.shape[0]
+    for body in range(ends.shape[0]):
+        a, b = counts[ends[body, 0]], counts[ends[body, 1]]
+        first, second = begins[ends[body, 0]], begins[ends[body, 1]]
+        rows[body, 0], rows[body, 1] = first, second
+        if a > 1 or b > 1:
+            rows[body, 2] = last
+            for i in range(min(a - 1, 1), max(a, 1)):
+                for k in range(min(b - 1, 1), max(b, 1)):
+                    rows[last, 0], rows[last, 1] = first + i, second + k
+                    last += 1
+            rows[body, 3] = last
+    for row in range(rows.shape[0]):
+        for side in range(2):
+            rows[row, CORNERS + side] = nodes[int(rows[row, side]), CORNER]
+    return rows
 
 
 @njit(**COMPILE)

@@ -11,7 +11,7 @@ import numpy as np
 from constraint_geodesics.fields import Positive
 from constraint_geodesics.robot.kinematics import RobotError
 from constraint_geodesics.scene.pieces import HULL_MARGIN, Piece, digest_of
-from constraint_geodesics.scene.shape import Placement, Shape, add_body
+from constraint_geodesics.scene.shape import Placement, Shape, add_mesh
 from constraint_geodesics.scene.triangles import Triangles, convex_pieces, read_triangles
 
 
@@ -53,18 +53,14 @@ class Mesh(Shape):
 
     def add_to(self, bullet: Any) -> int:
         """The triangles themselves, to PyBullet."""
-        mesh = _scaled(*self._read(), self.scale)
-        vertices = np.unique(mesh.places().reshape(-1, 3), axis=0, return_inverse=True)
-        corners, which = vertices
-        return add_body(
-            bullet,
-            self.pose.position_m,
-            self.pose.quaternion,
-            shapeType=bullet.GEOM_MESH,
-            vertices=corners.tolist(),
-            indices=which.reshape(-1).tolist(),
-            flags=bullet.GEOM_FORCE_CONCAVE_TRIMESH,
-        )
+        file, digest = self._read()
+
+        def mesh() -> Any:
+            places = _scaled(file, digest, self.scale).places().reshape(-1, 3)
+            return np.unique(places, axis=0, return_inverse=True)
+
+        key = f"{digest}{file.suffix.lower()} {self.scale!r}"
+        return add_mesh(bullet, self.pose, key, mesh)
 
     def drawn(self, rerun: Any, style: Mapping[str, Any]) -> Any:
         """A mesh of Rerun."""

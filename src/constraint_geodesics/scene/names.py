@@ -19,13 +19,14 @@ def require_names(
     """That every shape has a name of its own, which no link of the robot has, that links which are
     named are the robot's, and that what may touch is there.  Raises SceneError.
     """
-    shapes, names = (*workcell, *(one.shape for one in attached)), set[str]()
-    for shape in shapes:
-        if shape.name in links:
-            raise SceneError(f"{shape.name!r} is a link of the robot: give the shape another name")
-        if shape.name in names:
-            raise SceneError(f"two shapes are called {shape.name!r}: give one another name")
-        names.add(shape.name)
+    shapes = (*workcell, *(one.shape for one in attached))
+    given = [shape.name for shape in shapes]
+    names = set(given)
+    for name in names.intersection(links):
+        raise SceneError(f"{name!r} is a link of the robot: give the shape another name")
+    if len(names) < len(given):
+        twice = next(name for name in given if given.count(name) > 1)
+        raise SceneError(f"two shapes are called {twice!r}: give one another name")
     for link in (*(own for s in shapes for own in s.exempt_links), *(one.link for one in attached)):
         if link not in links:
             raise SceneError(f"no link is called {link!r}: {', '.join(links)}")

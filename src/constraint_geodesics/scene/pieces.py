@@ -66,7 +66,7 @@ class LinkPieces:
 
 def box_corners(half_edges: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
     """Corners of a box around the origin; fewer than 8 where edges are 0."""
-    return np.unique(_SIGNS * half_edges, axis=0)
+    return _SIGNS[((_SIGNS > 0.0) | (half_edges > 0.0)).all(axis=1)] * half_edges
 
 
 def prism(sides: int, radius: float, low: float, high: float) -> Float[np.ndarray, "n 3"]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from hashlib import blake2b
 from heapq import heappop, heappush
 from itertools import count
 from typing import Any, Literal
@@ -14,7 +15,7 @@ from scipy.spatial import ConvexHull
 
 from constraint_geodesics.fields import Positive
 from constraint_geodesics.scene.pieces import HULL_MARGIN, Piece
-from constraint_geodesics.scene.shape import Placement, RoundedBox, Shape, add_body
+from constraint_geodesics.scene.shape import Placement, RoundedBox, Shape, add_mesh
 
 MOST = 10_000
 """Points at most: PyBullet takes no larger mesh of balls."""
@@ -114,17 +115,14 @@ class PointCloud(Shape):
     def add_to(self, bullet: Any) -> int:
         """An icosahedron in each ball, to PyBullet."""
         points = self.points_m.array
-        corners = (points[:, None] + self.radius_m * _BALL).reshape(-1, 3)
-        faces = np.arange(len(points))[:, None, None] * len(_BALL) + ConvexHull(_BALL).simplices
-        return add_body(
-            bullet,
-            self.pose.position_m,
-            self.pose.quaternion,
-            shapeType=bullet.GEOM_MESH,
-            vertices=corners.tolist(),
-            indices=faces.reshape(-1).tolist(),
-            flags=bullet.GEOM_FORCE_CONCAVE_TRIMESH,
-        )
+
+        def mesh() -> Any:
+            corners = (points[:, None] + self.radius_m * _BALL).reshape(-1, 3)
+            faces = np.arange(len(points))[:, None, None] * len(_BALL)
+            return corners, faces + ConvexHull(_BALL).simplices
+
+        key = f"{blake2b(points.tobytes()).hexdigest()} {self.radius_m!r}"
+        return add_mesh(bullet, self.pose, key, mesh)
 
     def drawn(self, rerun: Any, style: Mapping[str, Any]) -> Any:
         """Points of Rerun, as large as the balls."""

@@ -4,8 +4,9 @@ A new kind is one more file in this folder, and its name in shapes.py.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from math import inf
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -26,6 +27,10 @@ _SIZES = ("size_m", "radius_m", "length_m")
 
 def _numbers(shape: str, name: str, value: Any) -> Any:
     """A field as a float, or a tuple of them."""
+    if type(value) is tuple and all(type(own) is float for own in value):
+        least = 0.0 if name in _SIZES else -inf
+        if all(least < own < inf for own in value):  # soon seen, as of most
+            return value
     try:
         given = np.array(value, float)
     except (TypeError, ValueError):
@@ -175,3 +180,19 @@ def add_body(bullet: Any, position: Triple, turn: Any = (0, 0, 0, 1), **geometry
     """A fixed body of PyBullet with one collision shape, turned by a quaternion x, y, z, w."""
     shape = bullet.createCollisionShape(**geometry)
     return int(bullet.createMultiBody(0, shape, basePosition=position, baseOrientation=turn))
+
+
+def add_mesh(bullet: Any, at: Placement, key: str, mesh: Callable[[], Any]) -> int:
+    """A fixed body of triangles: corners (n, 3) [m] and faces (m, 3), which are asked for where
+    the world has had none of this key: PyBullet never frees megabytes of each mesh that it makes.
+    """
+    if key not in bullet.meshes:
+        corners, faces = mesh()
+        bullet.meshes[key] = bullet.createCollisionShape(
+            shapeType=bullet.GEOM_MESH,
+            vertices=corners.tolist(),
+            indices=faces.reshape(-1).tolist(),
+            flags=bullet.GEOM_FORCE_CONCAVE_TRIMESH,
+        )
+    shape, turn = bullet.meshes[key], at.quaternion
+    return int(bullet.createMultiBody(0, shape, basePosition=at.position_m, baseOrientation=turn))

@@ -83,6 +83,7 @@ class _Client:
             import pybullet
         self._module = pybullet
         self._id = pybullet.connect(pybullet.DIRECT)
+        self.meshes = dict[str, int]()  # shapes of meshes that were made here, by what is in them
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(self._module, name)
@@ -174,11 +175,9 @@ class World:
         require_names(self._link_index, fixed, attached, allowed)
         everything: list[Shape | Attached] = [*fixed, *attached]
         wanted = {one.name: one for one in everything}
-        pairs = [*map(frozenset, allowed)]
-        for shape in (*fixed, *(one.shape for one in attached)):
-            pairs += [frozenset((shape.name, link)) for link in shape.exempt_links]
-        for held in attached:
-            pairs += [frozenset((held.name, other)) for other in (held.link, *held.touching)]
+        shapes = (*fixed, *(one.shape for one in attached))
+        pairs = [*allowed, *((s.name, link) for s in shapes for link in s.exempt_links)]
+        pairs += [(one.name, other) for one in attached for other in (one.link, *one.touching)]
         gone = {
             name
             for name, own in self._shapes.items()
@@ -186,7 +185,7 @@ class World:
         }
         news = {n: one for n, one in wanted.items() if n not in self._shapes or n in gone}
         made = self._made(news)  # all that can fail, before anything goes
-        now = frozenset(pairs) | self._never
+        now = frozenset(map(frozenset, pairs)) | self._never
         # before a body goes, since PyBullet gives its number to another
         over = {p for p in self._allowed if p not in now or p & gone}
         self._filter(over, 1)
