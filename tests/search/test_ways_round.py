@@ -9,6 +9,7 @@ from tests.recording.files import column
 
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.band import PROJECTION, project
+from constraint_geodesics.search.candidates import round_it
 from constraint_geodesics.search.ways_round import SIDES, bent_round
 from constraint_geodesics.trajectory import Trajectory
 
@@ -67,6 +68,26 @@ def test_nothing_is_bent_where_nothing_is_near() -> None:
     for side in SIDES:
         assert bent_round(task.open, task.clear, line, side, PROJECTION) is None
     assert start.tobytes() == line[0].tobytes()
+
+
+@pytest.mark.parametrize("name", ["free", "level_cup"])
+def test_ways_round_a_sphere_are_clear_and_those_seldom_sound_come_last(name: str) -> None:
+    planner, found = packaged_planner(), 0
+    for start, goal, ball, _ in queries(name, 12):
+        share = np.linspace(0.0, 1.0, 17)[:, None]
+        line = (1.0 - share) * start + share * goal
+        with planner.scene.including([ball]):
+            task = planner._preparation.task(planner.constraints[name])
+            project(task.open, line[1:-1])
+            ways = list(round_it(task, "straight", line))
+            assert ways.count(None) == 1
+            sound = [way for way in ways if way is not None]
+            found += len(sound)
+            for way in sound:
+                np.testing.assert_array_equal(way.points[[0, -1]], line[[0, -1]])
+                assert task.clearance.clearance(planner.robot, way.points).min() > 0.0
+                assert task.manifold.violation(way.points).max() <= 1e-6
+    assert found >= 12
 
 
 def test_an_answer_names_the_other_ways_and_a_recording_draws_them(tmp_path: Path) -> None:

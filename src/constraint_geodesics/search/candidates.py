@@ -41,8 +41,18 @@ ROW_SAFETY = 0.95
 """Share of the allowed violation between two rows that their distance is chosen for."""
 ALMOST = 1.1
 """A way that is no longer than so many times the straight distance is short enough."""
-MARGINS, AGAIN = (1.0, 2.0, 4.0), 10
-"""Of what is pushed clear, as multiples; iterations with more than the first."""
+WIDER, AGAIN = (2.0, 4.0), 10
+"""Margins of a band that still clips something, as multiples of the first; iterations with each."""
+FIRST, SHALLOW_M = 10, 0.01
+"""Iterations after which a bent band is looked at; one that clips nothing deeper [m] is pushed on
+at once.
+"""
+FINER, WITH_FINER = 3.0, 6
+"""Margin of a bent band with twice the nodes, as a multiple of the first; iterations with it."""
+NEARLY_STRAIGHT, FAR_ROUND = 1.02, 1.25
+"""A way no longer than so many times the straight distance is relaxed no further; one that is
+longer than so many is left for later where it clips something.
+"""
 PARTLY_RELAXED = (3, 1, 0)
 """Iterations of a band that must stay near the graph."""
 TREES = 4
@@ -143,6 +153,7 @@ def candidates(
     asked for a way.  Trees come last.
     """
     blocked = None
+    ways: Iterator[Candidate | None] = iter(())
     if parts.straight:
         share = _shares(task.settings.segments)
         line = (1.0 - share) * start + share * goal
@@ -155,7 +166,10 @@ def candidates(
     answer, known = Answer("not_found"), list[Candidate]()
     if blocked is not None and parts.refinement:
         enough = ALMOST * float(np.linalg.norm(goal - start))
-        for one in round_it(task, blocked.source, blocked.nodes):
+        ways = round_it(task, blocked.source, blocked.nodes)
+        for one in ways:
+            if one is None:
+                break
             known.append(one)
             if one.length <= enough:
                 break
@@ -166,6 +180,7 @@ def candidates(
         clear = blocked is not None
         answer = yield from _over_graph(task, start, goal, parts.refinement, known, clear)
         yield None
+    yield from ways
     if parts.tree:
         apart = answer.status == "not_connected"
         for seed in range(TREES_APART if apart else TREES):
@@ -179,13 +194,64 @@ def candidates(
     yield answer
 
 
-def round_it(task: Task, source: Source, nodes: Float[np.ndarray, "n D"]) -> Iterator[Candidate]:
-    """The ways round what a line of nodes leads through, to one side of it and to the other."""
+def round_it(
+    task: Task, source: Source, nodes: Float[np.ndarray, "n D"]
+) -> Iterator[Candidate | None]:
+    """The ways round what a line of nodes leads through, to one side of it and to the other; None
+    where those begin that are dearer and seldom come to anything.
+
+    Few bands that clip something after the first iterations are clear after many: one that hardly
+    does is pushed on with a wider margin at once, the others once both sides have been looked at,
+    with more nodes as well.
+    """
+    direct = float(np.linalg.norm(nodes[-1] - nodes[0]))
+    first = replace(task.settings, iterations=min(FIRST, task.settings.iterations))
+    near, far = list[Candidate](), list[Candidate]()
     for side in SIDES:
         bent = bent_round(task.open, task.clear, nodes, side, PROJECTION)
-        pushed = None if bent is None else _pushed(task, source, bent, task.settings)
-        if pushed is not None:
-            yield pushed
+        band = None if bent is None else _relaxed(task, source, bent, first, clear=True)
+        if band is None:
+            continue
+        if _is_clear(task, band.points):
+            yield _relaxed_on(task, band, direct)
+        elif band.length > FAR_ROUND * direct:
+            far.append(band)
+        else:
+            pushed = None
+            if _depth(task, band.points) <= SHALLOW_M:
+                again = replace(task.settings, iterations=AGAIN)
+                pushed = _relaxed(task, source, band.nodes, again, clear=True, wider=WIDER[0])
+            if pushed is not None and _is_clear(task, pushed.points):
+                yield pushed
+            else:
+                near.append(pushed or band)
+    settings = replace(task.settings, iterations=WITH_FINER)
+    for band in sorted(near, key=lambda one: one.length):
+        finer = _relaxed(task, source, _halved(band.nodes), settings, clear=True, wider=FINER)
+        if finer is not None and _is_clear(task, finer.points):
+            yield finer
+    yield None
+    for band in sorted(far, key=lambda one: one.length):
+        widened = _widened(task, band, task.settings)
+        if widened is not None:
+            yield widened
+
+
+def _relaxed_on(task: Task, band: Candidate, direct: float) -> Candidate:
+    """A clear band after the iterations that it has left, where they can gain something; as it is
+    where it clips something then.  direct: the straight distance of its ends [rad].
+    """
+    left = task.settings.iterations - FIRST
+    if band.iterations < FIRST or left <= 0 or band.length <= NEARLY_STRAIGHT * direct:
+        return band
+    settings = replace(task.settings, iterations=left)
+    further = _relaxed(task, band.source, band.nodes, settings, clear=True)
+    return further if further is not None and _is_clear(task, further.points) else band
+
+
+def _depth(task: Task, points: Float[np.ndarray, "n D"]) -> float:
+    """How deep bodies overlap at points of a curve [m]; 0 where they do between these alone."""
+    return -float(task.clearance.clearance(task.manifold.robot, points, 0.0).min())
 
 
 def _shortest_first(found: Iterable[Candidate]) -> Iterator[Candidate]:
@@ -313,7 +379,8 @@ def along(
         found = _pushed(task, source, points, task.settings)
         if found is None:
             found = _relaxed(task, source, points, task.settings, clear=True, guarded=True)
-        if found is not None and _is_clear(task, found.points):
+            found = found if found is not None and _is_clear(task, found.points) else None
+        if found is not None:
             yield found
     nodes = resample(corners, 4 * segments + 1)
     yield from less_and_less_relaxed(task, source, nodes, clear, PARTLY_RELAXED if refine else (0,))
@@ -359,18 +426,24 @@ def refined(
 def _pushed(
     task: Task, source: Source, nodes: Float[np.ndarray, "n D"], settings: BandSettings
 ) -> Candidate | None:
-    """The curve through a band that is pushed clear of what may meet; where it clips something
-    between the places that are looked at, with a wider margin, and then with more nodes too.
-    """
+    """The curve through a band that is pushed clear of what may meet."""
+    found = _relaxed(task, source, nodes, settings, clear=True)
+    if found is None or _is_clear(task, found.points):
+        return found
     unrefined = settings.iterations < task.settings.iterations
-    for wider in MARGINS[:1] if unrefined else MARGINS:
-        found = _relaxed(task, source, nodes, settings, clear=True, wider=wider)
-        if found is None:
-            return None
-        if _is_clear(task, found.points):
+    return None if unrefined else _widened(task, found, settings)
+
+
+def _widened(task: Task, clipping: Candidate, settings: BandSettings) -> Candidate | None:
+    """The curve through a band that clips something between the places that are looked at, pushed
+    on with a wider margin, and then with more nodes too.
+    """
+    settings, nodes = replace(settings, iterations=AGAIN), clipping.nodes
+    for wider in WIDER:
+        found = _relaxed(task, clipping.source, nodes, settings, clear=True, wider=wider)
+        if found is None or _is_clear(task, found.points):
             return found
-        nodes = found.nodes if wider == MARGINS[0] else _halved(found.nodes)
-        settings = replace(settings, iterations=AGAIN)
+        nodes = _halved(found.nodes)
     return None
 
 

@@ -25,7 +25,7 @@ def repaired(task: Task, rows: Float[np.ndarray, "T D"]) -> Iterator[Candidate]:
     found = pushed(task, nodes)
     if found is not None:
         yield found
-    yield from round_it(task, "bend", nodes)
+    yield from (way for way in round_it(task, "bend", nodes) if way is not None)
 
 
 def over_graph(
