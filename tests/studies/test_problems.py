@@ -21,7 +21,7 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.params import BaselineParams, load_params
 from constraint_geodesics.peers.baseline import BaselineError
 from constraint_geodesics.problem import Solution
-from constraint_geodesics.report.problems_page import problems_markdown
+from constraint_geodesics.report.problems_page import problems_markdown, totals_markdown
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.shape import Placement
 from constraint_geodesics.studies.clutter import KINDS, MAKERS, cluttered, shapes_of, write_bracket
@@ -220,6 +220,7 @@ def test_no_rows_are_an_empty_table() -> None:
     assert table.empty
     assert "length_rad" in table
     assert figures(table) == {}
+    assert totals_markdown({}).startswith("| constraint ")
 
 
 def test_what_was_trained_for_another_arm_is_refused(problems, tmp_path) -> None:
@@ -328,6 +329,8 @@ def test_figures_count_what_they_say() -> None:
     # failures as the whole limit: of b a late path and a wrongly certified one
     assert b["time_all_ms_median"] == pytest.approx(np.median([100.0, 300.0, 1e4, 1e4]))
     assert figures(table)["free"]["box"]["a"] == a
+    row = totals_markdown(figures(table)).splitlines()[2]
+    assert [cell.strip() for cell in row.split("|")[1:5]] == ["free", "a", "5", "3 of 4"]
 
 
 def test_kept_rows_make_the_same_file_twice(tmp_path) -> None:
