@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from tests.benchmark.problem_fixtures import small_file, written
+from tests.benchmark.problem_fixtures import moveit_pair, problem, small_file, written
 from tests.test_cli_plan import called, error_line, strict
 
 ROOT = Path(__file__).parents[1]
@@ -83,6 +83,10 @@ def test_wrong_usage_is_one_line(geodesics, tmp_path, words, said) -> None:
         (b"shapes?", "bad.json: neither JSON nor MoveIt's YAML"),
         (b'{"robot": "panda", "joints": ["a"], "scenes": {}}', "bad.json: scenes"),
         (b'{"robot": "r2d2", "joints": ["a"], "scenes": {"box": []}}', "robot='r2d2': known are"),
+        (
+            b'{"robot": "panda", "joints": ["a"], "scenes": {"box": []}}',
+            "scenes.box: has no problems",
+        ),
     ],
 )
 def test_a_bad_file_is_one_line(geodesics, tmp_path, content, said) -> None:
@@ -91,6 +95,46 @@ def test_a_bad_file_is_one_line(geodesics, tmp_path, content, said) -> None:
     code, out, err = geodesics("bench", "--problems", str(file))
     assert (code, out) == (2, "")
     assert said in error_line(err)
+
+
+def test_problems_of_folders_and_files_that_are_named_alike_are_told_apart(
+    geodesics, tmp_path
+) -> None:
+    folder = tmp_path / "mine"
+    for own in ("a/tests", "b/tests"):
+        moveit_pair(folder / own, "1")
+    moveit_pair(folder / "sides", "_left_1")
+    moveit_pair(folder / "sides", "_right_1")
+    words = ("--planner", "planner", "--time-limit", "20", "--json")
+    code, out, err = geodesics("bench", "--problems", str(folder), *words)
+    assert code == 0, err
+    answer = strict(out)
+    rows = pd.read_csv(answer["rows"], comment="#")
+    keys = list(zip(rows["scene"], rows["query"], strict=True))
+    assert keys == [("a/tests", 1), ("b/tests", 1), ("sides", 0), ("sides", 1)]
+    assert answer["figures"]["free"]["all"]["planner"]["solved"] == 4
+
+
+def test_ends_out_of_limits_are_counted_apart_and_nowhere_else(geodesics, tmp_path) -> None:
+    record = small_file()
+    record["scenes"] = {"far": [problem(start=[9.0] * 7)]}
+    file = str(written(record, tmp_path / "far.json"))
+    code, out, err = geodesics("bench", "--problems", file, "--planner", "planner")
+    assert code == 0, err
+    assert "1 of 1 problems have ends that touch something or are out of limits" in out
+    assert "of a core" not in out
+    cells = [cell.strip() for cell in out.splitlines()[2].split("|")[1:5]]
+    assert cells == ["free", "planner", "0", "0 of 0"]
+
+
+def test_outside_a_checkout_the_line_says_what_is_missing(geodesics, tmp_path) -> None:
+    (tmp_path / "params.yaml").unlink()
+    file = str(written(small_file(), tmp_path / "small.json"))
+    code, out, err = geodesics("bench", "--problems", file)
+    assert (code, out) == (2, "")
+    line = error_line(err)
+    assert f"{tmp_path / 'params.yaml'}: missing: --problems takes planners" in line
+    assert "run it in a checkout" in line
 
 
 def test_options_of_problems_need_problems(geodesics) -> None:

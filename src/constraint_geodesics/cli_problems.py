@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from constraint_geodesics.benchmark.arm_source import UrdfArm
     from constraint_geodesics.params import BaselineParams, Params
 
+PARAMS = Path("params.yaml")
+"""The checkout's, in the folder that the command runs in."""
+
 
 class ProblemOptions(NamedTuple):
     """What is asked, as options say it.  limit_s: of every query, None: those of params.yaml."""
@@ -44,7 +47,11 @@ def bench_problems(options: ProblemOptions) -> None:
     from constraint_geodesics.studies.problem_runs import MEASURED_BY, Asked, answered, figures
     from constraint_geodesics.studies.problems import TILTED, tilted
 
-    params = load_params()
+    if not PARAMS.is_file():
+        what = "--problems takes planners, limits and seeds from it: run it in a checkout"
+        error = FileNotFoundError(f"{PARAMS.absolute()}: missing: {what}")
+        raise SystemExit(complain(error, WRONG_USAGE))
+    params = load_params(PARAMS)
     own, limit = params.problems, options.limit_s
     held = {} if limit is not None else {TILTED: own.held_limit_s}
     try:

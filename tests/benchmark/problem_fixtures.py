@@ -51,3 +51,36 @@ def written(content: Any, file: Path) -> Path:
     raw = json.dumps(content).encode()
     file.write_bytes(gzip.compress(raw) if file.suffix == ".gz" else raw)
     return file
+
+
+MOVEIT_SCENE = """
+robot_model_name: panda
+robot_state:
+  joint_state:
+    name: [panda_finger_joint1, panda_finger_joint2]
+    position: [0.065, 0.065]
+world:
+  collision_objects:
+    - id: crate
+      primitives: [{type: box, dimensions: [0.2, 0.3, 0.4]}]
+      primitive_poses: [{position: [0.7, 0.5, 0.2], orientation: [0, 0, 0, 1]}]
+"""
+MOVEIT_REQUEST = """
+start_state:
+  joint_state: {{name: {joints}, position: {start}}}
+goal_constraints:
+  - joint_constraints:
+{goals}
+"""
+
+
+def moveit_pair(folder: Path, number: str, more: str = "") -> None:
+    """A planning scene and its request, named with that number; more: of the request."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"scene{number}.yaml").write_text(MOVEIT_SCENE)
+    goals = "\n".join(
+        f"      - {{joint_name: {name}, position: {value}}}"
+        for name, value in zip(JOINTS, TURNED, strict=True)
+    )
+    text = MOVEIT_REQUEST.format(joints=JOINTS, start=READY, goals=goals)
+    (folder / f"request{number}.yaml").write_text(text + more)

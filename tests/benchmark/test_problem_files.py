@@ -15,6 +15,7 @@ from tests.benchmark.problem_fixtures import (
     READY,
     TURNED,
     UPRIGHT,
+    moveit_pair,
     post,
     problem,
     shape,
@@ -147,7 +148,15 @@ BAD = [
     (lambda r: first(r).update(start=READY[:6]), "scenes.posts[0].start: 6 numbers for 7 joints"),
     (lambda r: first(r).update(goal=[*READY[:6], "far"]), "scenes.posts.0.goal.6='far'"),
     (lambda r: first(r)["held"].update(thumb=0.1), "'thumb' can't be held"),
-    (lambda r: first(r)["shapes"].append(post(1.0, 1.0)), "there is a shape called 'post' already"),
+    (
+        lambda r: first(r)["shapes"].append(post(1.0, 1.0)),
+        "scenes.posts[0].shapes[1]: there is a shape called 'post' already",
+    ),
+    (
+        lambda r: first(r)["shapes"][0].update(name="panda_link3"),
+        "scenes.posts[0].shapes[0]: 'panda_link3' is a link of the robot",
+    ),
+    (lambda r: r["scenes"].update(crate=[]), "scenes.crate: has no problems"),
     (lambda r: first(r)["shapes"][0].update(type="cone"), "'post' is a cone: must be one of"),
     (
         lambda r: first(r)["shapes"][0].update(dimensions=[0.8, -0.03]),
@@ -206,42 +215,12 @@ def test_a_missing_file_and_an_empty_folder_are_one_line(tmp_path) -> None:
         read_problems(tmp_path)
 
 
-MOVEIT_SCENE = """
-robot_model_name: panda
-robot_state:
-  joint_state:
-    name: [panda_finger_joint1, panda_finger_joint2]
-    position: [0.065, 0.065]
-world:
-  collision_objects:
-    - id: crate
-      primitives: [{type: box, dimensions: [0.2, 0.3, 0.4]}]
-      primitive_poses: [{position: [0.7, 0.5, 0.2], orientation: [0, 0, 0, 1]}]
-"""
-MOVEIT_REQUEST = """
-start_state:
-  joint_state: {{name: {joints}, position: {start}}}
-goal_constraints:
-  - joint_constraints:
-{goals}
-"""
 HELD = """
 path_constraints:
   orientation_constraints:
     - {link_name: panda_hand, orientation: [1, 0, 0, 0], absolute_x_axis_tolerance: 0.2,
        absolute_y_axis_tolerance: 0.2, absolute_z_axis_tolerance: 3.2}
 """
-
-
-def moveit_pair(folder: Path, number: str, more: str = "") -> None:
-    folder.mkdir(exist_ok=True)
-    (folder / f"scene{number}.yaml").write_text(MOVEIT_SCENE)
-    goals = "\n".join(
-        f"      - {{joint_name: {name}, position: {value}}}"
-        for name, value in zip(JOINTS, TURNED, strict=True)
-    )
-    text = MOVEIT_REQUEST.format(joints=JOINTS, start=READY, goals=goals)
-    (folder / f"request{number}.yaml").write_text(text + more)
 
 
 def test_moveits_files_say_what_the_record_says(tmp_path) -> None:
@@ -257,6 +236,41 @@ def test_moveits_files_say_what_the_record_says(tmp_path) -> None:
     assert told(alone[0]) == told(found[1])
     arm = found[0].arm
     assert not opened(arm).scene.workcell, "what is read stays in no planner"
+
+
+@pytest.mark.parametrize(
+    ("names", "numbers"),
+    [
+        (("_left_7", "_right_8"), [7, 8]),
+        (("_left_1", "_right_1"), [0, 1]),
+        (("", "0"), [0, 1]),
+        (("1", "_1_of_2", "_of_2"), [0, 1, 2]),
+    ],
+)
+def test_numbers_that_names_do_not_tell_are_counted(tmp_path, names, numbers) -> None:
+    for name in names:
+        moveit_pair(tmp_path / "crate", name)
+    assert [own.number for own in read_problems(tmp_path)] == numbers
+    assert {own.group for own in read_problems(tmp_path / "crate")} == {"crate"}
+
+
+def test_folders_that_are_named_alike_are_groups_of_their_own(tmp_path) -> None:
+    for folder in ("b/tests", "a/tests", "a"):
+        moveit_pair(tmp_path / folder, "1")
+    assert [own.group for own in read_problems(tmp_path)] == ["a", "a/tests", "b/tests"]
+    moveit_pair(tmp_path / "a" / "a", "1")
+    line = "two problems are number 1 of 'a': give one another name"
+    with pytest.raises(ProblemFileError, match=line):
+        read_problems(tmp_path / "a")
+
+
+def test_a_shape_of_moveits_that_is_named_like_a_link_is_one_line_with_the_file(tmp_path) -> None:
+    moveit_pair(tmp_path / "crate", "1")
+    scene = tmp_path / "crate" / "scene1.yaml"
+    scene.write_text(scene.read_text().replace("id: crate", "id: panda_link3"))
+    with pytest.raises(ProblemFileError, match="'panda_link3' is a link of the robot") as raised:
+        read_problems(tmp_path)
+    assert str(raised.value).startswith(f"{scene}: ")
 
 
 def test_a_scene_without_a_request_and_a_goal_of_poses_are_refused(tmp_path) -> None:

@@ -12,8 +12,8 @@ import pytest
 from tests.benchmark.problem_fixtures import problem, shape, small_file, written
 
 from constraint_geodesics import bundle
-from constraint_geodesics.benchmark.arm_source import PipelineArm, opened
-from constraint_geodesics.benchmark.problem_files import Problem, read_problems
+from constraint_geodesics.benchmark.arm_source import PipelineArm, UrdfArm, opened
+from constraint_geodesics.benchmark.problem_files import Problem, ProblemFileError, read_problems
 from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.benchmark.runner import batch_rows, rows_to_do, run_batch
 from constraint_geodesics.certification.certifier import Certifier
@@ -21,12 +21,13 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.params import BaselineParams, load_params
 from constraint_geodesics.peers.baseline import BaselineError
 from constraint_geodesics.problem import Solution
-from constraint_geodesics.report.problems_page import problems_markdown
+from constraint_geodesics.report.problems_page import problems_markdown, totals_markdown
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.shape import Placement
 from constraint_geodesics.studies.clutter import KINDS, MAKERS, cluttered, shapes_of, write_bracket
 from constraint_geodesics.studies.problem_runs import (
     Asked,
+    answered,
     batches,
     figures,
     limited,
@@ -172,6 +173,56 @@ def test_a_changed_scene_limit_or_code_is_asked_again(problems, tmp_path) -> Non
     assert batches(problems[:1], of)[0].baselines == batch.baselines
 
 
+TRIANGLE = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 {height}\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+ARM = """<robot name="two">
+  <link name="base"/>
+  <link name="upper"><collision><geometry><mesh filename="part.obj"/></geometry></collision></link>
+  <link name="tool"/>
+  <joint name="a" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/>
+    <limit lower="-2" upper="2" velocity="1" effort="1"/></joint>
+  <joint name="b" type="revolute"><parent link="upper"/><child link="tool"/>
+    <origin xyz="0 0 0.4"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" velocity="1" effort="1"/></joint>
+</robot>"""
+SRDF = '<robot name="two">{pairs}</robot>'
+PAIR = '<disable_collisions link1="base" link2="tool" reason="Never"/>'
+
+
+def test_an_arm_whose_files_change_in_place_is_asked_again(tmp_path) -> None:
+    urdf, srdf, mesh = (tmp_path / name for name in ("two.urdf", "two.srdf", "part.obj"))
+    urdf.write_text(ARM)
+    record = {
+        "joints": ["a", "b"],
+        "scenes": {"all": [{"start": [0.0, 0.0], "goal": [1.0, 0.5], "shapes": []}]},
+    }
+    file, seen = written(record, tmp_path / "two.json"), []
+    for height, pairs in ((0.1, ""), (0.2, ""), (0.1, PAIR), (0.1, "")):
+        mesh.write_text(TRIANGLE.format(height=height))
+        srdf.write_text(SRDF.format(pairs=pairs))
+        opened.cache_clear()  # as a later run
+        found = read_problems(file, UrdfArm(str(urdf), "tool", str(srdf)))
+        (batch,) = batches(found, asked(tmp_path, planner={"kind": "planner"}))
+        seen.append(batch.baselines[0].fingerprint)
+    assert len(set(seen)) == 3
+    assert seen[0] == seen[3]
+
+
+def test_problems_with_one_key_are_refused_before_any_work(problems, tmp_path) -> None:
+    of = asked(tmp_path / "rows", planner={"kind": "planner"})
+    again = [*problems, problems[0]]
+    with pytest.raises(ProblemFileError, match="two problems are number 0 of 'posts'"):
+        answered(again, of, "problems")
+    assert not of.rows.exists()
+
+
+def test_no_rows_are_an_empty_table() -> None:
+    table = table_of([], lambda name: 10.0)
+    assert table.empty
+    assert "length_rad" in table
+    assert figures(table) == {}
+    assert totals_markdown({}).startswith("| constraint ")
+
+
 def test_what_was_trained_for_another_arm_is_refused(problems, tmp_path) -> None:
     for own in ({"kind": "latent_graph"}, {"kind": "planner", "method": "learned"}):
         with pytest.raises(BaselineError, match="'trained' is made of what the pipeline trained"):
@@ -265,7 +316,8 @@ def test_figures_count_what_they_say() -> None:
     )
     a, b = (figures(table)["free"]["all"][name] for name in ("a", "b"))
     for own in (a, b):
-        assert (own["problems"], own["apart"], own["solvable"]) == (6, 1, 4)
+        counts = [own[name] for name in ("problems", "apart", "asked", "solvable")]
+        assert counts == [6, 1, 5, 4]
     assert (a["solved"], b["solved"]) == (3, 2)
     assert (a["late"], b["late"]) == (0, 1)
     assert (a["wrongly_certified"], b["wrongly_certified"]) == (0, 1)
@@ -277,6 +329,8 @@ def test_figures_count_what_they_say() -> None:
     # failures as the whole limit: of b a late path and a wrongly certified one
     assert b["time_all_ms_median"] == pytest.approx(np.median([100.0, 300.0, 1e4, 1e4]))
     assert figures(table)["free"]["box"]["a"] == a
+    row = totals_markdown(figures(table)).splitlines()[2]
+    assert [cell.strip() for cell in row.split("|")[1:5]] == ["free", "a", "5", "3 of 4"]
 
 
 def test_kept_rows_make_the_same_file_twice(tmp_path) -> None:

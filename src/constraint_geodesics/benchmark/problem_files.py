@@ -15,6 +15,7 @@ sphere's radius [m]; poses are in the base frame.  In place of "robot" stand "ur
 import gzip
 import json
 import re
+import xml.etree.ElementTree as ElementTree
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -38,8 +39,11 @@ from constraint_geodesics.moveit import (
     shape_of_record,
 )
 from constraint_geodesics.params import one_line
+from constraint_geodesics.robot.arm_file import digest_of
+from constraint_geodesics.robot.description import find_mesh
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
 from constraint_geodesics.scene.mesh import Mesh
+from constraint_geodesics.scene.names import require_names
 from constraint_geodesics.scene.point_cloud import PointCloud
 from constraint_geodesics.scene.scene import Scene, SceneError
 from constraint_geodesics.scene.shape import Shape
@@ -105,7 +109,8 @@ class _FileRecord(_Record):
 
 def read_problems(file: Path, given: UrdfArm | None = None) -> list[Problem]:
     """The problems of a file of JSON, gzipped or not; of a planning scene of MoveIt, whose request
-    lies beside it; or of all of those in a folder and its folders, each of which is a group.
+    lies beside it; or of all of those in a folder and its folders, each of which is a group, named
+    by its path in the folder.
 
     given: the arm, where the file is not to say it; values of its own of held joints come before
     the file's.  Raises ProblemFileError, one line, for what can't be used.
@@ -121,6 +126,20 @@ def every(problems: Sequence[Problem], step: int) -> list[Problem]:
     for _, own in groupby(problems, key=lambda problem: problem.group):
         found += list(own)[::step]
     return found
+
+
+def require_different(problems: Sequence[Problem]) -> None:
+    """That no two of them have one group, number and constraint, which results are told apart by.
+
+    Raises ProblemFileError.
+    """
+    seen = set()
+    for own in problems:
+        key = own.group, own.number, own.constraint_name
+        if key in seen:
+            line = f"two problems are number {own.number} of {own.group!r}: give one another name"
+            raise ProblemFileError(line)
+        seen.add(key)
 
 
 def _read(file: Path) -> _FileRecord:
@@ -145,6 +164,8 @@ def _record_problems(file: Path, record: _FileRecord, given: UrdfArm | None) -> 
     try:
         arm = given or _arm_named(record)
         for group, problems in record.scenes.items():
+            if not problems:
+                raise ProblemFileError(f"scenes.{group}: has no problems")
             for number, own in enumerate(problems):
                 where = f"scenes.{group}[{number}]"
                 held = {**own.held, **dict(arm.held)}
@@ -154,17 +175,26 @@ def _record_problems(file: Path, record: _FileRecord, given: UrdfArm | None) -> 
                     _configuration(getattr(own, end), order, f"{where}.{end}")
                     for end in ("start", "goal")
                 )
-                scene = Scene(robot).adding(
-                    *(
-                        shape_of_record(raw.model_dump(), f"{where}.shapes[{k}]")
-                        for k, raw in enumerate(own.shapes)
-                    )
-                )
+                scene = _scene(with_held, robot, own.shapes, where)
                 yield Problem(group, number, with_held, scene, start, goal)
     except ProblemFileError as error:
         raise ProblemFileError(f"{file}: {error}") from None
-    except (MoveitError, RobotError, SceneError) as error:
+    except (MoveitError, RobotError) as error:
         raise ProblemFileError(f"{file}: {error}") from None
+
+
+def _scene(arm: UrdfArm, robot: SerialRobot, records: Sequence[_ShapeRecord], where: str) -> Scene:
+    """The shapes around the arm.  where: the problem, for errors."""
+    scene, links = Scene(robot), opened(arm).scene.links
+    for k, record in enumerate(records):
+        place = f"{where}.shapes[{k}]"
+        shape = shape_of_record(record.model_dump(), place)
+        try:
+            scene = scene.adding(shape)
+            require_names(links, (shape,), (), ())
+        except SceneError as error:
+            raise ProblemFileError(f"{place}: {error}") from None
+    return scene
 
 
 def _arm_named(record: _FileRecord) -> UrdfArm:
@@ -203,20 +233,34 @@ def _configuration(
 
 def _moveit_problems(path: Path, given: UrdfArm | None) -> list[Problem]:
     found = []
-    numbers: dict[str, int] = {}
-    for scene, request in _pairs(path):
-        group = scene.parent.resolve().name
-        digits = re.findall(r"\d+", scene.stem)
-        number = int(digits[-1]) if digits else numbers.get(group, 0)
-        numbers[group] = number + 1
-        found.append(_moveit_problem(scene, request, given, group, number))
+    for folder, grouped in groupby(_pairs(path), key=lambda pair: pair[0].parent):
+        own = list(grouped)
+        # below the given folder its path tells it from others of the same name
+        below = path.is_dir() and folder != path
+        group = folder.relative_to(path).as_posix() if below else folder.resolve().name
+        numbers = _numbers([scene.stem for scene, _ in own])
+        for (scene, request), number in zip(own, numbers, strict=True):
+            found.append(_moveit_problem(scene, request, given, group, number))
+    try:
+        require_different(found)
+    except ProblemFileError as error:
+        raise ProblemFileError(f"{path}: {error}") from None
     return found
 
 
+def _numbers(names: Sequence[str]) -> Sequence[int]:
+    """The last number in each name; their places where these are not all there and different."""
+    digits = [re.findall(r"\d+", name)[-1:] for name in names]
+    numbers = [int(number) for own in digits for number in own]
+    return numbers if len(set(numbers)) == len(names) else range(len(names))
+
+
 def _pairs(path: Path) -> list[tuple[Path, Path]]:
-    """Planning scenes with their requests, by their names."""
+    """Planning scenes with their requests, folder by folder, by their names."""
     found = []
-    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    files = [path]
+    if path.is_dir():
+        files = sorted(path.rglob("*"), key=lambda file: (file.parent, file.name))
     for scene in files:
         if scene.suffix.lower() not in _YAML or "scene" not in scene.stem:
             continue
@@ -247,7 +291,9 @@ def _moveit_problem(
             scene = planner.scene.now
         finally:
             planner.scene.become(empty)
-    except (MoveitError, RobotError, SceneError) as error:
+    except SceneError as error:
+        raise ProblemFileError(f"{scene_file}: {error}") from None
+    except (MoveitError, RobotError) as error:
         raise ProblemFileError(str(error)) from None
     goal = request.goals[0]
     if len(request.goals) > 1 or not isinstance(goal, list):
@@ -266,7 +312,9 @@ def _content(shape: Shape) -> bytes:
 
 
 def told(problem: Problem) -> Mapping[str, Any]:
-    """All that an answer to a problem depends on, but the arm's files, for a fingerprint."""
+    """All that an answer to a problem depends on, but the arm's files (`told_of_arm`), for a
+    fingerprint.
+    """
     scene = problem.scene
     return {
         "arm": repr(problem.arm),
@@ -276,4 +324,18 @@ def told(problem: Problem) -> Mapping[str, Any]:
         "allowed": sorted(map(list, scene.allowed)),
         "ends": [problem.start.tolist(), problem.goal.tolist()],
         "constraint": repr(problem.constraint),
+    }
+
+
+def told_of_arm(robot: SerialRobot) -> Mapping[str, Any]:
+    """What answers depend on in the arm's files: its URDF, the meshes that are collided, and the
+    links that may touch, whoever says so.
+    """
+    meshes = ElementTree.parse(robot.urdf).iterfind("link/collision/geometry/mesh")
+    files = (find_mesh(mesh.get("filename", ""), robot.urdf) for mesh in meshes)
+    contents = [digest_of(file.read_bytes()) for file in files if file is not None]
+    return {
+        "urdf": digest_of(robot.urdf.read_bytes()),
+        "meshes": contents,
+        "allowed": sorted(map(list, robot.allowed)),
     }

@@ -16,15 +16,16 @@ from constraint_geodesics.studies.problem_runs import figures
 Figures = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]
 """By constraint, scene or "all", and planner."""
 HEADER = (
-    *("scene", "planner", "solved of what any solves", "time [ms], median", "p95"),
+    *("scene", "planner", "asked", "solved of what any solves", "time [ms], median", "p95"),
     *("failures too, p95", "length / best known, median", "p95", "wrongly certified"),
 )
 NOTE = (
-    "solved: a certified path that PyBullet finds free at configurations 5 mrad apart, within the "
-    "limit; of the problems that any planner here solves. Times end with the first certified path, "
-    "projection, simplification, band and failed attempts in them; for the limit where there is "
-    'none in "failures too". Best known: the shortest such path that any planner here found. '
-    "Wrongly certified: paths that the certificate takes and PyBullet does not"
+    "asked: problems whose ends are free and within limits. Solved: a certified path that PyBullet "
+    "finds free at configurations 5 mrad apart, within the limit; of those problems that any "
+    "planner here solves: where one is asked alone, of its own. Times end with the first "
+    "certified path, projection, simplification, band and failed attempts in them; for the limit "
+    'where there is none in "failures too". Best known: the shortest such path that any planner '
+    "here found. Wrongly certified: paths that the certificate takes and PyBullet does not"
 )
 
 
@@ -70,8 +71,10 @@ def totals_markdown(found: Figures) -> str:
     ]
     shares = [own["core_share"] for scenes in found.values() for own in scenes["all"].values()]
     had = [share for share in shares if share is not None]
-    busy = [f"Planners had {min(had):.0%} to {max(had):.0%} of a core in the median."] * bool(had)
-    return "\n\n".join([text, *apart, *busy])
+    parts = [text, *apart]
+    if had:
+        parts.append(f"Planners had {min(had):.0%} to {max(had):.0%} of a core in the median.")
+    return "\n\n".join(parts)
 
 
 def _rows(first: str, planners: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
@@ -79,6 +82,7 @@ def _rows(first: str, planners: Mapping[str, Mapping[str, Any]]) -> list[list[st
         [
             first,
             name,
+            str(own["asked"]),
             f"{own['solved']} of {own['solvable']}",
             fixed(own["time_ms_median"], 1),
             fixed(own["time_ms_p95"], 1),

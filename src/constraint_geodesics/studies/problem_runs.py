@@ -22,7 +22,12 @@ from jaxtyping import Float
 
 from constraint_geodesics.benchmark.arm_source import ArmSource, opened
 from constraint_geodesics.benchmark.judge import judge_limits
-from constraint_geodesics.benchmark.problem_files import Problem, told
+from constraint_geodesics.benchmark.problem_files import (
+    Problem,
+    require_different,
+    told,
+    told_of_arm,
+)
 from constraint_geodesics.benchmark.queries import Query
 from constraint_geodesics.benchmark.row import KEY
 from constraint_geodesics.benchmark.runner import (
@@ -164,9 +169,17 @@ def limited(entry: BaselineParams, limit_s: float) -> BaselineParams:
 def batches(problems: Sequence[Problem], asked: Asked) -> list[QueryBatch]:
     """The problems in batches: those that follow each other in one scene under one constraint.
 
-    Raises BaselineError for a planner that is made of what was trained for another arm.
+    Raises BaselineError for a planner that is made of what was trained for another arm,
+    ProblemFileError for two problems whose rows would have one key.
     """
-    return [_batch(own, asked) for own in _together(problems)]
+    require_different(problems)
+    arms, found = dict[ArmSource, Mapping[str, Any]](), []
+    for own in _together(problems):
+        arm, robot = own[0].arm, own[0].scene.robot
+        if arm not in arms:  # its meshes may be large
+            arms[arm] = told_of_arm(robot)
+        found.append(_batch(own, asked, arms[arm]))
+    return found
 
 
 def _together(problems: Sequence[Problem]) -> Iterator[list[Problem]]:
@@ -182,7 +195,8 @@ def _together(problems: Sequence[Problem]) -> Iterator[list[Problem]]:
         yield own
 
 
-def _batch(problems: Sequence[Problem], asked: Asked) -> QueryBatch:
+def _batch(problems: Sequence[Problem], asked: Asked, arm: Mapping[str, Any]) -> QueryBatch:
+    """arm: what is told of its files."""
     first, params = problems[0], asked.params
     name = first.constraint_name
     limit_s, robot = asked.limit(name), first.scene.robot
@@ -192,7 +206,7 @@ def _batch(problems: Sequence[Problem], asked: Asked) -> QueryBatch:
         asked.code,
         machine(),
         params.judge.model_dump(),
-        robot.urdf.read_bytes(),
+        arm,
         limit_s,
         *(told(problem) for problem in problems),
     ]
@@ -235,7 +249,7 @@ def _baseline(
 
 def answered(problems: Sequence[Problem], asked: Asked, description: str) -> pd.DataFrame:
     """The table of all rows, after those that are not there yet have been made.  description: names
-    the work where its progress is shown.  Raises BaselineError as `batches`.
+    the work where its progress is shown.  Raises BaselineError and ProblemFileError as `batches`.
     """
     own = batches(problems, asked)
     left = [batch for batch in own if rows_to_do(batch)]
@@ -247,6 +261,8 @@ def table_of(rows: Sequence[Mapping[str, Any]], limit: Callable[[str], float]) -
     """All rows, in the order of problems.  limit: of a constraint [s].  best_known_rad: the
     shortest certified path that PyBullet finds free, in whatever time.
     """
+    if not rows:
+        return pd.DataFrame(columns=list(COLUMNS))
     table = pd.DataFrame(rows)
     table["limit_s"] = table["constraint"].map(limit)
     numbers = ["time_s", "scene_s", "length_rad", "peak_memory_mb", "core_share"]
@@ -286,11 +302,12 @@ def figures_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Of one planner's rows, with the columns `solved` and `solvable`.
 
     apart: problems whose ends touch something or are out of limits; they count nowhere else.
-    solvable: of the others, those that any planner solves.  late: paths that are sound, after the
-    limit.  time: of what is solved [ms]; time_all: of what is solvable, a failure as the whole
-    limit.  ratio: of the length to the best known.  wrongly_certified: paths that the certifier
-    takes and PyBullet does not.  refused: paths that a planner answers and the certifier refuses.
-    ready_ms: preparation for the scene; core_share: what the process had of a core; in the median.
+    asked: the others.  solvable: of these, those that any planner solves.  late: paths that are
+    sound, after the limit.  time: of what is solved [ms]; time_all: of what is solvable, a failure
+    as the whole limit.  ratio: of the length to the best known.  wrongly_certified: paths that the
+    certifier takes and PyBullet does not.  refused: paths that a planner answers and the certifier
+    refuses.  ready_ms: preparation for the scene; core_share: what the process had of a core; in
+    the median.
     """
     within = rows[rows["ends"] == ""]
     solved, solvable = within[within["solved"]], within[within["solvable"]]
@@ -299,6 +316,7 @@ def figures_of(rows: pd.DataFrame) -> dict[str, Any]:
     return {
         "problems": len(rows),
         "apart": len(rows) - len(within),
+        "asked": len(within),
         "solvable": len(solvable),
         "solved": len(solved),
         "share": len(solved) / len(solvable) if len(solvable) else None,
