@@ -56,6 +56,8 @@ OFF_M, BESIDE_M = 0.03, (0.15, 0.35)
 """How far an obstacle's middle is from a link of the arm on its path: the standard deviation of one
 on the way, and the range of the others.
 """
+DRAWS = 2000
+"""Queries that are looked at for an episode, at most."""
 MIDDLE = (0.2, 0.9)
 """Shares of the motion at which obstacles are put."""
 RADII_M, EDGES_M = (0.04, 0.09), (0.06, 0.18)
@@ -124,7 +126,7 @@ class Answered(NamedTuple):
         """For people."""
         took = f"in {1e3 * self.spent_s:.0f} ms"
         if self.late:
-            return f"no answer {took}: stops"
+            return f"stops, as the answer came {took}"
         if self.path is None:
             return f"goes on, decided {took}"
         if self.path.status != "solved":
@@ -182,8 +184,8 @@ class Replanner:
 
 
 def run(episode: Episode, controller: Controller) -> Iterator[Happening]:
-    """What happens, in the order of time, until the arm is at its goal, gives up, or LONGEST_S are
-    over.  The controller's scene must be that of the episode's first path.
+    """What happens, in the order of time, until the arm is at its goal, touches something, or gives
+    up, or LONGEST_S are over.  The controller's scene must be that of the episode's first path.
     """
     with episode.everything.world() as world:
         yield from _Simulation(episode, controller, _Eyes(episode, world)).happenings()
@@ -232,6 +234,8 @@ class _Simulation:
             path, at_s = self.leg.path, self.at(self.now_s)
             q = path.state(at_s).configuration
             yield Moved(self.now_s, q)
+            if not self.eyes.world.is_free(q):
+                return
             seen = self.eyes.look(q, self.now_s)
             yield from seen
             if seen:
@@ -423,13 +427,18 @@ def carrying(planner: Planner, carried: bool) -> Iterator[None]:
     """With a cup in the tool, or without; and without what is seen within, afterwards."""
     before = planner.scene.now
     if carried:
-        height, radius = CUP_M
-        pose = Placement((0.0, 0.0, 0.5 * height))
-        planner.scene.attach(Cylinder(CUP, pose, height, radius), link=planner.robot.tool_link)
+        attach_cup(planner)
     try:
         yield
     finally:
         planner.scene.become(before)
+
+
+def attach_cup(planner: Planner) -> None:
+    """Put a cup into the tool."""
+    height, radius = CUP_M
+    pose = Placement((0.0, 0.0, 0.5 * height))
+    planner.scene.attach(Cylinder(CUP, pose, height, radius), link=planner.robot.tool_link)
 
 
 def drawn(planner: Planner, constraint: str, number: int, seed: int) -> Episode:
@@ -438,7 +447,7 @@ def drawn(planner: Planner, constraint: str, number: int, seed: int) -> Episode:
     """
     rng, nodes = np.random.default_rng([seed, number]), planner.nodes(constraint)
     sensing_m = SENSING_M[number % len(SENSING_M)]
-    while True:
+    for _ in range(DRAWS if len(nodes) else 0):
         start, goal = nodes[rng.integers(len(nodes), size=2)]
         path = planner.plan(start, goal, constraint)
         if path.status != "solved" or path.length_rad < SHORTEST_RAD:
@@ -448,6 +457,7 @@ def drawn(planner: Planner, constraint: str, number: int, seed: int) -> Episode:
         episode = Episode(number, path, obstacles, sensing_m, tuple(planner.scene.links))
         if _is_fit(episode):
             return episode
+    raise PlannerError(f"no path under {constraint} was found that an obstacle could be put on")
 
 
 def _obstacle(path: Trajectory, k: int, rng: np.random.Generator) -> Shape:
