@@ -16,7 +16,7 @@ from jaxtyping import Float
 from rerun.chunk import Chunk
 from rerun.urdf import UrdfTree
 
-from constraint_geodesics.palette import BLUE, GREY, VERMILION
+from constraint_geodesics.palette import BLACK, BLUE, GREY, VERMILION
 from constraint_geodesics.recording import recording
 from constraint_geodesics.recording.execution_recording import TIME, execution_time
 from constraint_geodesics.recording.recording import About, Frames, static
@@ -86,7 +86,7 @@ def record_episode(file: Path, record: EpisodeRecord, *, meshes: bool = True) ->
         *recording.scene_chunks(
             robot, scene.workcell, frames, meshes=meshes, attached=scene.attached
         ),
-        *recording.tool_chunks(frames, _OLD),
+        *recording.tool_chunks(frames, recording.rgb(BLACK)),
         *(static(_shadow(shape), _drawn(shape, _SHADOW)) for shape in record.obstacles),
         *_obstacle_chunks(record),
         *_path_chunks(record),
