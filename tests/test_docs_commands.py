@@ -50,6 +50,7 @@ COVERED: dict[str, str | tuple[str, str]] = {
     ),
     "geodesics replay": HERE,
     "geodesics replay FILE": ("tests/recording/test_recording.py", "open_recordings"),
+    "geodesics demo": ("tests/test_cli_demo.py", '"demo"'),
     "geodesics bench": ("tests/test_cli_json.py", '"bench"'),
     "geodesics ui": ("tests/tracking/test_experiment.py", "ui_command"),
     "make": MAKE,

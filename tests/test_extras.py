@@ -36,6 +36,7 @@ RECORDING = str(ROOT / "README.md")
 COMMANDS = {
     ("plan", *ENDS, "--record=path.rrd", "--out=path.csv"): "record",
     ("replay", RECORDING): "record",
+    ("demo",): "record",
     ("plan", *ENDS, "--method=learned"): "pipeline",
     ("plan", *ENDS[:3], "--planner=models:/planner/1"): "pipeline",
     ("ui",): "pipeline",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from constraint_geodesics import cli_identify, cli_planning, completion
+from constraint_geodesics import cli_demo, cli_identify, cli_planning, completion
 from constraint_geodesics.cli_problems import ProblemOptions, bench_problems
 from constraint_geodesics.errors import ParamsError
 from constraint_geodesics.extras import MissingExtraError, require
@@ -45,6 +45,7 @@ app.command("check")(cli_planning.check)
 app.command("robot")(cli_planning.show_robot)
 app.command("ik")(cli_planning.inverse_kinematics)
 app.command("identify")(cli_identify.identify_constraint)
+app.command("demo")(cli_demo.demo)
 
 
 def main() -> None:

@@ -8,11 +8,15 @@ import socket
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import rerun as rr
+
 from constraint_geodesics.recording.overlay import Opened, opened, overlaid, side_by_side
 from constraint_geodesics.recording.recording import (
+    APPLICATION,
     RecordingError,
     existing,
     rerun_command,
@@ -21,6 +25,8 @@ from constraint_geodesics.recording.recording import (
 
 LOOPBACK = "127.0.0.1"
 VIEWER_PORT, WEB_PORT = 9876, 9090
+STARTS_S = 20.0
+"""Time that a viewer is given to start."""
 
 
 def open_recordings(
@@ -37,22 +43,74 @@ def open_recordings(
     """
     for file in files:
         existing(file)
+    _require_display(web)
+    with _stopped_like_interrupted(), tempfile.TemporaryDirectory(prefix="geodesics-") as folder:
+        shown = [str(file) for file in prepared(files, Path(folder), apart=apart)]
+        options, _ = _announced(web=web, web_port=web_port)
+        return subprocess.call(rerun_command(*options, *shown))
+
+
+@contextlib.contextmanager
+def live_viewer(*, web: bool) -> Iterator[rr.RecordingStream]:
+    """A stream that a viewer shows while it is written, in a window or (web) served to a browser on
+    this machine alone; the viewer stays until it is closed.
+
+    Prints the address to open.  Raises RecordingError if there is no display for a window, or the
+    viewer does not start.
+    """
+    _require_display(web)
+    with _stopped_like_interrupted():
+        options, port = _announced(web=web, web_port=WEB_PORT)
+        # a session of its own, so that it can be ended with the viewer that it starts
+        viewer = subprocess.Popen(
+            rerun_command(*options),
+            stdin=subprocess.DEVNULL,
+            env={"RUST_LOG": "warn", **os.environ},
+            start_new_session=True,
+        )
+        try:
+            _wait_for(viewer, port)
+            stream = rr.RecordingStream(APPLICATION)
+            stream.connect_grpc(f"rerun+http://{LOOPBACK}:{port}/proxy")
+            yield stream
+            stream.flush()
+            stream.disconnect()  # or it would complain of a viewer that is closed
+            viewer.wait()
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(viewer.pid, signal.SIGTERM)
+            viewer.wait()
+
+
+def _announced(*, web: bool, web_port: int) -> tuple[list[str], int]:
+    """Options of a viewer that listens on this machine alone, and its port; the address to open is
+    printed.
+    """
+    port, page = _free_port(VIEWER_PORT), _free_port(web_port)
+    # without --bind the viewer listens on every address, the window's one too
+    options = ["--bind", LOOPBACK, "--port", str(port)]
+    source = f"http://{LOOPBACK}:{port}/proxy"
+    if web:
+        options += ["--serve-web", "--web-viewer-port", str(page)]
+    web_page = f"http://{LOOPBACK}:{page}?url=rerun%2B{source}"
+    print(web_page if web else f"rerun+{source}", flush=True)
+    return options, port
+
+
+def _wait_for(viewer: "subprocess.Popen[bytes]", port: int) -> None:
+    """Until the viewer listens: what is sent before would be held back for seconds."""
+    deadline = time.monotonic() + STARTS_S
+    while viewer.poll() is None and time.monotonic() < deadline:
+        with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, port), 1.0):
+            return
+        time.sleep(0.1)
+    raise RecordingError("Rerun's viewer does not start: `python -m rerun` says why")
+
+
+def _require_display(web: bool) -> None:
     if not web and not display():
         none = "there is no display for Rerun's window"
         raise RecordingError(f"{none}: add --web to open it in a browser")
-    with _stopped_like_interrupted(), tempfile.TemporaryDirectory(prefix="geodesics-") as folder:
-        shown = [str(file) for file in prepared(files, Path(folder), apart=apart)]
-        port, page = _free_port(VIEWER_PORT), _free_port(web_port)
-        # without --bind the viewer listens on every address, the window's one too
-        options, source = (
-            ["--bind", LOOPBACK, "--port", str(port)],
-            f"http://{LOOPBACK}:{port}/proxy",
-        )
-        if web:
-            options += ["--serve-web", "--web-viewer-port", str(page)]
-        web_page = f"http://{LOOPBACK}:{page}?url=rerun%2B{source}"
-        print(web_page if web else f"rerun+{source}", flush=True)
-        return subprocess.call(rerun_command(*options, *shown))
 
 
 def save_recordings(files: Sequence[Path], out: Path, *, apart: bool = False) -> None:

@@ -1,0 +1,83 @@
+"""Stage: episodes in simulation, an arm that moves among obstacles that it sees when they are near,
+with `replan` and beside BiRRT from scratch; goes on where an earlier run of it stopped.
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from constraint_geodesics.benchmark.entries import code_digest, data_digest
+from constraint_geodesics.benchmark.row import write_table
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import machine, run_header
+from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.recording.episode_recording import EpisodeRecord, Stretch, record_episode
+from constraint_geodesics.report.episodes_page import episodes_markdown
+from constraint_geodesics.studies import episode_runs as runs
+from constraint_geodesics.studies import episodes as study
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
+
+STAGE = "study_episodes"
+SEED, EPISODES = 0, 40
+KINDS = (runs.Kind("level_cup", True), runs.Kind("free", False), runs.Kind("slide", True))
+
+
+def main(params: Params, layout: Layout) -> None:
+    """Write data/episode_rows/ as episodes end, then reports/episodes.csv.gz, .json and .md, and
+    recordings of the first ones.
+    """
+    code = f"{code_digest('studies.episode_runs')} {data_digest(layout.planner)} {machine()}"
+    folder = layout.root / "data" / "episode_rows"
+    tasks = [
+        runs.Task(layout.planner, kind, number, SEED, code, folder)
+        for kind in KINDS
+        for number in range(EPISODES)
+    ]
+    settings: dict[str, Any] = {"seed": SEED, "episodes": EPISODES}
+    settings |= {"latency_s": study.LATENCY_S, "sensing_m": list(study.SENSING_M)}
+    work = Work(STAGE, "episodes", settings, [layout.planner])
+    reports = layout.root / "reports"
+    with tracked_stage(work, params.tracking.experiment, layout.root) as run:
+        rows = parallel_map(runs.kept, tasks, params.compute, description="episodes")
+        table, answers = runs.tables(rows)
+        found = runs.figures(table, answers)
+        both = [table.assign(table="run"), answers.assign(table="answer")]
+        write_table(pd.concat(both), reports / "episodes.csv.gz", run_header(layout.root))
+        run.report({"machine": machine(), "figures": found}, reports / "episodes.json")
+        (reports / "episodes.md").write_text(episodes_markdown(found))
+        _record(layout, tasks, rows)
+
+
+def _record(layout: Layout, tasks: Sequence[runs.Task], rows: Sequence[Mapping[str, Any]]) -> None:
+    planner = runs.opened(layout.planner)
+    for task, row in zip(tasks, rows, strict=True):
+        if not row["motions"]:
+            continue
+        constraint = task.kind.constraint
+        with study.carrying(planner, task.kind.carried):
+            episode = study.drawn(planner, constraint, task.number, task.seed)
+        for controller, own in row["motions"].items():
+            name = f"episode{task.number}-{controller.split()[0].lower()}.rrd"
+            file = layout.recordings(STAGE, constraint) / name
+            record_episode(file, _record_of(controller, constraint, episode, own), meshes=False)
+
+
+def _record_of(
+    controller: str, constraint: str, episode: study.Episode, own: Mapping[str, Any]
+) -> EpisodeRecord:
+    stretches = [
+        Stretch(leg["begins_s"], np.array(leg["times"]), np.array(leg["joints"]))
+        for leg in own["legs"]
+    ]
+    text = f"**{controller}**, constraint `{constraint}`: {own['outcome']}"
+    about = controller, constraint, episode.number, episode.first.scene, episode.obstacles
+    return EpisodeRecord(*about, own["seen"], stretches, own["over_s"], text)
+
+
+if __name__ == "__main__":
+    run_stage(main, sys.argv[1:])
