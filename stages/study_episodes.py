@@ -24,7 +24,7 @@ from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "study_episodes"
 SEED, EPISODES = 0, 40
-KINDS = (runs.Kind("level_cup", True), runs.Kind("free", False), runs.Kind("slide", True))
+CONSTRAINTS = ("level_cup", "free", "slide")
 
 
 def main(params: Params, layout: Layout) -> None:
@@ -34,8 +34,8 @@ def main(params: Params, layout: Layout) -> None:
     code = f"{code_digest('studies.episode_runs')} {data_digest(layout.planner)} {machine()}"
     folder = layout.root / "data" / "episode_rows"
     tasks = [
-        runs.Task(layout.planner, kind, number, SEED, code, folder)
-        for kind in KINDS
+        runs.Task(layout.planner, constraint, number, SEED, code, folder)
+        for constraint in CONSTRAINTS
         for number in range(EPISODES)
     ]
     settings: dict[str, Any] = {"seed": SEED, "episodes": EPISODES}
@@ -58,8 +58,8 @@ def _record(layout: Layout, tasks: Sequence[runs.Task], rows: Sequence[Mapping[s
     for task, row in zip(tasks, rows, strict=True):
         if not row["motions"]:
             continue
-        constraint = task.kind.constraint
-        with study.carrying(planner, task.kind.carried):
+        constraint = task.constraint
+        with study.carrying(planner, constraint):
             episode = study.drawn(planner, constraint, task.number, task.seed)
         for controller, own in row["motions"].items():
             name = f"episode{task.number}-{controller.split()[0].lower()}.rrd"

@@ -232,9 +232,30 @@ def test_files_and_messages_say_how_a_motion_begins(tmp_path):
     resting = "".join(line for line in text.splitlines(True) if "start_velocity" not in line)
     (tmp_path / "resting.csv").write_text(resting)
     assert planner.check(tmp_path / "resting.csv").violation.kind == "acceleration"
-    (tmp_path / "wrong.csv").write_text("# start_velocity: [1, 2]\n" + resting)
-    with pytest.raises(PlannerError, match=r"wrong.csv, line 1: not a velocity of 6 joints"):
-        planner.check(tmp_path / "wrong.csv")
+    (velocity,) = (line for line in text.splitlines() if "start_velocity" in line)
+    wrong = "not a velocity of 6 joints"
+    for line, said in (
+        ("# start_velocity: [1, 2]", wrong),
+        ("# start_velocity: [true, 0, 0, 0, 0, 0]", wrong),
+        ('# start_velocity: ["1", 0, 0, 0, 0, 0]', wrong),
+        (f"# start_velocity: [1{'0' * 400}, 0, 0, 0, 0, 0]", wrong),
+        (f"# start_velocity: {'[' * 100_000}", wrong),
+        (
+            f"{velocity}\n#start_velocity:{velocity.split(':')[1]}",
+            "line 2: a second start_velocity",
+        ),
+    ):
+        (tmp_path / "wrong.csv").write_text(f"{line}\n{resting}")
+        with pytest.raises(PlannerError, match=said):
+            planner.check(tmp_path / "wrong.csv")
+    (tmp_path / "close.csv").write_text(
+        f"{velocity.replace('# ', '#').replace(': ', ':')}\n{resting}"
+    )
+    assert planner.check(tmp_path / "close.csv").start_velocity == certificate.start_velocity
+    rows = [line.partition(",")[2] for line in resting.splitlines() if line[0] != "#"]
+    (tmp_path / "untimed.csv").write_text("\n".join([velocity, *rows]))
+    with pytest.raises(PlannerError, match="goes with times"):
+        planner.check(tmp_path / "untimed.csv", "level_cup")
     point = rest.to_joint_trajectory()["points"][0]
     np.testing.assert_allclose(point["velocities"], rest.start_velocity)
     json.dumps(rest.certificate.summary())
@@ -310,6 +331,46 @@ def test_a_stop_that_touches_something_says_so_and_is_there():
         if seen == 3:
             break
     assert seen == 3
+
+
+def test_a_goal_that_is_touched_stops_the_arm_at_once_and_is_named():
+    planner, path = packaged_planner(), planned(10)[0]
+    hand = Sphere("hand", tuple(planner.robot.skeleton(path.joints[-1])[-1]), 0.05)
+    planner.scene.add(hand)
+    try:
+        answer = planner.replan(path, 0.3 * path.times[-1])
+        assert answer.status == "stopped"
+        assert "no path to the goal: the goal touches" in answer.explanation
+        standing = planner.replan(path, path.times[-1])
+        assert standing.status == "in_collision"
+        assert standing.certificate is not None
+        assert standing.certificate.violation is not None
+        assert "hand" in standing.certificate.violation.message
+        assert len(standing.joints) == 2
+    finally:
+        planner.scene.remove("hand")
+
+
+def test_after_its_time_no_other_path_is_tried():
+    planner = packaged_planner()
+    for path in planned(20):
+        at = 0.25 * path.times[-1]
+        ball = on_the_way(path, at, np.random.default_rng(1))
+        if ball is None:
+            continue
+        planner.scene.add(ball)
+        try:
+            answer = planner.replan(path, at, limit_s=1e-9)
+        finally:
+            planner.scene.remove("sudden")
+        assert answer.status == "stopped"
+        assert "1e-09 s are over" in answer.explanation
+        break
+    for wrong in (0.0, -1.0, np.inf, "soon"):
+        with pytest.raises(PlannerError, match="limit_s = .*positive number of seconds"):
+            planner.replan(path, at, limit_s=wrong)
+    with pytest.raises(PlannerError, match="replan takes a trajectory, not a list"):
+        planner.replan([0.0] * 6, 0.0)
 
 
 def test_scales_stay_and_other_robots_are_refused():

@@ -39,6 +39,8 @@ _TIGHTENED = (1.0, 0.7, 0.4)
 """Shares of the allowed violation that a path's waypoints are drawn for, should the certificate ask
 for closer ones.
 """
+TOUCHES = ("self_collision", "workcell_collision", "clearance")
+"""What a certificate finds where a motion meets something."""
 _CLOSER = ("constraint_between_rows", "step")
 """What a certificate finds where waypoints lie too far apart."""
 _CONTINUED = 0.9
@@ -53,7 +55,7 @@ looked for.
 """
 
 
-class _Rest(NamedTuple):
+class _Further(NamedTuple):
     """What more configurations a goal has, its region and the room that an end has in it."""
 
     configurations: Iterator[Float[np.ndarray, "D"] | None]
@@ -97,20 +99,27 @@ class Answering:
         self, query: Query, goals: Sequence[Goal], budget_s: float | None
     ) -> Trajectory:
         """A path that begins in the direction of the query's velocity; where none of the straight
-        line and the graph can, a stop straight on and a path from there, and trees at last.
+        line and the graph can, a stop straight on and a path from there.  Trees come last, and are
+        grown once: from where the arm stops, if it can.
         """
         few = replace(query, parts=replace(query.parts, tree=False))
         found = self.found(few, goals, budget_s)
-        if found.status != "solved":
-            found = self._after_a_stop(query, goals, budget_s) or found
-        if found.status != "solved" and query.parts.tree:
-            found = self.found(query, goals, budget_s)
+        if found.status == "solved":
+            return found
+        tail = self._stop_straight_on(query)
+        for own in (few, query) if query.parts.tree else (few,):
+            if tail is not None:
+                found = self._joined(own, tail, goals, budget_s) or found
+            elif own.parts.tree:
+                found = self.found(query, goals, budget_s)
+            if found.status == "solved":
+                break
         return found
 
-    def _after_a_stop(
-        self, query: Query, goals: Sequence[Goal], budget_s: float | None
-    ) -> Trajectory | None:
-        """Straight on to a stop, and from there to a goal; None where there is no such path."""
+    def _stop_straight_on(self, query: Query) -> Float[np.ndarray, "n D"] | None:
+        """Waypoints of a stop straight on along the query's velocity; None where that touches
+        something or leaves the constraint.
+        """
         assert query.start_velocity is not None
         pace, velocity = self.pace(query), query.start_velocity
         straight = run_out(query.task.open, query.start, velocity, pace)
@@ -121,7 +130,7 @@ class Answering:
         stop = shortest_stop(rows, velocity, pace)
         if stop is None or not self.certifier.collisions.is_clear(stop.joints):
             return None
-        return self._joined(query, stop.joints, goals, budget_s)
+        return stop.joints
 
     def _joined(
         self,
@@ -182,10 +191,10 @@ class Answering:
         statistics = replace(statistics, ways=path.statistics.ways)
         return replace(path, explanation=line, statistics=statistics)
 
-    def _pursued(self, query: Query, goals: Iterable[Goal]) -> tuple[list[Pursued], list[_Rest]]:
+    def _pursued(self, query: Query, goals: Iterable[Goal]) -> tuple[list[Pursued], list[_Further]]:
         """The goals' configurations, the nearest first, and what more there are."""
         manifold = query.task.manifold
-        found, rest = list[Pursued](), list[_Rest]()
+        found, rest = list[Pursued](), list[_Further]()
         for goal in goals:
             room = None
             if goal.region is not None:
@@ -197,7 +206,7 @@ class Answering:
             configurations = iter(goal.configurations(manifold, query.start))
             for q in configurations:
                 if q is None:
-                    rest.append(_Rest(configurations, goal.region, room))
+                    rest.append(_Further(configurations, goal.region, room))
                     break
                 found.append(self._one(query, q, goal.region, room))
         return sorted(found, key=lambda one: one.distance), rest
@@ -212,7 +221,7 @@ class Answering:
         away = float(np.linalg.norm(q - query.start))
         return Pursued(q, away, self._curves(query, q), region, room)
 
-    def _more(self, query: Query, rest: Sequence[_Rest]) -> list[Pursued]:
+    def _more(self, query: Query, rest: Sequence[_Further]) -> list[Pursued]:
         """Of what more configurations there are the nearest free ones, and some that are spread
         over all.
         """
@@ -385,7 +394,8 @@ class Answering:
         line = "the start is the goal"
         if certificate.violation is not None:
             line = f"{line}, and no path: {certificate.violation.message}"
-            return self.nothing(query, "not_found", line)
+            touched = certificate.violation.kind in TOUCHES
+            return self.nothing(query, "in_collision" if touched else "not_found", line)
         about = self.asked(query), self._statistics(query, "straight")
         return Trajectory("solved", joints, times, line, *about, certificate)
 

@@ -76,8 +76,7 @@ def _prepared(planner: "Planner", constraint: str, seed: int) -> "Episode":
     from constraint_geodesics.studies import episodes as study
 
     planner.prepare(constraint)
-    if planner.constraints[constraint].level_axis is not None:
-        study.attach_cup(planner)
+    study.attach_cup(planner, constraint)
     episode = study.drawn(planner, constraint, NUMBER, seed)
     # what a process does for the first time takes longer
     planner.replan(episode.first, 0.5 * float(episode.first.times[-1]))

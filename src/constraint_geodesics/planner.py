@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -280,8 +280,7 @@ class Planner:
         given, name = self._named(constraint)
         given.compile()
         began = time.perf_counter()
-        if budget_s is not None and not (_is_number(budget_s) and 0.0 < budget_s < np.inf):
-            raise PlannerError(f"budget_s = {budget_s!r}: must be a positive number of seconds")
+        _require_seconds(budget_s, "budget_s")
         scales = velocity_scale, acceleration_scale
         for scale, which in zip(scales, ("velocity", "acceleration"), strict=True):
             if not (_is_number(scale) and 0.0 < scale <= 1.0):
@@ -300,7 +299,9 @@ class Planner:
             query = replace(query, start_velocity=moving)
             return self._answering.answer(query, goals, budget_s)
 
-    def replan(self, trajectory: Trajectory, at_s: float) -> Trajectory:
+    def replan(
+        self, trajectory: Trajectory, at_s: float, *, limit_s: float | None = None
+    ) -> Trajectory:
         """A certified trajectory for an arm that is under way: from its state at a time [s] of its
         trajectory on, in the scene as it is now, to the same last configuration.
 
@@ -308,12 +309,17 @@ class Planner:
         status "solved".  Where none is found, the hardest stop on the path: "stopped" if that is
         certified, else its waypoints come with the certificate that names what it breaks, under the
         status "in_collision" where it meets something.  A trajectory that stopped may be replanned:
-        it goes on to the configuration that was wanted.
+        it goes on to the configuration that was wanted.  limit_s: after so many seconds no other
+        path is tried, and the arm stops; by default all are.
         Raises PlannerError for a time beyond 0 and the duration, an answer without a path, or a
-        trajectory of another robot.
+        trajectory of another robot.  Shapes of `plan(scene=[…])` are not in the scene.
         """
         self._require_open()
-        return Replanning(self._answering, self._preparation).replan(trajectory, at_s)
+        if not isinstance(trajectory, Trajectory):
+            raise PlannerError(f"replan takes a trajectory, not a {type(trajectory).__name__}")
+        _require_seconds(limit_s, "limit_s")
+        limit = np.inf if limit_s is None else limit_s
+        return Replanning(self._answering, self._preparation).replan(trajectory, at_s, limit)
 
     def plan_batch(
         self,
@@ -362,7 +368,7 @@ class Planner:
             None if q is None else checked_configuration(q, self.robot.dof, name)
             for q, name in ((start, "start"), (goal, "goal"))
         )
-        held, moving = self._held_at(own, joints[0]), None if times is None else moving
+        held = self._held_at(own, joints[0])
         return self._certifier.certify(joints, held, first, last, times, start_velocity=moving)
 
     def _named(self, constraint: str | Constraint) -> tuple[Constraint, str]:
@@ -397,6 +403,11 @@ class Planner:
         if turned > SNAP_RAD or slid > SNAP_M or not self._certifier.collisions.is_clear(way):
             return start, 0.0
         return found.configuration, found.distance_rad
+
+
+def _require_seconds(value: Any, name: str) -> None:
+    if value is not None and not (_is_number(value) and 0.0 < value < np.inf):
+        raise PlannerError(f"{name} = {value!r}: must be a positive number of seconds")
 
 
 def _is_number(value: object) -> bool:

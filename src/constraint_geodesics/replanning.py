@@ -1,9 +1,9 @@
 """A new path for an arm that moves, in the scene as it is now.
 
-In order, until one is certified: what is left of the trajectory; the same as a band pushed clear of
-what is new; the planner's own search, begun from the state of the arm, and from where it comes to
-rest on its path.  Where none is, the arm stops on its path, and that stop is certified, too.  Trees
-are not grown while the arm moves, unless it can't even stop: they take seconds where there is no
+In order, until one is certified or the time is over: what is left of the trajectory; the same as a
+band pushed clear of what is new; the planner's own search, begun from the state of the arm, and
+from where it comes to rest on its path.  Where none is, the arm stops on its path, and that stop is
+certified, too.  Trees are grown for an arm that rests alone: they take seconds where there is no
 way.
 """
 
@@ -14,18 +14,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.answering import Answering, End, Refused
+from constraint_geodesics.answering import TOUCHES, Answering, End, Refused
 from constraint_geodesics.geometry.braking import Motion, State, ahead
 from constraint_geodesics.goals.goal import ConfigurationGoal
 from constraint_geodesics.problem import PlannerError, Status
 from constraint_geodesics.search.candidates import rows_of
+from constraint_geodesics.search.explanations import refused_end
 from constraint_geodesics.search.preparation import Preparation, Query
 from constraint_geodesics.search.repair import onward, over_graph, repaired
 from constraint_geodesics.search.run_out import left_over, rows_from
 from constraint_geodesics.trajectory import REDRAWN, Trajectory, stopping
 
-_TOUCHES = ("self_collision", "workcell_collision", "clearance")
-"""What a certificate finds where a motion meets something."""
+_NO_MORE = "no more"
 _TIGHTENED = (0.7, 0.4)
 """Shares of the allowed violation that waypoints after a stop are drawn for: it ends off the
 constraint.
@@ -39,7 +39,7 @@ class Replanning:
     answering: Answering
     preparation: Preparation
 
-    def replan(self, trajectory: Trajectory, at_s: float) -> Trajectory:
+    def replan(self, trajectory: Trajectory, at_s: float, limit_s: float) -> Trajectory:
         """The rest of a trajectory from a time [s] on, in the scene as it is now; `Planner.replan`
         says more.
         """
@@ -50,19 +50,30 @@ class Replanning:
             raise PlannerError(f"the trajectory is of another robot than {robot.name}")
         query = self._query(trajectory, state, began)
         rest = _Rest(trajectory, state)
-        moving = query.start_velocity is not None
-        if not moving and np.array_equal(query.start, query.goal):
+        collisions = self.answering.certifier.collisions
+        if (end := refused_end(query, "goal", collisions)) is not None:
+            return self._timed(query, self._stopped(query, self._stop(query, rest), end[1]))
+        if query.start_velocity is None and np.array_equal(query.start, query.goal):
             return self._timed(query, self.answering.standing(query))
-        refused = Refused("times", "the motion can't go on along its path")
+        why = "the motion can't go on along its path"
         for found in self._left(query, rest):
             if isinstance(found, Trajectory):
                 return self._timed(query, found)
-            refused = found
+            why = found.why
+        why = f"what is left of the motion fails: {why}"
         stop = self._stop(query, rest)
-        for other in self._others(query, rest, stop):
+        others = self._others(query, rest, stop)
+        while time.perf_counter() - began < limit_s:
+            other = next(others, _NO_MORE)
+            if isinstance(other, str):
+                break
             if other is not None and other.status == "solved":
                 return self._timed(query, other)
-        return self._timed(query, self._stopped(query, stop, refused))
+            if other is not None:
+                why = f"{why}; no other: {other.explanation}"
+        else:
+            why = f"{why}; {limit_s:g} s are over"
+        return self._timed(query, self._stopped(query, stop, why))
 
     def _query(self, trajectory: Trajectory, state: State, began: float) -> Query:
         asked = trajectory.asked
@@ -93,7 +104,7 @@ class Replanning:
             if times is not None:
                 found = self.answering.judged(query, joints, "rest", End(query.goal), times)
                 yield found
-                if isinstance(found, Refused) and found.kind in _TOUCHES:
+                if isinstance(found, Refused) and found.kind in TOUCHES:
                     return
 
     def _stop(self, query: Query, rest: "_Rest") -> Motion | None:
@@ -119,8 +130,10 @@ class Replanning:
         stops = stop is not None and self._is_clear(stop)
         if moving and stop is not None and stops:
             yield from self._after(query, stop)
-        if not (moving and stops):  # an arm that can stop has time for trees when it stands
-            yield self.answering.answer(query, (ConfigurationGoal(query.goal),), None)
+        if not (moving and stops):  # an arm that can stop plans again when it stands
+            parts = replace(query.parts, tree=query.parts.tree and not moving)
+            own = replace(query, parts=parts)
+            yield self.answering.answer(own, (ConfigurationGoal(query.goal),), None)
 
     def _after(self, query: Query, stop: Motion) -> Iterator[Trajectory | None]:
         """The stop, and other paths from there, as one trajectory."""
@@ -136,9 +149,11 @@ class Replanning:
     def _is_clear(self, stop: Motion) -> bool:
         return self.answering.certifier.collisions.is_clear(stop.joints)
 
-    def _stopped(self, query: Query, stop: Motion | None, refused: Refused) -> Trajectory:
-        """The stop, certified, or as it is where it can't be, with what it breaks."""
-        why = f"no path to the goal was found; what is left of the motion fails: {refused.why}"
+    def _stopped(self, query: Query, stop: Motion | None, why: str) -> Trajectory:
+        """The stop, certified, or as it is where it can't be, with what it breaks.  why: no path to
+        the goal is there.
+        """
+        why = f"no path to the goal: {why}"
         if stop is None:
             return self.answering.nothing(query, "not_found", f"{why}; nor can it stop on its path")
         query = query if stop.start_velocity.any() else replace(query, start_velocity=None)
@@ -147,7 +162,7 @@ class Replanning:
         if isinstance(found, Trajectory):
             return replace(found, status="stopped", explanation=line)
         assert found.certificate is not None
-        status: Status = "in_collision" if found.kind in _TOUCHES else "not_found"
+        status: Status = "in_collision" if found.kind in TOUCHES else "not_found"
         line = f"not even a stop is certified: {found.why}; {why}"
         nothing = self.answering.nothing(query, status, line)
         return replace(

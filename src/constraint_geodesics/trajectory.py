@@ -37,8 +37,8 @@ from constraint_geodesics.search.candidates import Candidate
 from constraint_geodesics.search.run_out import left_over, rows_from, run_out, run_outs
 from constraint_geodesics.search.space import space_of
 
-CONSTRAINT_LINE, VELOCITY_LINE = "# constraint: ", "# start_velocity: "
-"""What the comment lines of a trajectory's CSV begin with."""
+CONSTRAINT, VELOCITY = "constraint", "start_velocity"
+"""Names of the comment lines of a trajectory's CSV, `# name: JSON`."""
 REDRAWN = 0.9 * SATISFIED
 """Violation [rad or m] that lines may use which are drawn anew on a path's way."""
 STANDING_S = 0.001
@@ -63,8 +63,8 @@ class Asked:
 
 
 class Way(NamedTuple):
-    """A curve that was found with the answer's and is longer: the proposal that it came from, its
-    length [rad] and points (T, D) on it.  It is certified for nothing.
+    """Another curve that was found with the answer's: the proposal that it came from, its length
+    [rad] and points (T, D) on it.  It is certified for nothing.
     """
 
     source: str
@@ -456,9 +456,9 @@ def write_trajectory(
     """Write waypoints and times as CSV, the constraint in a comment line before the header, and the
     velocity at the first waypoint unless it rests; numbers to the last bit.
     """
-    lines = [f"{CONSTRAINT_LINE}{json.dumps(constraint.to_json())}"]
+    lines = [f"# {CONSTRAINT}: {json.dumps(constraint.to_json())}"]
     if motion.start_velocity.any():
-        lines.append(f"{VELOCITY_LINE}{json.dumps(motion.start_velocity.tolist())}")
+        lines.append(f"# {VELOCITY}: {json.dumps(motion.start_velocity.tolist())}")
     lines.append(",".join(("time_s", *names)))
     for t, row in zip(motion.times, motion.joints, strict=True):
         lines.append(",".join(repr(float(x)) for x in (t, *row)))
@@ -491,31 +491,39 @@ def read_trajectory(
     except (OSError, UnicodeDecodeError) as error:
         raise PlannerError(f"{file}: can't be read: {error}") from None
     lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
-    constraint, moving, table = None, None, []
+    said: dict[str, tuple[int, str]] = {}
+    table: list[tuple[int, list[str]]] = []
     for number, line in lines:
-        if line.startswith(CONSTRAINT_LINE):
-            constraint = _constraint_of(file, number, line.removeprefix(CONSTRAINT_LINE), robot)
-        elif line.startswith(VELOCITY_LINE):
-            moving = number, line.removeprefix(VELOCITY_LINE)
-        elif line and not line.startswith("#"):
-            table.append((number, line.split(",")))
+        if not line.startswith("#"):
+            table += [(number, line.split(","))] * bool(line)
+            continue
+        name, _, text = (part.strip() for part in line.removeprefix("#").partition(":"))
+        if name in said:
+            raise PlannerError(f"{file}, line {number}: a second {name}")
+        if name in (CONSTRAINT, VELOCITY):
+            said[name] = number, text
     if len(table) < 2:
         raise PlannerError(f"{file}: a header line and at least one row are needed")
     header = _header(file, table[0][1], names)
     array = np.array([_numbers(file, number, cells, len(header)) for number, cells in table[1:]])
     timed = header[0] == "time_s"
     joints, times = array[:, int(timed) :], array[:, 0] if timed else None
-    start = None if moving is None else _velocity_of(file, *moving, joints.shape[1])
+    constraint = _constraint_of(file, *said[CONSTRAINT], robot) if CONSTRAINT in said else None
+    start = _velocity_of(file, *said[VELOCITY], joints.shape[1]) if VELOCITY in said else None
+    if start is not None and not timed:
+        raise PlannerError(f"{file}: a {VELOCITY} goes with times: there is no column time_s")
     return Read(joints, times, constraint, start)
 
 
 def _velocity_of(file: Path, number: int, text: str, dof: int) -> Float[np.ndarray, "D"]:
     try:
-        found = np.array(json.loads(text), float)
-    except (TypeError, ValueError):
+        given = json.loads(text)
+        numbers = isinstance(given, list) and all(type(x) in (int, float) for x in given)
+        found = np.array(given if numbers else [], float)
+    except (ValueError, OverflowError, RecursionError):
         found = np.empty(0)
     if found.shape != (dof,) or not np.isfinite(found).all():
-        raise PlannerError(f"{file}, line {number}: not a velocity of {dof} joints: {text}")
+        raise PlannerError(f"{file}, line {number}: not a velocity of {dof} joints: {text[:80]}")
     return found
 
 

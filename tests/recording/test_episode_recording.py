@@ -17,7 +17,7 @@ LINE = "LineStrips3D:strips"
 @pytest.fixture(scope="module")
 def record() -> EpisodeRecord:
     planner = packaged_planner()
-    with study.carrying(planner, carried=True):
+    with study.carrying(planner, "level_cup"):
         episode = study.drawn(planner, "level_cup", 1, 0)
         happenings = list(study.run(episode, study.Replanner(planner)))
     report = study.report(episode, happenings)

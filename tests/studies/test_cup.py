@@ -1,3 +1,4 @@
+import itertools
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,7 +15,13 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.studies.cup import CupSettings, Execution, _cup_in_tool, execute
+from constraint_geodesics.studies.cup import (
+    CupSettings,
+    Execution,
+    _cup_boxes,
+    carried_cup,
+    execute,
+)
 
 UP_IN_TOOL = np.array([0.0, 1.0, 0.0])
 """Direction of a level cup's opening in the tool frame of the side grasp."""
@@ -40,19 +47,20 @@ def timed(robot: SerialRobot, path: np.ndarray, acceleration: float = 4.0) -> np
 
 
 def test_the_cup_that_is_carried_encloses_the_one_of_the_simulation(params: Params) -> None:
-    """Its walls' corners, in the tool's frame; the bottom is in them."""
+    """All corners of its walls."""
     (held,) = Scene.from_params(params, "level_cup").attached
     assert held.link == params.robot.tool_link
+    round_it = carried_cup(UP_IN_TOOL)
+    np.testing.assert_allclose(held.shape.at.matrix[:3, 3], round_it.at.matrix[:3, 3])
+    assert held.shape.at.matrix[:3, 2] @ round_it.at.matrix[:3, 2] == pytest.approx(1.0)
     assert isinstance(held.shape, Cylinder)
-    settings = CupSettings()
-    position, turn = _cup_in_tool(UP_IN_TOOL, settings)
-    up = Rotation.from_quat(turn).as_matrix()[:, 2]
-    half = 0.5 * held.shape.length_m
-    outer = (settings.inner_radius_m + settings.wall_m) / np.cos(np.pi / settings.walls)
-    inside = held.shape.at.matrix[:3]
-    assert np.allclose(inside[:, 3], position)
-    assert abs(up @ inside[:, 2]) == pytest.approx(1.0)
-    assert (half, held.shape.radius_m) >= (0.5 * settings.height_m, outer)
+    assert (held.shape.length_m, held.shape.radius_m) == (round_it.length_m, round_it.radius_m)
+    halves, centres, turns = _cup_boxes(CupSettings())
+    for half, centre, turn in zip(halves[1:], centres[1:], turns[1:], strict=True):
+        corners = np.array(list(itertools.product(*[(-x, x) for x in half])))
+        corners = Rotation.from_quat(turn).apply(corners) + centre
+        assert np.hypot(*corners.T[:2]).max() <= held.shape.radius_m
+        assert np.abs(corners[:, 2]).max() <= 0.5 * held.shape.length_m + 1e-12
     assert not Scene.from_params(params, "tool_down").attached
 
 

@@ -22,7 +22,7 @@ from constraint_geodesics.studies import episodes as study
 from constraint_geodesics.studies.episodes import Answered, Episode, Moved, Replanner, Report, Seen
 from constraint_geodesics.trajectory import Trajectory
 
-CUP = runs.Kind("level_cup", carried=True)
+CUP = "level_cup"
 
 
 @dataclass(frozen=True)
@@ -45,15 +45,15 @@ class Blind:
 @cache
 def episodes(count: int) -> tuple[Episode, ...]:
     planner = packaged_planner()
-    with study.carrying(planner, CUP.carried):
-        return tuple(study.drawn(planner, CUP.constraint, k, 0) for k in range(count))
+    with study.carrying(planner, CUP):
+        return tuple(study.drawn(planner, CUP, k, 0) for k in range(count))
 
 
 @cache
 def answered(count: int) -> tuple[Report, ...]:
     planner, found = packaged_planner(), []
     for episode in episodes(count):
-        with study.carrying(planner, CUP.carried):
+        with study.carrying(planner, CUP):
             happenings = list(study.run(episode, Replanner(planner)))
         found.append(study.report(episode, happenings))
     return tuple(found)
@@ -139,7 +139,6 @@ def rows_of(outcomes: dict[tuple[int, str], tuple[bool, str]]) -> pd.DataFrame:
     return pd.DataFrame(
         {
             "constraint": "free",
-            "carried": False,
             "episode": number,
             "controller": controller,
             "solved": outcome == "reached",
@@ -170,7 +169,6 @@ def test_figures_are_of_the_solvable_and_the_page_has_them() -> None:
     answers = pd.DataFrame(
         {
             "constraint": "free",
-            "carried": False,
             "episode": [0, 1, 3, 0],
             "controller": ["a", "a", "a", "b"],
             "ms": [10.0, 500.0, 70.0, 5.0],

@@ -92,6 +92,8 @@ def _passed(at_s: float, marks: Float[np.ndarray, "3"], speeds: Float[np.ndarray
     end that change evenly between them; at a sharp corner some may be negative, there it waits.
     """
     speeds = np.maximum(speeds, 0.0)
+    if not speeds.any():  # both ends are one place
+        return float((at_s - marks[0]) / (marks[2] - marks[0]))
     halves = 0.5 * (speeds[1:] + speeds[:-1]) * np.diff(marks)
     half = int(at_s >= marks[1])
     now = float(np.interp(at_s, marks, speeds))

@@ -14,10 +14,9 @@ from constraint_geodesics.learning.dataset import draw_queries
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.box import Box
-from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.shape import Placement
 from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.studies.cup import carried_cup
 from constraint_geodesics.studies.problem_runs import DENSE_RAD, quantiles
 from constraint_geodesics.trajectory import Trajectory
 
@@ -167,7 +166,7 @@ def _changed(planner: Planner, rng: np.random.Generator) -> Iterator[tuple[str, 
     scene, link = planner.scene, planner.robot.tool_link
     crate = Box("crate", (0.6, 0.4, 0.2), (0.1, 0.1, 0.1))
     elsewhere = Pose(rng.uniform((0.4, -0.9, 0.1), (0.9, 0.9, 1.0)), np.eye(3))
-    cup = Cylinder("cup", Placement((0.0, 0.0, 0.075), (-0.5 * np.pi, 0.0, 0.0)), 0.1, 0.037)
+    cup = carried_cup(np.array([0.0, 1.0, 0.0]))
     steps: Sequence[tuple[str, Callable[[], object]]] = (
         ("add", lambda: scene.add(crate)),
         ("move", lambda: scene.move("crate", elsewhere)),

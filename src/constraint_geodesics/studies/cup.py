@@ -10,7 +10,9 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
+from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.shape import Placement
 from constraint_geodesics.scene.world import Physics, physics
 
 GRAVITY = 9.81
@@ -271,7 +273,9 @@ def _velocities(q: np.ndarray, t: np.ndarray) -> np.ndarray:
     return np.concatenate([rest, inner, rest])
 
 
-def _cup_in_tool(axis: np.ndarray, settings: CupSettings) -> _Pose:
+def _cup_in_tool(
+    axis: np.ndarray, settings: CupSettings
+) -> tuple[tuple[float, float, float], tuple[float, ...]]:
     """Pose of the cup's centre in the tool frame: its opening along `axis`, all of it beyond the
     gap along z.
     """
@@ -283,6 +287,19 @@ def _cup_in_tool(axis: np.ndarray, settings: CupSettings) -> _Pose:
     reach = outer * np.hypot(axis[0], axis[1]) + 0.5 * settings.height_m * abs(axis[2])
     position = (0.0, 0.0, settings.gap_m + float(reach))
     return position, tuple(Rotation.from_matrix(rotation).as_quat().tolist())
+
+
+def carried_cup(axis: Float[np.ndarray, "3"], settings: CupSettings | None = None) -> Cylinder:
+    """A cylinder round the cup's walls in the tool's frame, as what the arm carries: its opening
+    along `axis`.
+    """
+    settings = settings or CupSettings()
+    x, y, z = (axis / np.linalg.norm(axis)).tolist()
+    position, _ = _cup_in_tool(np.array([x, y, z]), settings)
+    turn = (-float(np.arcsin(y)), float(np.arctan2(x, z)), 0.0)  # of its z axis onto the cup's
+    corner = (settings.inner_radius_m + settings.wall_m) / np.cos(np.pi / settings.walls)
+    radius = 1e-3 * float(np.ceil(1e3 * corner))
+    return Cylinder("cup", Placement(position, turn), settings.height_m, radius)
 
 
 def _cup_boxes(settings: CupSettings) -> tuple[list[list[float]], ...]:

@@ -40,19 +40,11 @@ RECORDED = 2
 
 
 @dataclass(frozen=True)
-class Kind:
-    """Episodes under one constraint, with or without a cup in the tool."""
-
-    constraint: str
-    carried: bool
-
-
-@dataclass(frozen=True)
 class Task:
     """One episode for a worker.  code: a digest of what its rows hang on; rows: their folder."""
 
     planner: Path
-    kind: Kind
+    constraint: str
     number: int
     seed: int
     code: str
@@ -61,7 +53,7 @@ class Task:
     @property
     def file(self) -> Path:
         """Where its rows are kept."""
-        return self.rows / f"{self.kind.constraint}-{self.number}.json"
+        return self.rows / f"{self.constraint}-{self.number}.json"
 
 
 class FromScratch(AbstractContextManager["FromScratch"]):
@@ -137,7 +129,10 @@ def kept(task: Task) -> dict[str, Any]:
         found: dict[str, Any] = json.loads(task.file.read_text())
         if found["code"] == task.code:
             return found
-    found = {"code": task.code, **ran(opened(task.planner), task.kind, task.number, task.seed)}
+    found = {
+        "code": task.code,
+        **ran(opened(task.planner), task.constraint, task.number, task.seed),
+    }
     task.file.parent.mkdir(parents=True, exist_ok=True)
     part = task.file.with_suffix(".part")
     part.write_text(json.dumps(found))
@@ -151,18 +146,18 @@ def opened(folder: Path) -> Planner:
     return Planner(read_bundle(folder), str(folder))
 
 
-def ran(planner: Planner, kind: Kind, number: int, seed: int) -> dict[str, Any]:
+def ran(planner: Planner, constraint: str, number: int, seed: int) -> dict[str, Any]:
     """One episode with each controller: `runs`, a row each, their `answers`, and of the first
     RECORDED episodes `motions`, to be recorded.
     """
     found = dict[str, Any](runs=[], answers=[], motions={})
-    with study.carrying(planner, kind.carried):
-        _prepare(planner, kind.constraint)
-        episode = study.drawn(planner, kind.constraint, number, seed)
+    with study.carrying(planner, constraint):
+        _prepare(planner, constraint)
+        episode = study.drawn(planner, constraint, number, seed)
         start = episode.first.joints[0]
         known = planner.scene.now
-        whole = planner.plan(start, episode.goal, kind.constraint, scene=episode.obstacles)
-        about = {"constraint": kind.constraint, "carried": kind.carried, "episode": number}
+        whole = planner.plan(start, episode.goal, constraint, scene=episode.obstacles)
+        about = {"constraint": constraint, "episode": number}
         for name, report in _reports(planner, episode, seed):
             planner.scene.become(known)
             solved = whole.status == "solved" or report.outcome == "reached"

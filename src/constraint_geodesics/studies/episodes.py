@@ -28,12 +28,12 @@ from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import PlannerError
 from constraint_geodesics.scene.box import Box
-from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.scene.shape import Placement, Shape
+from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.scene.world import BodyKey, World
 from constraint_geodesics.search.band import step_lengths
+from constraint_geodesics.studies.cup import carried_cup
 from constraint_geodesics.trajectory import Trajectory
 
 TICK_S, LATENCY_S = 0.02, 0.06
@@ -46,8 +46,8 @@ SENSING_M = (0.2, 0.3, 0.45)
 """Sensing radii, by turns."""
 DENSE_RAD = 0.005
 """Distance of the configurations at which PyBullet judges an executed motion."""
-CUP, CUP_M = "cup", (0.12, 0.04)
-"""What is carried: its name, height and radius."""
+ANSWER_S = 0.5 * LATENCY_S
+"""After which a replan begins no other path."""
 SHORTEST_RAD = 1.0
 """Of the paths that obstacles are put on."""
 MOST, ON_THE_WAY = 3, 0.7
@@ -173,7 +173,7 @@ class Replanner:
 
     def moving(self, path: Trajectory, at_s: float) -> Trajectory | None:
         """What is left, a path round what is new, or a stop."""
-        return self.planner.replan(path, at_s)
+        return self.planner.replan(path, at_s, limit_s=ANSWER_S)
 
     def resting(self, path: Trajectory) -> Trajectory:
         """With trees, if need be."""
@@ -315,9 +315,9 @@ def _between(
     between.
     """
     inner = path.times[(path.times > from_s) & (path.times < to_s)]
-    times = np.array([from_s, *inner, to_s])
-    rows = np.stack([np.interp(times, path.times, column) for column in path.joints.T], axis=1)
-    return times, rows
+    ends = [path.state(at_s).configuration for at_s in (from_s, to_s)]
+    rows = path.joints[np.searchsorted(path.times, inner)]
+    return np.array([from_s, *inner, to_s]), np.vstack([ends[0], rows, ends[1]])
 
 
 # What became of it
@@ -423,22 +423,23 @@ def _as_contact(scene: Scene, path: Trajectory, at_s: float, clock_s: float) -> 
 
 
 @contextmanager
-def carrying(planner: Planner, carried: bool) -> Iterator[None]:
-    """With a cup in the tool, or without; and without what is seen within, afterwards."""
+def carrying(planner: Planner, constraint: str) -> Iterator[None]:
+    """With a cup in the tool where the constraint keeps one upright; and without what is seen
+    within, afterwards.
+    """
     before = planner.scene.now
-    if carried:
-        attach_cup(planner)
+    attach_cup(planner, constraint)
     try:
         yield
     finally:
         planner.scene.become(before)
 
 
-def attach_cup(planner: Planner) -> None:
-    """Put a cup into the tool."""
-    height, radius = CUP_M
-    pose = Placement((0.0, 0.0, 0.5 * height))
-    planner.scene.attach(Cylinder(CUP, pose, height, radius), link=planner.robot.tool_link)
+def attach_cup(planner: Planner, constraint: str) -> None:
+    """Put a cup into the tool where the constraint keeps one upright."""
+    axis = planner.constraints[constraint].level_axis
+    if axis is not None:
+        planner.scene.attach(carried_cup(axis), link=planner.robot.tool_link)
 
 
 def drawn(planner: Planner, constraint: str, number: int, seed: int) -> Episode:
