@@ -193,6 +193,34 @@ def test_every_needed_option_is_asked_for(command, missing) -> None:
     assert "Traceback" not in err
 
 
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="a file that never ends is Linux's")
+@pytest.mark.parametrize("words", [("check",), (*asked(ZEROS, ZEROS), "--scene")])
+def test_a_file_that_never_ends_is_one_line(command, words) -> None:
+    code, out, err = command(*words, "/dev/zero")
+    assert (code, out) == (2, "")
+    assert "/dev/zero: " in error_line(err)
+    assert "longer than 256 MiB" in err
+
+
+def test_a_scene_whose_urdf_is_no_xml_is_one_line(command, tmp_path, monkeypatch) -> None:
+    (tmp_path / "lamp.urdf").write_text("a lamp")
+    (tmp_path / "scene.yaml").write_text("shapes: {lamp: {kind: urdf, urdf: lamp.urdf}}")
+    monkeypatch.chdir(tmp_path)
+    code, out, err = command(*asked(ZEROS, ZEROS), "--scene", "scene.yaml")
+    assert (code, out) == (2, "")
+    assert "lamp.urdf: no URDF: it is no XML" in error_line(err)
+
+
+def test_a_server_that_is_not_there_and_a_store_without_its_library_are_one_line(
+    command, monkeypatch
+) -> None:
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:1")
+    for address, said in (("models:/arm/1", "127.0.0.1"), ("s3://bucket/arm", "s3://bucket/arm: ")):
+        code, out, err = command(*asked(ZEROS, ZEROS), "--planner", address)
+        assert (code, out) == (1, "")
+        assert said in error_line(err)
+
+
 def test_a_planner_that_is_none_is_one_line(command, tmp_path) -> None:
     for words in (asked(ZEROS, ZEROS, "free"), ("constraints",)):
         code, out, err = command(*words, "--planner", str(tmp_path))

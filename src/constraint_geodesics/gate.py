@@ -6,7 +6,6 @@ what the stages ask of each other's parameters.
 
 import math
 from collections.abc import Iterator
-from xml.etree.ElementTree import ParseError
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from constraint_geodesics.peers import registry
 from constraint_geodesics.peers.baseline import BaselineError
 from constraint_geodesics.scene.pieces import read_pieces
 from constraint_geodesics.scene.scene import Scene, robot_from
-from constraint_geodesics.scene.urdf import find_urdf
 from constraint_geodesics.studies.hidden_tasks import TASKS
 
 TABLE_I = ("prm", "rrt_star", "birrt")
@@ -42,8 +40,6 @@ def _check_robot(params: Params) -> None:
     robot, carried = params.robot, params.carried
     try:
         read_pieces(robot_from(robot).urdf)
-    except ParseError as error:
-        raise ParamsError(f"robot.urdf: {find_urdf(robot.urdf)}: no URDF: {error}") from None
     except (ValueError, OSError) as error:
         raise ParamsError(f"robot: {error}") from None
     for entry, constraint in (("workcell", ""), ("carried", next(iter(carried.constraints), ""))):

@@ -36,6 +36,7 @@ from constraint_geodesics.fields import (
 )
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.shapes import AnyShape
+from constraint_geodesics.text_files import read_text
 
 
 class _Record(BaseModel):
@@ -798,7 +799,7 @@ def read_yaml(path: Path) -> Any:
     from ruamel.yaml.error import YAMLError
 
     try:
-        documents = list(YAML(typ="safe", pure=True).load_all(path.read_text()))
+        documents = list(YAML(typ="safe", pure=True).load_all(read_text(path)))
     except OSError as error:
         raise ParamsError(f"{path}: {error.strerror}") from None
     except (UnicodeError, RecursionError) as error:

@@ -36,6 +36,7 @@ from constraint_geodesics.search.band import project, step_lengths
 from constraint_geodesics.search.candidates import Candidate
 from constraint_geodesics.search.run_out import left_over, rows_from, run_out, run_outs
 from constraint_geodesics.search.space import space_of
+from constraint_geodesics.text_files import read_text
 
 CONSTRAINT, VELOCITY = "constraint", "start_velocity"
 """Names of the comment lines of a trajectory's CSV, `# name: JSON`."""
@@ -487,9 +488,10 @@ def read_trajectory(
     Raises PlannerError naming the file and the line that can't be read.
     """
     try:
-        text = file.read_text("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise PlannerError(f"{file}: can't be read: {error}") from None
+        text = read_text(file, "utf-8-sig")
+    except (OSError, UnicodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise PlannerError(f"{file}: can't be read: {why}") from None
     lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
     said: dict[str, tuple[int, str]] = {}
     table: list[tuple[int, list[str]]] = []

@@ -111,6 +111,14 @@ class SerialRobot:
         return np.require(q, np.float64, ("C", "W")).reshape(-1, self.dof)
 
 
+def urdf_root(urdf: Path) -> ElementTree.Element:
+    """The root element of a URDF; raises RobotError where it is no XML."""
+    try:
+        return ElementTree.parse(urdf).getroot()
+    except (ElementTree.ParseError, ValueError) as error:
+        raise RobotError(f"{urdf}: no URDF: it is no XML ({error})") from None
+
+
 def load_robot(
     urdf: Path, tool_link: str, tighter_limits: Mapping[str, tuple[float, float]] | None = None
 ) -> SerialRobot:
@@ -122,7 +130,7 @@ def load_robot(
     """
     if not urdf.is_file():
         raise RobotError(f"{urdf}: no such URDF file")
-    root = ElementTree.parse(urdf).getroot()
+    root = urdf_root(urdf)
     parent_joint = {_attribute(j, "child", "link", urdf): j for j in root.findall("joint")}
     if tool_link not in {link.get("name") for link in root.findall("link")}:
         raise RobotError(f"{urdf}: there is no link {tool_link!r}")

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from constraint_geodesics.robot.description import find_mesh
-from constraint_geodesics.robot.kinematics import RobotError, origin_of
+from constraint_geodesics.robot.kinematics import RobotError, origin_of, urdf_root
 
 HULL_MARGIN = 0.001
 """What PyBullet keeps around a hull [m]."""
@@ -81,7 +81,7 @@ def read_pieces(urdf: Path) -> list[LinkPieces]:
     """All links of a URDF.  Raises RobotError where a collision shape can't be bounded, naming the
     file and the link.
     """
-    root = ElementTree.parse(urdf).getroot()
+    root = urdf_root(urdf)
     above = {_link(j, "child"): (_link(j, "parent"), j) for j in root.findall("joint")}
     found = []
     for link in root.findall("link"):

@@ -89,6 +89,9 @@ def fetch_artifacts(address: str, root: Path = Path()) -> Iterator[Path]:
         try:
             found = _beside_store(uri, address)
             if found is None:
+                if urlsplit(uri).scheme in ("http", "https"):
+                    with _impatient():
+                        client_of(uri).search_experiments(max_results=1)
                 fetched = mlflow.artifacts.download_artifacts(
                     artifact_uri=address, dst_path=folder, tracking_uri=uri, registry_uri=uri
                 )
@@ -97,6 +100,8 @@ def fetch_artifacts(address: str, root: Path = Path()) -> Iterator[Path]:
                 raise FileNotFoundError(f"its files are missing in {found}")
         except (mlflow.exceptions.MlflowException, OSError) as error:
             raise TrackingError(f"{address}: {' '.join(str(error).split())[:200]}") from None
+        except ImportError as error:  # a kind of store that needs a library of its own
+            raise TrackingError(f"{address}: {error}: install it") from None
         own = found / "artifacts" / "planner"
         yield own if (found / "MLmodel").is_file() and own.is_dir() else found
 
