@@ -96,6 +96,7 @@ def test_the_benchmarks_summary_is_json(geodesics, tmp_path) -> None:
     }
     parameters["geodesics"]["illustrated_constraints"] = ["level_cup"]
     parameters["clutter"]["constraints"] = ["free"]
+    parameters["carried"]["constraints"] = ["level_cup"]
     parameters["studies"]["constraint"] = "level_cup"
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(parameters))
     shutil.copy(ROOT / "requirements.lock", tmp_path)

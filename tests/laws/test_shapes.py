@@ -276,17 +276,21 @@ def test_several_shapes_leave_the_smallest_distance() -> None:
 def test_a_kind_is_known_in_its_own_file_and_among_the_shapes() -> None:
     """A new kind takes two files.  The benchmarks choose a sphere as what stands in the way, so do
     the warm-up and the training of policies; the proof of collisions is tried among spheres and
-    boxes, ways among thin boxes, planners among shapes of all kinds.  Some are offered to users by
-    a short name, or read from the files of MoveIt and MotionBenchMaker; meshes lie beside a scene's
-    file.
+    boxes, ways among thin boxes, planners among shapes of all kinds, and a cup is a cylinder.
+    Some are offered to users by a short name, or read from the files of MoveIt and
+    MotionBenchMaker; meshes lie beside a scene's file.
     """
     package = Path(__file__).resolve().parents[2] / "src" / "constraint_geodesics"
     chosen = {"benchmark/queries.py", "benchmark/runner.py", "studies/growth.py", "kernel_jobs.py"}
     chosen |= {"geodesics/obstacles.py"}
     tried = {"studies/collision_proof.py"}
     offered = {"__init__.py", "moveit.py", "benchmark/problem_files.py", "scene/scene_file.py"}
-    tried |= {"studies/changing_scenes.py"}
-    others = {Sphere: chosen | tried, Box: tried | {"studies/thin_shapes.py"}, Cylinder: tried}
+    tried |= {"studies/changing_scenes.py", "studies/episodes.py"}
+    others = {
+        Sphere: chosen | tried,
+        Box: tried | {"studies/thin_shapes.py"},
+        Cylinder: {"studies/cup.py"},
+    }
     for kind in (Box, Sphere, Capsule, Cylinder, Mesh, PointCloud, Body):
         home = kind.__module__.split(".", 1)[1].replace(".", "/") + ".py"
         named = {

@@ -63,6 +63,7 @@ SMALL: dict[str, Any] = {
     "studies": {"queries": 3},
     "sweep": {"seeds": [0, 1], "steps": 1920, "queries": 3},
     "execution": {"queries": 1, "spheres": 4},
+    "carried": {"constraints": ["level_cup"]},
     "clutter": {"constraints": ["free", "level_cup"], "scenes": 1, "queries": 1},
     "benchmark": {"queries": 2, "compared": {"seeds": 1}},
     "recording": {"queries": 2},

@@ -252,7 +252,7 @@ def _runs(process: int) -> bool:
     return state.is_file() and state.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense"])
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://127.0.0.1:1"])
 def test_a_bad_address_is_one_line_within_seconds(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

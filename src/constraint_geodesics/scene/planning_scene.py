@@ -130,7 +130,8 @@ class PlanningScene:
         """Take all of another scene of the same robot."""
         if not _are_same(scene.robot, self.robot):
             raise SceneError(f"a scene of another robot: this one is {self.robot.name}")
-        scene = replace(scene, robot=self.robot)  # it may have come by pickle
+        if scene.robot is not self.robot:  # it came by pickle
+            scene = replace(scene, robot=self.robot)
         self._follow(scene)
         self._now = scene
 

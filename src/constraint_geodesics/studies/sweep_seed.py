@@ -169,8 +169,13 @@ def _training(params: Params, layout: Layout) -> ProblemSet:
     data = [(file.st_mtime_ns, file.st_size) for file in files]
     key = str((layout.root, params.geodesics.degree, trained, described, data))
     if key not in _KEPT:
-        alone = [_alone(params, layout, name) for name in params.constraints]
-        chart = alone[0][1].chart  # one for all: members of a set share it
+        # one robot and one chart for all: members of a set share them
+        robot, asked = Scene.from_params(params).robot, list[tuple[Scene, LearnedProblem]]()
+        for name in params.constraints:
+            scene, problem = _alone(params, layout, name)
+            manifold = replace(problem.manifold, robot=robot)
+            chart = asked[0][1].chart if asked else problem.chart
+            asked.append((scene, replace(problem, manifold=manifold, chart=chart)))
         _KEPT.clear()
-        _KEPT[key] = training_problem(params, [(s, replace(p, chart=chart)) for s, p in alone])
+        _KEPT[key] = training_problem(params, asked)
     return _KEPT[key]
