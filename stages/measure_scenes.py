@@ -44,7 +44,7 @@ def main(params: Params, layout: Layout) -> None:
         "changes_ms": study.change_figures(frames["changes"]),
         "cup_carried": study.answer_figures(frames["cup"]),
         "sudden_spheres": study.answer_figures(frames["sudden"])
-        | {"certified": int(frames["sudden"].certified.sum())},
+        | {"certified": int(frames["sudden"].certified.fillna(False).sum())},
         "beside_a_sphere": study.sphere_figures(frames["sphere"]),
     }
     rows = pd.concat([frame.assign(study=name) for name, frame in frames.items()])

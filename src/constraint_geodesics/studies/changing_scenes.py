@@ -17,6 +17,7 @@ from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.studies.cup import carried_cup
+from constraint_geodesics.studies.episodes import stop_on
 from constraint_geodesics.studies.problem_runs import DENSE_RAD, quantiles
 from constraint_geodesics.trajectory import Trajectory
 
@@ -112,13 +113,19 @@ def loaded(planner: Planner, scene: Scene, name: str, count: int, seed: int) -> 
 
 
 def sudden(planner: Planner, name: str, count: int, seed: int) -> Rows:
-    """Motions in whose way a sphere comes up, beyond where the arm could stop."""
+    """Motions in whose way a sphere comes up, beyond where the arm could stop; one that can't be
+    stopped at all is a row of its own, beside the `count`.
+    """
     rng, number = np.random.default_rng(seed + 1), 0
     for path in _long_paths(planner, name, seed):
         if number == count:
             return
         at_s = SUDDEN * float(path.times[-1])
-        ball = _in_the_way(planner, path, at_s, rng)
+        stop = stop_on(path, at_s)
+        if stop is None:
+            yield {"constraint": name, "status": "no stop on the path", "touches": False}
+            continue
+        ball = _in_the_way(planner, path, stop, rng)
         if ball is None:
             continue
         planner.scene.add(ball)
@@ -133,11 +140,10 @@ def sudden(planner: Planner, name: str, count: int, seed: int) -> Rows:
 
 
 def _in_the_way(
-    planner: Planner, path: Trajectory, at_s: float, rng: np.random.Generator
+    planner: Planner, path: Trajectory, stop: Trajectory, rng: np.random.Generator
 ) -> Sphere | None:
     """A sphere on a link's end that the rest of a path runs into, clear of stop and goal."""
-    stop = path.stop(at_s)
-    earliest = at_s + 1.05 * float(stop.times[-1])
+    earliest = SUDDEN * float(path.times[-1]) + 1.05 * float(stop.times[-1])
     for _ in range(TRIES if earliest < path.times[-1] else 0):
         place = path.state(rng.uniform(earliest, float(path.times[-1]))).configuration
         ends = planner.robot.skeleton(place)[3:]
