@@ -72,7 +72,7 @@ def filled(text: str) -> str:
     for name, file in BLOCKS.items():
         content = (ROOT / "reports" / file).read_text().strip()
         text = replaced(text, name, content.split("\n\n")[0] if name in SHORTENED else content)
-    return QUOTED.sub(_requoted, text)
+    return with_numbers(text)
 
 
 def _requoted(found: re.Match[str]) -> str:
@@ -111,7 +111,13 @@ def _range(values: list[float]) -> str:
     return low if low == high else f"{low} to {high}"
 
 
+def with_numbers(text: str) -> str:
+    """A page's text with every quoted number as the reports have it now."""
+    return QUOTED.sub(_requoted, text)
+
+
 PAGES = {README: with_planners, RESULTS: filled, EXPERIMENTS: with_stage_times}
+PAGES |= {ROOT / "docs" / page: with_numbers for page in ("scenes.md", "problems.md")}
 """What brings each page up to date."""
 
 if __name__ == "__main__":
