@@ -148,7 +148,10 @@ REFUSED: list[tuple[Change, tuple[str, ...]]] = [
     (lambda p: p["robot"].update(hold={"joint9": 0.0}), ("robot", "joint9")),
     (lambda p: p["robot"].update(may_touch="no.srdf"), ("robot", "no.srdf")),
     (lambda p: p["robot"].update(urdf="no/arm.urdf"), ("robot", "no/arm.urdf", "no such URDF")),
-    (lambda p: p["robot"].update(urdf="params.yaml"), ("robot.urdf", "params.yaml", "no URDF")),
+    (
+        lambda p: p["robot"].update(urdf="params.yaml"),
+        ("robot: ", "params.yaml: no URDF", "no XML"),
+    ),
     (lambda p: p["robot"].update(tool_link="hand"), ("robot", "there is no link 'hand'")),
     (lambda p: p["robot"].update(limits_rad={"elbow": [-1, 1]}), ("robot", "elbow", "joint6")),
     (
