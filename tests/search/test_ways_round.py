@@ -1,5 +1,6 @@
 """Lines bent round a sphere, and answers that name the ways that were found round it."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from tests.recording.files import column
 
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.band import PROJECTION, project
-from constraint_geodesics.search.candidates import round_it
+from constraint_geodesics.search.candidates import Task, round_it
 from constraint_geodesics.search.ways_round import SIDES, bent_round
 from constraint_geodesics.trajectory import Trajectory
 
@@ -33,30 +34,37 @@ def queries(name: str, count: int) -> list[tuple[np.ndarray, np.ndarray, Sphere,
     return found
 
 
-@pytest.mark.parametrize("name", ["free", "level_cup"])
-def test_a_line_is_bent_out_of_a_sphere_to_either_side(name: str) -> None:
-    planner, sides = packaged_planner(), 0
+def lines_through_spheres(name: str) -> Iterator[tuple[Task, np.ndarray]]:
+    """Lines of nodes, projected, each with the task in whose scene the sphere is meanwhile."""
+    planner = packaged_planner()
     for start, goal, ball, _ in queries(name, 12):
         share = np.linspace(0.0, 1.0, 17)[:, None]
         line = (1.0 - share) * start + share * goal
         with planner.scene.including([ball]):
             task = planner._preparation.task(planner.constraints[name])
             project(task.open, line[1:-1])
-            if task.clearance.clearance(planner.robot, line).min() > 0.0:
-                continue  # under a constraint the line itself may lead elsewhere
-            deepest = int(task.clearance.clearance(planner.robot, line[1:-1]).argmin()) + 1
-            bent = [bent_round(task.open, task.clear, line, side, PROJECTION) for side in SIDES]
-            for nodes in bent:
-                if nodes is None:
-                    continue
-                sides += 1
-                np.testing.assert_array_equal(nodes[[0, -1]], line[[0, -1]])
-                margin = task.settings.clearance_m - 1e-6
-                assert task.clearance.clearance(planner.robot, nodes[deepest]) >= margin
-                assert task.manifold.violation(nodes[deepest]) <= 1e-8
-            if all(nodes is not None for nodes in bent):
-                moved = [nodes[deepest] - line[deepest] for nodes in bent]
-                assert moved[0] @ moved[1] < 0.0
+            yield task, line
+
+
+@pytest.mark.parametrize("name", ["free", "level_cup"])
+def test_a_line_is_bent_out_of_a_sphere_to_either_side(name: str) -> None:
+    planner, sides = packaged_planner(), 0
+    for task, line in lines_through_spheres(name):
+        if task.clearance.clearance(planner.robot, line).min() > 0.0:
+            continue  # under a constraint the line itself may lead elsewhere
+        deepest = int(task.clearance.clearance(planner.robot, line[1:-1]).argmin()) + 1
+        bent = [bent_round(task.open, task.clear, line, side, PROJECTION) for side in SIDES]
+        for nodes in bent:
+            if nodes is None:
+                continue
+            sides += 1
+            np.testing.assert_array_equal(nodes[[0, -1]], line[[0, -1]])
+            margin = task.settings.clearance_m - 1e-6
+            assert task.clearance.clearance(planner.robot, nodes[deepest]) >= margin
+            assert task.manifold.violation(nodes[deepest]) <= 1e-8
+        if all(nodes is not None for nodes in bent):
+            moved = [nodes[deepest] - line[deepest] for nodes in bent]
+            assert moved[0] @ moved[1] < 0.0
     assert sides >= 8
 
 
@@ -73,20 +81,15 @@ def test_nothing_is_bent_where_nothing_is_near() -> None:
 @pytest.mark.parametrize("name", ["free", "level_cup"])
 def test_ways_round_a_sphere_are_clear_and_those_seldom_sound_come_last(name: str) -> None:
     planner, found = packaged_planner(), 0
-    for start, goal, ball, _ in queries(name, 12):
-        share = np.linspace(0.0, 1.0, 17)[:, None]
-        line = (1.0 - share) * start + share * goal
-        with planner.scene.including([ball]):
-            task = planner._preparation.task(planner.constraints[name])
-            project(task.open, line[1:-1])
-            ways = list(round_it(task, "straight", line))
-            assert ways.count(None) == 1
-            sound = [way for way in ways if way is not None]
-            found += len(sound)
-            for way in sound:
-                np.testing.assert_array_equal(way.points[[0, -1]], line[[0, -1]])
-                assert task.clearance.clearance(planner.robot, way.points).min() > 0.0
-                assert task.manifold.violation(way.points).max() <= 1e-6
+    for task, line in lines_through_spheres(name):
+        ways = list(round_it(task, "straight", line))
+        assert ways.count(None) == 1
+        sound = [way for way in ways if way is not None]
+        found += len(sound)
+        for way in sound:
+            np.testing.assert_array_equal(way.points[[0, -1]], line[[0, -1]])
+            assert task.clearance.clearance(planner.robot, way.points).min() > 0.0
+            assert task.manifold.violation(way.points).max() <= 1e-6
     assert found >= 12
 
 
