@@ -7,7 +7,7 @@ CONSTRAINT ?=
 FIRST_START = 1.329923 -0.584036 -3.766650 -2.008429 0.728803 -2.581396
 FIRST_GOAL = 1.071549 -0.217480 -1.682647 -2.906655 -0.337949 1.348704
 
-.PHONY: help env plan repro pretrained dag smoke bench bench-quick draw-queries bench-geometry test lint format results readme \
+.PHONY: help env plan repro pretrained dag smoke bench bench-quick draw-queries bench-geometry test test-faults soak lint format results readme \
 	docs notebook plots experiments sweep ui replay clean test-browser screenshots
 
 help:  ## list the targets
@@ -74,6 +74,12 @@ bench-geometry: env  ## time the geometry core again, after whatever it needs; w
 
 test: env  ## run the tests, the whole pipeline on small parameters among them
 	python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
+
+test-faults: env  ## break things on purpose: kills, full disks, bad input, hostile files, load (half an hour); writes reports/reliability.json
+	GEODESICS_RELIABILITY=reports/reliability.json python -m pytest tests/faults --faults
+
+soak: env  ## the same for hours, with more of each: 20 kills a stage, 100,000 requests; go on after an interruption by calling it again
+	GEODESICS_RELIABILITY=reports/reliability.json python -m pytest tests/faults --soak
 
 .venv/browser: tests/browser/requirements.lock .venv/installed
 	$(INSTALL) -r tests/browser/requirements.lock

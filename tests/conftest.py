@@ -21,6 +21,12 @@ from constraint_geodesics.scene.urdf import data_path
 ROOT = Path(__file__).resolve().parents[1]
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """How much tests/faults tries: `make test-faults` and `make soak`."""
+    parser.addoption("--faults", action="store_true", help="with long tests of faults")
+    parser.addoption("--soak", action="store_true", help="with hours of them")
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Before several workers start, each of which would wait for it."""
     if getattr(session.config.option, "numprocesses", None):
@@ -32,11 +38,14 @@ SLOW_FIRST = ("pipeline", "report", "laws", "constraints", "geodesics", "trackin
 
 
 @pytest.hookimpl(tryfirst=True)  # xdist reads the groups in the same hook
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """A file stays on one worker, so that what its tests share is made once."""
     order = {folder: place for place, folder in enumerate(SLOW_FIRST)}
     items.sort(key=lambda item: order.get(item.path.parent.name, len(order)))
+    long = config.getoption("faults") or config.getoption("soak")
     for item in items:
+        if item.get_closest_marker("long") and not long:
+            item.add_marker(pytest.mark.skip(reason="in make test-faults and make soak"))
         if not item.get_closest_marker("xdist_group"):
             item.add_marker(pytest.mark.xdist_group(item.path.relative_to(ROOT).as_posix()))
 

@@ -1,0 +1,13 @@
+"""What is broken on purpose is broken as often as the run's options say."""
+
+import pytest
+
+from tests.faults.effort import FAULTS, QUICK, SOAK, Effort
+
+
+@pytest.fixture(scope="session")
+def effort(request: pytest.FixtureRequest) -> Effort:
+    """Of this run: `--faults`, `--soak`, or that of `make test`."""
+    if request.config.getoption("soak"):
+        return SOAK
+    return FAULTS if request.config.getoption("faults") else QUICK
