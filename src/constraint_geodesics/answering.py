@@ -16,7 +16,6 @@ from constraint_geodesics.constraints.both import both
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.geometry.braking import Pace, shortest_stop
 from constraint_geodesics.geometry.errors import GeometryError
-from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.goals.goal import Goal
 from constraint_geodesics.methods import Method
 from constraint_geodesics.problem import PlannerError, Status
@@ -30,7 +29,7 @@ from constraint_geodesics.trajectory import STANDING_S, Asked, Statistics, Traje
 
 COINCIDENT_RAD = 1e-7
 """Ends that differ by less in every joint are one configuration."""
-_NO_MORE = "no more curves"
+NO_MORE = "no more curves"
 _WORTHWHILE = 1e-4
 """Share by which a curve must be shorter than the path so far to be certified."""
 _ROUND = BENDS + 1
@@ -41,6 +40,8 @@ for closer ones.
 """
 TOUCHES = ("self_collision", "workcell_collision", "clearance")
 """What a certificate finds where a motion meets something."""
+TIMES = "times"
+"""What is refused where a motion can't go on along its waypoints."""
 _CLOSER = ("constraint_between_rows", "step")
 """What a certificate finds where waypoints lie too far apart."""
 _CONTINUED = 0.9
@@ -283,7 +284,7 @@ class Answering:
             spent + (lasted[0] if len(lasted) == lasted.maxlen else max(lasted, default=0.0))
             < budget_s
         ):
-            item = next(curves, _NO_MORE)
+            item = next(curves, NO_MORE)
             if isinstance(item, str):
                 break
             one, candidate = item
@@ -330,13 +331,10 @@ class Answering:
         why = "no beginning goes on from the start's velocity"
         for own in run_outs(query.task.open, candidate, velocity, pace):
             joints = rows_from(own, query.start, velocity, pace, allowed)
-            times = pace.times(joints, velocity)
-            if times is None:
-                continue
-            found = self.judged(query, joints, candidate.source, end, times)
+            found = self.judged(query, joints, candidate.source, end)
             if isinstance(found, Trajectory):
                 return found
-            why = found.why
+            why = found.why if found.kind != TIMES else why
         return why
 
     def pace(self, query: Query) -> Pace:
@@ -359,11 +357,10 @@ class Answering:
         """
         constraint, velocity = query.task.manifold.constraint, query.start_velocity
         if times is None:
-            pace = self.pace(query)
             try:
-                times = time_parametrisation(joints, pace.velocity, pace.acceleration, velocity)
+                times = self.pace(query).times(joints, velocity)
             except GeometryError as error:
-                return Refused("times", str(error))
+                return Refused(TIMES, str(error))
         certificate = self.certifier.certify(
             joints,
             constraint,

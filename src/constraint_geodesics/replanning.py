@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.answering import TOUCHES, Answering, End, Refused
+from constraint_geodesics.answering import NO_MORE, TIMES, TOUCHES, Answering, End, Refused
 from constraint_geodesics.geometry.braking import Motion, State, ahead
 from constraint_geodesics.goals.goal import ConfigurationGoal
 from constraint_geodesics.problem import PlannerError, Status
@@ -25,7 +25,6 @@ from constraint_geodesics.search.repair import onward, over_graph, repaired
 from constraint_geodesics.search.run_out import left_over, rows_from
 from constraint_geodesics.trajectory import REDRAWN, Trajectory, stopping
 
-_NO_MORE = "no more"
 _TIGHTENED = (0.7, 0.4)
 """Shares of the allowed violation that waypoints after a stop are drawn for: it ends off the
 constraint.
@@ -64,7 +63,7 @@ class Replanning:
         stop = self._stop(query, rest)
         others = self._others(query, rest, stop)
         while time.perf_counter() - began < limit_s:
-            other = next(others, _NO_MORE)
+            other = next(others, NO_MORE)
             if isinstance(other, str):
                 break
             if other is not None and other.status == "solved":
@@ -98,14 +97,13 @@ class Replanning:
         """What is left of the trajectory, on its waypoints and on others of the same curve."""
         if not np.array_equal(rest.trajectory.joints[-1], query.goal):
             return  # it stops on the way
-        pace, velocity = self.answering.pace(query), rest.state.velocity
         for joints in rest.rows(query):
-            times = pace.times(joints, velocity)
-            if times is not None:
-                found = self.answering.judged(query, joints, "rest", End(query.goal), times)
-                yield found
-                if isinstance(found, Refused) and found.kind in TOUCHES:
-                    return
+            found = self.answering.judged(query, joints, "rest", End(query.goal))
+            if isinstance(found, Refused) and found.kind == TIMES:
+                continue
+            yield found
+            if isinstance(found, Refused) and found.kind in TOUCHES:
+                return
 
     def _stop(self, query: Query, rest: "_Rest") -> Motion | None:
         """The hardest stop on the way."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.geometry.errors import GeometryError
+from constraint_geodesics.geometry.errors import GeometryError, StartVelocityError
 from constraint_geodesics.geometry.timing import time_parametrisation
 
 AT_A_ROW = 1e-7
@@ -22,6 +22,10 @@ ROOM = 5e-7
 """Relative acceleration beyond the limits that a motion may use that goes on: it used them up
 before, to the last bit, and so must stop or go on with them but for rounding.  The certificate
 allows twice as much.
+"""
+SPARED = 0.98
+"""Share of the accelerations that a motion is planned with: a stop has all of them, so that it can
+nearly always stay on the path.
 """
 _FRACTIONS = 7
 """Bisections of the line on which a motion stops."""
@@ -44,22 +48,42 @@ class Motion(NamedTuple):
 
 
 class Pace(NamedTuple):
-    """The limits that a motion uses, of each joint [rad/s, rad/s²]."""
+    """The limits that a motion keeps, of each joint [rad/s, rad/s²]: planned ones use SPARED of the
+    accelerations where they can, stops all of them.
+    """
 
     velocity: Float[np.ndarray, "D"]
     acceleration: Float[np.ndarray, "D"]
 
     def times(
+        self, joints: Float[np.ndarray, "T D"], start_velocity: Float[np.ndarray, "D"] | None
+    ) -> Float[np.ndarray, "T"]:
+        """Of the rows of a path that goes on, from a velocity (None: from rest).
+
+        Raises GeometryError as `time_parametrisation` does.
+        """
+        try:
+            return self._times(joints, start_velocity, SPARED)
+        except StartVelocityError:
+            return self._times(joints, start_velocity, 1.0)
+
+    def hardest(
         self, joints: Float[np.ndarray, "T D"], start_velocity: Float[np.ndarray, "D"]
     ) -> Float[np.ndarray, "T"] | None:
-        """Of rows, from a velocity; None where the motion can't go on along them."""
-        room = 1.0 + ROOM if start_velocity.any() else 1.0
+        """Of the rows of a stop, with all of the accelerations; None where it can't be done on
+        them.
+        """
         try:
-            return time_parametrisation(
-                joints, self.velocity, room * self.acceleration, start_velocity
-            )
+            return self._times(joints, start_velocity, 1.0)
         except GeometryError:
             return None
+
+    def _times(
+        self, joints: np.ndarray, start_velocity: np.ndarray | None, share: float
+    ) -> Float[np.ndarray, "T"]:
+        room = 1.0 + ROOM if start_velocity is not None and start_velocity.any() else 1.0
+        limits = self.velocity, share * room * self.acceleration
+        return time_parametrisation(joints, *limits, start_velocity)
 
 
 def state_at(motion: Motion, at_s: float) -> State:
@@ -112,22 +136,22 @@ def shortest_stop(
     """The motion from a velocity at the first row that stops the earliest on the way along rows;
     None where it can't before their end.
     """
-    if len(rows) < 2 or pace.times(rows, velocity) is None:
+    if len(rows) < 2 or pace.hardest(rows, velocity) is None:
         return None
     short, last = 0, len(rows) - 1  # it stops by row `last`, and not by row `short`
     while last - short > 1:
         middle = (short + last) // 2
-        if pace.times(rows[: middle + 1], velocity) is None:
+        if pace.hardest(rows[: middle + 1], velocity) is None:
             short = middle
         else:
             last = middle
     low, high = 0.0, 1.0
     for _ in range(_FRACTIONS):
         share = 0.5 * (low + high)
-        found = pace.times(_ending(rows, last, share), velocity)
+        found = pace.hardest(_ending(rows, last, share), velocity)
         low, high = (share, high) if found is None else (low, share)
     ended = _ending(rows, last, high)
-    times = pace.times(ended, velocity)
+    times = pace.hardest(ended, velocity)
     return None if times is None else Motion(ended, times, velocity)
 
 

@@ -103,14 +103,12 @@ class FromScratch(AbstractContextManager["FromScratch"]):
         )
         self.seed += 1
         found = self._planner.plan(problem, self.seed)
-        pace, at_rest = path.asked.pace, np.zeros(self.scene.robot.dof)
-        times = pace.times(found.joints, at_rest) if found.status == "solved" else None
+        times = path.asked.pace.times(found.joints, None) if found.status == "solved" else None
         about = Statistics(time.perf_counter() - began, "birrt", "birrt")
         asked = replace(path.asked, scene=self.scene, wanted=path.wanted)
         if times is None:
-            status = "not_found" if found.status == "solved" else found.status
             nothing = np.empty((0, self.scene.robot.dof)), np.empty(0)
-            return Trajectory(status, *nothing, found.explanation, asked, about)
+            return Trajectory(found.status, *nothing, found.explanation, asked, about)
         return Trajectory("solved", found.joints, times, "by BiRRT", asked, about)
 
     def _is_sound(self, problem: PlanningProblem, joints: Float[np.ndarray, "T D"]) -> bool:

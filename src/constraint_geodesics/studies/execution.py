@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from constraint_geodesics.benchmark.judge import polyline_length
 from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.geometry.timing import time_parametrisation
+from constraint_geodesics.geometry.braking import Pace
 from constraint_geodesics.learning.dataset import Queries, draw_queries
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.params import ExecutionParams
@@ -161,11 +161,11 @@ def execute_queries(
     Raises ExecutionCheckError if the constraint does not hold roll and pitch.
     """
     scene, axis = carrying.scene, cup_axis(carrying.manifold)
-    limits = scene.robot.velocity, np.full(scene.robot.dof, carrying.acceleration_rad_s2)
+    pace = Pace(scene.robot.velocity, np.full(scene.robot.dof, carrying.acceleration_rad_s2))
     label, executed = f"executions {carrying.name}", list[Executed]()
     with scene.world() as world, progress(label, 2 * len(queries)) as advance:
         for query, ends in enumerate(zip(queries.starts, queries.goals, strict=True)):
-            for kind, status, joints, times in _paths(plan, *ends, limits):
+            for kind, status, joints, times in _paths(plan, *ends, pace):
                 if len(joints) < 2:
                     executed.append(Executed(query, kind, status))
                 else:
@@ -180,16 +180,13 @@ def execute_queries(
 
 
 def _paths(
-    plan: Plan,
-    start: Float[np.ndarray, "D"],
-    goal: Float[np.ndarray, "D"],
-    limits: tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D"]],
+    plan: Plan, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], pace: Pace
 ) -> Iterator[tuple[str, str, Float[np.ndarray, "T D"], Float[np.ndarray, "T"]]]:
     """Kind, status, rows and times of both paths of a query."""
     planned = plan(start, goal)
     yield PLANNED, planned.status, planned.joints, planned.times
     line = densify(np.stack([start, goal]), ROW_SPACING_RAD)
-    yield STRAIGHT, EXECUTED, line, time_parametrisation(line, *limits)
+    yield STRAIGHT, EXECUTED, line, pace.times(line, None)
 
 
 def execution_figures(table: pd.DataFrame, found: TippingQueries) -> dict[str, Any]:
