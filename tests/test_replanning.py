@@ -198,6 +198,37 @@ def test_a_stop_is_on_the_path_and_as_short_as_the_limits_allow():
     assert planner.replan(ended, ended.times[-1]).status == "solved"
 
 
+HARD_TO_STOP = (
+    (
+        "level_cup",
+        [2.781109095, 1.764213681, -3.157669067, -0.888130009, -0.27680096, -0.701730013],
+        [2.953006506, -1.397238016, -3.160125494, 0.764315724, -0.213207021, 0.817911446],
+        0.44948411054649784,
+    ),
+    (
+        "slide",
+        [-1.073732018, 0.05979722, -0.519874692, -3.44701314, 1.129300594, 1.704719663],
+        [-2.84348917, 0.606778204, -0.553711057, -1.025242805, -1.598357797, -1.616154313],
+        0.49743746729331023,
+    ),
+)
+"""Moments of motions whose waypoints, drawn anew from there, leave no stop: a joint is next to its
+limit, or the velocity turns off the line.
+"""
+
+
+@pytest.mark.parametrize(("name", "start", "goal", "share"), HARD_TO_STOP)
+def test_it_can_stop_where_no_line_of_the_path_lets_it(name, start, goal, share):
+    planner = packaged_planner()
+    start, goal = (planner.project(end, name).configuration for end in (start, goal))
+    path = planner.plan(start, goal, name)
+    assert path.status == "solved"
+    stop = path.stop(share * path.times[-1])
+    assert 0.0 < stop.times[-1] < 0.5
+    violation = certified(stop).certificate.violation
+    assert violation is None or violation.kind == "constraint_between_rows"
+
+
 def too_short(stop: Trajectory, path: Trajectory, state: State) -> bool:
     """Whether no stop ends on a line of the path a little earlier."""
     if not state.velocity.any():
@@ -208,7 +239,7 @@ def too_short(stop: Trajectory, path: Trajectory, state: State) -> bool:
     share = np.linalg.norm(used) / np.linalg.norm(line) - 0.02
     ends = [] if share <= 0.0 else [before + share * line]
     rows = np.vstack([stop.joints[:-1], *ends])
-    return len(rows) < 2 or path.asked.pace.times(rows, state.velocity) is None
+    return len(rows) < 2 or path.asked.pace.hardest(rows, state.velocity) is None
 
 
 def certified(stop: Trajectory) -> Trajectory:

@@ -412,7 +412,9 @@ def stopping(
     motion's; None where there is none.
 
     A motion that uses its accelerations up may leave none to go on with on what is left of a line:
-    its waypoints are drawn anew then, its curve is begun straight, and at last it goes straight on.
+    its waypoints are drawn anew then, its curve is begun straight, or it goes straight on.  At last
+    the next waypoint is left out, so that the first line has the time which the motion had: that
+    can break the constraint by the height of a line's curve, a fraction of a mrad.
     """
     if not state.velocity.any():
         place, rest = state.configuration, np.zeros_like(state.velocity)
@@ -427,9 +429,10 @@ def stopping(
     if curve is not None:
         curves = chain([curve], run_outs(space, curve, velocity, pace))
     straight = run_out(space, state.configuration, velocity, pace)
-    for own in chain(curves, [] if straight is None else [straight]):
-        drawn = rows_from(own, state.configuration, velocity, pace, REDRAWN)
-        found = shortest_stop(drawn, velocity, pace)
+    drawn = chain(curves, [] if straight is None else [straight])
+    redrawn = (rows_from(own, rows[0], velocity, pace, REDRAWN) for own in drawn)
+    for others in chain(redrawn, [np.delete(rows, 1, axis=0)]):
+        found = shortest_stop(others, velocity, pace)
         if found is not None:
             return found, False
     return None
