@@ -7,7 +7,7 @@ CONSTRAINT ?=
 FIRST_START = 1.329923 -0.584036 -3.766650 -2.008429 0.728803 -2.581396
 FIRST_GOAL = 1.071549 -0.217480 -1.682647 -2.906655 -0.337949 1.348704
 
-.PHONY: help env plan repro pretrained dag smoke bench bench-quick draw-queries bench-geometry test test-faults soak lint format results readme \
+.PHONY: help env plan repro pretrained dag smoke bench bench-quick draw-queries bench-geometry test test-pipeline test-faults soak lint format results readme \
 	docs notebook plots experiments sweep ui replay clean test-browser screenshots
 
 help:  ## list the targets
@@ -53,7 +53,7 @@ dag: env  ## the pipeline as a graph, a node a stage
 	@python -m constraint_geodesics.pipeline.dag
 
 smoke: env  ## the same pipeline on small parameters, in a copy of this checkout
-	python tests/pipeline/smoke.py .geodesics/smoke
+	python tests/end_to_end/smoke.py .geodesics/smoke
 
 bench: env  ## all planners on all queries, and the studies (three hours; go on after an interruption by calling it again)
 	geodesics params
@@ -72,8 +72,11 @@ bench-geometry: env  ## time the geometry core again, after whatever it needs; w
 	dvc repro label_joints train_manifold train_analytic
 	dvc repro --single-item --force stages/dvc.yaml:benchmark_geometry
 
-test: env  ## run the tests, the whole pipeline on small parameters among them
-	python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
+test: env  ## run the tests of every part
+	python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder --ignore tests/end_to_end
+
+test-pipeline: env  ## run the whole pipeline, its studies, an experiment and a sweep on small parameters
+	python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder tests/end_to_end
 
 test-faults: env  ## break things on purpose: kills, full disks, bad input, hostile files, load (half an hour); writes reports/reliability.json
 	GEODESICS_RELIABILITY=reports/reliability.json python -m pytest tests/faults --faults

@@ -33,7 +33,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         warmup.ensure()
 
 
-SLOW_FIRST = ("pipeline", "report", "laws", "constraints", "geodesics", "tracking", "studies")
+SLOW_FIRST = ("end_to_end", "report", "laws", "constraints", "geodesics", "tracking", "studies")
 """Folders that take longest: what is left for the end is small, and no worker waits for another."""
 
 

@@ -30,7 +30,7 @@ MAKE = "make -n"
 """What `make` would do is printed by make itself; what a target runs is a command of ours with a
 test of its own.
 """
-EXPERIMENT = "tests/pipeline/test_experiment.py"
+EXPERIMENT = "tests/end_to_end/test_experiment.py"
 REGISTRY = "tests/tracking/test_registry.py"
 COVERED: dict[str, str | tuple[str, str]] = {
     "geodesics constraints": HERE,
@@ -45,7 +45,7 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "geodesics package": ("tests/test_bundle.py", "package"),
     "geodesics results": HERE,
     "geodesics results --experiments": (
-        "tests/pipeline/test_sweep.py",
+        "tests/end_to_end/test_sweep.py",
         '"results", "--experiments"',
     ),
     "geodesics replay": HERE,
@@ -62,7 +62,7 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "dvc metrics diff": (EXPERIMENT, '"dvc", "metrics", "diff"'),
     "dvc params diff": (EXPERIMENT, '"dvc", "params", "diff"'),
     "dvc plots diff": (EXPERIMENT, '"dvc", "plots", "diff"'),
-    "dvc repro": ("tests/pipeline/smoke.py", '"repro"'),
+    "dvc repro": ("tests/end_to_end/smoke.py", '"repro"'),
     "git restore": (EXPERIMENT, '"git", "restore"'),
     "git status": (EXPERIMENT, '"git", "status"'),
     "mlflow models": (REGISTRY, "mlflow models serve"),

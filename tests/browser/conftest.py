@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.browser.chromium import ROOT, chromium, free_port, missing, served
-from tests.pipeline import smoke
+from tests.end_to_end import smoke
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

@@ -38,7 +38,7 @@ from tests.browser.dashboard import (
     runs_found,
 )
 from tests.browser.pixels import having, picture, scene_of
-from tests.pipeline import smoke
+from tests.end_to_end import smoke
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -19,7 +19,7 @@ from constraint_geodesics.recording.recording import PathRecord, record_path
 from constraint_geodesics.scene.scene import Scene
 from tests.browser.chromium import ROOT, served, until, visit
 from tests.browser.pixels import Picture, having, picture, scene_of
-from tests.pipeline import smoke
+from tests.end_to_end import smoke
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

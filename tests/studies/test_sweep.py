@@ -1,5 +1,5 @@
 """What decides whether a seed is trained again, and what is kept of it; the rest is in
-tests/pipeline/test_sweep.py.
+tests/end_to_end/test_sweep.py.
 """
 
 import json

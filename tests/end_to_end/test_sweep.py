@@ -20,7 +20,7 @@ from constraint_geodesics.pipeline.experiments import (
     ExperimentError,
     experiment_names,
 )
-from tests.pipeline import smoke
+from tests.end_to_end import smoke
 
 pytestmark = pytest.mark.timeout(900)
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.pipeline import smoke
+from tests.end_to_end import smoke
 
 
 @pytest.fixture(scope="session")

@@ -18,7 +18,7 @@ from mlflow.tracking import MlflowClient
 from constraint_geodesics.benchmark.row import read_table
 from constraint_geodesics.recording.recording import read_recording
 from constraint_geodesics.tracking.store import fetch_artifacts
-from tests.pipeline import smoke
+from tests.end_to_end import smoke
 from tests.recording.files import same_recordings
 
 pytestmark = pytest.mark.timeout(1200)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.pipeline import smoke
+from tests.end_to_end import smoke
 from tests.test_docs import ROOT, words_of
 
 pytestmark = pytest.mark.timeout(600)

@@ -1,5 +1,5 @@
 """The whole pipeline on small parameters, in a copy of this checkout: `python
-tests/pipeline/smoke.py FOLDER`.
+tests/end_to_end/smoke.py FOLDER`.
 """
 
 import os
