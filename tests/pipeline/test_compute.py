@@ -1,5 +1,6 @@
 """One answer wherever the work runs, and one line where it can't."""
 
+import logging
 import os
 import pty
 import subprocess
@@ -183,6 +184,9 @@ def test_a_worker_that_dies_is_an_error_not_a_wait(dask: ComputeParams) -> None:
 
 
 def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
+    logged, handler = list[logging.LogRecord](), logging.Handler()
+    handler.emit = logged.append
+    logging.getLogger("distributed").addHandler(handler)
     with cluster(tmp_path, workers=1) as machines:
         outcomes = as_finished(pause, range(20), machines.compute)
         next(outcomes)
@@ -191,7 +195,9 @@ def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
         with pytest.raises(ComputeError, match="pause: lost the Dask scheduler at tcp") as caught:
             list(outcomes)
         assert time.monotonic() - began < 20
+    logging.getLogger("distributed").removeHandler(handler)
     assert "\n" not in str(caught.value)
+    assert not logged, "a traceback beside it"
 
 
 def test_workers_do_not_outlive_a_killed_run(tmp_path: Path) -> None:

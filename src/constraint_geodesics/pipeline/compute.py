@@ -6,6 +6,7 @@ result, is the same on any backend and with any number of workers.
 """
 
 import asyncio
+import logging
 import os
 import reprlib
 import threading
@@ -192,6 +193,8 @@ def _dask_client(address: str) -> Iterator["Client"]:
     from distributed import Client
 
     _check_scheduler(address)
+    # of a scheduler that is gone it logs tracebacks, beside the error that says so
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     with Client(address, timeout=DASK_CONNECT_S, set_as_default=False) as client:
         try:
             client.wait_for_workers(1, timeout=DASK_WORKERS_S)
