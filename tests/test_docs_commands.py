@@ -52,6 +52,7 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "geodesics replay FILE": ("tests/recording/test_recording.py", "open_recordings"),
     "geodesics demo": ("tests/test_cli_demo.py", '"demo"'),
     "geodesics bench": ("tests/test_cli_json.py", '"bench"'),
+    "geodesics serve": (REGISTRY, "geodesics (serve"),
     "geodesics ui": ("tests/tracking/test_experiment.py", "ui_command"),
     "make": MAKE,
     "dvc checkout": (EXPERIMENT, '"dvc", "checkout"'),
@@ -65,10 +66,8 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "dvc repro": ("tests/end_to_end/smoke.py", '"repro"'),
     "git restore": (EXPERIMENT, '"git", "restore"'),
     "git status": (EXPERIMENT, '"git", "status"'),
-    "mlflow models": (REGISTRY, "mlflow models serve"),
     "curl": (REGISTRY, "curl"),
     "source": ("tests/test_doctor.py", "source .venv/bin/activate"),
-    "export": (REGISTRY, "MLFLOW_TRACKING_URI"),
 }
 """Where each kind of command runs: here, or in the file that is named, by what is called there."""
 ELLIPSIS = {

@@ -386,6 +386,30 @@ def ui(
     os.execvp(command[0], command)
 
 
+@app.command("serve")
+def serve(
+    address: str = typer.Argument(
+        "models:/constraint_geodesics@champion", help="The planner in MLflow's registry."
+    ),
+    port: int = typer.Option(5002, help="Port that it listens on.", min=1, max=65535),
+    host: str = typer.Option("127.0.0.1", help="Who else may ask: 0.0.0.0 is everybody."),
+    workers: int = typer.Option(1, help="Processes, each with its own planner.", min=1, max=1024),
+    waiting: int = typer.Option(16, help="Requests that a process lets in at once.", min=1),
+    as_json: bool = JSON,
+) -> None:
+    """Answer planning requests over HTTP, on this machine only; it runs until it is stopped.
+
+    Requests are those of MLflow's model server. Where too many wait, the answer is 503.
+    """
+    require("pipeline")
+    from constraint_geodesics.tracking.serving import Served, serve
+
+    where = f"http://{host}:{port}"
+    text = json.dumps({"address": where}) if as_json else f"{where}/invocations  (stop with Ctrl-C)"
+    served = Served(host, port, workers, waiting)
+    serve(address, Path().resolve(), served, lambda: print(text, flush=True))
+
+
 def _records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
     """The rows of a table for JSON: what is not a finite number there is null."""
     records: list[dict[str, Any]] = json.loads(frame.to_json(orient="records", double_precision=15))

@@ -1,6 +1,6 @@
 """One answer wherever the work runs, and one line where it can't."""
 
-import json
+import logging
 import os
 import pty
 import subprocess
@@ -23,11 +23,11 @@ from constraint_geodesics.pipeline.compute import ComputeError, as_finished, par
 from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.threads import ONE_THREAD
 from constraint_geodesics.scene.scene import Scene
+from tests.pipeline.cluster import DEAD, cluster
 
 TWO = ComputeParams(backend="loky", workers=2)
 ONE = ComputeParams(backend="loky", workers=1)
 SEEDS = range(6)
-DEAD = 9
 
 
 def products(seed: int) -> tuple[float, float, float]:
@@ -67,60 +67,21 @@ def die_at_three(item: int) -> int:
     return item
 
 
+def pause(item: int) -> int:
+    time.sleep(0.2)
+    return item
+
+
 def overwrite(values: np.ndarray) -> float:
     values[0] = 1.0
     return float(values.sum())
 
 
-def stop(process: subprocess.Popen[bytes]) -> int:
-    process.terminate()
-    try:
-        return process.wait(20)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        raise
-
-
 @pytest.fixture(scope="module")
 def dask(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ComputeParams]:
-    """A real scheduler with two workers, on loopback; they must stop in order when asked to."""
-    folder = tmp_path_factory.mktemp("dask")
-    file, command = folder / "scheduler.json", [sys.executable, "-m", "dask"]
-    loopback = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
-    root = Path(__file__).parents[2]
-    sources = os.pathsep.join([str(root), str(root / "src")])
-    environment = {**os.environ, "PYTHONPATH": sources}
-    environment |= {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
-    environment |= {
-        "OMP_NUM_THREADS": "2",
-        "OPENBLAS_NUM_THREADS": "2",
-    }  # workers that someone started with other ideas
-    with (folder / "log.txt").open("w") as log:
-        options = {"stdout": log, "stderr": log, "env": environment, "cwd": folder}
-        scheduler = subprocess.Popen([*command, "scheduler", "--port", "0", *loopback], **options)
-        worker = [
-            *command,
-            "worker",
-            "--no-nanny",
-            "--nthreads",
-            "1",
-            "--local-directory",
-            str(folder),
-            *loopback,
-        ]
-        workers = [subprocess.Popen(worker, **options) for _ in range(2)]
-        try:
-            deadline = time.monotonic() + 30
-            while not file.exists() and time.monotonic() < deadline:
-                time.sleep(0.05)
-            yield ComputeParams(
-                backend="dask", workers=0, dask_address=json.loads(file.read_text())["address"]
-            )
-        finally:
-            # workers first: one that is told to stop by its scheduler and by a signal at once may
-            # hang
-            codes = [stop(process) for process in (*workers, scheduler)]
-    assert set(codes) <= {0, DEAD}, (folder / "log.txt").read_text()
+    """A real scheduler with two workers, on loopback."""
+    with cluster(tmp_path_factory.mktemp("dask")) as machines:
+        yield machines.compute
 
 
 def test_results_are_those_of_a_plain_loop_in_its_order() -> None:
@@ -220,6 +181,23 @@ def test_a_worker_that_dies_is_an_error_not_a_wait(dask: ComputeParams) -> None:
         with pytest.raises(ComputeError, match="died") as caught:
             parallel_map(die_at_three, [1, 2, 3, 4], settings)
         assert "\n" not in str(caught.value)
+
+
+def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
+    logged, handler = list[logging.LogRecord](), logging.Handler()
+    handler.emit = logged.append
+    logging.getLogger("distributed").addHandler(handler)
+    with cluster(tmp_path, workers=1) as machines:
+        outcomes = as_finished(pause, range(20), machines.compute)
+        next(outcomes)
+        machines.scheduler.kill()
+        began = time.monotonic()
+        with pytest.raises(ComputeError, match="pause: lost the Dask scheduler at tcp") as caught:
+            list(outcomes)
+        assert time.monotonic() - began < 20
+    logging.getLogger("distributed").removeHandler(handler)
+    assert "\n" not in str(caught.value)
+    assert not logged, "a traceback beside it"
 
 
 def test_workers_do_not_outlive_a_killed_run(tmp_path: Path) -> None:

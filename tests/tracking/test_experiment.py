@@ -437,7 +437,10 @@ def test_inputs_are_linked_by_dvcs_own_md5_and_nothing_is_printed(tmp_path: Path
 
 @contextmanager
 def server(
-    command: list[str], page: str, environment: dict[str, str] | None = None
+    command: list[str],
+    page: str,
+    environment: dict[str, str] | None = None,
+    cwd: Path | None = None,
 ) -> Iterator[str]:
     """The address of what a command serves on a free port, from when a page of it answers."""
     with socket.socket() as probe:
@@ -447,7 +450,7 @@ def server(
     command[command.index("--port") + 1] = str(port)
     with tempfile.TemporaryFile() as log:
         process = subprocess.Popen(
-            command, stdout=log, stderr=log, env=environment, start_new_session=True
+            command, stdout=log, stderr=log, env=environment, cwd=cwd, start_new_session=True
         )
         try:
             deadline = time.monotonic() + 90

@@ -1,22 +1,22 @@
-"""The planner in a real registry: registered, loaded by its alias, and served by MLflow's own
-command.
+"""The planner in a real registry: registered, loaded by its alias, and served as its page
+says.
 """
 
 import json
-import os
 import re
 import shutil
+import socket
+import subprocess
 import sys
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tests.tracking.test_experiment import dashboard, server
+from tests.tracking.test_experiment import server
 
 from constraint_geodesics import Planner
 from constraint_geodesics.bundle import PACKAGED
@@ -140,11 +140,11 @@ def test_a_model_has_a_signature_an_example_and_nothing_pickled(root: Path) -> N
 
 def test_the_champion_is_served_as_its_page_says(root: Path) -> None:
     page = (ROOT / "docs" / "mlflow.md").read_text()
-    (serve,) = re.findall(r"^(mlflow models serve .*)$", page, re.M)
+    (serve,) = re.findall(r"^geodesics (serve .*)$", page, re.M)
     (body,) = re.findall(r"^curl \S+ .*? -d '(.*?)'$", page, re.M | re.S)
+    command = [sys.executable, "-m", "constraint_geodesics.cli", *serve.split()]
     with (
-        dashboard(root) as runs,
-        served(serve.split(), runs) as address,
+        server([*command, "--host", "127.0.0.1"], "ping", cwd=root) as address,
         ThreadPoolExecutor(4) as pool,
     ):
         (path,) = ask(address, body)
@@ -166,15 +166,27 @@ def test_the_champion_is_served_as_its_page_says(root: Path) -> None:
     assert "level_cup" in unknown["explanation"]
 
 
-def served(command: list[str], runs: str) -> AbstractContextManager[str]:
-    """What a command serves; runs: the address of the dashboard."""
-    environment = {
-        **os.environ,
-        "MLFLOW_TRACKING_URI": runs,
-        "MLFLOW_DISABLE_TELEMETRY": "true",
-        "PATH": f"{Path(sys.executable).parent}:/usr/bin",
-    }
-    return server(command, "ping", environment)
+def test_what_cannot_be_served_is_one_line(root: Path, tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        for folder, address, words in (
+            (root, ADDRESS, f"127.0.0.1:{port}: Address already in use; --port takes another"),
+            (root, f"models:/{PLANNER_MODEL}@nobody", "nobody"),
+            (tmp_path, ADDRESS, "mlflow.db is missing"),
+        ):
+            command = [sys.executable, "-m", "constraint_geodesics.cli", "serve", address]
+            if folder == root and address == ADDRESS:
+                command += ["--port", str(port)]
+            done = subprocess.run(
+                command, cwd=folder, capture_output=True, text=True, check=False, timeout=60
+            )
+            assert (done.returncode, done.stdout) == (1, "")
+            (line,) = done.stderr.splitlines()
+            assert line.startswith("error: ")
+            assert words in line
+    assert not list(tmp_path.iterdir()), "looking makes no store"
 
 
 def ask(address: str, body: str) -> list[dict[str, Any]]:

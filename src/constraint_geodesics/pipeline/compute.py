@@ -6,6 +6,7 @@ result, is the same on any backend and with any number of workers.
 """
 
 import asyncio
+import logging
 import os
 import reprlib
 import threading
@@ -18,11 +19,10 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import joblib
 from joblib.externals.loky.process_executor import BrokenProcessPool
-from threadpoolctl import threadpool_limits
 
 from constraint_geodesics.params import ComputeParams
 from constraint_geodesics.pipeline.progress import progress
-from constraint_geodesics.pipeline.threads import ONE_THREAD, one_thread, set_torch_threads
+from constraint_geodesics.pipeline.threads import one_thread, stay_on_one_thread
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -103,9 +103,7 @@ class _Task(Generic[Item, Result]):
 
     def in_worker(self, index: int, item: Item) -> tuple[int, Result]:
         # never undone: a Dask worker may run other tasks beside this one
-        os.environ.update(ONE_THREAD)
-        threadpool_limits(1)
-        set_torch_threads(1)
+        stay_on_one_thread()
         return self(index, item)
 
     def below(self, parent: int, folder: str, index: int, item: Item) -> tuple[int, Result]:
@@ -195,6 +193,8 @@ def _dask_client(address: str) -> Iterator["Client"]:
     from distributed import Client
 
     _check_scheduler(address)
+    # of a scheduler that is gone it logs tracebacks, beside the error that says so
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     with Client(address, timeout=DASK_CONNECT_S, set_as_default=False) as client:
         try:
             client.wait_for_workers(1, timeout=DASK_WORKERS_S)

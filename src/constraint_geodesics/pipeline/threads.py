@@ -35,6 +35,15 @@ def one_thread() -> Iterator[None]:
             set_torch_threads(torch_threads)
 
 
+def stay_on_one_thread() -> None:
+    """From now on, in a process that does nothing else."""
+    from threadpoolctl import threadpool_limits
+
+    os.environ.update(ONE_THREAD)
+    threadpool_limits(1)
+    set_torch_threads(1)
+
+
 def set_torch_threads(count: int) -> None:
     """Torch's own count, where something has loaded torch; loading it for this alone would take
     seconds.

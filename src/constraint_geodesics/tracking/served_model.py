@@ -1,4 +1,4 @@
-"""The planner as MLflow serves it: `mlflow models serve` answers planning requests with it.
+"""The planner as a model of MLflow: `geodesics serve` answers planning requests with it.
 
 MLflow keeps a copy of this file with the model and runs it there, so a model holds no pickled
 object; the networks beside it are safetensors, whose checksums are verified.  Not to be imported:
@@ -7,16 +7,20 @@ importing it hands a model to MLflow.
 
 import json
 import threading
+import time
 from collections.abc import Hashable, Mapping
 from typing import Any
 
 import mlflow
 import mlflow.pyfunc
 import pandas as pd
+from mlflow.exceptions import MlflowException
+from mlflow.protos.databricks_pb2 import DEADLINE_EXCEEDED
 
 from constraint_geodesics.constraints.constraint import Constraint
-from constraint_geodesics.pipeline.threads import one_thread
+from constraint_geodesics.pipeline.threads import stay_on_one_thread
 from constraint_geodesics.planner import Planner
+from constraint_geodesics.tracking.serving import WANTED_UNTIL
 
 
 class ServedPlanner(mlflow.pyfunc.PythonModel):
@@ -26,6 +30,7 @@ class ServedPlanner(mlflow.pyfunc.PythonModel):
 
     def load_context(self, context: Any) -> None:
         """Load the planner whose files lie with the model."""
+        stay_on_one_thread()
         self.planner = Planner.load(context.artifacts["planner"])
         # the server answers on several threads, and there is one world for collisions
         self.free = threading.Lock()
@@ -33,9 +38,18 @@ class ServedPlanner(mlflow.pyfunc.PythonModel):
     def predict(
         self, context: Any, model_input: pd.DataFrame, params: dict[str, Any] | None = None
     ) -> Any:
-        """One answer a row, a query that has no path among them: status and explanation say why."""
-        with self.free, one_thread():
-            return [self.answer(row) for row in model_input.to_dict("records")]
+        """One answer a row, a query that has no path among them: status and explanation say why.
+
+        Raises MlflowException when the client has given up.
+        """
+        return [self.in_turn(row) for row in model_input.to_dict("records")]
+
+    def in_turn(self, row: Mapping[Hashable, Any]) -> dict[str, Any]:
+        """When the planner is free: between two rows of a long request others have their turn."""
+        with self.free:
+            if time.monotonic() > WANTED_UNTIL.get():
+                raise MlflowException("nobody waits for the answer", DEADLINE_EXCEEDED)
+            return self.answer(row)
 
     def answer(self, row: Mapping[Hashable, Any]) -> dict[str, Any]:
         """The path's summary with its rows [rad] and their times [s]; a bad query is an answer as

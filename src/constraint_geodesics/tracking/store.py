@@ -111,6 +111,8 @@ def _beside_store(uri: str, address: str) -> Path | None:
     that server now.  None for all others.
     """
     database = _sqlite_file(uri)
+    if database is not None and not database.is_file():  # MLflow would make one
+        raise FileNotFoundError(f"there are no runs yet: {database} is missing")
     source = "" if database is None else _stored_at(uri, address)
     if database is None or not source.startswith("mlflow-artifacts:"):
         return None
