@@ -15,6 +15,7 @@ from constraint_geodesics.benchmark.queries import Query
 from constraint_geodesics.benchmark.runner import Answer
 from constraint_geodesics.recording.recorder import status_text
 from constraint_geodesics.recording.recording import PathRecord, record_path
+from constraint_geodesics.text_files import written
 
 
 def first_queries(queries: Sequence[Query]) -> frozenset[tuple[str, str, int]]:
@@ -78,8 +79,8 @@ class PathKeeper:
 
     def __call__(self, answer: Answer) -> str:
         """It is no recording."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        np.save(self._file(answer.planner, answer.query.number, answer.seed), answer.joints)
+        with written(self._file(answer.planner, answer.query.number, answer.seed)) as part:
+            np.save(part, answer.joints)
         return ""
 
     def path(self, row: Mapping[str, Any], dof: int) -> Float[np.ndarray, "T D"]:

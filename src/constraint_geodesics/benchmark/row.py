@@ -11,6 +11,8 @@ from typing import Any, TextIO
 import numpy as np
 import pandas as pd
 
+from constraint_geodesics.text_files import written
+
 KEY = ("planner", "constraint", "scene", "query", "seed")
 LATENT = "latent_length_"
 """Before a learned manifold's name: length of the encoded path on it (eq. 2)."""
@@ -78,14 +80,13 @@ def write_table(table: pd.DataFrame, file: Path, about: Mapping[str, str]) -> No
     """Write the rows as CSV, with a comment line for each entry of `about` (commit, lock file,
     processor) before; gzipped where the file is called so, the same bytes for the same rows.
     """
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as opened:
+    with written(file) as part, ExitStack() as opened:
         if file.suffix == ".gz":
-            raw = opened.enter_context(file.open("wb"))
+            raw = opened.enter_context(part.open("wb"))
             packed = opened.enter_context(GzipFile("", "wb", fileobj=raw, mtime=0))
             lines: TextIO = opened.enter_context(TextIOWrapper(packed, encoding="utf-8"))
         else:
-            lines = opened.enter_context(file.open("w"))
+            lines = opened.enter_context(part.open("w"))
         lines.writelines(f"# {name}: {' '.join(value.split())}\n" for name, value in about.items())
         table.to_csv(lines, index=False, float_format="%.12g")
 

@@ -15,7 +15,7 @@ import joblib
 import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors.torch import save_file
+from safetensors.torch import save
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -35,6 +35,7 @@ from constraint_geodesics.geodesics.proposals import MeanPolicy, Met, random_rou
 from constraint_geodesics.geodesics.solver import goal_images
 from constraint_geodesics.geometry.manifold import GeometryError
 from constraint_geodesics.params import GeodesicParams, PpoParams
+from constraint_geodesics.text_files import write_bytes, written
 
 MOST_CHECKED = 40
 """Candidates given to the exact check at most: those behind them are no shorter and mostly alike.
@@ -219,8 +220,7 @@ def _shortest(found: Sequence[Geodesic]) -> Geodesic:
 
 def save_policy(policy: TrainedPolicy, folder: Path, seed: int) -> None:
     """Weights (safetensors) of one seed; `MeanPolicy.load` reads them."""
-    folder.mkdir(parents=True, exist_ok=True)
-    save_file(policy.actor.state_dict(), folder / f"policy-{seed}.safetensors")
+    write_bytes(folder / f"policy-{seed}.safetensors", save(policy.actor.state_dict()))
 
 
 def actor_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -332,10 +332,8 @@ class _Progress(BaseCallback):
             "unreported": [environment.savings, environment.episode_returns, environment.solved],
             "rows": self.rows,
         }
-        self.file.parent.mkdir(parents=True, exist_ok=True)
-        torch.save(content, self.file.with_suffix(".new"))
-        # an interruption leaves the old or the new, never half
-        self.file.with_suffix(".new").replace(self.file)
+        with written(self.file) as part:
+            torch.save(content, part)
         self._saved_at = self.num_timesteps
 
     def restore(self, model: PPO) -> None:

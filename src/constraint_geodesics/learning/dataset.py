@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.text_files import written
 
 POSE_COLUMNS = (*(f"tool_{x}" for x in "xyz"), *(f"quaternion_{x}" for x in "xyzw"))
 RPY_COLUMNS = ("roll", "pitch", "yaw")
@@ -190,8 +191,8 @@ def write_joints(shards: Sequence[Shard], file: Path, about: dict[str, str]) -> 
     table = table.cast(
         pa.schema(fields, metadata={"constraint_geodesics." + k: v for k, v in about.items()})
     )
-    file.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(table, file, compression="zstd")
+    with written(file) as part:
+        pq.write_table(table, part, compression="zstd")
 
 
 def read_joints(file: Path) -> JointSet:
@@ -207,8 +208,8 @@ def write_queries(queries: Queries, file: Path) -> None:
         for end, values in (("start", queries.starts), ("goal", queries.goals))
         for i in range(values.shape[1])
     }
-    file.parent.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(columns).rename_axis("query").to_csv(file)
+    with written(file) as part:
+        pd.DataFrame(columns).rename_axis("query").to_csv(part)
 
 
 def read_queries(file: Path) -> Queries:

@@ -29,6 +29,7 @@ from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.studies import episodes as study
 from constraint_geodesics.studies.episodes import Answered, Controller, Episode, Replanner, Report
 from constraint_geodesics.studies.problem_runs import quantiles
+from constraint_geodesics.text_files import write_text
 from constraint_geodesics.trajectory import Statistics, Trajectory
 
 REPLAN, SCRATCH = "replan", "BiRRT + band from scratch"
@@ -133,10 +134,7 @@ def kept(task: Task) -> dict[str, Any]:
         "code": task.code,
         **ran(opened(task.planner), task.constraint, task.number, task.seed),
     }
-    task.file.parent.mkdir(parents=True, exist_ok=True)
-    part = task.file.with_suffix(".part")
-    part.write_text(json.dumps(found))
-    part.replace(task.file)
+    write_text(task.file, json.dumps(found))
     return found
 
 

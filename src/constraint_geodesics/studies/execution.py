@@ -23,6 +23,7 @@ from constraint_geodesics.params import ExecutionParams
 from constraint_geodesics.pipeline.progress import progress
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.cup import CupSettings, Execution, execute
+from constraint_geodesics.text_files import written
 from constraint_geodesics.trajectory import Trajectory
 
 PLANNED, STRAIGHT = "planned path", "straight joint line"
@@ -217,8 +218,8 @@ def execution_figures(table: pd.DataFrame, found: TippingQueries) -> dict[str, A
 
 def save_execution(file: Path, execution: Execution) -> None:
     """What became of a path, for `load_execution`."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(file, **asdict(execution))
+    with written(file) as part:
+        np.savez_compressed(part, **asdict(execution))
 
 
 def load_execution(file: Path) -> Execution:
