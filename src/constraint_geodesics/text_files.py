@@ -23,6 +23,27 @@ def read_text(file: Path, encoding: str = "utf-8") -> str:
     return content.decode(encoding)
 
 
+class DamagedFileError(ValueError):
+    """A file is not what was written; the message is one line with its name."""
+
+
+@contextmanager
+def reading(file: Path) -> Iterator[None]:
+    """Within, all ways in which a library fails on a damaged file are a DamagedFileError.
+
+    Raises OSError as it is where the file is missing or can't be opened.
+    """
+    try:
+        yield
+    except DamagedFileError:
+        raise
+    except Exception as error:  # readers of a format have kinds of their own, or none at all
+        if isinstance(error, OSError) and error.filename is not None:
+            raise
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise DamagedFileError(f"{file}: damaged: {reason}") from error
+
+
 @contextmanager
 def written(file: Path) -> Iterator[Path]:
     """The path of the same name, in a folder of its own beside `file`, at which the body writes; it
@@ -32,10 +53,10 @@ def written(file: Path) -> Iterator[Path]:
     Its folder is made.  What is no plain file, as a terminal or a pipe, is written to directly.
     Raises OSError with the name of `file` if it can't be written, besides what the body raises.
     """
-    whole = Path(os.path.realpath(file))  # a link stays, and what it leads to is written
-    if whole.exists() and not whole.is_file():
+    if file.exists() and not file.is_file():
         yield file
         return
+    whole = Path(os.path.realpath(file))  # a link stays, and what it leads to is written
     try:
         whole.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(".part", ".", whole.parent) as beside:

@@ -1,9 +1,9 @@
 """The benchmark's table: one row a planner, constraint, scene, query and seed."""
 
+import gzip
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from gzip import GzipFile
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, TextIO
@@ -11,7 +11,7 @@ from typing import Any, TextIO
 import numpy as np
 import pandas as pd
 
-from constraint_geodesics.text_files import written
+from constraint_geodesics.text_files import reading, written
 
 KEY = ("planner", "constraint", "scene", "query", "seed")
 LATENT = "latent_length_"
@@ -83,7 +83,7 @@ def write_table(table: pd.DataFrame, file: Path, about: Mapping[str, str]) -> No
     with written(file) as part, ExitStack() as opened:
         if file.suffix == ".gz":
             raw = opened.enter_context(part.open("wb"))
-            packed = opened.enter_context(GzipFile("", "wb", fileobj=raw, mtime=0))
+            packed = opened.enter_context(gzip.GzipFile("", "wb", fileobj=raw, mtime=0))
             lines: TextIO = opened.enter_context(TextIOWrapper(packed, encoding="utf-8"))
         else:
             lines = opened.enter_context(part.open("w"))
@@ -95,9 +95,11 @@ def read_table(file: Path) -> tuple[pd.DataFrame, dict[str, str]]:
     """The rows of `write_table`, and what its comment lines say; columns that an older table does
     not have are blank.
     """
-    with file.open() as lines:
-        head = [line[2:].split(": ", 1) for line in lines if line.startswith("# ")]
-    table = pd.read_csv(
-        file, comment="#", float_precision="round_trip", dtype=dict.fromkeys(TEXTS, str)
-    )
-    return _completed(table), {name: value.strip() for name, value in head}
+    with reading(file):
+        opened = gzip.open if file.suffix == ".gz" else open
+        with opened(file, "rt", encoding="utf-8") as lines:
+            head = [line[2:].split(": ", 1) for line in lines if line.startswith("# ")]
+        table = pd.read_csv(
+            file, comment="#", float_precision="round_trip", dtype=dict.fromkeys(TEXTS, str)
+        )
+        return _completed(table), {name: value.strip() for name, value in head}

@@ -139,7 +139,10 @@ class LearnedManifold:
                     f"{folder / WEIGHTS}: altered since it was written (its checksum differs)"
                 )
             return cls.from_arrays(load_file(folder / WEIGHTS))
-        except (OSError, KeyError, json.JSONDecodeError, SafetensorError, RuntimeError) as error:
+        except (
+            *(OSError, KeyError, TypeError, UnicodeDecodeError),
+            *(json.JSONDecodeError, SafetensorError, RuntimeError),
+        ) as error:
             raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None
 
 

@@ -21,7 +21,7 @@ from constraint_geodesics.geometry.graph import (
 )
 from constraint_geodesics.learning.lift import Chart, corrected, jump_excess, retracted
 from constraint_geodesics.params import SubmanifoldParams
-from constraint_geodesics.text_files import write_text, written
+from constraint_geodesics.text_files import reading, write_text, written
 
 Free = Callable[[Float[np.ndarray, "m D"]], Bool[np.ndarray, "m"]]
 """Which configurations touch neither the arm itself nor the workcell."""
@@ -195,7 +195,10 @@ def save_submanifold(submanifold: Submanifold, folder: Path) -> None:
 
 
 def load_submanifold(folder: Path) -> Submanifold:
-    """Read what `save_submanifold` wrote."""
-    form = json.loads((folder / CARD).read_text())["form"]
-    with np.load(folder / ARRAYS, allow_pickle=False) as arrays:
-        return (GridSubmanifold if form == "grid" else GraphSubmanifold)(**arrays)
+    """Read what `save_submanifold` wrote.  Raises DamagedFileError."""
+    with reading(folder / CARD):
+        kind = {"grid": GridSubmanifold, "graph": GraphSubmanifold}[
+            json.loads((folder / CARD).read_text())["form"]
+        ]
+    with reading(folder / ARRAYS), np.load(folder / ARRAYS, allow_pickle=False) as arrays:
+        return kind(**arrays)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.text_files import written
+from constraint_geodesics.text_files import reading, written
 
 Row = Mapping[str, Any]
 
@@ -39,7 +39,7 @@ def save_paths(
 
 def read_paths(rows: Sequence[Row], folder: Path) -> list[Float[np.ndarray, "T D"]]:
     """The paths of some rows of the table that `save_paths` kept."""
-    with np.load(folder / "paths.npz") as kept:
+    with reading(folder / "paths.npz"), np.load(folder / "paths.npz") as kept:
         return [kept[_name(row)] for row in rows]
 
 

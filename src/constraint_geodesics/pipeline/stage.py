@@ -13,7 +13,7 @@ from constraint_geodesics.extras import MissingExtraError
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.threads import one_thread
-from constraint_geodesics.text_files import write_text
+from constraint_geodesics.text_files import reading, write_text
 
 if TYPE_CHECKING:
     from constraint_geodesics.params import Params
@@ -50,8 +50,9 @@ def note_stage_time(file: Path, stage: str, names: Sequence[str], seconds: float
     """Keep how long the last finished run of each stage took, workers and all: what training costs
     is read from it.
     """
-    lines = file.read_text().splitlines()[1:] if file.is_file() else []
-    kept = dict(line.split(",") for line in lines)
+    with reading(file):
+        lines = file.read_text().splitlines()[1:] if file.is_file() else []
+        kept = dict(line.split(",") for line in lines)
     kept[" ".join([stage, *names])] = f"{seconds:.1f}"
     table = ["stage,seconds", *(f"{own},{kept[own]}" for own in sorted(kept))]
     write_text(file, "\n".join(table) + "\n")

@@ -23,7 +23,7 @@ from constraint_geodesics.params import ExecutionParams
 from constraint_geodesics.pipeline.progress import progress
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.cup import CupSettings, Execution, execute
-from constraint_geodesics.text_files import written
+from constraint_geodesics.text_files import reading, written
 from constraint_geodesics.trajectory import Trajectory
 
 PLANNED, STRAIGHT = "planned path", "straight joint line"
@@ -224,5 +224,5 @@ def save_execution(file: Path, execution: Execution) -> None:
 
 def load_execution(file: Path) -> Execution:
     """An execution that was kept in a file."""
-    with np.load(file) as kept:
+    with reading(file), np.load(file) as kept:
         return Execution(**{n: v if v.ndim else v.item() for n, v in kept.items()})

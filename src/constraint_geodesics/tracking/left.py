@@ -15,7 +15,7 @@ import json
 import os
 import shutil
 import uuid
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 RUNS = Path(".geodesics") / "runs"
 """Relative to the checkout."""
 HELD, UNSENT = "process.json", "unsent.jsonl"
+
+
+class AtWorkError(RuntimeError):
+    """Another process does the same; the message is one line with its number."""
 
 
 @dataclass(frozen=True)
@@ -45,21 +49,38 @@ class Left:
 
 def hold(root: Path, name: str, store: str) -> Path:
     """A folder of this process, for a run, until `release` or the end of the process; the same one
-    for the same name.
+    for the same name.  Raises AtWorkError where another process has one of that name: both would
+    write the same files.
     """
     runs = root.resolve() / RUNS
     if (str(runs), name) in _held:
         return _held[str(runs), name][0]
-    key = uuid.uuid4().hex[:16]
-    new = runs / ("." + key)  # nobody looks at it before it is locked
-    new.mkdir(parents=True)
-    file = os.open(str(new / HELD), os.O_RDWR | os.O_CREAT, 0o644)
-    fcntl.flock(file, fcntl.LOCK_EX)
-    told = {"name": name, "store": store, "file": os.fstat(file).st_ino, "pid": os.getpid()}
-    os.write(file, json.dumps(told).encode())
-    new.rename(runs / key)
+    runs.mkdir(parents=True, exist_ok=True)
+    with (runs / ".lock").open("w") as one_at_a_time:
+        fcntl.flock(one_at_a_time, fcntl.LOCK_EX)
+        _refuse_second(runs, name)
+        key = uuid.uuid4().hex[:16]
+        new = runs / ("." + key)  # nobody looks at it before it is locked
+        new.mkdir()
+        file = os.open(str(new / HELD), os.O_RDWR | os.O_CREAT, 0o644)
+        fcntl.flock(file, fcntl.LOCK_EX)
+        told = {"name": name, "store": store, "file": os.fstat(file).st_ino, "pid": os.getpid()}
+        os.write(file, json.dumps(told).encode())
+        new.rename(runs / key)
     _held[str(runs), name] = runs / key, file
     return runs / key
+
+
+def _refuse_second(runs: Path, name: str) -> None:
+    for folder in runs.glob("[!.]*"):
+        file = _locked(folder)
+        if file is not None:
+            os.close(file)
+            continue
+        with suppress(OSError, ValueError, KeyError):  # it may be gone by now
+            told = json.loads((folder / HELD).read_text("utf-8"))
+            if told["name"] == name:
+                raise AtWorkError(f"{name}: process {told['pid']} is at work on it already")
 
 
 _held: dict[tuple[str, str], tuple[Path, int]] = {}
