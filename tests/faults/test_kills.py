@@ -35,7 +35,7 @@ from constraint_geodesics.text_files import write_text
 from constraint_geodesics.tracking.experiment import Work, begin_run, tracked_stage
 from constraint_geodesics.tracking.left import AtWorkError, left_runs
 from constraint_geodesics.tracking.sending import recover
-from constraint_geodesics.tracking.store import TrackingError, ui_command
+from constraint_geodesics.tracking.store import TrackingError, open_store, tracking_uri, ui_command
 from tests.faults.effort import SOAK, Effort, count
 from tests.pipeline import smoke
 
@@ -68,6 +68,14 @@ def own_store(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DVC_STAGE", raising=False)
 
 
+@pytest.fixture(scope="module")
+def empty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store without runs: to make one takes seconds."""
+    folder = tmp_path_factory.mktemp("store")
+    open_store(tracking_uri(folder), "kills")
+    return folder / "mlflow.db"
+
+
 def started(program: str, folder: Path, *words: str) -> subprocess.Popen[str]:
     pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     command = [sys.executable, "-c", program, *words]
@@ -93,10 +101,11 @@ def statuses(folder: Path) -> dict[str, list[str]]:
 
 
 def test_runs_of_a_process_that_is_gone_for_sure_are_ended_and_no_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, empty: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     here, copy = tmp_path / "here", tmp_path / "copy"
     here.mkdir()
+    shutil.copy2(empty, here)
     process = within(here)
     shutil.copytree(here, copy)  # as on a machine with a copy of the folder
     for folder in (here, copy):
@@ -125,8 +134,9 @@ def test_runs_of_a_process_that_is_gone_for_sure_are_ended_and_no_others(
 
 
 def test_what_a_store_that_is_gone_did_not_take_is_sent_later(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, empty: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    shutil.copy2(empty, tmp_path)
     process = within(tmp_path)
     store, away = tmp_path / "mlflow.db", tmp_path / "away.db"
     store.rename(away)
@@ -206,14 +216,15 @@ def test_a_killed_training_of_a_policy_ends_as_one_that_was_not(
 
 
 def test_a_lock_file_that_is_cut_short_is_put_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, effort: Effort
 ) -> None:
     monkeypatch.setenv("DVC_STAGE", "train")
     lock, whole = tmp_path / "dvc.lock", (smoke.ROOT / "dvc.lock").read_bytes()
     lock.write_bytes(whole)
     keep_locks(tmp_path)
     rng = random.Random(1)
-    for cut in (0, 1, 8192, len(whole) - 1, *(rng.randrange(len(whole)) for _ in range(20))):
+    cuts = [rng.randrange(len(whole)) for _ in range(effort.faults // 10)]
+    for cut in (0, 8192, len(whole) - 1, *cuts):
         lock.write_bytes(whole[:cut])
         broken = not is_whole(lock)
         assert bool(recover_locks(tmp_path)) == broken
@@ -306,10 +317,10 @@ def kill_once(pair: Pair, stage: str, number: int) -> bool:
     whether it was at work then.
     """
     rng = random.Random(f"{stage} {number}")
-    name = " ".join(re.split("[@-]", stage, maxsplit=2))
+    script, *items = lock_of(pair.whole)[stage]["cmd"].split()[1:]
     times = pd.read_csv(pair.whole / "reports/stage_times.csv").set_index("stage")["seconds"]
-    lasts = float(times.get(name, times.filter(like=name.split()[0]).max()))
-    done = stage in (lock_of(pair.hurt) or {})
+    lasts = float(times[" ".join([Path(script).stem, *items])])
+    done = stage in lock_of(pair.hurt)
     dvc = repro(pair.hurt, *(["--single-item", "--force"] if done else []), stage)
     process = process_of(stage, dvc)
     if process is None:
@@ -326,10 +337,11 @@ def kill_once(pair: Pair, stage: str, number: int) -> bool:
     return dvc.returncode != 0
 
 
-def lock_of(folder: Path) -> dict[str, Any] | None:
+def lock_of(folder: Path) -> dict[str, Any]:
+    """What DVC knows of each stage that ran."""
     file = folder / "dvc.lock"
     if not file.is_file():
-        return None
+        return {}
     if not is_whole(file):  # DVC itself was killed while it wrote
         assert recover_locks(folder)
     return yaml.safe_load(file.read_text())["stages"]

@@ -18,6 +18,7 @@ from constraint_geodesics.text_files import write_text
 from constraint_geodesics.tracking.left import UNSENT, Left, left_runs, taken
 from constraint_geodesics.tracking.store import (
     TrackingError,
+    check_database,
     client_of,
     explained,
     impatient,
@@ -132,6 +133,7 @@ def recover(root: Path) -> list[str]:
 
 def _recovered(left: Left, uri: str) -> list[str]:
     with explained(uri), impatient():
+        check_database(uri)
         told = Sender(uri, left.folder, "").tell_kept()
         client = client_of(uri)
         experiments = [own.experiment_id for own in client.search_experiments()]

@@ -195,14 +195,15 @@ def open_store(uri: str, experiment: str) -> tuple["MlflowClient", str]:
         database.parent.mkdir(parents=True, exist_ok=True)
         lock = FileLock(f"{database}.lock")
     with lock, impatient():
-        if not uri.startswith("http"):
-            _check_database(uri)
+        check_database(uri)
         client = client_of(uri)
         return client, _experiment(client, experiment, database is not None)
 
 
-def _check_database(uri: str) -> None:
-    """MLflow tries a database that it can't open again and again, for minutes."""
+def check_database(uri: str) -> None:
+    """MLflow tries a database that it can't open again and again, for minutes.  Raises what
+    SQLAlchemy does; does nothing for a store that is none.
+    """
     import sqlalchemy
 
     if urlsplit(uri).scheme.partition("+")[0] in ("sqlite", "postgresql", "mysql", "mssql"):
