@@ -2,11 +2,13 @@
 all.
 """
 
+import json
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 MOST_BYTES = 256 * 2**20
 """Of a file: a million waypoints are less."""
@@ -42,6 +44,15 @@ def reading(file: Path) -> Iterator[None]:
             raise
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise DamagedFileError(f"{file}: damaged: {reason}") from error
+
+
+def kept_json(file: Path) -> Any:
+    """What was kept in a file of JSON; None where it is missing or damaged, and is made again."""
+    try:
+        with reading(file):
+            return json.loads(file.read_text("utf-8"))
+    except (DamagedFileError, OSError):
+        return None
 
 
 @contextmanager

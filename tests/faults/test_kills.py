@@ -209,6 +209,12 @@ def test_a_killed_training_of_a_policy_ends_as_one_that_was_not(
         began.add(said[0])
     began.add(train(hurt)[0])
     assert len(began) > 1, "it went on from a checkpoint"
+    (checkpoint,) = (hurt / "scratch").glob("*.pt")
+    damaged = bytearray(checkpoint.read_bytes())
+    for place in range(len(damaged) // 2, len(damaged) // 2 + 1024, 8):  # more than filling
+        damaged[place] ^= 1
+    checkpoint.write_bytes(damaged)
+    assert train(hurt) == steps, "what is damaged is not gone on from"
     once, again = (load_file(own / "policy-0.safetensors") for own in (tmp_path / "whole", hurt))
     assert once.keys() == again.keys()
     for name, values in once.items():

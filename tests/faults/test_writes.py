@@ -24,7 +24,15 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from constraint_geodesics.benchmark.row import COLUMNS, TEXTS, read_table, write_table
+from constraint_geodesics.benchmark.row import (
+    COLUMNS,
+    KEY,
+    TEXTS,
+    read_rows,
+    read_table,
+    row_line,
+    write_table,
+)
 from constraint_geodesics.bundle import PACKAGED, Bundle, read_bundle
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.geodesics.policy_search import Actor, TrainedPolicy, save_policy
@@ -334,6 +342,29 @@ def test_a_file_that_was_damaged_is_refused_or_says_what_it_said(
                 assert same(found, right), f"{file}: {len(changed)} of {len(content)} bytes"
         (tmp_path / file).write_bytes(content)
     INJECTED.append(injected)
+
+
+def test_a_kept_row_that_was_damaged_is_asked_again(tmp_path: Path, effort: Effort) -> None:
+    file, rng = tmp_path / "rows.jsonl", random.Random(2)
+    rows = [
+        dict(zip(KEY, ("p", "free", "table", k, 0), strict=True))
+        | {"fingerprint": "0", "length_rad": 1.0 / (k + 1), "status": "solved"}
+        for k in range(8)
+    ]
+    whole = "".join(row_line(row) + "\n" for row in rows).encode()
+    file.write_bytes(whole)
+    assert read_rows(file, {"p": "0"}) == rows
+    cuts = [whole[:place] for place in cut_at(len(whole), rng, effort.faults)]
+    for changed in (*cuts, *(flipped(whole, rng) for _ in range(10 * effort.faults))):
+        file.write_bytes(changed)
+        assert all(row in rows for row in told_of(read_rows(file, {"p": "0"})))
+    INJECTED.append(len(cuts) + 10 * effort.faults)
+
+
+def told_of(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What is read of rows: another column that a changed letter makes of the seal is not."""
+    names = (*KEY, "fingerprint", "length_rad", "status")
+    return [{name: row[name] for name in names} for row in rows]
 
 
 def test_faults_are_counted(effort: Effort) -> None:

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from io import TextIOWrapper
@@ -16,6 +17,8 @@ from constraint_geodesics.text_files import reading, written
 KEY = ("planner", "constraint", "scene", "query", "seed")
 LATENT = "latent_length_"
 """Before a learned manifold's name: length of the encoded path on it (eq. 2)."""
+SEAL = "crc32"
+"""The checksum in a kept row; rows of before there was one have none."""
 TEXTS = ("kind", "settings", "status", "reason", "recording")
 COLUMNS = (
     *("planner", "kind", "settings", "constraint", "scene", "query", "seed"),
@@ -36,17 +39,28 @@ def key_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
     return tuple(row[name] for name in KEY)
 
 
+def row_line(row: Mapping[str, Any]) -> str:
+    """A row as a line of JSON, with a checksum of the rest."""
+    return json.dumps({**row, SEAL: _seal(row)}, allow_nan=False)
+
+
+def _seal(row: Mapping[str, Any]) -> int:
+    return zlib.crc32(json.dumps({name: row[name] for name in row if name != SEAL}).encode())
+
+
 def read_rows(file: Path, wanted: Mapping[str, str]) -> list[dict[str, Any]]:
     """Rows of a file of JSON lines whose planner has the wanted fingerprint, the last of each key;
-    no torn lines.
+    no torn lines, and none whose checksum differs.
     """
     found: dict[tuple[Any, ...], dict[str, Any]] = {}
-    for line in file.read_text().splitlines() if file.is_file() else ():
+    for line in file.read_text(errors="replace").splitlines() if file.is_file() else ():
         try:
             row = json.loads(line)
-        except json.JSONDecodeError:  # killed while it was written
+        except ValueError:  # killed while it was written
             continue
-        if "started" not in row and wanted.get(row["planner"]) == row["fingerprint"]:
+        if not isinstance(row, dict) or row.pop(SEAL, None) not in (None, _seal(row)):
+            continue  # damaged since: asked again
+        if "started" not in row and wanted.get(row.get("planner"), "") == row.get("fingerprint"):
             found[key_of(row)] = row
     return list(found.values())
 

@@ -5,7 +5,9 @@ PPO comes from stable-baselines3; what leaves this module is a small actor netwo
 """
 
 import json
+import sys
 import time
+import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,7 +37,7 @@ from constraint_geodesics.geodesics.proposals import MeanPolicy, Met, random_rou
 from constraint_geodesics.geodesics.solver import goal_images
 from constraint_geodesics.geometry.manifold import GeometryError
 from constraint_geodesics.params import GeodesicParams, PpoParams
-from constraint_geodesics.text_files import write_bytes, written
+from constraint_geodesics.text_files import DamagedFileError, reading, write_bytes, written
 
 MOST_CHECKED = 40
 """Candidates given to the exact check at most: those behind them are no shorter and mostly alike.
@@ -257,6 +259,15 @@ def ppo_model(environment: VecEnv, params: GeodesicParams, seed: int) -> PPO:
     return model
 
 
+def _checkpoint(file: Path) -> dict[str, Any]:
+    """Raises DamagedFileError; torch itself does not look at the checksums that it writes."""
+    with reading(file), zipfile.ZipFile(file) as whole:
+        if bad := whole.testzip():
+            raise DamagedFileError(f"{file}: damaged: the checksum of {bad} differs")
+        content: dict[str, Any] = torch.load(file, weights_only=True)
+        return content
+
+
 class _Progress(BaseCallback):
     """Reports each rollout and keeps a checkpoint from which training goes on exactly."""
 
@@ -340,7 +351,11 @@ class _Progress(BaseCallback):
         """Put the last checkpoint, if there is one, back into the model and the environment."""
         if not self.file.is_file():
             return
-        content = torch.load(self.file, weights_only=True)
+        try:
+            content = _checkpoint(self.file)
+        except DamagedFileError as error:
+            print(f"{error}: training begins anew", file=sys.stderr, flush=True)
+            return
         model.policy.load_state_dict(content["policy"])
         model.policy.optimizer.load_state_dict(content["optimiser"])
         torch.set_rng_state(content["torch_rng"])

@@ -36,7 +36,7 @@ from constraint_geodesics.scene.allowed_collisions import (
 from constraint_geodesics.scene.collada import as_obj
 from constraint_geodesics.scene.pieces import is_binary_stl, read_pieces, stl_as_obj
 from constraint_geodesics.scene.urdf import find_urdf, has_pybullet
-from constraint_geodesics.text_files import write_text
+from constraint_geodesics.text_files import kept_json, write_text
 
 ADJACENT, FOUND = "adjacent", "found"
 """What `RobotParams.may_touch` says where it names no SRDF."""
@@ -99,8 +99,9 @@ def _allowed(
     if may_touch != FOUND:
         return allowed_by_srdf(Path(may_touch), arm.description), None
     kept = robot.urdf.with_name(f"{robot.urdf.stem}-{_sampled_digest(robot)}.json")
-    if kept.is_file():
-        pairs, often, free = json.loads(kept.read_text(encoding="utf-8"))
+    before = kept_json(kept)
+    if before is not None:
+        pairs, often, free = before
         found = tuple(AllowedPair(*pair) for pair in pairs)
         return found, Sampled(tuple(OftenTouching(*own) for own in often), free)
     if not has_pybullet():

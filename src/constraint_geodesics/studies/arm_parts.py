@@ -21,7 +21,7 @@ from constraint_geodesics.studies.arm_queries import (
     to_redundant_poses,
 )
 from constraint_geodesics.studies.arms import ARMS, REDUNDANT, first_paths
-from constraint_geodesics.text_files import write_text
+from constraint_geodesics.text_files import kept_json, write_text
 
 Table = Literal["first_path", "configurations", "pose", "free_yaw", "redundant_pose", "held_angle"]
 PIPELINE_ARM = "xArm 6 on its table"
@@ -90,11 +90,8 @@ def measure(part: Part) -> None:
 
 def kept(part: Part) -> list[dict[str, Any]] | None:
     """The rows of a part that was measured on the same code and data; None if there are none."""
-    try:
-        content = json.loads(part.file.read_text())
-    except (OSError, json.JSONDecodeError):
-        return None
-    if content["fingerprint"] != part.fingerprint:
+    content = kept_json(part.file)
+    if content is None or content["fingerprint"] != part.fingerprint:
         return None
     about = {"table": part.table, "arm": part.arm, "constraint": part.constraint}
     return [about | row for row in content["rows"]]

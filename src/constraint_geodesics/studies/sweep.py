@@ -21,7 +21,7 @@ from constraint_geodesics.pipeline.compute import as_finished
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.studies.search_space import Changes, SearchSpace, label_of
 from constraint_geodesics.studies.sweep_ranking import FIGURES, seed_figures
-from constraint_geodesics.text_files import write_text
+from constraint_geodesics.text_files import reading, write_text
 from constraint_geodesics.tracking.experiment import (
     StageRun,
     Subject,
@@ -76,7 +76,7 @@ class Configuration:
     def results(self, layout: Layout) -> list[Record]:
         """Those of the seeds that are done."""
         files = [self._file(layout, seed) for seed in self.params.sweep.seeds]
-        return [json.loads(file.read_text()) for file in files if file.is_file()]
+        return [_read(file) for file in files if file.is_file()]
 
     def _file(self, layout: Layout, seed: int) -> Path:
         return layout.sweep / self.name / f"seed-{seed}.json"
@@ -302,6 +302,12 @@ def _work(own: Configuration, layout: Layout) -> Work:
 def _lengths(file: Path) -> list[float]:
     found = json.loads(file.read_text())["optimum_rad"]
     return [float("nan") if length is None else length for length in found]
+
+
+def _read(file: Path) -> Record:
+    with reading(file):
+        found: Record = json.loads(file.read_text())
+        return found
 
 
 def _write(file: Path, content: Mapping[str, Any]) -> None:
