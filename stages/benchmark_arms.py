@@ -25,6 +25,7 @@ from constraint_geodesics.studies.arm_parts import (
     table_of,
 )
 from constraint_geodesics.studies.arms import robots_folder
+from constraint_geodesics.text_files import write_text
 
 MEASURED_BY = "studies.arm_parts"
 """The module that measures: every row depends on what it imports."""
@@ -39,7 +40,7 @@ def main(params: Params, layout: Layout) -> None:
     rows = table_of([row for part in parts for row in kept(part) or ()])
     reports = layout.root / "reports"
     write_table(rows, reports / "arms.csv", run_header(layout.root))
-    (reports / "arms.json").write_text(json.dumps(figures(rows), indent=1) + "\n")
+    write_text(reports / "arms.json", json.dumps(figures(rows), indent=1) + "\n")
 
 
 def fingerprinted(params: Params, layout: Layout) -> list[Part]:

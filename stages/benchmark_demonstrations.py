@@ -24,6 +24,7 @@ from constraint_geodesics.studies.demonstrations import (
     ranks,
     summary,
 )
+from constraint_geodesics.text_files import written
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "benchmark_demonstrations"
@@ -36,12 +37,9 @@ def main(params: Params, layout: Layout) -> None:
         cells = cells_of(params, layout, STAGE)
         found = parallel_map(measure, cells, params.compute, description="demonstrations")
         table = pd.DataFrame([row for rows in found for row in rows])
-        table.to_csv(
-            reports / "demonstrations.csv.gz",
-            index=False,
-            compression={"method": "gzip", "mtime": 0},
-            float_format="%.6g",
-        )
+        packed = {"method": "gzip", "mtime": 0}
+        with written(reports / "demonstrations.csv.gz") as part:
+            table.to_csv(part, index=False, compression=packed, float_format="%.6g")
         figures: dict[str, Any] = {
             "cells": summary(table, own.peer_pairs),
             "ranks": ranks(table),
@@ -49,7 +47,8 @@ def main(params: Params, layout: Layout) -> None:
             "machine": machine(),
         }
         picture = demonstrations_figure(example(params, layout))
-        picture.savefig(reports / "demonstrations.png", dpi=110)
+        with written(reports / "demonstrations.png") as part:
+            picture.savefig(part, dpi=110)
         run.cells(by_cell(figures["cells"]))
         run.report(figures, reports / "demonstrations.json")
         for cell in cells:  # finished: the next run of this stage starts from nothing

@@ -15,6 +15,7 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.paths import named_recordings, save_paths
 from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.text_files import written
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "benchmark_planners"
@@ -53,9 +54,9 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
         rows = named_recordings(rows, paths, folder, params.recording.queries)
         run.recordings(rows)
         file = layout.report(STAGE, constraint, "csv")
-        file.parent.mkdir(parents=True, exist_ok=True)
         table = pd.DataFrame(rows)
-        table.to_csv(file, index=False)
+        with written(file) as part:
+            table.to_csv(part, index=False)
         run.report(comparison_figures(table), layout.report(STAGE, constraint))
 
 

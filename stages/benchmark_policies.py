@@ -14,6 +14,7 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import robot_from
 from constraint_geodesics.studies.proposals import PolicyTask, grouped_figures, run_policies
+from constraint_geodesics.text_files import written
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "benchmark_policies"
@@ -36,8 +37,8 @@ def main(params: Params, layout: Layout) -> None:
         )
         for task, rows in zip(tasks, tables, strict=True):
             file = layout.report(STAGE, f"{task.name}-{task.scene}", "csv.gz")
-            file.parent.mkdir(parents=True, exist_ok=True)
-            rows.round(6).to_csv(file, index=False, compression={"method": "gzip", "mtime": 0})
+            with written(file) as part:
+                rows.round(6).to_csv(part, index=False, compression={"method": "gzip", "mtime": 0})
         every = pd.concat(tables, ignore_index=True)
         run.report(grouped_figures(every, params), layout.report(STAGE, "policies"))
 

@@ -15,6 +15,7 @@ from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search.preparation import named_roadmaps
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 from constraint_geodesics.tracking.registry import register_planner
+from constraint_geodesics.tracking.store import TrackingError
 
 STAGE = "build_planner"
 CODE = Path(constraint_geodesics.__file__).parent / "tracking" / "served_model.py"
@@ -42,7 +43,11 @@ def main(params: Params, layout: Layout) -> None:
         roadmap = bundle.roadmaps[shown]
         nodes = roadmap.joints[roadmap.labels == np.bincount(roadmap.labels).argmax()]
         ends = {"start": nodes[0].tolist(), "goal": nodes[-1].tolist()}
-        register_planner(run, layout.planner, CODE, ends | {"constraint": shown})
+        try:
+            register_planner(run, layout.planner, CODE, ends | {"constraint": shown})
+        except TrackingError as error:  # the planner itself is whole
+            again = "`dvc repro --single-item --force build_planner` registers this planner"
+            print(f"{error}; {again}", file=sys.stderr)
 
 
 if __name__ == "__main__":

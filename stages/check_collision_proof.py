@@ -26,6 +26,7 @@ from constraint_geodesics.studies.collision_proof import (
     try_scene,
 )
 from constraint_geodesics.studies.thin_shapes import Thicket, try_thicket
+from constraint_geodesics.text_files import write_text
 
 SEVEN_JOINTS = ("kuka_iiwa/model.urdf", "lbr_iiwa_link_7", "lbr_iiwa_link_0")
 """A robot of pybullet_data: its URDF, its tool's link and the one that stands on the table."""
@@ -76,7 +77,7 @@ def main(params: Params, layout: Layout) -> None:
         },
     }
     file = layout.root / "reports" / "collision_proof.json"
-    file.write_text(json.dumps(report, indent=1) + "\n")
+    write_text(file, json.dumps(report, indent=1) + "\n")
 
 
 if __name__ == "__main__":

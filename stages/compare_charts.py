@@ -11,6 +11,7 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.studies.charts import measure, summary, table_of, tasks_of
+from constraint_geodesics.text_files import written
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "compare_charts"
@@ -27,9 +28,8 @@ def main(params: Params, layout: Layout) -> None:
         found = parallel_map(measure, tasks, params.compute, description="charts")
         table = table_of([row for rows in found for row in rows])
         kept = {"method": "gzip", "mtime": 0}
-        table.to_csv(
-            reports / f"{STAGE}.csv.gz", index=False, compression=kept, float_format="%.6g"
-        )
+        with written(reports / f"{STAGE}.csv.gz") as part:
+            table.to_csv(part, index=False, compression=kept, float_format="%.6g")
         run.report({**summary(table), "machine": machine()}, reports / f"{STAGE}.json")
         for task in tasks:  # finished: the next run of this stage starts from nothing
             shutil.rmtree(task.scratch, ignore_errors=True)

@@ -8,6 +8,7 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.code import code_of
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.text_files import write_text
 
 
 def main(_: Params, layout: Layout) -> None:
@@ -16,7 +17,7 @@ def main(_: Params, layout: Layout) -> None:
     layout.code.mkdir(parents=True, exist_ok=True)
     for script in sorted(Path(__file__).parent.glob("*.py")):
         lines = [f"{digest}  {name}\n" for name, digest in code_of(script, package).items()]
-        (layout.code / f"{script.stem}.txt").write_text("".join(lines))
+        write_text(layout.code / f"{script.stem}.txt", "".join(lines))
 
 
 if __name__ == "__main__":

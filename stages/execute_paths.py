@@ -20,6 +20,7 @@ from constraint_geodesics.studies.execution import (
     save_execution,
     tipping_queries,
 )
+from constraint_geodesics.text_files import written
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "execute_paths"
@@ -55,8 +56,8 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
             file = layout.recordings(STAGE, constraint) / f"{name}.rrd"
             files.append(file.as_posix() if recorded else "")
         file = layout.report(STAGE, constraint, "csv")
-        file.parent.mkdir(parents=True, exist_ok=True)
-        table.assign(recording=files).to_csv(file, index=False)
+        with written(file) as part:
+            table.assign(recording=files).to_csv(part, index=False)
         run.report(execution_figures(table, found), layout.report(STAGE, constraint))
 
 

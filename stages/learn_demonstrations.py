@@ -14,6 +14,7 @@ from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.studies.demonstrations import by_cell, cells_of, summary
 from constraint_geodesics.studies.learned_demonstrations import measure
+from constraint_geodesics.text_files import written
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "learn_demonstrations"
@@ -26,12 +27,9 @@ def main(params: Params, layout: Layout) -> None:
         cells = cells_of(params, layout, STAGE)
         found = parallel_map(measure, cells, params.compute, description="learned of rows")
         table = pd.DataFrame([row for rows in found for row in rows])
-        table.to_csv(
-            reports / "learned_demonstrations.csv.gz",
-            index=False,
-            compression={"method": "gzip", "mtime": 0},
-            float_format="%.6g",
-        )
+        packed = {"method": "gzip", "mtime": 0}
+        with written(reports / "learned_demonstrations.csv.gz") as part:
+            table.to_csv(part, index=False, compression=packed, float_format="%.6g")
         figures = {"cells": summary(table, own.peer_pairs), "machine": machine()}
         run.cells(by_cell(figures["cells"]))
         run.report(figures, reports / "learned_demonstrations.json")

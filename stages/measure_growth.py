@@ -31,6 +31,7 @@ from constraint_geodesics.studies.growth import (
     measure_growth,
     slopes,
 )
+from constraint_geodesics.text_files import write_text
 
 STAGE = "measure_growth"
 SEVEN_JOINTS = ("kuka_iiwa/model.urdf", "lbr_iiwa_link_7")
@@ -85,7 +86,7 @@ def main(params: Params, layout: Layout) -> None:
     fits, about = slopes(table), run_header(layout.root)
     write_table(table, folder / "growth.csv", about)
     write_table(fits, folder / "slopes.csv", about)
-    (folder / "growth.md").write_text(slopes_markdown(fits))
+    write_text(folder / "growth.md", slopes_markdown(fits))
     save_png(growth_figure(table, fits), folder / "growth.png")
 
 

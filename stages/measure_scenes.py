@@ -16,6 +16,7 @@ from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies import changing_scenes as study
+from constraint_geodesics.text_files import write_text
 
 SEED, SPHERES, CUPS, SUDDEN, CHANGES = 0, 100, 200, 100, 20
 LOADED = "level_cup"
@@ -50,7 +51,7 @@ def main(params: Params, layout: Layout) -> None:
     rows = pd.concat([frame.assign(study=name) for name, frame in frames.items()])
     reports = layout.root / "reports"
     write_table(rows, reports / "scenes.csv.gz", run_header(layout.root))
-    (reports / "scenes.json").write_text(json.dumps(found, indent=1) + "\n")
+    write_text(reports / "scenes.json", json.dumps(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":

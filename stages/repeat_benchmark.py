@@ -12,6 +12,7 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.benchmark_tables import repeated_cells
 from constraint_geodesics.report.cells import markdown_table
+from constraint_geodesics.text_files import write_text, written
 
 STAGE = "repeat_benchmark"
 SEEDS = 2
@@ -34,9 +35,9 @@ def main(params: Params, layout: Layout) -> None:
     compared = repeated(first, table)
     order = {name: k for k, name in enumerate(again)}
     compared = compared.sort_values("planner", key=lambda names: names.map(order))
-    folder.mkdir(parents=True, exist_ok=True)
-    compared.to_csv(folder / "repeat.csv", index=False, float_format="%.6g")
-    (folder / "repeat.md").write_text(f"{markdown_table(repeated_cells(compared))}\n")
+    with written(folder / "repeat.csv") as part:
+        compared.to_csv(part, index=False, float_format="%.6g")
+    write_text(folder / "repeat.md", f"{markdown_table(repeated_cells(compared))}\n")
 
 
 if __name__ == "__main__":

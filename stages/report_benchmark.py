@@ -25,6 +25,7 @@ from constraint_geodesics.recording.png import save_png
 from constraint_geodesics.report import benchmark_figures as figures
 from constraint_geodesics.report import benchmark_tables as tables
 from constraint_geodesics.report.cells import markdown_table
+from constraint_geodesics.text_files import write_text, written
 
 BUDGETS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 20.0)
 """Time budgets at which the planner is held against its baselines [s]."""
@@ -62,7 +63,7 @@ def main(params: Params, layout: Layout) -> None:
         save_png(figure, folder / f"{name}.png")
     told = {name: json.dumps(own.model_dump(mode="json")) for name, own in settings.items()}
     export_arena(rows, layout.root / "data" / "benchmark.db", about, told)
-    (folder / "about.json").write_text(json.dumps(about, indent=2) + "\n")
+    write_text(folder / "about.json", json.dumps(about, indent=2) + "\n")
 
 
 def write_tables(
@@ -91,9 +92,10 @@ def write_tables(
         ("budgets", ahead, tables.ahead_markdown(ahead)),
         ("break_even", costs, f"{markdown_table(tables.break_even_cells(costs))}\n"),
     ):
-        (folder / f"{name}.md").write_text(text)
+        write_text(folder / f"{name}.md", text)
         if table is not None:
-            table.to_csv(folder / f"{name}.csv", index=False, float_format="%.6g")
+            with written(folder / f"{name}.csv") as part:
+                table.to_csv(part, index=False, float_format="%.6g")
     return costs
 
 

@@ -25,6 +25,7 @@ from constraint_geodesics.studies.sweep import (
     run_sweep,
     tell_ranks,
 )
+from constraint_geodesics.text_files import write_text
 from constraint_geodesics.tracking.store import tracking_uri
 
 TARGET = "stages/sweep/dvc.yaml:sweep_policies"
@@ -52,7 +53,7 @@ def main(space: Path) -> None:
         write_ranking(configurations, layout)
         try:
             clone.run(own.name, own.changes, TARGET)
-            mark.write_text(seeds)
+            write_text(mark, seeds)
             recorded.append(own.name)
         except ExperimentError as error:
             failed.append(str(error))

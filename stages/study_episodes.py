@@ -20,6 +20,7 @@ from constraint_geodesics.recording.episode_recording import EpisodeRecord, Stre
 from constraint_geodesics.report.episodes_page import episodes_markdown
 from constraint_geodesics.studies import episode_runs as runs
 from constraint_geodesics.studies import episodes as study
+from constraint_geodesics.text_files import write_text
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "study_episodes"
@@ -49,7 +50,7 @@ def main(params: Params, layout: Layout) -> None:
         both = [table.assign(table="run"), answers.assign(table="answer")]
         write_table(pd.concat(both), reports / "episodes.csv.gz", run_header(layout.root))
         run.report({"machine": machine(), "figures": found}, reports / "episodes.json")
-        (reports / "episodes.md").write_text(episodes_markdown(found))
+        write_text(reports / "episodes.md", episodes_markdown(found))
         _record(layout, tasks, rows)
 
 

@@ -13,6 +13,7 @@ from constraint_geodesics.studies.sweep import (
     configuration_figures,
     run_sweep,
 )
+from constraint_geodesics.text_files import write_text
 from constraint_geodesics.tracking.store import stable
 
 
@@ -24,9 +25,8 @@ def main(params: Params, layout: Layout) -> None:
     if own.seeds_left(layout):
         run_sweep(Sweep([own], layout, lambda _: None))
     file = layout.report(STAGE, "configuration")
-    file.parent.mkdir(parents=True, exist_ok=True)
     figures = stable(configuration_figures(own, layout))
-    file.write_text(json.dumps(figures, indent=2, sort_keys=True) + "\n")
+    write_text(file, json.dumps(figures, indent=2, sort_keys=True) + "\n")
 
 
 if __name__ == "__main__":

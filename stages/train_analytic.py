@@ -17,6 +17,7 @@ from constraint_geodesics.studies.geodesic_search import (
     run_analytic,
     write_rows,
 )
+from constraint_geodesics.text_files import written
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "train_analytic"
@@ -52,7 +53,8 @@ def main(params: Params, layout: Layout, analytic: str) -> None:
         for result in results:
             save_policy(result.policy, folder, result.seed)
         first = results[0]
-        np.savez_compressed(folder / "curves.npz", sampled=first.sampled, learned=first.learned)
+        with written(folder / "curves.npz") as part:
+            np.savez_compressed(part, sampled=first.sampled, learned=first.learned)
         learning = [
             {"seed": result.seed, **row} for result in results for row in result.policy.curve
         ]

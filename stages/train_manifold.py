@@ -10,6 +10,7 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import robot_from
+from constraint_geodesics.text_files import written
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "train_manifold"
@@ -31,7 +32,8 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
         )
         trained.manifold.save(layout.manifold(manifold))
         run.report({"rows": len(joints), **trained.metrics}, layout.report(STAGE, manifold))
-        pd.DataFrame(trained.history).to_csv(layout.report(STAGE, manifold, "csv"), index=False)
+        with written(layout.report(STAGE, manifold, "csv")) as part:
+            pd.DataFrame(trained.history).to_csv(part, index=False)
 
 
 if __name__ == "__main__":

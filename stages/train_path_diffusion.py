@@ -16,6 +16,7 @@ from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.text_files import written
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE, ITEM = "train_path_diffusion", "paths"
@@ -36,7 +37,8 @@ def main(params: Params, layout: Layout) -> None:
         paths = sum(part.paths.shape[1] for part in parts)
         run.report({"paths": paths, **trained.history[-1]}, layout.report(STAGE, ITEM))
         table = pd.DataFrame(trained.history)
-        table.to_csv(layout.report(STAGE, ITEM, "csv"), index=False)
+        with written(layout.report(STAGE, ITEM, "csv")) as part:
+            table.to_csv(part, index=False)
 
 
 if __name__ == "__main__":

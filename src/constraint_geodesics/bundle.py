@@ -8,6 +8,7 @@ Nothing in it is code, nothing is unpickled.
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from constraint_geodesics.params import (
 )
 from constraint_geodesics.plugs import MLFLOW, plug
 from constraint_geodesics.search.roadmap import Roadmap
+from constraint_geodesics.text_files import written
 
 FORMAT = 2
 _CONSTRAINT: TypeAdapter[ConstraintParams] = TypeAdapter(ConstraintParams)
@@ -72,19 +74,18 @@ def write_files(
     card: Mapping[str, Any],
     arrays: Mapping[str, Mapping[str, np.ndarray]],
 ) -> None:
-    """Write arrays as safetensors files and the card beside them with their checksums: the card
-    last, so that an interrupted write leaves nothing that looks whole.
+    """Write arrays as safetensors files and the card beside them with their checksums, all of them
+    or none; who is killed between two of them leaves what the card does not fit.
     """
-    folder = card_file.parent
-    folder.mkdir(parents=True, exist_ok=True)
-    card_file.unlink(missing_ok=True)
-    whole: dict[str, Any] = {"format": version, **card, "sha256": {}}
-    for name, values in arrays.items():
-        content = save(dict(values))
-        (folder / name).write_bytes(content)
-        whole["sha256"][name] = hashlib.sha256(content).hexdigest()
-    whole["sha256"][card_file.name] = card_digest(whole)
-    card_file.write_text(json.dumps(whole, indent=1) + "\n")
+    contents = {name: save(dict(values)) for name, values in arrays.items()}
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+    whole: dict[str, Any] = {"format": version, **card, "sha256": digests}
+    digests[card_file.name] = card_digest(whole)
+    with ExitStack() as files:  # the card, which was entered first, takes its place last
+        part = files.enter_context(written(card_file))
+        part.write_text(json.dumps(whole, indent=1) + "\n")
+        for name, content in contents.items():
+            files.enter_context(written(card_file.parent / name)).write_bytes(content)
 
 
 def read_files(

@@ -21,6 +21,7 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.progress import progress
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
 from constraint_geodesics.pipeline.threads import ONE_THREAD
+from constraint_geodesics.text_files import write_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -109,6 +110,24 @@ def look_for_trouble(as_json: bool = JSON) -> None:
     from constraint_geodesics import doctor
 
     raise SystemExit(doctor.show(Path(), json_wanted=as_json))
+
+
+@app.command("recover")
+def recover(as_json: bool = JSON) -> None:
+    """Put right what killed stages left: end their runs in MLflow, send what MLflow did not take,
+    and mend a dvc.lock that is cut short.
+    """
+    require("pipeline")
+    from constraint_geodesics.pipeline.lock_files import recover_locks
+    from constraint_geodesics.tracking.left import left_runs
+
+    root = Path().resolve()
+    done = recover_locks(root)
+    if left_runs(root):  # else MLflow need not be loaded
+        from constraint_geodesics.tracking.sending import recover as recover_runs
+
+        done += recover_runs(root)
+    print(json.dumps({"done": done}) if as_json else "\n".join(done) or "nothing was left")
 
 
 @app.command("constraints")
@@ -219,7 +238,7 @@ def bench(
     table = table.sort_values("planner", key=lambda names: names.map(order), kind="stable")
     summary = benchmark_summary(all_constraints(table), next(iter(some.benchmark.planners)))
     text = overview_markdown(summary, asks_in_python(all_settings(some)))
-    (out / "overview.md").write_text(text)
+    write_text(out / "overview.md", text)
     rows = out / "benchmark.csv"
     if as_json:
         answer = {"rows": str(rows), "overview": _records(summary), "left_out": left_out}

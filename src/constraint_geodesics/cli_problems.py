@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from constraint_geodesics.cli_planning import loading
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
+from constraint_geodesics.text_files import write_text
 
 if TYPE_CHECKING:
     from constraint_geodesics.benchmark.arm_source import UrdfArm
@@ -67,7 +68,7 @@ def bench_problems(options: ProblemOptions) -> None:
     found, file = figures(table), options.out / "problems.csv.gz"
     write_table(table, file, run_header(Layout().root))
     text = totals_markdown(found)
-    (options.out / "problems.md").write_text(text + "\n")
+    write_text(options.out / "problems.md", text + "\n")
     print(json.dumps({"rows": str(file), "figures": found}) if options.as_json else text)
     if not options.as_json:
         print(f"rows: {file}")

@@ -28,6 +28,8 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 from xml.etree import ElementTree
 
+from constraint_geodesics.tracking.left import left_runs
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
     from typing import Literal
@@ -599,6 +601,7 @@ def check_mlflow(root: Path, here: Surroundings) -> Answers:
         file = root / uri.partition(":///")[2].partition("?")[0]
     if file is not None and file.exists():
         yield from _of_database(file, root, here)
+    yield from _of_runs(root)
     kept = (root / "mlruns").glob("*/*/meta.yaml")
     if runs := [meta for meta in kept if "run_id:" in meta.read_text("utf-8")]:
         message = f"{len(runs)} runs in mlruns/, a store of files that `geodesics ui` does not show"
@@ -611,6 +614,18 @@ def check_mlflow(root: Path, here: Surroundings) -> Answers:
     if file is None:
         return f"runs in the store that MLFLOW_TRACKING_URI names ({uri.partition(':')[0]})"
     return f"runs in {file.name}" if file.exists() else "no runs yet"
+
+
+def _of_runs(root: Path) -> Iterator[Answer]:
+    """What killed stages left behind."""
+    left = left_runs(root)
+    if left:
+        names = _few(list(dict.fromkeys(run.name for run in left)))
+        unsent = sum(run.unsent for run in left)
+        message = f"{len(left)} stages were killed, whose runs stay RUNNING in MLflow: {names}"
+        if unsent:
+            message += f"; MLflow did not take {unsent} things that they told it"
+        yield _note(f"{message} (the next stage mends it too)", "geodesics recover")
 
 
 def _wrong_address(uri: str, files_allowed: bool) -> str:
@@ -718,7 +733,9 @@ def check_pipeline(root: Path, here: Surroundings, longest_s: float = LONGEST_ST
     elif "is not a git repository" in line:
         yield _note(f"DVC refuses to run outside of a git repository: {unseen}")
     elif "dvc.lock" in line:
-        yield _problem(f"DVC can't read dvc.lock: {line[:200]}", "git checkout -- dvc.lock")
+        kept = (root / ".geodesics/locks/dvc.lock").is_file()
+        mend = "geodesics recover" if kept else "git checkout -- dvc.lock"
+        yield _problem(f"DVC can't read dvc.lock: {line[:200]}", mend)
     else:
         named = "mend the file that the message names"
         yield _problem(f"DVC can't read the pipeline: {line[:200]}", named)

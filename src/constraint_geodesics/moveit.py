@@ -22,7 +22,6 @@ from constraint_geodesics.goals.goal import Wanted
 from constraint_geodesics.goals.region import GoalRegion
 from constraint_geodesics.params import read_yaml
 from constraint_geodesics.planner import Planner
-from constraint_geodesics.robot.arm_file import write_file
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
 from constraint_geodesics.scene.arm import arms_folder
 from constraint_geodesics.scene.attached import Attached
@@ -32,6 +31,7 @@ from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.planning_scene import PlanningScene
 from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.text_files import write_text
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _KINDS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
@@ -348,7 +348,7 @@ def _mesh_file(raw: Any) -> Path:
     text = "\n".join(lines) + "\n"
     file = arms_folder() / f"mesh-{sha256(text.encode()).hexdigest()[:16]}.obj"
     if not file.is_file():
-        write_file(file, text)
+        write_text(file, text)
     return file
 
 

@@ -36,7 +36,7 @@ from constraint_geodesics.search.band import project, step_lengths
 from constraint_geodesics.search.candidates import Candidate
 from constraint_geodesics.search.run_out import left_over, rows_from, run_out, run_outs
 from constraint_geodesics.search.space import space_of
-from constraint_geodesics.text_files import read_text
+from constraint_geodesics.text_files import read_text, write_text
 
 CONSTRAINT, VELOCITY = "constraint", "start_velocity"
 """Names of the comment lines of a trajectory's CSV, `# name: JSON`."""
@@ -466,8 +466,7 @@ def write_trajectory(
     lines.append(",".join(("time_s", *names)))
     for t, row in zip(motion.times, motion.joints, strict=True):
         lines.append(",".join(repr(float(x)) for x in (t, *row)))
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text("\n".join(lines) + "\n")
+    write_text(file, "\n".join(lines) + "\n")
 
 
 class Read(NamedTuple):

@@ -19,6 +19,7 @@ from constraint_geodesics.params import BenchmarkParams
 from constraint_geodesics.problem import PathPlanner, PlanningProblem
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.text_files import written
 
 TABLE, KEEP_OUT = "table", "keep_out"
 """Scenes: the workcell of params.yaml, and the same with a sphere between the ends."""
@@ -68,8 +69,8 @@ def write_queries(queries: Sequence[Query], file: Path) -> None:
             | {f"goal_{k + 1}": value for k, value in enumerate(query.goal)}
             | dict(zip(SPHERE, place, strict=True))
         )
-    file.parent.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(rows).to_csv(file, index=False)
+    with written(file) as part:
+        pd.DataFrame(rows).to_csv(part, index=False)
 
 
 def read_queries(file: Path) -> list[Query]:

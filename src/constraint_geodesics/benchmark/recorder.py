@@ -15,6 +15,7 @@ from constraint_geodesics.benchmark.queries import Query
 from constraint_geodesics.benchmark.runner import Answer
 from constraint_geodesics.recording.recorder import status_text
 from constraint_geodesics.recording.recording import PathRecord, record_path
+from constraint_geodesics.text_files import reading, written
 
 
 def first_queries(queries: Sequence[Query]) -> frozenset[tuple[str, str, int]]:
@@ -78,15 +79,16 @@ class PathKeeper:
 
     def __call__(self, answer: Answer) -> str:
         """It is no recording."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        np.save(self._file(answer.planner, answer.query.number, answer.seed), answer.joints)
+        with written(self._file(answer.planner, answer.query.number, answer.seed)) as part:
+            np.save(part, answer.joints)
         return ""
 
     def path(self, row: Mapping[str, Any], dof: int) -> Float[np.ndarray, "T D"]:
         """The path of a row, or (0, D)."""
         file = self._file(str(row["planner"]), int(row["query"]), int(row["seed"]))
         found = np.isfinite(row["length_rad"]) and file.is_file()
-        return np.load(file) if found else np.empty((0, dof))
+        with reading(file):
+            return np.load(file) if found else np.empty((0, dof))
 
     def _file(self, planner: str, query: int, seed: int) -> Path:
         return self.folder / f"{planner}-{query}-{seed}.npy"

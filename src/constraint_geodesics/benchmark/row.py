@@ -1,9 +1,10 @@
 """The benchmark's table: one row a planner, constraint, scene, query and seed."""
 
+import gzip
 import json
+import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from gzip import GzipFile
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, TextIO
@@ -11,9 +12,13 @@ from typing import Any, TextIO
 import numpy as np
 import pandas as pd
 
+from constraint_geodesics.text_files import reading, written
+
 KEY = ("planner", "constraint", "scene", "query", "seed")
 LATENT = "latent_length_"
 """Before a learned manifold's name: length of the encoded path on it (eq. 2)."""
+SEAL = "crc32"
+"""The checksum in a kept row; rows of before there was one have none."""
 TEXTS = ("kind", "settings", "status", "reason", "recording")
 COLUMNS = (
     *("planner", "kind", "settings", "constraint", "scene", "query", "seed"),
@@ -34,17 +39,28 @@ def key_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
     return tuple(row[name] for name in KEY)
 
 
+def row_line(row: Mapping[str, Any]) -> str:
+    """A row as a line of JSON, with a checksum of the rest."""
+    return json.dumps({**row, SEAL: _seal(row)}, allow_nan=False)
+
+
+def _seal(row: Mapping[str, Any]) -> int:
+    return zlib.crc32(json.dumps({name: row[name] for name in row if name != SEAL}).encode())
+
+
 def read_rows(file: Path, wanted: Mapping[str, str]) -> list[dict[str, Any]]:
     """Rows of a file of JSON lines whose planner has the wanted fingerprint, the last of each key;
-    no torn lines.
+    no torn lines, and none whose checksum differs.
     """
     found: dict[tuple[Any, ...], dict[str, Any]] = {}
-    for line in file.read_text().splitlines() if file.is_file() else ():
+    for line in file.read_text(errors="replace").splitlines() if file.is_file() else ():
         try:
             row = json.loads(line)
-        except json.JSONDecodeError:  # killed while it was written
+        except ValueError:  # killed while it was written
             continue
-        if "started" not in row and wanted.get(row["planner"]) == row["fingerprint"]:
+        if not isinstance(row, dict) or row.pop(SEAL, None) not in (None, _seal(row)):
+            continue  # damaged since: asked again
+        if "started" not in row and wanted.get(row.get("planner"), "") == row.get("fingerprint"):
             found[key_of(row)] = row
     return list(found.values())
 
@@ -78,14 +94,13 @@ def write_table(table: pd.DataFrame, file: Path, about: Mapping[str, str]) -> No
     """Write the rows as CSV, with a comment line for each entry of `about` (commit, lock file,
     processor) before; gzipped where the file is called so, the same bytes for the same rows.
     """
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as opened:
+    with written(file) as part, ExitStack() as opened:
         if file.suffix == ".gz":
-            raw = opened.enter_context(file.open("wb"))
-            packed = opened.enter_context(GzipFile("", "wb", fileobj=raw, mtime=0))
+            raw = opened.enter_context(part.open("wb"))
+            packed = opened.enter_context(gzip.GzipFile("", "wb", fileobj=raw, mtime=0))
             lines: TextIO = opened.enter_context(TextIOWrapper(packed, encoding="utf-8"))
         else:
-            lines = opened.enter_context(file.open("w"))
+            lines = opened.enter_context(part.open("w"))
         lines.writelines(f"# {name}: {' '.join(value.split())}\n" for name, value in about.items())
         table.to_csv(lines, index=False, float_format="%.12g")
 
@@ -94,9 +109,11 @@ def read_table(file: Path) -> tuple[pd.DataFrame, dict[str, str]]:
     """The rows of `write_table`, and what its comment lines say; columns that an older table does
     not have are blank.
     """
-    with file.open() as lines:
-        head = [line[2:].split(": ", 1) for line in lines if line.startswith("# ")]
-    table = pd.read_csv(
-        file, comment="#", float_precision="round_trip", dtype=dict.fromkeys(TEXTS, str)
-    )
-    return _completed(table), {name: value.strip() for name, value in head}
+    with reading(file):
+        opened = gzip.open if file.suffix == ".gz" else open
+        with opened(file, "rt", encoding="utf-8") as lines:
+            head = [line[2:].split(": ", 1) for line in lines if line.startswith("# ")]
+        table = pd.read_csv(
+            file, comment="#", float_precision="round_trip", dtype=dict.fromkeys(TEXTS, str)
+        )
+        return _completed(table), {name: value.strip() for name, value in head}

@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from constraint_geodesics.benchmark.judge import PathMeasures, judge_limits, measure_path
 from constraint_geodesics.benchmark.queries import Query
-from constraint_geodesics.benchmark.row import KEY, key_of, read_rows
+from constraint_geodesics.benchmark.row import KEY, key_of, read_rows, row_line
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.params import JudgeParams
@@ -142,7 +142,7 @@ def run_batch(batch: QueryBatch) -> int:
     for query in batch.queries:
         own = [job for job in jobs if job.query is query]
         for row in _answered(batch, query, own) if own else ():
-            _append(batch.file, json.dumps(row, allow_nan=False))
+            _append(batch.file, row_line(row))
             added += 1
     return added
 

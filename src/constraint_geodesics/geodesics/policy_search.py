@@ -5,7 +5,9 @@ PPO comes from stable-baselines3; what leaves this module is a small actor netwo
 """
 
 import json
+import sys
 import time
+import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +17,7 @@ import joblib
 import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors.torch import save_file
+from safetensors.torch import save
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -35,6 +37,7 @@ from constraint_geodesics.geodesics.proposals import MeanPolicy, Met, random_rou
 from constraint_geodesics.geodesics.solver import goal_images
 from constraint_geodesics.geometry.manifold import GeometryError
 from constraint_geodesics.params import GeodesicParams, PpoParams
+from constraint_geodesics.text_files import DamagedFileError, reading, write_bytes, written
 
 MOST_CHECKED = 40
 """Candidates given to the exact check at most: those behind them are no shorter and mostly alike.
@@ -219,8 +222,7 @@ def _shortest(found: Sequence[Geodesic]) -> Geodesic:
 
 def save_policy(policy: TrainedPolicy, folder: Path, seed: int) -> None:
     """Weights (safetensors) of one seed; `MeanPolicy.load` reads them."""
-    folder.mkdir(parents=True, exist_ok=True)
-    save_file(policy.actor.state_dict(), folder / f"policy-{seed}.safetensors")
+    write_bytes(folder / f"policy-{seed}.safetensors", save(policy.actor.state_dict()))
 
 
 def actor_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -255,6 +257,15 @@ def ppo_model(environment: VecEnv, params: GeodesicParams, seed: int) -> PPO:
     )
     model.set_logger(Logger(None, []))  # its own would leave a folder in /tmp for every training
     return model
+
+
+def _checkpoint(file: Path) -> dict[str, Any]:
+    """Raises DamagedFileError; torch itself does not look at the checksums that it writes."""
+    with reading(file), zipfile.ZipFile(file) as whole:
+        if bad := whole.testzip():
+            raise DamagedFileError(f"{file}: damaged: the checksum of {bad} differs")
+        content: dict[str, Any] = torch.load(file, weights_only=True)
+        return content
 
 
 class _Progress(BaseCallback):
@@ -332,17 +343,19 @@ class _Progress(BaseCallback):
             "unreported": [environment.savings, environment.episode_returns, environment.solved],
             "rows": self.rows,
         }
-        self.file.parent.mkdir(parents=True, exist_ok=True)
-        torch.save(content, self.file.with_suffix(".new"))
-        # an interruption leaves the old or the new, never half
-        self.file.with_suffix(".new").replace(self.file)
+        with written(self.file) as part:
+            torch.save(content, part)
         self._saved_at = self.num_timesteps
 
     def restore(self, model: PPO) -> None:
         """Put the last checkpoint, if there is one, back into the model and the environment."""
         if not self.file.is_file():
             return
-        content = torch.load(self.file, weights_only=True)
+        try:
+            content = _checkpoint(self.file)
+        except DamagedFileError as error:
+            print(f"{error}: training begins anew", file=sys.stderr, flush=True)
+            return
         model.policy.load_state_dict(content["policy"])
         model.policy.optimizer.load_state_dict(content["optimiser"])
         torch.set_rng_state(content["torch_rng"])

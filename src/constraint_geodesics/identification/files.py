@@ -11,6 +11,7 @@ from constraint_geodesics.constraints.constraint import (
 from constraint_geodesics.identification.identify import Identified
 from constraint_geodesics.params import ParamsError, read_yaml
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.text_files import written
 
 FORMAT = 1
 SUFFIXES = (".yaml", ".yml")
@@ -43,11 +44,10 @@ def save_constraint(identified: Identified, file: str | Path, where_shown: bool 
         },
         "constraint": constraint.to_json(),
     }
-    file.parent.mkdir(parents=True, exist_ok=True)
     writer = YAML(typ="safe", pure=True)
     writer.width = 1000
-    with file.open("w", encoding="utf-8") as stream:
-        writer.dump(about, stream)
+    with written(file) as part:
+        writer.dump(about, part)
 
 
 def load_constraint(file: str | Path, robot: SerialRobot | None = None) -> Constraint:

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.text_files import reading, written
 
 POSE_COLUMNS = (*(f"tool_{x}" for x in "xyz"), *(f"quaternion_{x}" for x in "xyzw"))
 RPY_COLUMNS = ("roll", "pitch", "yaw")
@@ -190,13 +191,15 @@ def write_joints(shards: Sequence[Shard], file: Path, about: dict[str, str]) -> 
     table = table.cast(
         pa.schema(fields, metadata={"constraint_geodesics." + k: v for k, v in about.items()})
     )
-    file.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(table, file, compression="zstd")
+    with written(file) as part:
+        pq.write_table(table, part, compression="zstd", write_page_checksum=True)
 
 
 def read_joints(file: Path) -> JointSet:
     """Read and check one set.  Raises DatasetError with file and column of a bad row."""
-    frame = _checked(pd.read_parquet(file), file)
+    with reading(file):
+        frame = pq.read_table(file, page_checksum_verification=True).to_pandas()
+    frame = _checked(frame, file)
     return JointSet(joints_of(frame), free_rows(frame))
 
 
@@ -207,14 +210,16 @@ def write_queries(queries: Queries, file: Path) -> None:
         for end, values in (("start", queries.starts), ("goal", queries.goals))
         for i in range(values.shape[1])
     }
-    file.parent.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(columns).rename_axis("query").to_csv(file)
+    with written(file) as part:
+        pd.DataFrame(columns).rename_axis("query").to_csv(part)
 
 
 def read_queries(file: Path) -> Queries:
     """Read what `write_queries` wrote."""
-    frame = pd.read_csv(file, index_col="query", float_precision="round_trip")
-    return Queries(*(frame.filter(like=f"{end}_").to_numpy(float) for end in ("start", "goal")))
+    with reading(file):
+        frame = pd.read_csv(file, index_col="query", float_precision="round_trip")
+        ends = (frame.filter(like=f"{end}_").to_numpy(float) for end in ("start", "goal"))
+        return Queries(*ends)
 
 
 def joints_of(frame: pd.DataFrame) -> Float[np.ndarray, "n D"]:

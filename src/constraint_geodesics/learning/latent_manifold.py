@@ -13,13 +13,14 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from constraint_geodesics.geometry.manifold import pullback_metric
 from constraint_geodesics.learning.inference import CARD, WEIGHTS, ManifoldFileError
 from constraint_geodesics.learning.learned_manifold import PIECE
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.text_files import write_bytes, write_text
 
 
 class JointDecoder(nn.Module, ABC):
@@ -125,15 +126,15 @@ class LatentManifold:
 
     def save(self, folder: Path) -> None:
         """Write weights (safetensors) and a card (JSON: kind, sizes and the weights' SHA-256)."""
-        folder.mkdir(parents=True, exist_ok=True)
         state = {name: values.contiguous() for name, values in self.decoder.state_dict().items()}
-        save_file(state, folder / WEIGHTS)
+        weights = save(state)
         card = {
             "kind": type(self.decoder).__name__,
             "sizes": self.decoder.sizes,
-            "sha256": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest(),
+            "sha256": hashlib.sha256(weights).hexdigest(),
         }
-        (folder / CARD).write_text(json.dumps(card, indent=2, sort_keys=True) + "\n")
+        write_bytes(folder / WEIGHTS, weights)
+        write_text(folder / CARD, json.dumps(card, indent=2, sort_keys=True) + "\n")
 
     @classmethod
     def load(cls, folder: Path, kind: type[JointDecoder]) -> "LatentManifold":

@@ -13,13 +13,14 @@ import torch
 from jaxtyping import Float
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from constraint_geodesics.geometry.manifold import pullback_metric
 from constraint_geodesics.learning.inference import CARD, WEIGHTS, ManifoldFileError
 from constraint_geodesics.learning.vae import JointVae
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.text_files import write_bytes, write_text
 
 PIECE = 1024
 """Points embedded at once: the temporaries of many more leave the processor's cache."""
@@ -96,8 +97,7 @@ class LearnedManifold:
 
     def save(self, folder: Path) -> None:
         """Write weights (safetensors) and a card (JSON: sizes and the weights' SHA-256)."""
-        folder.mkdir(parents=True, exist_ok=True)
-        save_file(self.vae.state_dict(), folder / WEIGHTS)
+        weights = save(self.vae.state_dict())
         card = {
             "dof": self.vae.dof,
             "latent_dim": self.dim,
@@ -107,9 +107,10 @@ class LearnedManifold:
                 if hasattr(layer, "out_features")
             ][:-1],
             "variance_centres": len(self.vae.precision.centres),
-            "sha256": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest(),
+            "sha256": hashlib.sha256(weights).hexdigest(),
         }
-        (folder / CARD).write_text(json.dumps(card, indent=2, sort_keys=True) + "\n")
+        write_bytes(folder / WEIGHTS, weights)
+        write_text(folder / CARD, json.dumps(card, indent=2, sort_keys=True) + "\n")
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> "LearnedManifold":
@@ -138,7 +139,10 @@ class LearnedManifold:
                     f"{folder / WEIGHTS}: altered since it was written (its checksum differs)"
                 )
             return cls.from_arrays(load_file(folder / WEIGHTS))
-        except (OSError, KeyError, json.JSONDecodeError, SafetensorError, RuntimeError) as error:
+        except (
+            *(OSError, KeyError, TypeError, UnicodeDecodeError),
+            *(json.JSONDecodeError, SafetensorError, RuntimeError),
+        ) as error:
             raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None
 
 

@@ -21,6 +21,7 @@ from constraint_geodesics.geometry.graph import (
 )
 from constraint_geodesics.learning.lift import Chart, corrected, jump_excess, retracted
 from constraint_geodesics.params import SubmanifoldParams
+from constraint_geodesics.text_files import reading, write_text, written
 
 Free = Callable[[Float[np.ndarray, "m D"]], Bool[np.ndarray, "m"]]
 """Which configurations touch neither the arm itself nor the workcell."""
@@ -187,15 +188,17 @@ def submanifold_figures(
 
 def save_submanifold(submanifold: Submanifold, folder: Path) -> None:
     """Write the arrays (npz) and which form they have (JSON)."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ARRAYS).open("wb") as file:
-        np.savez_compressed(file, **vars(submanifold))
+    with written(folder / ARRAYS) as part:
+        np.savez_compressed(part, **vars(submanifold))
     form = "grid" if isinstance(submanifold, GridSubmanifold) else "graph"
-    (folder / CARD).write_text(json.dumps({"form": form}) + "\n")
+    write_text(folder / CARD, json.dumps({"form": form}) + "\n")
 
 
 def load_submanifold(folder: Path) -> Submanifold:
-    """Read what `save_submanifold` wrote."""
-    form = json.loads((folder / CARD).read_text())["form"]
-    with np.load(folder / ARRAYS, allow_pickle=False) as arrays:
-        return (GridSubmanifold if form == "grid" else GraphSubmanifold)(**arrays)
+    """Read what `save_submanifold` wrote.  Raises DamagedFileError."""
+    with reading(folder / CARD):
+        kind = {"grid": GridSubmanifold, "graph": GraphSubmanifold}[
+            json.loads((folder / CARD).read_text())["form"]
+        ]
+    with reading(folder / ARRAYS), np.load(folder / ARRAYS, allow_pickle=False) as arrays:
+        return kind(**arrays)

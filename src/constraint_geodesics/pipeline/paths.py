@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from constraint_geodesics.text_files import reading, written
+
 Row = Mapping[str, Any]
 
 
@@ -30,14 +32,14 @@ def save_paths(
     rows: Sequence[Row], paths: Sequence[Float[np.ndarray, "T D"]], folder: Path
 ) -> None:
     """All joint paths [rad] of a table in one npz, for `read_paths`."""
-    folder.mkdir(parents=True, exist_ok=True)
     named = {_name(row): path for row, path in zip(rows, paths, strict=True)}
-    np.savez_compressed(folder / "paths.npz", **named)  # type: ignore[arg-type]
+    with written(folder / "paths.npz") as part:
+        np.savez_compressed(part, **named)  # type: ignore[arg-type]
 
 
 def read_paths(rows: Sequence[Row], folder: Path) -> list[Float[np.ndarray, "T D"]]:
     """The paths of some rows of the table that `save_paths` kept."""
-    with np.load(folder / "paths.npz") as kept:
+    with reading(folder / "paths.npz"), np.load(folder / "paths.npz") as kept:
         return [kept[_name(row)] for row in rows]
 
 

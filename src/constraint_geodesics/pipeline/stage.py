@@ -13,6 +13,7 @@ from constraint_geodesics.extras import MissingExtraError
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.threads import one_thread
+from constraint_geodesics.text_files import reading, write_text
 
 if TYPE_CHECKING:
     from constraint_geodesics.params import Params
@@ -29,11 +30,13 @@ def run_stage(stage: Callable[..., None], arguments: Sequence[str]) -> None:
     params.yaml has.
     """
     from constraint_geodesics.params import load_params
+    from constraint_geodesics.pipeline.lock_files import keep_locks
 
     began, name = time.perf_counter(), Path(sys.argv[0]).stem
     try:
         params = load_params()
         _check_names(params, stage, arguments)
+        keep_locks(Layout().root)
         with one_thread(), waiting(" ".join([name, *arguments])):
             stage(params, Layout(), *arguments)
         note_stage_time(Layout().stage_times, name, arguments, time.perf_counter() - began)
@@ -47,12 +50,12 @@ def note_stage_time(file: Path, stage: str, names: Sequence[str], seconds: float
     """Keep how long the last finished run of each stage took, workers and all: what training costs
     is read from it.
     """
-    file.parent.mkdir(parents=True, exist_ok=True)
-    lines = file.read_text().splitlines()[1:] if file.is_file() else []
-    kept = dict(line.split(",") for line in lines)
+    with reading(file):
+        lines = file.read_text().splitlines()[1:] if file.is_file() else []
+        kept = dict(line.split(",") for line in lines)
     kept[" ".join([stage, *names])] = f"{seconds:.1f}"
     table = ["stage,seconds", *(f"{own},{kept[own]}" for own in sorted(kept))]
-    file.write_text("\n".join(table) + "\n")
+    write_text(file, "\n".join(table) + "\n")
 
 
 def complain(error: Exception, code: int | None = None) -> int:

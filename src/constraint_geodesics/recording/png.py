@@ -6,6 +6,8 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from PIL import Image
 
+from constraint_geodesics.text_files import written
+
 DPI = 120
 
 
@@ -15,5 +17,5 @@ def save_png(figure: Figure, file: Path) -> None:
     figure.savefig(raw, format="png", dpi=DPI, facecolor="white", metadata={"Software": None})
     with Image.open(raw) as image:
         reduced = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=2)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    reduced.save(file, format="PNG", optimize=True)
+    with written(file) as part:
+        reduced.save(part, format="PNG", optimize=True)

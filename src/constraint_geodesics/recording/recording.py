@@ -34,6 +34,7 @@ from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.urdf import urdf_name
+from constraint_geodesics.text_files import write_bytes
 
 APPLICATION = "constraint_geodesics"
 TIMELINE = "frame"
@@ -225,14 +226,16 @@ def write_recording(
     file: Path, recording_id: str, name: str, chunks: Sequence[Chunk], blueprint: Any = None
 ) -> None:
     """Write chunks and a blueprint as one recording; without a name it is a part of another."""
-    file.parent.mkdir(parents=True, exist_ok=True)
     # the properties would hold the time of writing
     stream = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
+    content = stream.binary_stream()  # its own files would be half written where a disk is full
     with stream:
-        stream.save(file, default_blueprint=blueprint)
+        if blueprint is not None:
+            stream.send_blueprint(blueprint, make_active=False)
         if name:
             stream.send_recording_name(name)
         rr.send_chunks(chunks, recording=stream)
+    write_bytes(file, content.read() or b"")
 
 
 def read_recording(file: Path) -> RecordingSummary:

@@ -16,6 +16,7 @@ from PIL import Image
 from constraint_geodesics.palette import FAMILIES, planner_colour, planner_family
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.results import ReportError
+from constraint_geodesics.text_files import write_text
 
 DASHBOARD = "http://127.0.0.1:5000"
 """Where `make ui` shows the runs, on this machine alone."""
@@ -135,7 +136,7 @@ def write_page(layout: Layout, name: str, **content: Any) -> Path:
     environment.filters["size"] = _size
     environment.filters["link"] = lambda target: target.relative_to(file.parent).as_posix()
     page = environment.get_template(f"{name}.html.j2").render(content, families=FAMILIES.values())
-    file.write_text(page, encoding="utf-8")
+    write_text(file, page)
     return file
 
 

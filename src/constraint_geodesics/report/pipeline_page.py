@@ -28,6 +28,7 @@ from constraint_geodesics.report.results import (
     result_table,
     studies_at_hand,
 )
+from constraint_geodesics.text_files import write_text, written
 
 ABLATION = "ablation"
 """The figure that stands with the ablations' tables, not among the others."""
@@ -46,23 +47,24 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
     except FileNotFoundError as error:
         raise ReportError(f"{error.filename or error}: missing; `dvc repro` makes it") from None
     reports = layout.root / "reports"
-    table.to_csv(reports / "table.csv", index=False, float_format="%.6g")
-    (reports / "table.md").write_text(result_table(layout))
+    with written(reports / "table.csv") as part:
+        table.to_csv(part, index=False, float_format="%.6g")
+    write_text(reports / "table.md", result_table(layout))
     studies = studies_at_hand(params, layout)
     if "geometry" in studies:
-        (reports / "geometry.md").write_text(geometry_table(layout))
+        write_text(reports / "geometry.md", geometry_table(layout))
     executed = study_report.execution_markdown(params, layout)
-    (reports / "execution.md").write_text(executed)
+    write_text(reports / "execution.md", executed)
     if "policies" in studies:
-        (reports / "policies.md").write_text(study_report.policies_markdown(params, layout))
+        write_text(reports / "policies.md", study_report.policies_markdown(params, layout))
     if "arms" in studies:
-        (reports / "arms.md").write_text(arms_markdown(layout))
+        write_text(reports / "arms.md", arms_markdown(layout))
     if "manifolds" in studies:
-        (reports / "manifolds.md").write_text(manifolds_markdown(params, layout))
+        write_text(reports / "manifolds.md", manifolds_markdown(params, layout))
     if "charts" in studies:
-        (reports / "charts.md").write_text(charts_markdown(params, layout))
+        write_text(reports / "charts.md", charts_markdown(params, layout))
     if "demonstrations" in studies:
-        (reports / "demonstrations.md").write_text(demonstrations_markdown(params, layout))
+        write_text(reports / "demonstrations.md", demonstrations_markdown(params, layout))
     pictures, described = ([save_figure(layout, one) for one in own] for own in (drawn, cards))
     ablated = [picture for picture in pictures if picture.name == ABLATION]
     others = [picture for picture in pictures if picture.name != ABLATION]

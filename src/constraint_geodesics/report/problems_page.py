@@ -12,6 +12,7 @@ import pandas as pd
 from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.report.cells import fixed, markdown_table
 from constraint_geodesics.studies.problem_runs import figures
+from constraint_geodesics.text_files import write_text
 
 Figures = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]
 """By constraint, scene or "all", and planner."""
@@ -44,8 +45,8 @@ def write_problem_report(
     found = figures(table)
     write_table(table, folder / f"{name}.csv.gz", run)
     told = {"about": list(about), "figures": found}
-    (folder / f"{name}.json").write_text(json.dumps(told, indent=1) + "\n")
-    (folder / f"{name}.md").write_text(problems_markdown(title, about, found))
+    write_text(folder / f"{name}.json", json.dumps(told, indent=1) + "\n")
+    write_text(folder / f"{name}.md", problems_markdown(title, about, found))
 
 
 def problems_markdown(title: str, about: Sequence[str], found: Figures) -> str:

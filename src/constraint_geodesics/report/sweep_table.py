@@ -9,6 +9,7 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.cells import Cells, fixed, markdown_table, share, short
 from constraint_geodesics.studies.sweep import STAGE, Configuration
 from constraint_geodesics.studies.sweep_ranking import ranking, seed_rows
+from constraint_geodesics.text_files import write_text, written
 
 HEADER = (
     *("", "configuration", "seeds", "score", "95 %", "above own", "feasible"),
@@ -32,11 +33,11 @@ def write_ranking(configurations: Sequence[Configuration], layout: Layout) -> li
         {**row, "changes": labels[row["configuration"]]}
         for row in ranking(rows, configurations[0].name)
     ]
-    layout.report(STAGE, "ranking").parent.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(rows).to_csv(layout.report(STAGE, "seeds", "csv"), index=False)
-    pd.DataFrame(ranked).to_csv(layout.report(STAGE, "ranking", "csv"), index=False)
+    for name, table in (("seeds", rows), ("ranking", ranked)):
+        with written(layout.report(STAGE, name, "csv")) as part:
+            pd.DataFrame(table).to_csv(part, index=False)
     text = f"{ranking_markdown(ranked)}\n\n{NOTE}\n"
-    layout.report(STAGE, "ranking", "md").write_text(text)
+    write_text(layout.report(STAGE, "ranking", "md"), text)
     return ranked
 
 

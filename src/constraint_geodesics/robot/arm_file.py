@@ -8,7 +8,6 @@ room, and the tool's own frame a link; meshes are named by their whole paths.
 import copy
 import hashlib
 import math
-import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +17,7 @@ from jaxtyping import Float
 
 from constraint_geodesics.robot.description import Arm, Joint, find_mesh
 from constraint_geodesics.robot.kinematics import origin_of, rotation_about, rpy_of
+from constraint_geodesics.text_files import write_text
 
 TOOL = "tool"
 """The link of a tool's own frame, with as many underscores as make it a new name."""
@@ -39,23 +39,13 @@ def write_arm(
     text = ElementTree.tostring(tree, encoding="unicode")
     file = folder / f"{arm.description.file.stem}-{digest_of(text.encode())}.urdf"
     if not file.is_file():
-        write_file(file, text)
+        write_text(file, text)
     return file, link
 
 
 def digest_of(content: bytes) -> str:
     """A few letters that tell a content."""
     return hashlib.sha256(content).hexdigest()[:16]
-
-
-def write_file(file: Path, text: str) -> None:
-    """Write a file at once, whoever else writes the same."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(
-        "w", encoding="utf-8", dir=file.parent, suffix=".part", delete=False
-    ) as part:
-        part.write(text)
-    Path(part.name).replace(file)
 
 
 def _tree_of(

@@ -17,7 +17,7 @@ import numpy as np
 from platformdirs import user_cache_path
 
 from constraint_geodesics.params import RobotParams
-from constraint_geodesics.robot.arm_file import digest_of, write_arm, write_file
+from constraint_geodesics.robot.arm_file import digest_of, write_arm
 from constraint_geodesics.robot.description import Arm, arm_to, read_description
 from constraint_geodesics.robot.kinematics import (
     RobotError,
@@ -36,6 +36,7 @@ from constraint_geodesics.scene.allowed_collisions import (
 from constraint_geodesics.scene.collada import as_obj
 from constraint_geodesics.scene.pieces import is_binary_stl, read_pieces, stl_as_obj
 from constraint_geodesics.scene.urdf import find_urdf, has_pybullet
+from constraint_geodesics.text_files import kept_json, write_text
 
 ADJACENT, FOUND = "adjacent", "found"
 """What `RobotParams.may_touch` says where it names no SRDF."""
@@ -98,8 +99,9 @@ def _allowed(
     if may_touch != FOUND:
         return allowed_by_srdf(Path(may_touch), arm.description), None
     kept = robot.urdf.with_name(f"{robot.urdf.stem}-{_sampled_digest(robot)}.json")
-    if kept.is_file():
-        pairs, often, free = json.loads(kept.read_text(encoding="utf-8"))
+    before = kept_json(kept)
+    if before is not None:
+        pairs, often, free = before
         found = tuple(AllowedPair(*pair) for pair in pairs)
         return found, Sampled(tuple(OftenTouching(*own) for own in often), free)
     if not has_pybullet():
@@ -108,7 +110,7 @@ def _allowed(
             "installed: name an SRDF (--srdf), or use Python 3.11"
         )
     found, sampled = allowed_by_sampling(robot)
-    write_file(kept, json.dumps([found, *sampled]))
+    write_text(kept, json.dumps([found, *sampled]))
     return found, sampled
 
 
@@ -129,5 +131,5 @@ def _readable(mesh: Path) -> Path:
         return mesh
     written = arms_folder() / f"{mesh.stem}-{digest_of(mesh.read_bytes())}.obj"
     if not written.is_file():
-        write_file(written, _AS_OBJ[kind](mesh))
+        write_text(written, _AS_OBJ[kind](mesh))
     return written

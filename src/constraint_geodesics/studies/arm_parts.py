@@ -3,7 +3,6 @@ interrupted goes on; and the figures of its rows.
 """
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -22,6 +21,7 @@ from constraint_geodesics.studies.arm_queries import (
     to_redundant_poses,
 )
 from constraint_geodesics.studies.arms import ARMS, REDUNDANT, first_paths
+from constraint_geodesics.text_files import kept_json, write_text
 
 Table = Literal["first_path", "configurations", "pose", "free_yaw", "redundant_pose", "held_angle"]
 PIPELINE_ARM = "xArm 6 on its table"
@@ -85,19 +85,13 @@ def parts_of(
 def measure(part: Part) -> None:
     """Ask the part's queries and keep their rows."""
     rows = [asdict(row) for row in _rows(part)]
-    part.file.parent.mkdir(parents=True, exist_ok=True)
-    written = part.file.with_suffix(".tmp")
-    written.write_text(json.dumps({"fingerprint": part.fingerprint, "rows": rows}) + "\n")
-    os.replace(written, part.file)  # whole or not at all
+    write_text(part.file, json.dumps({"fingerprint": part.fingerprint, "rows": rows}) + "\n")
 
 
 def kept(part: Part) -> list[dict[str, Any]] | None:
     """The rows of a part that was measured on the same code and data; None if there are none."""
-    try:
-        content = json.loads(part.file.read_text())
-    except (OSError, json.JSONDecodeError):
-        return None
-    if content["fingerprint"] != part.fingerprint:
+    content = kept_json(part.file)
+    if content is None or content["fingerprint"] != part.fingerprint:
         return None
     about = {"table": part.table, "arm": part.arm, "constraint": part.constraint}
     return [about | row for row in content["rows"]]

@@ -22,6 +22,7 @@ from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.preparation import free_configurations
+from constraint_geodesics.text_files import write_text
 
 AWAY_M, HIGH_M = (0.3, 0.8), (0.05, 0.9)
 """Where the middles of shapes lie: from the base's axis, and above the table."""
@@ -108,8 +109,7 @@ def write_bracket(folder: Path) -> Path:
         faces += [(a, b, b + 6), (a, b + 6, a + 6)]
     lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {a} {b} {c}" for a, b, c in faces]
     file = folder / "bracket.obj"
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text("\n".join(lines) + "\n")
+    write_text(file, "\n".join(lines) + "\n")
     return file
 
 

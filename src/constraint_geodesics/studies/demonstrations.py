@@ -24,6 +24,7 @@ from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.arms import ARMS
 from constraint_geodesics.studies.hidden_tasks import HOLE, HOLE_M, ROWS, TASKS, HiddenTask
 from constraint_geodesics.studies.local_models import Answer, LocalModels, NearestRows, poses_of
+from constraint_geodesics.text_files import kept_json, write_text
 
 FORMULA, IDENTIFIED, WITHIN = "formula", "identified", "identified, where shown"
 ROUNDED, COMPARED = "identified, rounded", "identified, as asked of peers"
@@ -144,16 +145,12 @@ def measure(cell: Cell) -> list[Columns]:
 
 def kept_rows(cell: Cell, name: str, rows_of: Callable[[Cell], Iterator[Columns]]) -> list[Columns]:
     """Rows of one cell, written down under a name until all cells are measured."""
-    folder = cell.folder
-    file = folder / f"{name}.json"
-    if file.is_file():
-        found: list[Columns] = json.loads(file.read_text())
+    file = cell.folder / f"{name}.json"
+    found: list[Columns] | None = kept_json(file)
+    if found is not None:
         return found
     rows = list(rows_of(cell))
-    folder.mkdir(parents=True, exist_ok=True)
-    begun = file.with_suffix(".begun")
-    begun.write_text(json.dumps(rows))
-    begun.replace(file)
+    write_text(file, json.dumps(rows))
     return rows
 
 

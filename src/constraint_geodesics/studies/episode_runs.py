@@ -29,6 +29,7 @@ from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.studies import episodes as study
 from constraint_geodesics.studies.episodes import Answered, Controller, Episode, Replanner, Report
 from constraint_geodesics.studies.problem_runs import quantiles
+from constraint_geodesics.text_files import kept_json, write_text
 from constraint_geodesics.trajectory import Statistics, Trajectory
 
 REPLAN, SCRATCH = "replan", "BiRRT + band from scratch"
@@ -123,18 +124,14 @@ def kept(task: Task) -> dict[str, Any]:
     """The rows of an episode: those that are kept where the code is the same, else run now, and
     kept.
     """
-    if task.file.is_file():
-        found: dict[str, Any] = json.loads(task.file.read_text())
-        if found["code"] == task.code:
-            return found
+    before: dict[str, Any] | None = kept_json(task.file)
+    if before is not None and before["code"] == task.code:
+        return before
     found = {
         "code": task.code,
         **ran(opened(task.planner), task.constraint, task.number, task.seed),
     }
-    task.file.parent.mkdir(parents=True, exist_ok=True)
-    part = task.file.with_suffix(".part")
-    part.write_text(json.dumps(found))
-    part.replace(task.file)
+    write_text(task.file, json.dumps(found))
     return found
 
 

@@ -23,6 +23,7 @@ from constraint_geodesics.params import ExecutionParams
 from constraint_geodesics.pipeline.progress import progress
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.cup import CupSettings, Execution, execute
+from constraint_geodesics.text_files import reading, written
 from constraint_geodesics.trajectory import Trajectory
 
 PLANNED, STRAIGHT = "planned path", "straight joint line"
@@ -214,11 +215,11 @@ def execution_figures(table: pd.DataFrame, found: TippingQueries) -> dict[str, A
 
 def save_execution(file: Path, execution: Execution) -> None:
     """What became of a path, for `load_execution`."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(file, **asdict(execution))
+    with written(file) as part:
+        np.savez_compressed(part, **asdict(execution))
 
 
 def load_execution(file: Path) -> Execution:
     """An execution that was kept in a file."""
-    with np.load(file) as kept:
+    with reading(file), np.load(file) as kept:
         return Execution(**{n: v if v.ndim else v.item() for n, v in kept.items()})

@@ -54,6 +54,7 @@ from constraint_geodesics.learning.submanifold import (
 from constraint_geodesics.params import GeodesicParams, JudgeParams, Params, SubmanifoldParams
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.text_files import written
 
 OBSTACLES_SEED = 5
 """Of the spheres that policies are trained with."""
@@ -299,13 +300,12 @@ def save_seeds(
     results: Sequence[SeedResult], queries: Queries, folder: Path, learning: Path
 ) -> None:
     """Curves, and weights trained here, into a folder, the latter's learning into a table."""
-    folder.mkdir(parents=True, exist_ok=True)
     trained = [(result.seed, result.policy) for result in results if result.policy is not None]
     for seed, policy in trained:
         save_policy(policy, folder, seed)
     phi, seeds = np.array([r.phi for r in results]), np.array([r.seed for r in results])
-    with (folder / "curves.npz").open("wb") as file:
-        np.savez_compressed(file, phi=phi, seeds=seeds, starts=queries.starts, goals=queries.goals)
+    with written(folder / "curves.npz") as part:
+        np.savez_compressed(part, phi=phi, seeds=seeds, starts=queries.starts, goals=queries.goals)
     rows = [{"seed": seed, **row} for seed, policy in trained for row in policy.curve]
     if rows:
         write_rows(rows, learning)
@@ -313,8 +313,8 @@ def save_seeds(
 
 def write_rows(rows: Sequence[Mapping[str, Any]], file: Path, **columns: str) -> None:
     """Rows as CSV, with the same text in the given columns of each."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(rows).assign(**columns).to_csv(file, index=False)
+    with written(file) as part:
+        pd.DataFrame(rows).assign(**columns).to_csv(part, index=False)
 
 
 def geodesic_figures(

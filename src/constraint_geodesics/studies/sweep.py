@@ -21,13 +21,14 @@ from constraint_geodesics.pipeline.compute import as_finished
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.studies.search_space import Changes, SearchSpace, label_of
 from constraint_geodesics.studies.sweep_ranking import FIGURES, seed_figures
+from constraint_geodesics.text_files import reading, write_text
 from constraint_geodesics.tracking.experiment import (
-    MetricLogger,
     StageRun,
     Subject,
     Work,
     continue_run,
     end_run,
+    log_figures,
     subject_of,
 )
 from constraint_geodesics.tracking.store import dvc_md5, stable
@@ -75,7 +76,7 @@ class Configuration:
     def results(self, layout: Layout) -> list[Record]:
         """Those of the seeds that are done."""
         files = [self._file(layout, seed) for seed in self.params.sweep.seeds]
-        return [json.loads(file.read_text()) for file in files if file.is_file()]
+        return [_read(file) for file in files if file.is_file()]
 
     def _file(self, layout: Layout, seed: int) -> Path:
         return layout.sweep / self.name / f"seed-{seed}.json"
@@ -185,7 +186,7 @@ def tell_ranks(sweep: Sweep, ranked: Sequence[Mapping[str, Any]]) -> None:
         file = _told(own, sweep.layout)
         if file.is_file() and own.name in rows:
             told = json.loads(file.read_text())
-            MetricLogger(told["tracking_uri"], told["run_id"])(0, rows[own.name])
+            log_figures(told["tracking_uri"], told["run_id"], rows[own.name])
 
 
 def _finish(own: Configuration, sweep: Sweep) -> None:
@@ -303,8 +304,11 @@ def _lengths(file: Path) -> list[float]:
     return [float("nan") if length is None else length for length in found]
 
 
+def _read(file: Path) -> Record:
+    with reading(file):
+        found: Record = json.loads(file.read_text())
+        return found
+
+
 def _write(file: Path, content: Mapping[str, Any]) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    new = file.with_suffix(".new")
-    new.write_text(json.dumps(stable(content), allow_nan=False) + "\n")
-    new.replace(file)
+    write_text(file, json.dumps(stable(content), allow_nan=False) + "\n")

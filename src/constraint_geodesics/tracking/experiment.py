@@ -9,10 +9,11 @@ import json
 import logging
 import math
 import re
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import fmean, pstdev
@@ -22,18 +23,21 @@ from typing import Any, Self
 from pydantic import BaseModel
 
 from constraint_geodesics.params import Params, RewardParams
+from constraint_geodesics.text_files import write_text
+from constraint_geodesics.tracking.left import hold, release
+from constraint_geodesics.tracking.sending import CHILD, PROCESS, Sender, recover
 from constraint_geodesics.tracking.store import (
     TrackingError,
     client_of,
     dataset_of,
     explained,
     flat,
-    keep_copy,
+    impatient,
     log_params,
-    mlflow_module,
     open_store,
     source_tags,
     stable,
+    store_name,
     stored,
     tracking_uri,
 )
@@ -83,25 +87,17 @@ def subject_of(
 class MetricLogger:
     """Sends figures at a step to one run, in one call.  Picklable, so that a worker process can use
     it.
+
+    run: its id, or CHILD and the name of one below the stage's.
     """
 
-    tracking_uri: str
-    run_id: str
+    send: Sender
+    run: str
 
     def __call__(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Log figures at an epoch or environment step; those that are not finite are left out.
-
-        Raises TrackingError if the store does not take them.
-        """
-        now = round(time.time() * 1000)
-        entity = mlflow_module().entities.Metric
-        batch = [
-            entity(name, float(value), now, step)
-            for name, value in metrics.items()
-            if math.isfinite(value)
-        ]
-        with explained(self.tracking_uri):
-            client_of(self.tracking_uri).log_batch(self.run_id, metrics=batch)
+        """Log figures at an epoch or environment step; those that are not finite are left out."""
+        finite = {name: float(value) for name, value in metrics.items() if math.isfinite(value)}
+        self.send("metrics", self.run, step=step, metrics=finite)
 
 
 @dataclass
@@ -113,26 +109,29 @@ class ChildRun:
     another run.
     """
 
-    tracking_uri: str
+    send: Sender
     experiment_id: str
     tags: Mapping[str, str]
     params: Mapping[str, Any]
     run_id: str = field(default="", init=False)
+    """Blank where the store did not take it yet."""
 
     def __enter__(self) -> Self:
-        with explained(self.tracking_uri):
-            client = client_of(self.tracking_uri)
-            self.run_id = client.create_run(self.experiment_id, tags=dict(self.tags)).info.run_id
-            log_params(client, self.run_id, self.params)
+        about = {"experiment": self.experiment_id, "tags": dict(self.tags)}
+        self.run_id = self.send("begin", self._run, **about, params=dict(self.params))
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        with explained(self.tracking_uri) if error is None else suppress(Exception):
-            client_of(self.tracking_uri).set_terminated(self.run_id, _status(error))
+        with nullcontext() if error is None else suppress(Exception):
+            self.send("end", self._run, status=_status(error))
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
         """Figures at an environment step."""
-        MetricLogger(self.tracking_uri, self.run_id)(step, metrics)
+        MetricLogger(self.send, self._run)(step, metrics)
+
+    @property
+    def _run(self) -> str:
+        return self.run_id or CHILD + self.tags["child"]
 
 
 @dataclass(frozen=True)
@@ -146,6 +145,13 @@ class StageRun:
     params: Mapping[str, Any]
     children: list[str]
     """Names, in the order in which `child` was called."""
+    folder: Path
+    """Of what is kept on disk while the run lasts."""
+
+    @property
+    def send(self) -> Sender:
+        """What tells the store."""
+        return Sender(self.tracking_uri, self.folder, self.run_id)
 
     def report(self, metrics: Mapping[str, Any], file: Path) -> None:
         """Write figures as JSON, the truth, and mirror the numbers among them under names joined by
@@ -157,14 +163,13 @@ class StageRun:
         """
         plain = stable(metrics)
         text = json.dumps(plain, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(text + "\n", "utf-8")
+        write_text(file, text + "\n")
         self.metric_logger()(0, _numbers(plain))
-        keep_copy(self.tracking_uri, self.run_id, file, "reports")
+        self._keep(file, "reports")
 
     def metric_logger(self) -> MetricLogger:
         """Where a training loop reports."""
-        return MetricLogger(self.tracking_uri, self.run_id)
+        return MetricLogger(self.send, self.run_id)
 
     def child(self, name: str, params: Mapping[str, Any]) -> ChildRun:
         """A run below this one, not yet started; its name must be new.
@@ -180,7 +185,7 @@ class StageRun:
             "mlflow.runName": _named(f"{self.tags['item']} {name}", self.tags),
             "mlflow.parentRunId": self.run_id,
         }
-        return ChildRun(self.tracking_uri, self.experiment_id, tags, {**self.params, **params})
+        return ChildRun(self.send, self.experiment_id, tags, {**self.params, **params})
 
     def cells(self, table: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]]) -> None:
         """A child for each cell of a table: by its name, what sets it apart and its figures."""
@@ -202,10 +207,9 @@ class StageRun:
         curves: each child's figures over its `steps`, which it has logged itself; their mean and
         spread at each step that all of them have is logged on this run, as a learning curve.
         """
-        run_ids = self._child_ids()
         for name, row in zip(self.children, figures, strict=True):
             final = {f"final/{key}": value for key, value in row.items()}
-            MetricLogger(self.tracking_uri, run_ids[name])(0, final)
+            MetricLogger(self.send, CHILD + name)(0, final)
         self.metric_logger()(0, _spread(figures))
         for step, rows in _together(curves):
             spread = _spread(rows).items()
@@ -226,32 +230,31 @@ class StageRun:
             "`geodesics replay {recording}`"
         )
         lines = [line.format_map(row) for row in recorded]
-        run_ids = self._child_ids() if self.children else {}
-        with explained(self.tracking_uri):
-            client = client_of(self.tracking_uri)
-            note = client.get_run(self.run_id).data.tags.get("mlflow.note.content", "")
-            client.set_tag(
-                self.run_id, "mlflow.note.content", "\n".join([note, "", "Recordings:", "", *lines])
-            )
-            for name, run_id in run_ids.items():
-                own = [r for r in recorded if r["planner"] == shown and name == f"seed {r['seed']}"]
-                if own:
-                    client.set_tag(run_id, "recording", str(own[0]["recording"]))
+        self.send("note", self.run_id, lines=["Recordings:", "", *lines])
+        for name in self.children:
+            own = [r for r in recorded if r["planner"] == shown and name == f"seed {r['seed']}"]
+            if own:
+                about = {"key": "recording", "value": str(own[0]["recording"])}
+                self.send("tag", CHILD + name, **about)
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "recordings.md"
-            file.write_text("\n".join(lines) + "\n")
-            keep_copy(self.tracking_uri, self.run_id, file)
+            write_text(file, "\n".join(lines) + "\n")
+            self._keep(file)
 
     def child_names(self) -> list[str]:
-        """Of the runs below this one that were started, by whatever process."""
-        return list(self._child_ids())
-
-    def _child_ids(self) -> dict[str, str]:
-        return {run.data.tags["child"]: run.info.run_id for run in _children(self)}
+        """Of the runs below this one that were started, by whatever process, oldest first."""
+        query, order = f"tags.`mlflow.parentRunId` = '{self.run_id}'", "attributes.start_time ASC"
+        with explained(self.tracking_uri):
+            client = client_of(self.tracking_uri)
+            found = client.search_runs([self.experiment_id], query, order_by=[order])
+        return list(dict.fromkeys(run.data.tags["child"] for run in found))
 
     def figure(self, file: Path) -> None:
         """Keep a copy of a figure with the run."""
-        keep_copy(self.tracking_uri, self.run_id, file, "figures")
+        self._keep(file, "figures")
+
+    def _keep(self, file: Path, folder: str | None = None) -> None:
+        self.send("copy", self.run_id, file=str(file.resolve()), into=folder)
 
 
 @dataclass(frozen=True)
@@ -276,7 +279,7 @@ def tracked_stage(work: Work, experiment: str, root: Path) -> Iterator[StageRun]
     end with it.  What the machine does in a stage that takes long is logged as `system/...`.
 
     Raises TrackingError, one line, before any work: an input is missing, or the store can't be
-    reached.
+    reached.  What the store does not take later is kept (`sending.py`), and the stage goes on.
     """
     run = begin_run(work, experiment, root)
     try:
@@ -297,16 +300,18 @@ def begin_run(work: Work, experiment: str, root: Path) -> StageRun:
     run = _run_of(work, experiment, root)
     shown = {"mlflow.runName": _named(f"{work.stage} {work.item}", run.tags)}
     shown["mlflow.note.content"] = _note(work.stage, run.tags)
-    with explained(run.tracking_uri):
-        client, tags = client_of(run.tracking_uri), {**run.tags, **shown}
-        run = replace(run, run_id=client.create_run(run.experiment_id, tags=tags).info.run_id)
-        try:
+    try:
+        with explained(run.tracking_uri):
+            client, tags = client_of(run.tracking_uri), {**run.tags, **shown}
+            run = replace(run, run_id=client.create_run(run.experiment_id, tags=tags).info.run_id)
             log_params(client, run.run_id, run.params)
             client.log_inputs(run.run_id, [dataset_of(file, root) for file in work.inputs])
-        except BaseException as error:
+    except BaseException as error:
+        if run.run_id:
             with suppress(Exception):
                 end_run(run, _status(error))
-            raise
+        release(run.folder)
+        raise
     return run
 
 
@@ -326,6 +331,7 @@ def continue_run(work: Work, experiment: str, root: Path) -> StageRun:
         parents = [old for old in found if "child" not in old.data.tags]
         if not parents:
             return begin_run(work, experiment, root)
+        client.set_tag(parents[0].info.run_id, PROCESS, run.tags[PROCESS])
         client.update_run(parents[0].info.run_id, status="RUNNING")
     return replace(run, run_id=parents[0].info.run_id)
 
@@ -335,12 +341,18 @@ def end_run(run: StageRun, status: str) -> None:
 
     status: FINISHED, FAILED or KILLED.
     """
-    with explained(run.tracking_uri):
-        client, left = client_of(run.tracking_uri), "KILLED" if status == "FINISHED" else status
-        for child in _children(run):
-            if child.info.status == "RUNNING":
-                client.set_terminated(child.info.run_id, left)
-        client.set_terminated(run.run_id, status)
+    try:
+        run.send("end", run.run_id, status=status)
+        with suppress(TrackingError), impatient():  # the store may be back
+            run.send.tell_kept()
+    finally:
+        release(run.folder)
+
+
+def log_figures(uri: str, run_id: str, figures: Mapping[str, float]) -> None:
+    """Figures of a run that has ended.  Raises TrackingError if the store does not take them."""
+    told = {"call": "metrics", "run": run_id, "time": round(1000 * time.time()), "step": 0}
+    Sender(uri, Path(), run_id).tell({**told, "metrics": figures})
 
 
 def _run_of(work: Work, experiment: str, root: Path) -> StageRun:
@@ -353,7 +365,19 @@ def _run_of(work: Work, experiment: str, root: Path) -> StageRun:
             raise TrackingError(f"{name}: its input {file} does not exist")
     with explained(uri):
         _, experiment_id = open_store(uri, experiment)
-    return StageRun(uri, experiment_id, "", tags, params, [])
+    _end_left(root)
+    folder = hold(root, name, store_name(uri, root))
+    tags[PROCESS] = folder.name
+    return StageRun(uri, experiment_id, "", tags, params, [], folder)
+
+
+def _end_left(root: Path) -> None:
+    """Runs of this checkout whose process was killed end now, and what they could not tell goes
+    out.
+    """
+    with suppress(TrackingError):  # what there is to do now is another run's
+        for line in recover(root):
+            print(f"MLflow: {line}", file=sys.stderr, flush=True)
 
 
 @contextmanager
@@ -363,8 +387,8 @@ def _system_metrics(uri: str, run_id: str) -> Iterator[None]:
     def begin() -> None:
         from mlflow.system_metrics.system_metrics_monitor import SystemMetricsMonitor
 
-        # it tells of every start and end
-        logging.getLogger(SystemMetricsMonitor.__module__).setLevel(logging.WARNING)
+        # it tells of every start and end, and what it thinks of a store that is gone
+        logging.getLogger(SystemMetricsMonitor.__module__).setLevel(logging.CRITICAL)
         monitor = SystemMetricsMonitor(run_id, SYSTEM_EVERY_S, tracking_uri=uri)
         monitor.start()
         monitors.append(monitor)
@@ -373,7 +397,8 @@ def _system_metrics(uri: str, run_id: str) -> Iterator[None]:
     timer.daemon = True
     timer.start()
     try:
-        yield
+        with impatient(tries=3, answer_s=30):  # it would wait for minutes, and this process for it
+            yield
     finally:
         timer.cancel()
         if timer.is_alive():
@@ -396,13 +421,6 @@ def _note(stage: str, tags: Mapping[str, str]) -> str:
         else f"`stages/{stage}.py`"
     )
     return f"Made by {again}; its figures are under `reports/{stage}/`."
-
-
-def _children(run: StageRun) -> list[Any]:
-    """Oldest first, so that the last run of one name is the one that counts."""
-    query, order = f"tags.`mlflow.parentRunId` = '{run.run_id}'", ["attributes.start_time ASC"]
-    client = client_of(run.tracking_uri)
-    return list(client.search_runs([run.experiment_id], query, order_by=order))
 
 
 def _status(error: BaseException | None) -> str:

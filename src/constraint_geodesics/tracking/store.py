@@ -43,8 +43,19 @@ PLANNER_MODEL, CHAMPION = "constraint_geodesics", "champion"
 """The registered planner's name, and the alias of the version that people load."""
 
 
+REFUSED = ("INVALID_PARAMETER_VALUE", "RESOURCE_DOES_NOT_EXIST", "RESOURCE_ALREADY_EXISTS")
+"""MLflow's codes of what it will not take another time either."""
+
+
 class TrackingError(RuntimeError):
-    """MLflow can't be used; the message is one line with the store's address."""
+    """MLflow can't be used; the message is one line with the store's address.
+
+    refused: the store is there and does not take what it was told.
+    """
+
+    def __init__(self, message: str, refused: bool = False) -> None:
+        super().__init__(message)
+        self.refused = refused
 
 
 def tracking_uri(root: Path) -> str:
@@ -52,6 +63,11 @@ def tracking_uri(root: Path) -> str:
     uri = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{root / 'mlflow.db'}"
     file = _sqlite_file(uri)
     return uri if file is None or file.is_absolute() else f"sqlite:///{file.resolve()}"
+
+
+def store_name(uri: str, root: Path) -> str:
+    """A store's address without a password, and without the folder of its own checkout."""
+    return _without_password(uri).replace(f"{root.resolve()}/", "")
 
 
 def ui_command(root: Path, port: int) -> list[str]:
@@ -90,7 +106,7 @@ def fetch_artifacts(address: str, root: Path = Path()) -> Iterator[Path]:
             found = _beside_store(uri, address)
             if found is None:
                 if urlsplit(uri).scheme in ("http", "https"):
-                    with _impatient():
+                    with impatient():
                         client_of(uri).search_experiments(max_results=1)
                 fetched = mlflow.artifacts.download_artifacts(
                     artifact_uri=address, dst_path=folder, tracking_uri=uri, registry_uri=uri
@@ -140,7 +156,7 @@ def mlflow_module() -> ModuleType:
     links.
     """
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
+    os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "CRITICAL")
     os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
     import mlflow
@@ -163,7 +179,8 @@ def explained(uri: str) -> Iterator[None]:
         yield
     except (mlflow_module().MlflowException, SQLAlchemyError, OSError, ImportError) as error:
         message = f"MLflow store {uri}: {' '.join(str(error).split())[:300]}"
-        raise TrackingError(_without_password(message)) from error
+        refused = getattr(error, "error_code", "") in REFUSED
+        raise TrackingError(_without_password(message), refused) from error
 
 
 def _without_password(text: str) -> str:
@@ -179,15 +196,16 @@ def open_store(uri: str, experiment: str) -> tuple["MlflowClient", str]:
     if database is not None:
         database.parent.mkdir(parents=True, exist_ok=True)
         lock = FileLock(f"{database}.lock")
-    with lock, _impatient():
-        if not uri.startswith("http"):
-            _check_database(uri)
+    with lock, impatient():
+        check_database(uri)
         client = client_of(uri)
         return client, _experiment(client, experiment, database is not None)
 
 
-def _check_database(uri: str) -> None:
-    """MLflow tries a database that it can't open again and again, for minutes."""
+def check_database(uri: str) -> None:
+    """MLflow tries a database that it can't open again and again, for minutes.  Raises what
+    SQLAlchemy does; does nothing for a store that is none.
+    """
     import sqlalchemy
 
     if urlsplit(uri).scheme.partition("+")[0] in ("sqlite", "postgresql", "mysql", "mssql"):
@@ -197,11 +215,11 @@ def _check_database(uri: str) -> None:
 
 
 @contextmanager
-def _impatient() -> Iterator[None]:
-    """For the first call alone: MLflow waits minutes for a server that does not answer."""
+def impatient(tries: int = 1, answer_s: int = FIRST_ANSWER_S) -> Iterator[None]:
+    """MLflow itself waits minutes for a server that does not answer."""
     wanted = {
-        "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
-        "MLFLOW_HTTP_REQUEST_TIMEOUT": str(FIRST_ANSWER_S),
+        "MLFLOW_HTTP_REQUEST_MAX_RETRIES": str(tries),
+        "MLFLOW_HTTP_REQUEST_TIMEOUT": str(answer_s),
     }
     added = {name: value for name, value in wanted.items() if name not in os.environ}
     os.environ.update(added)
@@ -209,7 +227,7 @@ def _impatient() -> Iterator[None]:
         yield
     finally:
         for name in added:
-            del os.environ[name]
+            os.environ.pop(name, None)  # another thread's block may have ended first
 
 
 def _experiment(client: "MlflowClient", name: str, in_sqlite: bool) -> str:
