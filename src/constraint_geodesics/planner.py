@@ -44,8 +44,9 @@ from constraint_geodesics.replanning import Replanning
 from constraint_geodesics.robot.inverse_kinematics import Search, solutions, spread
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, rpy_of
 from constraint_geodesics.scene.arm import FOUND
+from constraint_geodesics.scene.names import shapes_of
 from constraint_geodesics.scene.planning_scene import PlanningScene
-from constraint_geodesics.scene.scene import Scene, robot_from, shapes_of, workcell_from
+from constraint_geodesics.scene.scene import Scene, robot_from, workcell_from
 from constraint_geodesics.scene.scene import SceneError as SceneError
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.search.candidates import ALL_PARTS, Parts

@@ -64,9 +64,8 @@ def checked_joints(q: Any, dof: int, name: str, error: type[ValueError]) -> np.n
         raise error(f"{name} has shape {values.shape}: must be ({dof},) [rad]")
     if not are_usable(values):
         which = int(np.argmin(np.abs(values) <= LARGEST))
-        what = "is not finite" if not np.isfinite(values[which]) else f"= {values[which]:g}"
-        line = f"{name}[{which}] {what}"
-        raise error(line if "not" in what else f"{line}: must be at most {LARGEST:g} in size")
+        what = f"= {values[which]:g}: must be at most {LARGEST:g} in size"
+        raise error(f"{name}[{which}] {what if np.isfinite(values[which]) else 'is not finite'}")
     return values
 
 

@@ -3,6 +3,7 @@ is a traceback, hangs, or is taken for something else.
 """
 
 import os
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -170,3 +171,17 @@ def test_the_shell(
     assert said in line
     assert "Traceback" not in told.err
     assert not told.out
+
+
+def test_a_pipe_that_is_written_to_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However late, and in parts; a file is read to its end, and no further than it may be."""
+    monkeypatch.setattr(text_files, "PATIENCE_S", 30.0)
+    os.mkfifo(tmp_path / "pipe")
+    content = b"0123456789" * 100_000
+    command = "sleep 0.2; head -c 500000 whole; sleep 0.2; tail -c 500000 whole"
+    (tmp_path / "whole").write_bytes(content)
+    with subprocess.Popen(f"({command}) > pipe", shell=True, cwd=tmp_path):
+        assert text_files.read_content(tmp_path / "pipe") == content
+    assert text_files.read_content(tmp_path / "whole", most=len(content)) == content
+    with pytest.raises(OSError, match="longer than"):
+        text_files.read_content(tmp_path / "whole", most=len(content) - 1)

@@ -1,11 +1,11 @@
 """Requests at random against the planner: no exception but a typed one, and no path that an oracle
-of its own calls wrong: PyBullet's shapes every 0.005 rad, and limits, constraint, ends, velocities
-and accelerations by other formulas than the planner's.
+of its own calls wrong: PyBullet's shapes every 0.005 rad (0.02 in `make test`), and limits,
+constraint, ends, velocities and accelerations by other formulas than the planner's.
 """
 
 import json
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
@@ -23,7 +23,8 @@ from tests.faults.requests import A_SCENE, SEED, Request, request, scene_of
 from tests.planner_fixtures import packaged_planner
 from tests.scene.judge import Judge
 
-STEP_RAD = 0.005
+STEP_RAD = {"quick": 0.02, "faults": 0.005, "soak": 0.005}
+"""Between configurations that the oracle looks at."""
 DEEP_M = 1e-6
 """PyBullet's distances are off by less."""
 OFF = 1e-4 + 1e-9
@@ -58,7 +59,8 @@ def test_random_requests(effort: Effort) -> None:
             planner.scene.become(scene_of(planner, first, block))
             with Judge(planner.scene.now, {}) as judge:
                 for number in range(block * A_SCENE, (block + 1) * A_SCENE):
-                    _ask(planner, request(planner, number), judge, figures)
+                    step = STEP_RAD[effort.name]
+                    _ask(planner, request(planner, number), judge, figures, step)
             if figures.requests % KEPT_EVERY == 0:
                 _keep(effort, figures)
     finally:
@@ -89,8 +91,9 @@ def test_the_oracle_sees_what_is_wrong(spoil: str) -> None:
     else:
         times *= 0.5
     with Judge(planner.scene.now, {}) as judge:
-        assert not _faults(planner, asked, path.joints, path.times, path, judge)[0]
-        faults, _ = _faults(planner, asked, joints, times, path, judge)
+        assert not _faults(planner, asked, path, judge, 0.005)[0]
+        spoiled = replace(path, joints=joints, times=times)
+        faults, _ = _faults(planner, asked, spoiled, judge, 0.005)
     assert any(spoil in fault for fault in faults), faults
 
 
@@ -104,7 +107,7 @@ def _solved(planner: Planner) -> tuple[Trajectory, Request]:
     raise AssertionError("no path")
 
 
-def _ask(planner: Planner, asked: Request, judge: Judge, figures: Figures) -> None:
+def _ask(planner: Planner, asked: Request, judge: Judge, figures: Figures, step: float) -> None:
     figures.requests += 1
     where = f"request {asked.number} ({asked.kind})"
     try:
@@ -124,9 +127,9 @@ def _ask(planner: Planner, asked: Request, judge: Judge, figures: Figures) -> No
         only = asked.words.get("scene")
         if only:
             with Judge(planner.scene.now.adding(*only), {}) as own_judge:
-                more, looked = _faults(planner, asked, path.joints, path.times, path, own_judge)
+                more, looked = _faults(planner, asked, path, own_judge, step)
         else:
-            more, looked = _faults(planner, asked, path.joints, path.times, path, judge)
+            more, looked = _faults(planner, asked, path, judge, step)
         figures.configurations += looked
         figures.wrongly_certified += bool(more)
         faults += more
@@ -150,16 +153,11 @@ def _answer_faults(path: Trajectory) -> list[str]:
 
 
 def _faults(
-    planner: Planner,
-    asked: Request,
-    joints: np.ndarray,
-    times: np.ndarray,
-    path: Trajectory,
-    judge: Judge,
+    planner: Planner, asked: Request, path: Trajectory, judge: Judge, step: float
 ) -> tuple[list[str], int]:
     """What is wrong with a path, and how many configurations were looked at."""
-    robot, found = planner.robot, []
-    rows = _dense(joints)
+    robot, found, joints, times = planner.robot, list[str](), path.joints, path.times
+    rows = _dense(joints, step)
     least, names = min((judge.deepest(row) for row in rows), key=lambda one: one[0])
     if least < -DEEP_M:
         found.append(f"collision of {names}: {least:.3g} m")
@@ -174,10 +172,10 @@ def _faults(
     return found, len(rows)
 
 
-def _dense(joints: np.ndarray) -> np.ndarray:
+def _dense(joints: np.ndarray, step: float) -> np.ndarray:
     found = [joints[:1]]
     for first, last in pairwise(joints):
-        steps = max(1, math.ceil(float(np.linalg.norm(last - first)) / STEP_RAD))
+        steps = max(1, math.ceil(float(np.linalg.norm(last - first)) / step))
         found.append(first + np.linspace(0.0, 1.0, steps + 1)[1:, None] * (last - first))
     return np.concatenate(found)
 

@@ -9,8 +9,7 @@ from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, load_
 from constraint_geodesics.scene.arm import ADJACENT, load_arm
 from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.names import SceneError as SceneError
-from constraint_geodesics.scene.names import require_texts
-from constraint_geodesics.scene.names import shapes_of as shapes_of
+from constraint_geodesics.scene.names import require_texts, shapes_of
 from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.urdf import find_urdf, has_pybullet
 from constraint_geodesics.scene.world import World
