@@ -208,7 +208,7 @@ def test_slower_motions_use_a_share_of_the_limits() -> None:
     assert slow.times[-1] > 2.0 * whole.times[-1]
     for name in ("velocity_scale", "acceleration_scale"):
         for value in (0.0, -0.1, 1.1, np.nan):
-            with pytest.raises(PlannerError, match=f"{name} = .*above 0 and at most 1"):
+            with pytest.raises(PlannerError, match=f"{name} = .*at least 1e-06 and at most 1"):
                 planner.plan(start, goal, "level_cup", **{name: value})
 
 

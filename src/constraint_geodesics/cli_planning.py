@@ -477,13 +477,16 @@ def _constraint(name: str, planner: "Planner") -> "str | Constraint":
 
 
 def _pose(text: str, option: str) -> "Pose":
-    from constraint_geodesics.constraints.constraint import Pose
+    from constraint_geodesics.constraints.constraint import ConstraintError, Pose
     from constraint_geodesics.planner import PlannerError
 
     values = _joints(text, option)
     if len(values) != 6 or not all(map(math.isfinite, values)):
         raise PlannerError(f"{option} {text!r}: must be six finite numbers, {POSE}")
-    return Pose.from_rpy(values[:3], values[3:])
+    try:
+        return Pose.from_rpy(values[:3], values[3:])
+    except ConstraintError as error:
+        raise PlannerError(f"{option} {text!r}: {error}") from None
 
 
 def _joints(text: str, option: str) -> list[float]:

@@ -1,11 +1,11 @@
 """Numbers and names as params.yaml may hold them, checked by Pydantic."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
-LARGEST = 1e9
-"""Of any number: beyond it squares and sums overflow, and nothing here is counted or measured."""
+from constraint_geodesics.values import LARGEST
+
 Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
 Finite = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
@@ -16,6 +16,12 @@ Rows = Annotated[int, Field(ge=1, le=10**8)]
 """Of a set that is held in memory."""
 Width = Annotated[int, Field(ge=1, le=2**16)]
 """Of a network's layer."""
+Few = Annotated[int, Field(ge=2, le=10_000)]
+"""Steps, segments or points along something: one more costs as much again."""
+Points = Annotated[int, Field(ge=10, le=10**6)]
+"""Of a graph, or of something else that has a matrix or a search."""
+Degree = Annotated[int, Field(ge=4, le=256, multiple_of=4)]
+"""Of the polynomials that lengths are measured with."""
 ChartDim = Annotated[int, Field(ge=1, le=64)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
@@ -29,4 +35,12 @@ def _different(seeds: tuple[int, ...]) -> tuple[int, ...]:
 Seeds = Annotated[tuple[Seed, ...], Field(min_length=1), AfterValidator(_different)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 Vector3 = tuple[Finite, Finite, Finite]
-Bit = Literal[0, 1]
+
+
+def _no_flag(value: Any) -> Any:
+    if isinstance(value, bool):  # which equals one of them
+        raise ValueError(f"{value}: must be 0 or 1")
+    return value
+
+
+Bit = Annotated[Literal[0, 1], BeforeValidator(_no_flag)]

@@ -132,6 +132,12 @@ def _planner_problems(params: Params) -> Iterator[str]:
                 f"benchmark.compared.planners={name!r}: its kind must be one of "
                 f"{', '.join(TABLE_I)}"
             )
+    for entry, planners in (("benchmark", bench.planners), ("problems", params.problems.planners)):
+        for name, planner in planners.items():
+            manifold = planner.settings.get("manifold")
+            if manifold is not None and manifold not in params.manifolds:
+                known = ", ".join(params.manifolds)
+                yield f"{entry}.planners.{name}.manifold={manifold!r}: must be one of {known}"
     for entry in ("recorded", "drawn"):
         for name in getattr(bench, entry):
             if name not in bench.planners:

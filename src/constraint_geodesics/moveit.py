@@ -21,7 +21,7 @@ from constraint_geodesics.errors import ParamsError
 from constraint_geodesics.goals.goal import Wanted
 from constraint_geodesics.goals.region import GoalRegion
 from constraint_geodesics.params import read_yaml
-from constraint_geodesics.planner import Planner
+from constraint_geodesics.planner import SLOWEST, Planner, SceneError
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
 from constraint_geodesics.scene.arm import arms_folder
 from constraint_geodesics.scene.attached import Attached
@@ -29,9 +29,10 @@ from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.planning_scene import PlanningScene
-from constraint_geodesics.scene.shape import Placement, Shape
+from constraint_geodesics.scene.shape import Placement, Shape, ShapeError
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.text_files import write_text
+from constraint_geodesics.values import LARGEST
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _KINDS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
@@ -70,7 +71,7 @@ def add_moveit_scene(file: Path, scene: PlanningScene) -> dict[str, float]:
     """Add a planning scene's objects, attached ones and allowed collisions to a planner's scene,
     all or nothing; returns the values of joints [rad or m] that it names.
 
-    Raises MoveitError, SceneError or RobotError, one line.
+    Raises MoveitError, one line.
     """
     raw = _read(file)
     try:
@@ -102,13 +103,11 @@ def add_moveit_scene(file: Path, scene: PlanningScene) -> dict[str, float]:
             for a in named.get(first, [first]):
                 for b in named.get(second, [second]):
                     now = now.allowing(a, b)
-    except MoveitError as error:
+        scene.become(now)
+    except (MoveitError, RobotError, SceneError, ShapeError) as error:
         raise MoveitError(f"{file}: {error}") from None
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        if type(error).__module__.startswith("constraint_geodesics"):
-            raise
         raise MoveitError(f"{file}: no planning scene of MoveIt: {_said(error)}") from None
-    scene.become(now)
     return joints
 
 
@@ -139,10 +138,7 @@ def read_moveit_request(
         if not goals:
             raise MoveitError("goal_constraints: there is none")
         constraint = _path_constraint(_entry(raw, "path_constraints", {}), planner.scene)
-        scales = [  # 0 means the whole, as in MoveIt
-            float(raw.get(f"max_{what}_scaling_factor") or 1.0)
-            for what in ("velocity", "acceleration")
-        ]
+        scales = [_scale(raw, what) for what in ("velocity", "acceleration")]
     except MoveitError as error:
         raise MoveitError(f"{file}: {error}") from None
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
@@ -239,15 +235,28 @@ def _pose(raw: Any) -> Float[np.ndarray, "4 4"]:
     return pose
 
 
+def _scale(raw: Any, what: str) -> float:
+    """The share of a limit that is used; 0 means the whole, as in MoveIt."""
+    entry = f"max_{what}_scaling_factor"
+    scale = float(raw.get(entry) or 1.0)
+    if not SLOWEST <= scale <= 1.0:
+        raise MoveitError(f"{entry}: {scale:g}: must be 0, or at least {SLOWEST:g} and at most 1")
+    return scale
+
+
 def _joint_state(raw: Any, where: str) -> dict[str, float]:
     names, values = _list(raw, "name"), _list(raw, "position")
     if len(names) != len(values):
         raise MoveitError(f"{where}.joint_state: {len(names)} names, {len(values)} positions")
     found = {str(name): float(value) for name, value in zip(names, values, strict=True)}
-    for name, value in found.items():
-        if not math.isfinite(value):
-            raise MoveitError(f"{where}.joint_state: {name} is {value}: must be finite")
-    return found
+    return _all_finite(found, f"{where}.joint_state")
+
+
+def _all_finite(joints: dict[str, float], where: str) -> dict[str, float]:
+    for name, value in joints.items():
+        if not abs(value) <= LARGEST:
+            raise MoveitError(f"{where}: {name} is {value}: must be finite")
+    return joints
 
 
 def _configuration(joints: Mapping[str, float], robot: SerialRobot) -> np.ndarray | None:
@@ -420,6 +429,7 @@ def _goal(raw: Any, scene: PlanningScene, where: str) -> Wanted:
             if _list(raw, other):
                 raise MoveitError(f"{where}.{other}: goes without joint_constraints")
         values = {str(own["joint_name"]): float(own["position"]) for own in joints}
+        _all_finite(values, where)
         if unknown := sorted(values.keys() - set(robot.joint_names)):
             raise MoveitError(f"{where}: {', '.join(unknown)} is no joint that is planned")
         return _named_joints(values, robot, where)

@@ -22,9 +22,12 @@ from constraint_geodesics.fields import (
     Bit,
     ChartDim,
     Count,
+    Degree,
+    Few,
     Finite,
     Name,
     NonNegative,
+    Points,
     Positive,
     Rate,
     Rows,
@@ -37,6 +40,7 @@ from constraint_geodesics.fields import (
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.shapes import AnyShape
 from constraint_geodesics.text_files import read_text
+from constraint_geodesics.values import shown
 
 
 class _Record(BaseModel):
@@ -82,11 +86,12 @@ class WorkcellParams(_Record):
     @classmethod
     def _named(cls, raw: Any) -> Any:
         """Each shape with its name."""
-        if not isinstance(raw, dict):
+        shapes = raw.get("shapes") or {} if isinstance(raw, dict) else None
+        if not isinstance(shapes, dict):
             return raw
         found = {
             name: shape | {"name": name} if isinstance(shape, dict) else shape
-            for name, shape in (raw.get("shapes") or {}).items()
+            for name, shape in shapes.items()
         }
         return _tuples(raw | {"shapes": found})
 
@@ -211,9 +216,10 @@ class FunctionsConstraintParams(_Record):
         return self.factory
 
 
-def _kind(entry: Any) -> str:
-    kind = entry.get("kind", "pose") if isinstance(entry, dict) else entry.kind
-    return f"<{kind}>"
+def _kind(entry: Any) -> str | None:
+    if isinstance(entry, dict):
+        return f"<{entry.get('kind', 'pose')}>"
+    return f"<{entry.kind}>" if isinstance(entry, _Record) else None
 
 
 ConstraintParams = Annotated[
@@ -254,7 +260,7 @@ class GplvmParams(_Record):
     steps: Count
     batch_size: Count
     learning_rate: Rate
-    centres: Annotated[int, Field(ge=2)]
+    centres: Annotated[int, Field(ge=2, le=10**6)]
 
 
 class GanParams(_Record):
@@ -345,10 +351,10 @@ class DemonstrationsParams(_Record):
 class SubmanifoldParams(_Record):
     """How a constraint's sub-manifold is drawn or sampled in the latent space."""
 
-    grid: Annotated[int, Field(ge=10)]
-    nodes: Annotated[int, Field(ge=10)]
+    grid: Annotated[int, Field(ge=10, le=10_000)]
+    nodes: Points
     neighbours: Count
-    edge_points: Annotated[int, Field(ge=2)]
+    edge_points: Few
     resolution_m: Positive
     resolution_rad: Positive
 
@@ -387,8 +393,8 @@ class PpoParams(_Record):
     learning_rate_end: Rate
     gamma: Annotated[float, Field(gt=0, le=1)]
     gae_lambda: Annotated[float, Field(gt=0, le=1)]
-    rollout_steps: Annotated[int, Field(ge=2)]
-    batch_size: Annotated[int, Field(ge=2)]
+    rollout_steps: Few
+    batch_size: Annotated[int, Field(ge=2, le=10**9)]
     epochs: Count
     clip: Share
     entropy: NonNegative
@@ -418,8 +424,8 @@ class PolicyParams(_Record):
     seeds: Seeds
     chart: Name
     steps: Count
-    training_length_degree: Annotated[int, Field(ge=4, multiple_of=4)]
-    length_degree: Annotated[int, Field(ge=4, multiple_of=4)]
+    training_length_degree: Degree
+    length_degree: Degree
     environments: Count
     episode_steps: Count
     heads: Count
@@ -455,9 +461,9 @@ class GeodesicParams(_Record):
     analytic_steps: Count
     analytic_episode_steps: Count
     analytic: tuple[Literal["plane", "sphere", "torus"], ...]
-    ablated_segments: tuple[Annotated[int, Field(ge=2)], ...]
+    ablated_segments: tuple[Few, ...]
     degree: Annotated[int, Field(ge=2, le=9)]
-    length_degree: Annotated[int, Field(ge=4, multiple_of=4)]
+    length_degree: Degree
     steps: Count
     environments: Count
     episode_steps: Count
@@ -498,7 +504,7 @@ class GeometryParams(_Record):
     rounds: Count
     batch: Count
     checked: Count
-    graph_points: Annotated[int, Field(ge=20)]
+    graph_points: Annotated[int, Field(ge=20, le=10**6)]
     pairs: Count
 
 
@@ -510,16 +516,16 @@ class PlannerParams(_Record):
     no such bound.  acceleration: of turning joints and of prismatic ones.
     """
 
-    segments: Annotated[int, Field(ge=4)] = 16
-    iterations: Count = 30
+    segments: Annotated[int, Field(ge=4, le=1000)] = 16
+    iterations: Annotated[int, Field(ge=1, le=10_000)] = 30
     accuracy: Positive = 1e-5
     largest_step_rad: Positive = 0.5
     clearance_m: Annotated[float, Field(ge=0, le=1)] = 0.006
     clearance_share: Annotated[float, Field(gt=0, le=1)] | None = None
     acceleration_rad_s2: Positive = 10.0
     acceleration_m_s2: Positive = 1.0
-    roadmap_nodes: Annotated[int, Field(ge=10)] = 2000
-    roadmap_neighbours: Count = 12
+    roadmap_nodes: Points = 2000
+    roadmap_neighbours: Annotated[int, Field(ge=1, le=1000)] = 12
     seed: Seed = 0
 
 
@@ -590,7 +596,7 @@ class ProblemsParams(_Record):
 
     file: str
     every: Count
-    tilted: Annotated[int, Field(ge=0)]
+    tilted: Annotated[int, Field(ge=0, le=10**6)]
     seed: Seed
     limit_s: Positive
     held_limit_s: Positive
@@ -763,6 +769,12 @@ class Params(_Record):
         return self
 
 
+MOST_YAML = 16 * 2**20
+"""Bytes of a file of YAML, which is read slowly."""
+MOST_VALUES = 10**6
+"""Values in one."""
+
+
 def load_params(
     path: Path = Path("params.yaml"), changes: Mapping[str, Any] | None = None
 ) -> Params:
@@ -773,6 +785,11 @@ def load_params(
     raw = read_yaml(path)
     for entry, value in (changes or {}).items():
         _change(raw, entry, value, path)
+    return params_of(raw, path)
+
+
+def params_of(raw: Any, path: Path) -> Params:
+    """Check what was read of a file.  Raises ParamsError, as `load_params`."""
     try:
         # in JSON's strict mode lists may become tuples, but neither "5" nor true becomes a number
         return Params.model_validate_json(json.dumps(raw, default=str), strict=True)
@@ -799,7 +816,10 @@ def read_yaml(path: Path) -> Any:
     from ruamel.yaml.error import YAMLError
 
     try:
-        documents = list(YAML(typ="safe", pure=True).load_all(read_text(path)))
+        text = read_text(path, most=MOST_YAML)
+        documents = list(YAML(typ="safe", pure=True).load_all(text))
+        for document in documents:
+            _whole_size(document, {})
     except OSError as error:
         raise ParamsError(f"{path}: {error.strerror}") from None
     except (UnicodeError, RecursionError) as error:
@@ -813,6 +833,28 @@ def read_yaml(path: Path) -> Any:
     return documents[0] if documents else None
 
 
+def _whole_size(raw: Any, known: dict[int, int | None]) -> int:
+    """How many values a document has, those that aliases repeat each time.  Raises ValueError for
+    more than MOST_VALUES, for one that holds itself, and for names that are no texts.
+    """
+    if not isinstance(raw, dict | list):
+        return 1
+    if id(raw) not in known:
+        known[id(raw)] = None  # until it is counted
+        if isinstance(raw, dict):
+            for name in raw:
+                if not isinstance(name, str):
+                    raise ValueError(f"{shown(name)} is the name of an entry: must be a text")
+        inner = raw.values() if isinstance(raw, dict) else raw
+        known[id(raw)] = 1 + sum(_whole_size(value, known) for value in inner)
+    size = known[id(raw)]
+    if size is None:
+        raise ValueError("an entry holds itself, by an alias")
+    if size > MOST_VALUES:
+        raise ValueError(f"more than {MOST_VALUES} values, by aliases")
+    return size
+
+
 def one_line(error: ValidationError) -> str:
     """What is wrong first: the entry, its value and what is allowed."""
     first = error.errors()[0]
@@ -820,11 +862,11 @@ def one_line(error: ValidationError) -> str:
     where = ".".join(str(part) for part in first["loc"] if not str(part).startswith("<"))
     message = first["msg"].removeprefix("Value error, ")
     if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        return f"{where}={first['input']!r}: there is no such parameter{more}"
+        return f"{where}={shown(first['input'])}: there is no such parameter{more}"
     if first["type"] == "union_tag_not_found":
         return f"{where}.kind is missing{more}"
     if first["type"] == "missing":
         return f"{where} is missing{more}"
     if first["type"] == "value_error":
         return f"{where + ': ' if where else ''}{message}{more}"
-    return f"{where}={first['input']!r}: {message[0].lower()}{message[1:]}{more}"
+    return f"{where}={shown(first['input'])}: {message[0].lower()}{message[1:]}{more}"

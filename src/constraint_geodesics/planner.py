@@ -44,6 +44,7 @@ from constraint_geodesics.replanning import Replanning
 from constraint_geodesics.robot.inverse_kinematics import Search, solutions, spread
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, rpy_of
 from constraint_geodesics.scene.arm import FOUND
+from constraint_geodesics.scene.names import shapes_of
 from constraint_geodesics.scene.planning_scene import PlanningScene
 from constraint_geodesics.scene.scene import Scene, robot_from, workcell_from
 from constraint_geodesics.scene.scene import SceneError as SceneError
@@ -52,6 +53,7 @@ from constraint_geodesics.search.candidates import ALL_PARTS, Parts
 from constraint_geodesics.search.nearest import Projection, projection
 from constraint_geodesics.search.preparation import Preparation, Query
 from constraint_geodesics.trajectory import Trajectory, read_trajectory
+from constraint_geodesics.values import LARGEST, checked_path, is_number, numbers, shown
 
 SNAP_RAD, SNAP_M = 0.01, 0.001
 """Distances by which a start is moved on request, at most: of its turning joints, and of its
@@ -59,6 +61,8 @@ prismatic ones.
 """
 CLEARANCE_SHARE = 0.05
 """Of what an arm typically keeps, asked for in the search by a planner that is made from a URDF."""
+SLOWEST = 1e-6
+"""Share of the limits that a motion uses, at least: a second becomes days."""
 SPREAD = 64
 """Of the configurations that reach a pose, where there is no end of them."""
 OWN_CONSTRAINTS = {"free": Constraint((0,) * 6), "level": Constraint((0, 0, 0, 1, 1, 0))}
@@ -105,6 +109,10 @@ class Planner:
         paper does; "learned+band": the same, refined by the planner's elastic band.
         Raises BundleError if files are missing or altered, PlannerError for another method.
         """
+        if source is not None:
+            checked_path(source, "source", PlannerError)
+        if not isinstance(method, str):
+            raise PlannerError(f"method = {shown(method)}: must be a name")
         bundle, where = open_bundle(source)
         return cls(bundle, where, open_method(method, source, bundle))
 
@@ -130,22 +138,30 @@ class Planner:
         clearance than CLEARANCE_SHARE of what the arm typically keeps.
         Raises RobotError, one line with the mend, where no arm can be made of the files.
         """
+        for name, given in (("urdf", urdf), *([] if srdf is None else [("srdf", srdf)])):
+            checked_path(given, name, RobotError)
+        if not (hold is None or isinstance(hold, Mapping)):
+            raise RobotError(f"hold = {shown(hold)}: must be values by the names of joints")
+        if not (settings is None or isinstance(settings, PlannerParams)):
+            raise PlannerError(f"settings = {shown(settings)}: must be PlannerParams")
         own = None
         if tool is not None:
             _require_pose(tool, "tool")
             rpy = rpy_of(tool.rotation)
             own = PoseParams(position_m=tuple(tool.position.tolist()), rpy_rad=rpy)
         try:
-            robot = RobotParams(
-                urdf=str(urdf),
-                tool_link=tool_link,
-                hold=dict(hold or {}),
-                tool=own,
-                may_touch=FOUND if srdf is None else str(srdf),
-            )
+            values = dict(hold or {})
+            about = {
+                "urdf": str(urdf),
+                "tool_link": tool_link,
+                "hold": {n: float(x) if is_number(x) else x for n, x in values.items()},
+                "tool": own,
+                "may_touch": FOUND if srdf is None else str(srdf),
+            }
+            robot = RobotParams.model_validate(about, strict=True)
         except ValidationError as error:
             raise RobotError(f"{urdf}: {one_line(error)}") from None
-        around = WorkcellParams().including(*workcell)
+        around = WorkcellParams().including(*shapes_of(workcell, "workcell"))
         settings = settings or PlannerParams(clearance_share=CLEARANCE_SHARE)
         made = cls(Bundle(robot, around, {}, settings, JudgeParams(), {}), str(urdf))
         made.constraints |= OWN_CONSTRAINTS
@@ -268,7 +284,7 @@ class Planner:
         constraint or a limit is moved to the nearest configuration that keeps them, where that is
         at most SNAP_RAD away, and SNAP_M for prismatic joints, and nothing is touched on the way;
         else such a start is refused.  velocity_scale, acceleration_scale: the shares of the limits
-        that the motion uses, above 0 and at most 1.  scene: shapes for this query alone, beside
+        that the motion uses, from SLOWEST to 1.  scene: shapes for this query alone, beside
         what is in `planner.scene`.  start_velocity: of an arm that moves at the start [rad/s, m/s
         for prismatic joints]: the path begins in its direction, or stops straight on first; a
         velocity beyond the scaled limits, or one that leads off the constraint, is refused.
@@ -283,8 +299,14 @@ class Planner:
         _require_seconds(budget_s, "budget_s")
         scales = velocity_scale, acceleration_scale
         for scale, which in zip(scales, ("velocity", "acceleration"), strict=True):
-            if not (_is_number(scale) and 0.0 < scale <= 1.0):
-                raise PlannerError(f"{which}_scale = {scale!r}: must be above 0 and at most 1")
+            if not (is_number(scale) and SLOWEST <= scale <= 1.0):
+                line = f"must be at least {SLOWEST:g} and at most 1"
+                raise PlannerError(f"{which}_scale = {shown(scale)}: {line}")
+        if not isinstance(parts, Parts):
+            raise PlannerError(f"parts = {shown(parts)}: must be Parts")
+        if not isinstance(snap, bool | np.bool_):
+            raise PlannerError(f"snap = {shown(snap)}: must be True or False")
+        scene = shapes_of(scene, "scene")
         dof = self.scene.robot.dof
         q_start, goals = checked_configuration(start, dof, "start"), as_goals(goal, dof)
         moving = None
@@ -335,6 +357,8 @@ class Planner:
         """
         self._require_open()
         self._named(constraint)
+        if not (progress is None or callable(progress)):
+            raise PlannerError(f"progress = {shown(progress)}: must be a function")
         first, last = _batch(starts, goals, self.scene.robot.dof)
         answers = []
         for row, (start, goal) in enumerate(zip(first, last, strict=True)):
@@ -359,7 +383,8 @@ class Planner:
         """
         self._require_open()
         names = self.robot.joint_names
-        joints, times, own, moving = read_trajectory(Path(file), names, self.robot)
+        path = Path(checked_path(file, "file", PlannerError))
+        joints, times, own, moving = read_trajectory(path, names, self.robot)
         if constraint is not None:
             own, _ = self._named(constraint)
         if own is None:
@@ -376,7 +401,8 @@ class Planner:
             return constraint, constraint.label
         if not isinstance(constraint, str) or constraint not in self.constraints:
             known = ", ".join(self.constraints)
-            raise PlannerError(f"there is no constraint {constraint!r}: must be one of {known}")
+            line = f"there is no constraint {shown(constraint)}: must be one of {known}"
+            raise PlannerError(line)
         return self.constraints[constraint], constraint
 
     def _held_at(self, constraint: Constraint, start: Float[np.ndarray, "D"]) -> Constraint:
@@ -406,32 +432,27 @@ class Planner:
 
 
 def _require_seconds(value: Any, name: str) -> None:
-    if value is not None and not (_is_number(value) and 0.0 < value < np.inf):
-        raise PlannerError(f"{name} = {value!r}: must be a positive number of seconds")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float | np.number)
+    if value is not None and not (is_number(value) and 0.0 < value <= LARGEST):
+        raise PlannerError(f"{name} = {shown(value)}: must be a positive number of seconds")
 
 
 def _require_pose(value: object, name: str) -> None:
     if not isinstance(value, Pose):
-        raise PlannerError(f"{name} = {value!r}: must be a Pose")
+        raise PlannerError(f"{name} = {shown(value)}: must be a Pose")
 
 
 def _batch(
     starts: Float[np.ndarray, "B D"], goals: Float[np.ndarray, "B D"], dof: int
 ) -> tuple[Float[np.ndarray, "B D"], Float[np.ndarray, "B D"]]:
-    try:
-        first, last = np.asarray(starts, float), np.asarray(goals, float)
-    except (TypeError, ValueError):
+    first, last = numbers(starts), numbers(goals)
+    if first is None or last is None:
         line = f"starts and goals must be (B, {dof}) numbers [rad]; other goals are `plan`'s"
-        raise PlannerError(line) from None
+        raise PlannerError(line)
     if first.ndim != 2 or first.shape != last.shape or first.shape[1] != dof:
         shapes = f"starts and goals have shapes {first.shape} and {last.shape}"
         raise PlannerError(f"{shapes}: both must be (B, {dof})")
     for name, ends in (("starts", first), ("goals", last)):
-        wrong = np.flatnonzero(~np.isfinite(ends).all(axis=1))
+        wrong = np.flatnonzero(~(np.abs(ends) <= LARGEST).all(axis=1))
         if len(wrong):
             raise PlannerError(f"{name}[{wrong[0]}] = {ends[wrong[0]].tolist()}: must be finite")
     return first, last

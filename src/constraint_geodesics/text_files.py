@@ -4,6 +4,8 @@ all.
 
 import json
 import os
+import select
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,17 +14,49 @@ from typing import Any
 
 MOST_BYTES = 256 * 2**20
 """Of a file: a million waypoints are less."""
+PATIENCE_S = 60.0
+"""For so long a pipe may say nothing: longer than a planner takes that writes to it."""
+_BLOCK = 2**20
 
 
-def read_text(file: Path, encoding: str = "utf-8") -> str:
-    """All of a file.  Raises OSError, with a `strerror`, for one that can't be read or does not end
-    within MOST_BYTES, UnicodeError for one that is no text.
+def read_text(
+    file: Path, encoding: str = "utf-8", errors: str = "strict", most: int = MOST_BYTES
+) -> str:
+    """All of a file.  Raises OSError as `read_content`, UnicodeError for one that is no text."""
+    return read_content(file, most).decode(encoding, errors)
+
+
+def read_content(file: Path, most: int = MOST_BYTES) -> bytes:
+    """All of a file.  Raises OSError, with a `strerror`, for one that can't be read, has more than
+    `most` bytes, or is a pipe that nothing comes from for PATIENCE_S.
     """
-    with file.open("rb") as data:
-        content = data.read(MOST_BYTES + 1)
-    if len(content) > MOST_BYTES:
-        raise OSError(None, f"longer than {MOST_BYTES // 2**20} MiB", str(file))
-    return content.decode(encoding)
+    with open(file, "rb", opener=_at_once) as data:
+        if stat.S_ISREG(os.fstat(data.fileno()).st_mode):
+            content = data.read(most + 1)
+        else:
+            content = _from_pipe(data.fileno(), file, most)
+    if len(content) > most:
+        raise OSError(None, f"longer than {most / 2**20:g} MiB", str(file))
+    return content
+
+
+def _at_once(name: str, flags: int) -> int:
+    """Opens it; a pipe that nobody writes to would keep us here already."""
+    return os.open(name, flags | os.O_NONBLOCK)
+
+
+def _from_pipe(pipe: int, file: Path, most: int) -> bytes:
+    """What comes out of a pipe or a device."""
+    found, waiting = bytearray(), select.poll()
+    waiting.register(pipe, select.POLLIN)
+    while len(found) <= most:
+        if not waiting.poll(1e3 * PATIENCE_S):
+            raise OSError(None, f"nothing came from it for {PATIENCE_S:g} s", str(file))
+        block = os.read(pipe, _BLOCK)
+        if not block:
+            break
+        found += block
+    return bytes(found)
 
 
 class DamagedFileError(ValueError):

@@ -37,11 +37,14 @@ from constraint_geodesics.search.candidates import Candidate
 from constraint_geodesics.search.run_out import left_over, rows_from, run_out, run_outs
 from constraint_geodesics.search.space import space_of
 from constraint_geodesics.text_files import read_text, write_text
+from constraint_geodesics.values import checked_path, finite_number, numbers, shown
 
 CONSTRAINT, VELOCITY = "constraint", "start_velocity"
 """Names of the comment lines of a trajectory's CSV, `# name: JSON`."""
 REDRAWN = 0.9 * SATISFIED
 """Violation [rad or m] that lines may use which are drawn anew on a path's way."""
+_FRAMES = 10_000
+"""Of a recording, at most."""
 STANDING_S = 0.001
 """Duration of a path from a configuration to itself."""
 
@@ -211,6 +214,7 @@ class Trajectory:
         """
         self._require_path("save")
         names = self.scene.robot.joint_names
+        checked_path(file, "file", PlannerError)
         write_trajectory(Path(file), self.motion, self.constraint, names)
 
     def to_joint_trajectory(self) -> dict[str, Any]:
@@ -299,12 +303,10 @@ class Trajectory:
         return Motion(self.joints, self.times, resting if start is None else start)
 
     def _moment(self, at_s: float) -> float:
-        try:
-            moment = float(at_s)
-        except (TypeError, ValueError):
-            moment = np.nan
-        if not 0.0 <= moment <= self.times[-1]:
-            raise PlannerError(f"at_s = {at_s!r}: must be a time from 0 to {self.times[-1]:.6g} s")
+        moment = finite_number(at_s)
+        if moment is None or not 0.0 <= moment <= self.times[-1]:
+            what = f"must be a time from 0 to {self.times[-1]:.6g} s"
+            raise PlannerError(f"at_s = {shown(at_s)}: {what}")
         return moment
 
     def _inherited(self, motion: Motion) -> Certificate | None:
@@ -342,16 +344,20 @@ class Trajectory:
         from constraint_geodesics.recording.recording import PathRecord, record_path
 
         self._require_path("record")
+        checked_path(file, "file", PlannerError)
+        if isinstance(frames, bool) or not isinstance(frames, int) or not 2 <= frames <= _FRAMES:
+            line = f"must be a whole number from 2 to {_FRAMES}"
+            raise PlannerError(f"frames = {shown(frames)}: {line}")
         looked_at, regions = self.statistics.looked_at, self.asked.regions
         goal = None
         if looked_at is not None and (regions or len(looked_at) > 1):
             goal = GoalView(looked_at, regions)
         name, text = self.constraint_name, self._markdown()
-        shown: tuple[np.ndarray, ...] = ()
+        motions: tuple[np.ndarray, ...] = ()
         if demonstrations is not None:
-            shown = tuple(demonstrations_from(demonstrations, self.scene.robot)[0])
+            motions = tuple(demonstrations_from(demonstrations, self.scene.robot)[0])
         record = PathRecord(
-            "planner", name, 0, 0, self.joints, text, goal=goal, demonstrations=shown
+            "planner", name, 0, 0, self.joints, text, goal=goal, demonstrations=motions
         )
         record = replace(record, ways=tuple(way.points for way in self.statistics.ways))
         manifold = ConstraintManifold(self.scene.robot, self.constraint)
@@ -445,12 +451,10 @@ def _duration(seconds: float) -> dict[str, int]:
 
 
 def _shares(s: Any) -> Float[np.ndarray, "n"]:
-    try:
-        shares = np.atleast_1d(np.asarray(s, float))
-    except (TypeError, ValueError):
-        shares = np.array([np.nan])
+    found = numbers(s)
+    shares = np.array([np.nan]) if found is None else np.atleast_1d(found)
     if shares.ndim != 1 or not ((shares >= 0.0) & (shares <= 1.0)).all():
-        raise PlannerError(f"s = {s}: must be a number or a row of numbers in [0, 1]")
+        raise PlannerError(f"s = {shown(s)}: must be a number or a row of numbers in [0, 1]")
     return shares
 
 
@@ -496,10 +500,11 @@ def read_trajectory(
         raise PlannerError(f"{file}: can't be read: {why}") from None
     lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
     said: dict[str, tuple[int, str]] = {}
-    table: list[tuple[int, list[str]]] = []
+    table: list[tuple[int, str]] = []
     for number, line in lines:
         if not line.startswith("#"):
-            table += [(number, line.split(","))] * bool(line)
+            if line:
+                table.append((number, line))
             continue
         name, _, text = (part.strip() for part in line.removeprefix("#").partition(":"))
         if name in said:
@@ -508,8 +513,8 @@ def read_trajectory(
             said[name] = number, text
     if len(table) < 2:
         raise PlannerError(f"{file}: a header line and at least one row are needed")
-    header = _header(file, table[0][1], names)
-    array = np.array([_numbers(file, number, cells, len(header)) for number, cells in table[1:]])
+    header = _header(file, table[0][1].split(","), names)
+    array = _table(file, table[1:], len(header))
     timed = header[0] == "time_s"
     joints, times = array[:, int(timed) :], array[:, 0] if timed else None
     constraint = _constraint_of(file, *said[CONSTRAINT], robot) if CONSTRAINT in said else None
@@ -542,6 +547,17 @@ def _header(file: Path, cells: Sequence[str], names: Sequence[str] | None) -> li
             f"time_s if any"
         )
     return header
+
+
+def _table(file: Path, lines: Sequence[tuple[int, str]], count: int) -> Float[np.ndarray, "T n"]:
+    """All rows at once, which is three times as fast; where one is broken, each by itself."""
+    text = ",".join(line for _, line in lines)
+    try:
+        if all(line.count(",") == count - 1 for _, line in lines):
+            return np.array(list(map(float, text.split(",")))).reshape(-1, count)
+    except ValueError:
+        pass
+    return np.array([_numbers(file, number, line.split(","), count) for number, line in lines])
 
 
 def _numbers(file: Path, number: int, cells: Sequence[str], count: int) -> list[float]:

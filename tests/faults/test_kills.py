@@ -36,8 +36,8 @@ from constraint_geodesics.tracking.experiment import Work, begin_run, tracked_st
 from constraint_geodesics.tracking.left import AtWorkError, left_runs
 from constraint_geodesics.tracking.sending import recover
 from constraint_geodesics.tracking.store import TrackingError, open_store, tracking_uri, ui_command
+from tests.end_to_end import smoke
 from tests.faults.effort import SOAK, Effort, count
-from tests.pipeline import smoke
 
 STAGE = """
 import sys

@@ -19,6 +19,7 @@ import xml.etree.ElementTree as ElementTree
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from io import BytesIO
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any
@@ -47,6 +48,7 @@ from constraint_geodesics.scene.names import require_names
 from constraint_geodesics.scene.point_cloud import PointCloud
 from constraint_geodesics.scene.scene import Scene, SceneError
 from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.text_files import MOST_BYTES, read_content
 
 NOTHING_HELD = Constraint((0,) * 6)
 FREE = "free"
@@ -144,8 +146,8 @@ def require_different(problems: Sequence[Problem]) -> None:
 
 def _read(file: Path) -> _FileRecord:
     try:
-        content = file.read_bytes()
-        text = gzip.decompress(content) if content.startswith(_GZIP) else content
+        content = read_content(file)
+        text = _unzipped(content) if content.startswith(_GZIP) else content
         return _FileRecord.model_validate(json.loads(text))
     except OSError as error:
         if isinstance(error, gzip.BadGzipFile):
@@ -158,6 +160,14 @@ def _read(file: Path) -> _FileRecord:
     except (UnicodeError, RecursionError, ValueError) as error:
         what = " ".join(str(error).split())
         raise ProblemFileError(f"{file}: neither JSON nor MoveIt's YAML: {what}") from None
+
+
+def _unzipped(content: bytes) -> bytes:
+    with gzip.GzipFile(fileobj=BytesIO(content)) as whole:
+        text = whole.read(MOST_BYTES + 1)
+    if len(text) > MOST_BYTES:
+        raise OSError(None, f"gzipped, and longer than {MOST_BYTES // 2**20} MiB")
+    return text
 
 
 def _record_problems(file: Path, record: _FileRecord, given: UrdfArm | None) -> Iterator[Problem]:

@@ -36,6 +36,7 @@ from constraint_geodesics.certification.motion import MotionLimits, check_times
 from constraint_geodesics.certification.urdf_chain import chain_of_urdf
 from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.values import shown
 
 __all__ = ["Certificate", "CertificationError", "Certifier", "Limits", "Violation"]
 
@@ -166,6 +167,9 @@ class Certifier:
         none or comes without times, or the reference is no pose.
         """
         began = time.perf_counter()
+        for own, name in ((constraint, "constraint"), (region, "region")):
+            if not isinstance(own, Constraint) and (own is not None or name == "constraint"):
+                raise CertificationError(f"{name} = {shown(own)}: must be a Constraint")
         moving = self._moving(start_velocity, times)
         ends = self._end(start, "start"), self._end(goal, "goal")
         rows, violation = self._as_rows(joints)

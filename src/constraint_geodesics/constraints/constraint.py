@@ -20,6 +20,7 @@ from constraint_geodesics.constraints import kernels
 from constraint_geodesics.constraints.kernels import ConstraintArrays, ManifoldArrays, Rows
 from constraint_geodesics.params import ConstraintParams
 from constraint_geodesics.robot.kinematics import SerialRobot, rotation_from_rpy
+from constraint_geodesics.values import are_usable, numbers, shown
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 """Of a tool's pose, in the base frame."""
@@ -45,13 +46,12 @@ class Pose:
     rotation: Float[np.ndarray, "3 3"]
 
     def __post_init__(self) -> None:
-        position, rotation = (
-            np.array(values, dtype=np.float64) for values in (self.position, self.rotation)
-        )
-        if position.shape != (3,) or not np.isfinite(position).all():
-            raise ConstraintError(f"position = {self.position}: must be 3 finite numbers [m]")
-        if rotation.shape != (3, 3) or not np.isfinite(rotation).all():
-            raise ConstraintError(f"rotation has shape {rotation.shape}: must be (3, 3), finite")
+        position = _three(self.position, "position", "m")
+        rotation = numbers(self.rotation)
+        if rotation is None or rotation.shape != (3, 3) or not are_usable(rotation):
+            raise ConstraintError(
+                f"rotation = {shown(self.rotation)}: must be (3, 3) finite numbers"
+            )
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0.0:
             raise ConstraintError(
                 f"rotation = {rotation.tolist()}: must be orthonormal and right-handed"
@@ -62,7 +62,15 @@ class Pose:
     @classmethod
     def from_rpy(cls, position_m: Any, rpy_rad: Any) -> "Pose":
         """From a position [m] and roll, pitch, yaw [rad] about the fixed axes."""
-        return cls(np.asarray(position_m, float), rotation_from_rpy(np.asarray(rpy_rad, float)))
+        position = _three(position_m, "position_m", "m")
+        return cls(position, rotation_from_rpy(_three(rpy_rad, "rpy_rad", "rad")))
+
+
+def _three(values: Any, name: str, unit: str) -> Float[np.ndarray, "3"]:
+    found = numbers(values)
+    if found is None or found.shape != (3,) or not are_usable(found):
+        raise ConstraintError(f"{name} = {shown(values)}: must be 3 finite numbers [{unit}]")
+    return found
 
 
 class Series(NamedTuple):
@@ -241,7 +249,7 @@ class Constraint:
 
 def kind_named(kind: str) -> type[Constraint]:
     """The class of a kind, from the file of its name."""
-    if not kind.isidentifier():
+    if not isinstance(kind, str) or not kind.isidentifier():
         raise ConstraintError(f"kind = {kind!r}: there is no such kind of constraint")
     try:
         found: type[Constraint] = import_module(f"constraint_geodesics.constraints.{kind}").KIND
@@ -258,9 +266,19 @@ def constraint_from(params: ConstraintParams, robot: SerialRobot) -> Constraint:
 def constraint_from_json(about: Mapping[str, Any], robot: SerialRobot | None = None) -> Constraint:
     """The constraint that `Constraint.to_json` wrote; robot: for the kinds that need one.
 
-    Raises ConstraintError, KeyError or TypeError if it is none.
+    Raises ConstraintError if it is none.
     """
-    return kind_named(str(about.get("kind", "pose"))).from_json(about, robot)
+    if not isinstance(about, Mapping):
+        raise ConstraintError(f"{shown(about)}: no constraint: must be entries by name")
+    kind = kind_named(about.get("kind", "pose"))
+    try:
+        return kind.from_json(about, robot)
+    except KeyError as error:
+        raise ConstraintError(f"{kind.kind}: {error} is missing") from None
+    except (AttributeError, IndexError, OverflowError, TypeError, ValueError) as error:
+        if isinstance(error, ConstraintError):
+            raise
+        raise ConstraintError(f"{kind.kind}: {' '.join(str(error).split())}") from None
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,7 @@ from constraint_geodesics.constraints.kernels import (
 )
 from constraint_geodesics.robot.kernels import geometric_jacobian, poses_of, posture_in
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.values import LARGEST, numbers, shown
 
 SEEN_TOLERANCE = 0.2
 """Tolerance [rad or m] that a policy sees as 1."""
@@ -65,24 +66,23 @@ class PoseConstraint(Constraint):
     reference: Pose | None = None
 
     def __post_init__(self) -> None:
-        for name, entries in (("axes", self.axes), ("tolerance", self.tolerance)):
-            if len(entries) != len(AXES):
-                raise ConstraintError(
-                    f"{name} has {len(entries)} entries: one is needed for each of {' '.join(AXES)}"
-                )
-        for axis, held, tolerance in zip(AXES, self.axes, self.tolerance, strict=True):
+        axes, widths = _entries(self.axes, "axes"), _entries(self.tolerance, "tolerance")
+        for axis, held, tolerance in zip(AXES, axes, widths, strict=True):
             if held not in (0, 1):
-                raise ConstraintError(f"axes[{axis}] = {held}: must be 0 (free) or 1 (held)")
-            if not (np.isfinite(tolerance) and tolerance >= 0):
+                raise ConstraintError(f"axes[{axis}] = {held:g}: must be 0 (free) or 1 (held)")
+            if not 0.0 <= tolerance <= LARGEST:
                 raise ConstraintError(
-                    f"tolerance[{axis}] = {tolerance}: must be finite and not negative"
+                    f"tolerance[{axis}] = {tolerance:g}: must be finite and not negative"
                 )
             if tolerance and not held:
                 raise ConstraintError(
                     f"tolerance[{axis}] = {tolerance}: the axis is free, so it can have none"
                 )
-        object.__setattr__(self, "axes", tuple(int(x) for x in self.axes))
-        object.__setattr__(self, "tolerance", tuple(float(x) for x in self.tolerance))
+        if not (self.reference is None or isinstance(self.reference, Pose)):
+            line = f"reference = {shown(self.reference)}: must be a Pose, or None"
+            raise ConstraintError(line)
+        object.__setattr__(self, "axes", tuple(map(int, axes)))
+        object.__setattr__(self, "tolerance", tuple(widths))
 
     @property
     def rows(self) -> Rows:
@@ -117,6 +117,8 @@ class PoseConstraint(Constraint):
 
     def relative_to(self, pose: Pose) -> "PoseConstraint":
         """The same constraint held at `pose`."""
+        if not isinstance(pose, Pose):
+            raise ConstraintError(f"pose = {shown(pose)}: must be a Pose")
         return replace(self, reference=pose)
 
     def apart_from(self, other: Constraint) -> tuple[Constraint, Constraint]:
@@ -219,6 +221,17 @@ class PoseConstraint(Constraint):
 
 
 KIND = PoseConstraint
+
+
+def _entries(given: Any, name: str) -> list[float]:
+    """One number an axis."""
+    found = numbers(given, flags=name == "axes")
+    if found is None or found.ndim != 1:
+        raise ConstraintError(f"{name} = {shown(given)}: must be six numbers")
+    if len(found) != len(AXES):
+        line = f"{name} has {len(found)} entries: one is needed for each of {' '.join(AXES)}"
+        raise ConstraintError(line)
+    return list(map(float, found))
 
 
 @njit(**LEAF)

@@ -6,7 +6,6 @@ from that file it touches `cli_planning.py`, if the command is to have an option
 tests: search, certification, recording and benchmark know configurations and constraints alone.
 """
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -17,6 +16,7 @@ from jaxtyping import Float
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.problem import PlannerError
 from constraint_geodesics.robot.inverse_kinematics import whole_turns
+from constraint_geodesics.values import checked_joints
 
 ArrayLike = Float[np.ndarray, "D"] | Sequence[float]
 
@@ -85,15 +85,4 @@ class ConfigurationGoal:
 
 def checked_configuration(q: Any, dof: int, name: str) -> Float[np.ndarray, "D"]:
     """A copy of one configuration [rad].  Raises PlannerError with its name if it is none."""
-    try:
-        given = np.asarray(q)
-        if given.dtype.kind == "c":
-            raise TypeError("complex")
-        values = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise PlannerError(f"{name} = {q}: must be {dof} numbers [rad]") from None
-    if values.shape != (dof,):
-        raise PlannerError(f"{name} has shape {values.shape}: must be ({dof},) [rad]")
-    if not all(map(math.isfinite, values.tolist())):
-        raise PlannerError(f"{name}[{int(np.argmin(np.isfinite(values)))}] is not finite")
-    return values
+    return checked_joints(q, dof, name, PlannerError)

@@ -1,6 +1,6 @@
 """A region of tool poses as the goal: some axes free, others within a box around a pose."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,6 +11,7 @@ from constraint_geodesics.constraints.constraint import AXES, Constraint, Constr
 from constraint_geodesics.problem import PlannerError
 from constraint_geodesics.robot.inverse_kinematics import seeds_of, solutions, turned_towards
 from constraint_geodesics.search.nearest import members_of, nearest_on
+from constraint_geodesics.values import numbers, shown
 
 SEEDS = 256
 """Configurations from which the nearest of the region are looked for,"""
@@ -37,19 +38,18 @@ class GoalRegion:
 
     def __post_init__(self) -> None:
         if not isinstance(self.pose, Pose):
-            raise PlannerError(f"goal region: pose = {self.pose!r}: must be a Pose")
-        names = [self.free] if isinstance(self.free, str) else list(self.free)
-        for name in names:
+            raise PlannerError(f"goal region: pose = {shown(self.pose)}: must be a Pose")
+        names = [self.free] if isinstance(self.free, str) else self.free
+        for name in names if isinstance(names, Collection) else [names]:
             if name not in AXES:
-                raise PlannerError(f"free = {name!r}: must be of {', '.join(AXES)}")
+                raise PlannerError(f"free = {shown(name)}: must be of {', '.join(AXES)}")
         held = tuple(int(axis not in names) for axis in AXES)
+        widths = numbers(self.tolerance)
+        if widths is None or widths.ndim != 1:
+            line = f"goal region: tolerance = {shown(self.tolerance)}: must be six numbers"
+            raise PlannerError(line)
         try:
-            widths = tuple(map(float, self.tolerance))
-        except (TypeError, ValueError):
-            line = f"goal region: tolerance = {self.tolerance!r}: must be six numbers"
-            raise PlannerError(line) from None
-        try:
-            region = Constraint(held, widths, self.pose)
+            region = Constraint(held, tuple(widths.tolist()), self.pose)
         except ValueError as error:
             raise PlannerError(f"goal region: {error}") from None
         object.__setattr__(self, "region", region)

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from constraint_geodesics import values
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.text_files import read_text
 
 FEWEST_ROWS = 12
 """Rows of all demonstrations together."""
@@ -40,6 +42,10 @@ def demonstrations_from(
     given: an array (n, D) or (demonstrations, T, D), a list of arrays (T, D), or a file: CSV, or
     parquet as LeRobot writes it.  Raises DemonstrationError, one line.
     """
+    if not isinstance(robot, SerialRobot):
+        raise DemonstrationError(
+            f"robot = {values.shown(robot)}: must be a SerialRobot, as planner.robot"
+        )
     if isinstance(given, (str, Path)):
         given = _read(Path(given), robot)
     shown, motions = _arrays(given)
@@ -56,16 +62,20 @@ def demonstrations_from(
 
 
 def _arrays(given: Any) -> tuple[list[np.ndarray], bool]:
-    try:
-        if hasattr(given, "to_numpy"):  # a table of pandas
-            given = given.to_numpy()
-        whole = isinstance(given, np.ndarray) and given.ndim == 2
-        return [np.asarray(rows, float) for rows in ([given] if whole else given)], not whole
-    except (TypeError, ValueError) as error:
+    if hasattr(given, "to_numpy"):  # a table of pandas
+        given = given.to_numpy()
+    whole = isinstance(given, np.ndarray) and given.ndim == 2
+    own = [given] if whole else given
+    found = (
+        [values.numbers(rows) for rows in own] if isinstance(own, np.ndarray | Sequence) else [None]
+    )
+    arrays = [rows for rows in found if rows is not None]
+    if len(arrays) < len(found):
         raise DemonstrationError(
             f"demonstrations must be rows (n, D), (demonstrations, T, D), a list of (T, D) or a "
-            f"file: {error}"
-        ) from None
+            f"file, of numbers: {values.shown(given)}"
+        )
+    return arrays, not whole
 
 
 def _is_a_motion(rows: Float[np.ndarray, "n D"]) -> bool:
@@ -106,16 +116,17 @@ def _read(file: Path, robot: SerialRobot) -> Any:
     if file.suffix == ".parquet":
         return _read_lerobot(file)
     try:
-        with file.open(encoding="utf-8-sig", newline="") as stream:
-            lines = [line for line in csv.reader(stream) if any(line) and line[0][:1] != "#"]
+        stream = read_text(file, "utf-8-sig").splitlines()
+        lines = [line for line in csv.reader(stream) if any(line) and line[0][:1] != "#"]
         names: list[str] = []
         try:
             table = np.array(lines, float)
         except ValueError:  # a line of names stands above
             names = lines.pop(0)
             table = np.array(lines, float)
-    except (OSError, ValueError) as error:
-        raise DemonstrationError(f"{file}: not a table of numbers: {error}") from None
+    except (OSError, ValueError, csv.Error) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise DemonstrationError(f"{file}: not a table of numbers: {why}") from None
     if table.ndim != 2 or not table.size:
         raise DemonstrationError(f"{file}: no rows of numbers")
     return _told_apart(file, [name.strip() for name in names], table, robot)

@@ -7,6 +7,7 @@ remembers contacts), so the bytes are the same for any number of workers.
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from jaxtyping import Bool, Float
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.text_files import reading, written
+from constraint_geodesics.text_files import read_text, written
 
 POSE_COLUMNS = (*(f"tool_{x}" for x in "xyz"), *(f"quaternion_{x}" for x in "xyzw"))
 RPY_COLUMNS = ("roll", "pitch", "yaw")
@@ -197,9 +198,13 @@ def write_joints(shards: Sequence[Shard], file: Path, about: dict[str, str]) -> 
 
 def read_joints(file: Path) -> JointSet:
     """Read and check one set.  Raises DatasetError with file and column of a bad row."""
-    with reading(file):
-        frame = pq.read_table(file, page_checksum_verification=True).to_pandas()
-    frame = _checked(frame, file)
+    try:
+        table = pq.read_table(file, page_checksum_verification=True).to_pandas()
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise DatasetError(f"{file}: no table of configurations: {_said(error)}") from None
+    if table.empty:
+        raise DatasetError(f"{file}: has no rows")
+    frame = _checked(table, file)
     return JointSet(joints_of(frame), free_rows(frame))
 
 
@@ -215,11 +220,26 @@ def write_queries(queries: Queries, file: Path) -> None:
 
 
 def read_queries(file: Path) -> Queries:
-    """Read what `write_queries` wrote."""
-    with reading(file):
-        frame = pd.read_csv(file, index_col="query", float_precision="round_trip")
-        ends = (frame.filter(like=f"{end}_").to_numpy(float) for end in ("start", "goal"))
-        return Queries(*ends)
+    """Read what `write_queries` wrote.  Raises DatasetError, one line, for what is none."""
+    try:
+        text = StringIO(read_text(file))
+        frame = pd.read_csv(text, index_col="query", float_precision="round_trip")
+        first, last = (frame.filter(like=f"{end}_").to_numpy(float) for end in ("start", "goal"))
+    except (OSError, TypeError, ValueError) as error:
+        raise DatasetError(f"{file}: no table of queries: {_said(error)}") from None
+    if first.shape != last.shape or not first.size:
+        what = f"starts {first.shape} and goals {last.shape}"
+        raise DatasetError(f"{file}: no table of queries: has {what}")
+    bad = np.flatnonzero(~np.isfinite(np.hstack([first, last])).all(axis=1))
+    if len(bad):
+        raise DatasetError(f"{file}: query {frame.index[bad[0]]}: must be finite numbers")
+    return Queries(first, last)
+
+
+def _said(error: Exception) -> str:
+    return (
+        error.strerror or "" if isinstance(error, OSError) else " ".join(str(error).split())[:200]
+    )
 
 
 def joints_of(frame: pd.DataFrame) -> Float[np.ndarray, "n D"]:
@@ -247,5 +267,5 @@ def _checked(frame: pd.DataFrame, file: Path) -> pd.DataFrame:
     )
     try:
         return schema.validate(frame)
-    except pandera.errors.SchemaError as error:
+    except (pandera.errors.SchemaError, pandera.errors.SchemaErrors) as error:
         raise DatasetError(f"{file}: {' '.join(str(error).split())[:300]}") from None

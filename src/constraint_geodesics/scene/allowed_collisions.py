@@ -15,6 +15,7 @@ import numpy as np
 from constraint_geodesics.robot.description import Description, read_description
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
 from constraint_geodesics.scene.world import World, physics
+from constraint_geodesics.text_files import read_content
 
 SAMPLES = 2000
 """Configurations that are looked at."""
@@ -69,7 +70,7 @@ def allowed_by_srdf(srdf: Path, description: Description) -> tuple[AllowedPair, 
     enables again.  Raises RobotError for a file that is none, and for links that the robot has not.
     """
     try:
-        root = ElementTree.parse(srdf).getroot()
+        root = ElementTree.fromstring(read_content(srdf))
     except (OSError, ElementTree.ParseError, ValueError) as error:
         raise RobotError(f"{srdf}: no SRDF: {error}: give the path of one") from None
     if root.tag != "robot":

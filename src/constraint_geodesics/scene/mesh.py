@@ -75,8 +75,9 @@ class Mesh(Shape):
         """The file, and what is in it."""
         try:
             return Path(self.file), digest_of(Path(self.file))
-        except OSError:
-            raise RobotError(f"{self.name!r}: there is no mesh {str(self.file)!r}") from None
+        except OSError as error:
+            line = f"{self.name!r}: there is no mesh {str(self.file)!r}: {error.strerror}"
+            raise RobotError(line) from None
 
 
 @lru_cache(maxsize=64)

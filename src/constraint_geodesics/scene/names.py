@@ -1,13 +1,33 @@
 """Names of shapes and links in a scene: what they may be, and what may be named."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
 
 from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.values import shown
 
 
 class SceneError(ValueError):
     """A change that a scene can't take; the message names the shape and what is wrong."""
+
+
+def shapes_of(given: Any, name: str) -> tuple[Shape, ...]:
+    """Shapes of a list.  Raises SceneError, with the name of the list, for what is none."""
+    if not isinstance(given, Iterable) or isinstance(given, str | Mapping):
+        raise SceneError(f"{name} = {shown(given)}: must be a list of shapes")
+    found = tuple(given)
+    for shape in found:
+        if not isinstance(shape, Shape):
+            raise SceneError(f"{shown(shape)} is no shape: a scene takes Box, Sphere, …")
+    return found
+
+
+def require_texts(*names: Any) -> None:
+    """That names are texts.  Raises SceneError."""
+    for name in names:
+        if not isinstance(name, str):
+            raise SceneError(f"{shown(name)} is no name of a link, nor of a shape")
 
 
 def require_names(

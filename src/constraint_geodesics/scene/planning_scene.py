@@ -10,9 +10,11 @@ from jaxtyping import Float
 
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.names import require_texts
 from constraint_geodesics.scene.scene import Scene, SceneError
 from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.world import World
+from constraint_geodesics.values import checked_joints, shown
 
 LinkPoses = Callable[[Float[np.ndarray, "D"], str], Float[np.ndarray, "4 4"]]
 
@@ -62,16 +64,10 @@ class PlanningScene:
 
     def link_pose(self, q: Float[np.ndarray, "D"], link: str) -> Float[np.ndarray, "4 4"]:
         """Of a link's frame in the base frame at a configuration [rad]."""
+        require_texts(link)
         if link not in self.links:
             raise SceneError(f"no link is called {link!r}: {', '.join(self.links)}")
-        try:
-            place = np.array(q, float)
-        except (TypeError, ValueError):
-            place = np.empty(0)
-        dof = self.robot.dof
-        if place.shape != (dof,) or not np.isfinite(place).all():
-            raise SceneError(f"{q!r} is no configuration: must be {dof} finite numbers")
-        return self._link_pose(place, link)
+        return self._link_pose(checked_joints(q, self.robot.dof, "q", SceneError), link)
 
     def add(self, *shapes: Shape) -> None:
         """Put shapes around the robot, in the base frame, beside what is there.  Several at once
@@ -94,9 +90,10 @@ class PlanningScene:
         name is taken away.  touching: names of links and shapes that may touch it.
         """
         if not isinstance(shape, Shape):
-            raise SceneError(f"{shape!r} can't be attached: it is no shape")
+            raise SceneError(f"{shown(shape)} can't be attached: it is no shape")
         if isinstance(touching, str) or not isinstance(touching, Sequence):
-            raise SceneError(f"touching = {touching!r}: must be a list of names")
+            raise SceneError(f"touching = {shown(touching)}: must be a list of names")
+        require_texts(link, *touching)
         self.become(self._now.attaching(Attached(shape, link, tuple(touching))))
 
     def detach(self, name: str, at: Float[np.ndarray, "D"] | None = None) -> None:
@@ -128,6 +125,8 @@ class PlanningScene:
 
     def become(self, scene: Scene) -> None:
         """Take all of another scene of the same robot."""
+        if not isinstance(scene, Scene):
+            raise SceneError(f"scene = {shown(scene)}: must be a Scene")
         if not _are_same(scene.robot, self.robot):
             raise SceneError(f"a scene of another robot: this one is {self.robot.name}")
         if scene.robot is not self.robot:  # it came by pickle

@@ -15,7 +15,8 @@ from scipy.spatial import ConvexHull
 
 from constraint_geodesics.fields import Positive
 from constraint_geodesics.scene.pieces import HULL_MARGIN, Piece
-from constraint_geodesics.scene.shape import Placement, RoundedBox, Shape, add_mesh
+from constraint_geodesics.scene.shape import Placement, RoundedBox, Shape, ShapeError, add_mesh
+from constraint_geodesics.values import are_usable, numbers
 
 MOST = 10_000
 """Points at most: PyBullet takes no larger mesh of balls."""
@@ -34,14 +35,13 @@ class Points:
     """
 
     def __init__(self, points: Any) -> None:
-        try:
-            own = np.array(points, float)
-        except (TypeError, ValueError):
-            raise ValueError("points are no array of numbers: must be (n, 3) [m]") from None
-        if own.ndim != 2 or own.shape[1] != 3 or not len(own) or not np.isfinite(own).all():
-            raise ValueError(f"points of shape {own.shape}: must be (n, 3) finite numbers [m]")
+        own = numbers(points)
+        if own is None:
+            raise ShapeError("points are no array of numbers: must be (n, 3) [m]")
+        if own.ndim != 2 or own.shape[1] != 3 or not len(own) or not are_usable(own):
+            raise ShapeError(f"points of shape {own.shape}: must be (n, 3) finite numbers [m]")
         if len(own) > MOST:
-            raise ValueError(f"{len(own)} points: at most {MOST}: keep one a voxel")
+            raise ShapeError(f"{len(own)} points: at most {MOST}: keep one a voxel")
         own.flags.writeable = False
         self.array: Float[np.ndarray, "n 3"] = own
         self._hash = hash(own.tobytes())

@@ -9,6 +9,7 @@ from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, load_
 from constraint_geodesics.scene.arm import ADJACENT, load_arm
 from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.names import SceneError as SceneError
+from constraint_geodesics.scene.names import require_texts, shapes_of
 from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.urdf import find_urdf, has_pybullet
 from constraint_geodesics.scene.world import World
@@ -56,9 +57,7 @@ class Scene:
     def adding(self, *shapes: Shape) -> "Scene":
         """With more shapes, whose names are new."""
         taken = set(self.names)
-        for shape in shapes:
-            if not isinstance(shape, Shape):
-                raise SceneError(f"{shape!r} is no shape: a scene takes Box, Sphere, …")
+        for shape in shapes_of(shapes, "shapes"):
             if shape.name in taken:
                 raise SceneError(f"there is a shape called {shape.name!r} already: remove it first")
             taken.add(shape.name)
@@ -111,6 +110,7 @@ class Scene:
 
     def allowing(self, first: str, second: str) -> "Scene":
         """With two bodies, links or shapes, that may touch."""
+        require_texts(first, second)
         return replace(self, allowed=self.allowed | {(first, second)})
 
     def _forgetting(self, *names: str) -> "Scene":

@@ -4,7 +4,7 @@ A new kind is one more file in this folder, and its name in shapes.py.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from math import inf
 from pathlib import Path
@@ -17,27 +17,36 @@ from pydantic import ConfigDict
 from constraint_geodesics.fields import Vector3
 from constraint_geodesics.robot.kinematics import RobotError, rotation_from_rpy, rpy_of
 from constraint_geodesics.scene.pieces import Piece, box_corners
+from constraint_geodesics.values import LARGEST, are_usable, checked_path, numbers, shown
 
 Triple = tuple[float, float, float]
 
 
-_SIZES = ("size_m", "radius_m", "length_m")
-"""Fields of shapes that must be positive."""
+class ShapeError(ValueError):
+    """A shape that there can't be; the message names it, its field, the value and what is
+    allowed.
+    """
+
+
+_SINGLE = ("radius_m", "length_m", "scale")
+"""Fields of shapes that are one number and positive."""
+_SIZES = ("size_m", *_SINGLE)
+"""All that must be positive."""
 
 
 def _numbers(shape: str, name: str, value: Any) -> Any:
-    """A field as a float, or a tuple of them."""
-    if type(value) is tuple and all(type(own) is float for own in value):
-        least = 0.0 if name in _SIZES else -inf
-        if all(least < own < inf for own in value):  # soon seen, as of most
-            return value
-    try:
-        given = np.array(value, float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{shape!r}: {name} = {value!r}: must be numbers") from None
-    if not np.isfinite(given).all() or (name in _SIZES and not (given > 0.0).all()):
+    """A field as a float, or a tuple of three."""
+    least = 0.0 if name in _SIZES else -inf
+    is_triple = type(value) is tuple and [type(own) for own in value] == [float] * 3
+    usable = is_triple and all(least < own and abs(own) <= LARGEST for own in value)
+    if usable and name not in _SINGLE:  # soon seen, as of most
+        return value
+    given, count = numbers(value), "a number" if name in _SINGLE else "three numbers"
+    if given is None or given.shape != (() if name in _SINGLE else (3,)):
+        raise ShapeError(f"{shape!r}: {name} = {shown(value)}: must be {count}")
+    if not are_usable(given) or not (given > least).all():
         what = "positive and finite" if name in _SIZES else "finite"
-        raise ValueError(f"{shape!r}: {name} = {value!r}: must be {what}")
+        raise ShapeError(f"{shape!r}: {name} = {shown(value)}: must be {what}")
     return float(given) if given.ndim == 0 else tuple(given.tolist())
 
 
@@ -71,8 +80,6 @@ class Placement:
     def __post_init__(self) -> None:
         for name in ("position_m", "rpy_rad"):
             own = _numbers("placement", name, getattr(self, name))
-            if not isinstance(own, tuple) or len(own) != 3:
-                raise ValueError(f"placement: {name} = {own!r}: must be three numbers")
             object.__setattr__(self, name, own)
 
     @classmethod
@@ -84,7 +91,8 @@ class Placement:
             x, y, z = (float(value) for value in pose.position)
             return cls((x, y, z), rpy_of(np.asarray(pose.rotation, float)))
         except (AttributeError, TypeError):
-            raise ValueError(f"{pose!r} is no pose: must be a Pose or a Placement") from None
+            line = f"{shown(pose)} is no pose: must be a Pose or a Placement"
+            raise ShapeError(line) from None
 
     @classmethod
     def of_matrix(cls, matrix: Float[np.ndarray, "4 4"]) -> "Placement":
@@ -134,10 +142,21 @@ class Shape(ABC):
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     def __post_init__(self) -> None:
-        """Raises ValueError for numbers that are none, and for sizes that are not positive."""
+        """Raises ShapeError for numbers, names and files that are none, and for sizes that are not
+        positive.
+        """
+        if not isinstance(self.name, str) or not self.name:
+            raise ShapeError(f"name = {shown(self.name)}: must be a text, of a shape")
+        links = self.exempt_links
+        is_list = isinstance(links, Sequence) and not isinstance(links, str)
+        if not is_list or not all(isinstance(link, str) for link in links):
+            line = f"exempt_links = {shown(links)}: must be a list of names"
+            raise ShapeError(f"{self.name!r}: {line}")
         for own in fields(self):  # type: ignore[arg-type]
             value = getattr(self, own.name)
-            if own.name.endswith(("_m", "_rad")) and not hasattr(value, "array"):
+            if own.name in ("file", "urdf"):
+                checked_path(value, f"{self.name!r}: {own.name}", ShapeError)
+            elif own.name.endswith(("_m", "_rad", "scale")) and not hasattr(value, "array"):
                 object.__setattr__(self, own.name, _numbers(self.name, own.name, value))
         object.__setattr__(self, "exempt_links", tuple(self.exempt_links))
 

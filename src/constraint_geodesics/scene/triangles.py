@@ -19,6 +19,7 @@ from constraint_geodesics.scene.pieces import (
     stl_as_obj,
     stl_triangles,
 )
+from constraint_geodesics.text_files import read_text
 
 KINDS = (".obj", ".stl", ".dae")
 BESIDE_M = 0.002
@@ -54,7 +55,7 @@ def read_triangles(file: Path, _digest: str) -> Triangles:
         if kind == ".stl":
             found = _of_obj(stl_as_obj(file)) if not is_binary_stl(file) else _of_stl(file)
         else:
-            found = _of_obj(as_obj(file) if kind == ".dae" else file.read_text(errors="replace"))
+            found = _of_obj(as_obj(file) if kind == ".dae" else read_text(file, errors="replace"))
     except (OSError, ValueError) as error:
         if isinstance(error, RobotError):
             raise

@@ -1,0 +1,90 @@
+"""What bad input must come to: one line of a typed error that names the culprit, soon."""
+
+import re
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+LONGEST = 500
+"""Letters of a message."""
+SECONDS = 60
+"""That one of them may take, on a machine that does other things."""
+
+
+class Bad(NamedTuple):
+    """A call that must be refused, and what the line says.  said: parts of it, as they are."""
+
+    name: str
+    ask: Callable[[], object]
+    said: tuple[str, ...]
+
+
+@dataclass
+class Tally:
+    """What was tried, and what went wrong."""
+
+    cases: int = 0
+    tracebacks: int = 0
+    accepted: int = 0
+    hung: int = 0
+    unnamed: int = 0
+    wrong: list[str] = field(default_factory=list)
+
+    def judge(self, case: Bad) -> None:
+        """Ask, and note what is not as it must be."""
+        self.cases += 1
+        try:
+            with _in_time():
+                found = case.ask()
+        except _HangsError:
+            self.hung += 1
+            self.wrong.append(f"{case.name}: is not answered within {SECONDS} s")
+        except Exception as error:
+            self._refused(case, error)
+        else:
+            self.accepted += 1
+            self.wrong.append(f"{case.name}: accepted: {str(found)[:200]}")
+
+    def _refused(self, case: Bad, error: Exception) -> None:
+        line, kind = str(error), type(error)
+        typed = kind.__module__.startswith("constraint_geodesics")
+        if not (typed and isinstance(error, ValueError)):
+            self.tracebacks += 1
+            self.wrong.append(f"{case.name}: {kind.__name__}: {line[:200]}")
+        elif "\n" in line or len(line) > LONGEST or not all(part in line for part in case.said):
+            self.unnamed += 1
+            self.wrong.append(f"{case.name}: {case.said} is not in one line: {line[:300]}")
+
+
+class _HangsError(BaseException):
+    pass
+
+
+@contextmanager
+def _in_time() -> Iterator[None]:
+    def stop(*_: object) -> None:
+        raise _HangsError
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(SECONDS)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def written(folder: Path, name: str, content: str | bytes) -> Path:
+    """A file with some content."""
+    file = folder / name
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(content.encode() if isinstance(content, str) else content)
+    return file
+
+
+def told(text: str) -> str:
+    """A text in one line, as shells compare it."""
+    return re.sub(r"\s+", " ", text).strip()

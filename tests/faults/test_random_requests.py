@@ -1,0 +1,278 @@
+"""Requests at random against the planner: no exception but a typed one, and no path that an oracle
+of its own calls wrong: PyBullet's shapes every 0.005 rad (0.02 in `make test`), and limits,
+constraint, ends, velocities and accelerations by other formulas than the planner's.
+"""
+
+import json
+import math
+from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from constraint_geodesics.benchmark.entries import code_digest
+from constraint_geodesics.planner import Planner
+from constraint_geodesics.problem import Status
+from constraint_geodesics.trajectory import Trajectory
+from tests.faults.effort import Effort, count
+from tests.faults.requests import A_SCENE, SEED, Request, request, scene_of
+from tests.planner_fixtures import packaged_planner
+from tests.scene.judge import Judge
+
+STEP_RAD = {"quick": 0.02, "faults": 0.005, "soak": 0.005}
+"""Between configurations that the oracle looks at."""
+DEEP_M = 1e-6
+"""PyBullet's distances are off by less."""
+OFF = 1e-4 + 1e-9
+"""What a path may be off its constraint [rad or m]."""
+SLACK = 1e-6
+KEPT = Path(".geodesics/soak/random_requests.json")
+"""Where the figures of a run of hours are kept, so that it goes on where it was ended."""
+KEPT_EVERY = 20 * A_SCENE
+
+
+@dataclass
+class Figures:
+    """What was asked, and what came of it."""
+
+    requests: int = 0
+    answered: int = 0
+    refused: int = 0
+    exceptions: int = 0
+    wrongly_certified: int = 0
+    configurations: int = 0
+    statuses: dict[str, int] = field(default_factory=dict)
+    wrong: list[str] = field(default_factory=list)
+
+
+def test_random_requests(effort: Effort) -> None:
+    planner, figures = packaged_planner(), _begun(effort)
+    first = planner.scene.now
+    try:
+        while figures.requests < effort.requests:
+            block = figures.requests // A_SCENE
+            planner.scene.become(first)
+            planner.scene.become(scene_of(planner, first, block))
+            with Judge(planner.scene.now, {}) as judge:
+                for number in range(block * A_SCENE, (block + 1) * A_SCENE):
+                    step = STEP_RAD[effort.name]
+                    _ask(planner, request(planner, number), judge, figures, step)
+            if figures.requests % KEPT_EVERY == 0:
+                _keep(effort, figures)
+    finally:
+        planner.scene.become(first)
+    about = {name: value for name, value in asdict(figures).items() if isinstance(value, int)}
+    count("random_requests", effort, **about)
+    _keep(effort, figures)
+    assert not figures.wrong, "\n".join(figures.wrong[:20])
+    assert figures.answered > 0.3 * figures.requests
+    assert figures.statuses["solved"] > 0.1 * figures.requests
+    assert figures.refused > 0.05 * figures.requests
+    assert figures.configurations > 10 * figures.requests
+
+
+@pytest.mark.parametrize("spoil", ["collision", "constraint", "limits", "end", "velocity"])
+def test_the_oracle_sees_what_is_wrong(spoil: str) -> None:
+    planner = packaged_planner()
+    path, asked = _solved(planner)
+    joints, times = path.joints.copy(), path.times.copy()
+    if spoil == "collision":
+        joints[len(joints) // 2] = np.array([0.0, 1.5, 0.0, 0.0, 0.0, 0.0])  # in the table
+    elif spoil == "constraint":
+        joints[1:-1, 4] += 0.01
+    elif spoil == "limits":
+        joints[1, 0] = 4.0
+    elif spoil == "end":
+        joints[-1] += 1e-4
+    else:
+        times *= 0.5
+    with Judge(planner.scene.now, {}) as judge:
+        assert not _faults(planner, asked, path, judge, 0.005)[0]
+        spoiled = replace(path, joints=joints, times=times)
+        faults, _ = _faults(planner, asked, spoiled, judge, 0.005)
+    assert any(spoil in fault for fault in faults), faults
+
+
+def _solved(planner: Planner) -> tuple[Trajectory, Request]:
+    for number in range(1000):
+        asked = request(planner, number)
+        if asked.kind == "good" and asked.words["constraint"] == "level_cup":
+            found = planner.plan(**asked.words)
+            if found.status == "solved" and "scene" not in asked.words:
+                return found, asked
+    raise AssertionError("no path")
+
+
+def _ask(planner: Planner, asked: Request, judge: Judge, figures: Figures, step: float) -> None:
+    figures.requests += 1
+    where = f"request {asked.number} ({asked.kind})"
+    try:
+        path = planner.plan(**asked.words)
+    except Exception as error:
+        own = type(error).__module__.startswith("constraint_geodesics")
+        typed = own and isinstance(error, ValueError) and "\n" not in str(error)
+        figures.refused += typed
+        if not typed or asked.kind != "corrupt":
+            figures.exceptions += not typed
+            figures.wrong.append(f"{where}: {type(error).__name__}: {str(error)[:300]}")
+        return
+    figures.answered += 1
+    figures.statuses[path.status] = figures.statuses.get(path.status, 0) + 1
+    faults = list(_answer_faults(path))
+    if path.status == "solved":
+        only = asked.words.get("scene")
+        if only:
+            with Judge(planner.scene.now.adding(*only), {}) as own_judge:
+                more, looked = _faults(planner, asked, path, own_judge, step)
+        else:
+            more, looked = _faults(planner, asked, path, judge, step)
+        figures.configurations += looked
+        figures.wrongly_certified += bool(more)
+        faults += more
+    figures.wrong += [f"{where}: {fault}" for fault in faults]
+
+
+def _answer_faults(path: Trajectory) -> list[str]:
+    """What an answer must say, whatever it is."""
+    found, solved = [], path.status == "solved"
+    if path.status not in get_args(Status):
+        found.append(f"status {path.status}")
+    if not path.explanation or "\n" in path.explanation or "nan" in path.explanation:
+        found.append(f"explanation {path.explanation!r}")
+    if solved != bool(len(path.joints)) or (solved and not path.certificate.valid):
+        found.append(f"{path.status} with {len(path.joints)} rows")
+    try:
+        json.dumps(path.summary(), allow_nan=False)
+    except ValueError:
+        found.append("its summary is no JSON")
+    return found
+
+
+def _faults(
+    planner: Planner, asked: Request, path: Trajectory, judge: Judge, step: float
+) -> tuple[list[str], int]:
+    """What is wrong with a path, and how many configurations were looked at."""
+    robot, found, joints, times = planner.robot, list[str](), path.joints, path.times
+    rows = _dense(joints, step)
+    least, names = min((judge.deepest(row) for row in rows), key=lambda one: one[0])
+    if least < -DEEP_M:
+        found.append(f"collision of {names}: {least:.3g} m")
+    beyond = float(np.maximum(robot.lower - rows, rows - robot.upper).max())
+    if beyond > SLACK:
+        found.append(f"limits: beyond by {beyond:.3g}")
+    off = _off(planner, path, rows)
+    if off > OFF:
+        found.append(f"constraint: off by {off:.3g}")
+    found += _end_faults(planner, asked, joints)
+    found += _motion_faults(planner, asked, joints, times)
+    return found, len(rows)
+
+
+def _dense(joints: np.ndarray, step: float) -> np.ndarray:
+    found = [joints[:1]]
+    for first, last in pairwise(joints):
+        steps = max(1, math.ceil(float(np.linalg.norm(last - first)) / step))
+        found.append(first + np.linspace(0.0, 1.0, steps + 1)[1:, None] * (last - first))
+    return np.concatenate(found)
+
+
+def _off(planner: Planner, path: Trajectory, rows: np.ndarray) -> float:
+    """By how much rows are off the constraint at most, by SciPy's rotations."""
+    constraint = path.constraint
+    axes = np.array(constraint.axes, bool)
+    if not axes.any():
+        return 0.0
+    tolerance, reference = np.array(constraint.tolerance), constraint.reference
+    places, turns = planner.robot.forward(rows)
+    worst = float(
+        np.max(
+            np.abs(places - reference.position)[:, axes[:3]] - tolerance[:3][axes[:3]], initial=0.0
+        )
+    )
+    held = np.flatnonzero(axes[3:])
+    if not len(held):
+        return worst
+    away = Rotation.from_matrix(turns @ reference.rotation.T)
+    angles = np.zeros((len(rows), 3))
+    if len(held) == 3:
+        angles = away.as_rotvec()
+    elif len(held) == 2:
+        axis = np.eye(3)[({0, 1, 2} - set(held.tolist())).pop()]
+        turned = away.apply(axis)
+        size = np.arctan2(np.linalg.norm(np.cross(axis, turned), axis=1), turned @ axis)
+        across = np.cross(axis, turned)
+        length = np.linalg.norm(across, axis=1, keepdims=True)
+        angles = size[:, None] * across / np.where(length > 0.0, length, 1.0)
+    else:
+        x = away.as_quat()
+        angles[:, held[0]] = 2.0 * np.arctan2(x[:, held[0]], x[:, 3])
+        angles = (angles + np.pi) % (2.0 * np.pi) - np.pi
+    allowed = tolerance[3:][held]
+    if len(set(allowed.tolist())) == 1:  # one cone
+        beyond = np.linalg.norm(angles[:, held], axis=1) - allowed[0]
+    else:
+        beyond = (np.abs(angles[:, held]) - allowed).max(axis=1)
+    return max(worst, float(beyond.max()))
+
+
+def _end_faults(planner: Planner, asked: Request, joints: np.ndarray) -> list[str]:
+    found, words = [], asked.words
+    moved = float(np.abs(joints[0] - words["start"]).max())
+    if moved > (0.01 if words.get("snap") else SLACK):
+        found.append(f"end: the start is off by {moved:.3g}")
+    goal = words["goal"]
+    if isinstance(goal, np.ndarray):
+        missed = float(np.abs(joints[-1] - goal).max())
+        if missed > SLACK:
+            found.append(f"end: the goal is off by {missed:.3g}")
+    return found
+
+
+def _motion_faults(
+    planner: Planner, asked: Request, joints: np.ndarray, times: np.ndarray
+) -> list[str]:
+    """Velocities of the lines and accelerations between them."""
+    robot, words, settings = planner.robot, asked.words, planner.bundle.planner
+    lasting = np.diff(times)[:, None]
+    if not (lasting > 0.0).all():
+        return ["velocity: times do not rise"]
+    speeds = np.diff(joints, axis=0) / lasting
+    most = words.get("velocity_scale", 1.0) * robot.velocity
+    over = float((np.abs(speeds) / most).max())
+    found = [f"velocity: {over:.6g} times its limit"] if over > 1.0 + SLACK else []
+    begin = np.zeros(robot.dof)
+    if words.get("start_velocity") is not None:
+        begin = np.asarray(words["start_velocity"], float)
+    whole = np.vstack([begin, speeds, np.zeros(robot.dof)])
+    around = np.pad(lasting, ((1, 1), (0, 0)))
+    rates = 2.0 * np.diff(whole, axis=0) / (around[:-1] + around[1:])
+    allowed = words.get("acceleration_scale", 1.0) * settings.acceleration_rad_s2
+    over = float(np.abs(rates).max() / allowed)
+    if over > 1.0 + 1e-3:
+        found.append(f"velocity: it changes {over:.6g} times as fast as it may")
+    return found
+
+
+def _begun(effort: Effort) -> Figures:
+    """Figures of a run that was ended before, of this code."""
+    if effort.name != "soak" or not KEPT.is_file():
+        return Figures()
+    about: dict[str, Any] = json.loads(KEPT.read_text())
+    of = about.pop("of")
+    return Figures(**about) if of == _of() else Figures()
+
+
+def _keep(effort: Effort, figures: Figures) -> None:
+    if effort.name == "soak":
+        KEPT.parent.mkdir(parents=True, exist_ok=True)
+        part = KEPT.with_suffix(".part")
+        part.write_text(json.dumps({"of": _of(), **asdict(figures)}))
+        part.replace(KEPT)
+
+
+def _of() -> list[Any]:
+    return [SEED, code_digest("planner")]
