@@ -5,6 +5,7 @@ PPO comes from stable-baselines3; what leaves this module is a small actor netwo
 """
 
 import json
+import pickle
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -52,6 +53,12 @@ DIAGNOSTICS = {
 """PPO's own figures of its last update, by stable-baselines3's names and by ours."""
 
 Report = Callable[[int, dict[str, float]], None]
+
+
+class CheckpointError(ValueError):
+    """A training can't go on from what lies there; the message names the file."""
+
+
 Accept = Callable[[Float[np.ndarray, "p"]], bool]
 
 
@@ -342,7 +349,7 @@ class _Progress(BaseCallback):
         """Put the last checkpoint, if there is one, back into the model and the environment."""
         if not self.file.is_file():
             return
-        content = torch.load(self.file, weights_only=True)
+        content = _checkpoint(self.file)
         model.policy.load_state_dict(content["policy"])
         model.policy.optimizer.load_state_dict(content["optimiser"])
         torch.set_rng_state(content["torch_rng"])
@@ -361,3 +368,15 @@ class _Progress(BaseCallback):
         self._before_s, self._began = content["seconds"], time.perf_counter()
         self._reported_at, self._reported_s = int(content["reported"][0]), content["reported"][1]
         environment.savings, environment.episode_returns, environment.solved = content["unreported"]
+
+
+def _checkpoint(file: Path) -> dict[str, Any]:
+    """What `_Progress.save` wrote; of a file with code in it nothing is run."""
+    try:
+        content: dict[str, Any] = torch.load(file, weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, ValueError) as error:
+        reason = (str(error).splitlines() or ["broken"])[0][:200]
+        raise CheckpointError(
+            f"{file}: no checkpoint of this training: {reason}: remove it to begin anew"
+        ) from None
+    return content

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from constraint_geodesics.array_files import read_npz
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.geometry.graph import (
@@ -197,5 +198,4 @@ def save_submanifold(submanifold: Submanifold, folder: Path) -> None:
 def load_submanifold(folder: Path) -> Submanifold:
     """Read what `save_submanifold` wrote."""
     form = json.loads((folder / CARD).read_text())["form"]
-    with np.load(folder / ARRAYS, allow_pickle=False) as arrays:
-        return (GridSubmanifold if form == "grid" else GraphSubmanifold)(**arrays)
+    return (GridSubmanifold if form == "grid" else GraphSubmanifold)(**read_npz(folder / ARRAYS))

@@ -19,6 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from constraint_geodesics.robot.description import find_mesh
 from constraint_geodesics.robot.kinematics import RobotError, origin_of, urdf_root
+from constraint_geodesics.text_files import read_bytes
 
 HULL_MARGIN = 0.001
 """What PyBullet keeps around a hull [m]."""
@@ -208,7 +209,7 @@ def _deepest(corners: Float[np.ndarray, "n 3"], faces: Float[np.ndarray, "f 4"])
 
 def digest_of(file: Path) -> str:
     """Of what is in a file: its time is no sign, which a copy may keep.  Raises OSError."""
-    return blake2b(file.read_bytes()).hexdigest()
+    return blake2b(read_bytes(file)).hexdigest()
 
 
 def read_mesh(file: Path) -> list[Float[np.ndarray, "n 3"]]:
@@ -227,7 +228,7 @@ def read_mesh(file: Path) -> list[Float[np.ndarray, "n 3"]]:
 
 def _read_obj(file: Path) -> list[Float[np.ndarray, "n 3"]]:
     try:
-        points, objects = parse_obj(file.read_text(errors="replace"))
+        points, objects = parse_obj(read_bytes(file).decode(errors="replace"))
     except ValueError as error:
         raise ValueError(f"{file.name}: {error}") from None
     used = [sorted({number for face in faces for number in face}) for faces in objects]
@@ -289,6 +290,6 @@ def stl_as_obj(file: Path) -> str:
 
 def _stl_corners(file: Path) -> Float[np.ndarray, "n 3"]:
     """Of all triangles of an STL file that is a text."""
-    words = (line.split() for line in file.read_text(errors="replace").splitlines())
+    words = (line.split() for line in read_bytes(file).decode(errors="replace").splitlines())
     rows = [row[1:4] for row in words if row[:1] == ["vertex"]]
     return np.array(rows, float).reshape(-1, 3)

@@ -19,6 +19,7 @@ from constraint_geodesics.scene.pieces import (
     stl_as_obj,
     stl_triangles,
 )
+from constraint_geodesics.text_files import read_bytes
 
 KINDS = (".obj", ".stl", ".dae")
 BESIDE_M = 0.002
@@ -54,7 +55,7 @@ def read_triangles(file: Path, _digest: str) -> Triangles:
         if kind == ".stl":
             found = _of_obj(stl_as_obj(file)) if not is_binary_stl(file) else _of_stl(file)
         else:
-            found = _of_obj(as_obj(file) if kind == ".dae" else file.read_text(errors="replace"))
+            found = _of_obj(as_obj(file) if kind == ".dae" else _text(file))
     except (OSError, ValueError) as error:
         if isinstance(error, RobotError):
             raise
@@ -62,6 +63,10 @@ def read_triangles(file: Path, _digest: str) -> Triangles:
     if not len(found.faces) or not np.isfinite(found.corners).all():
         raise RobotError(f"{file}: no mesh: has no faces, or corners that are no finite numbers")
     return found
+
+
+def _text(file: Path) -> str:
+    return read_bytes(file).decode(errors="replace")
 
 
 def _of_obj(text: str) -> Triangles:

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from constraint_geodesics.array_files import read_npz
 from constraint_geodesics.benchmark.judge import polyline_length
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.geometry.timing import time_parametrisation
@@ -223,5 +224,5 @@ def save_execution(file: Path, execution: Execution) -> None:
 
 def load_execution(file: Path) -> Execution:
     """An execution that was kept in a file."""
-    with np.load(file) as kept:
-        return Execution(**{n: v if v.ndim else v.item() for n, v in kept.items()})
+    kept = read_npz(file)
+    return Execution(**{n: v if v.ndim else v.item() for n, v in kept.items()})
