@@ -7,7 +7,7 @@ CONSTRAINT ?=
 FIRST_START = 1.329923 -0.584036 -3.766650 -2.008429 0.728803 -2.581396
 FIRST_GOAL = 1.071549 -0.217480 -1.682647 -2.906655 -0.337949 1.348704
 
-.PHONY: help env plan repro pretrained dag smoke bench bench-quick draw-queries bench-geometry test test-pipeline test-faults soak lint format results readme \
+.PHONY: help env plan repro pretrained dag smoke bench bench-quick draw-queries bench-geometry test test-pipeline test-faults soak lint format audit lock results readme \
 	docs notebook plots experiments sweep ui replay clean test-browser screenshots
 
 help:  ## list the targets
@@ -18,17 +18,22 @@ help:  ## list the targets
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { echo "error: $(PYTHON) is not Python 3.11, which PyBullet's wheels need"; exit 1; }
 	$(PYTHON) -m venv .venv
 
-INSTALL := .venv/bin/python -m pip install --quiet --disable-pip-version-check
+INSTALL := -m pip install --quiet --disable-pip-version-check
+# What is listed, to the byte, and nothing besides; what must be built is built with the setuptools that is listed.
+HASHED := $(INSTALL) --no-compile --require-hashes --no-deps --no-build-isolation
 
-.venv/planning: requirements.lock pyproject.toml | .venv/bin/python
-	$(INSTALL) --no-compile --constraint requirements.lock --editable ".[record]"  # Python compiles what it loads
+.venv/planning: requirements.hashes pyproject.toml | .venv/bin/python
+	@sed '/^# What the pipeline/,$$d' requirements.hashes > .venv/planning.txt
+	.venv/bin/python $(HASHED) -r .venv/planning.txt
+	.venv/bin/python $(INSTALL) --no-deps --no-build-isolation --editable .
 	@touch $@
 
-.venv/installed: requirements.lock pyproject.toml | .venv/bin/python
-	$(INSTALL) -r requirements.lock
-	$(INSTALL) --no-deps --editable .
+.venv/installed: .venv/planning
+	.venv/bin/python $(HASHED) -r requirements.hashes
+	@# torch's build for graphics cards pins libraries of its own, which other machines need not have: they are in no lock
+	@.venv/bin/python -m pip check > /dev/null || .venv/bin/python $(INSTALL) torch
 	.venv/bin/python -m pip check
-	@touch .venv/planning $@
+	@touch $@
 
 env: .venv/installed  ## make .venv with every pinned package, those of the pipeline and the tests too, and compile the kernels
 	@geodesics warmup
@@ -85,7 +90,7 @@ soak: env  ## the same for hours, with more of each: 20 kills a stage, 100,000 r
 	GEODESICS_RELIABILITY=reports/reliability.json python -m pytest tests/faults --soak
 
 .venv/browser: tests/browser/requirements.lock .venv/installed
-	$(INSTALL) -r tests/browser/requirements.lock
+	.venv/bin/python $(HASHED) -r tests/browser/requirements.lock
 	@touch $@
 
 test-browser: env .venv/browser  ## MLflow's dashboard, Rerun's viewer and the report in headless Chromium (minutes)
@@ -106,6 +111,19 @@ format: env  ## format and mend what can be mended
 	ruff format .
 	ruff check --fix .
 
+TOOLS := .geodesics/tools-venv
+
+$(TOOLS)/installed: .ci/requirements.lock | .venv/bin/python
+	.venv/bin/python -m venv $(TOOLS)
+	$(TOOLS)/bin/python $(HASHED) -r .ci/requirements.lock
+	@touch $@
+
+audit: $(TOOLS)/installed  ## ask for advisories against the locked packages; says of how many it could not ask
+	@.venv/bin/python .ci/audit.py $(TOOLS)/bin/python
+
+lock: env $(TOOLS)/installed  ## after a change of versions in a lock file: write the hashes of their files again
+	.venv/bin/python .ci/lock.py $(TOOLS)/bin/python
+
 results: env  ## print the result table
 	geodesics results
 
@@ -118,7 +136,7 @@ TO ?= workspace
 
 $(DOCS)/installed: docs/requirements.lock | .venv/installed
 	.venv/bin/python -m venv $(DOCS)
-	$(DOCS)/bin/python -m pip install --quiet --disable-pip-version-check -r docs/requirements.lock
+	$(DOCS)/bin/python $(HASHED) -r docs/requirements.lock
 	@touch $@
 
 docs: $(DOCS)/installed  ## the documentation as a site that opens offline: .geodesics/site/index.html

@@ -2,22 +2,26 @@
 with the package; nothing in them is trained.
 
 A folder with planner.json (the SHA-256 of every other file in it too) and roadmaps.safetensors.
-Nothing in it is code, nothing is unpickled.
+Nothing in it is code, nothing is unpickled.  Checksums tell what was altered by accident, not who
+wrote it: what a folder names (URDFs, meshes, modules) and holds (graphs) is looked at as well.
 """
 
 import hashlib
 import json
+import sys
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
+from safetensors.numpy import save
 
+from constraint_geodesics.array_files import ArrayFileError, read_weights
+from constraint_geodesics.fields import Name
+from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.graph import components
 from constraint_geodesics.params import (
     ConstraintParams,
@@ -25,13 +29,16 @@ from constraint_geodesics.params import (
     PlannerParams,
     RobotParams,
     WorkcellParams,
+    one_line,
 )
 from constraint_geodesics.plugs import MLFLOW, plug
+from constraint_geodesics.robot.kinematics import RobotError
+from constraint_geodesics.scene.urdf import data_path
 from constraint_geodesics.search.roadmap import Roadmap
-from constraint_geodesics.text_files import written
+from constraint_geodesics.text_files import read_json, written
 
 FORMAT = 2
-_CONSTRAINT: TypeAdapter[ConstraintParams] = TypeAdapter(ConstraintParams)
+_CONSTRAINTS: TypeAdapter[dict[Name, ConstraintParams]] = TypeAdapter(dict[Name, ConstraintParams])
 CARD, ROADMAPS = "planner.json", "roadmaps.safetensors"
 PIPELINE = Path("data/planner")
 """Where the pipeline leaves the planner's files, in a checkout."""
@@ -112,10 +119,16 @@ def roadmap_arrays(roadmaps: Mapping[str, Roadmap]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def roadmaps_of(arrays: Mapping[str, np.ndarray]) -> dict[str, Roadmap]:
-    """What `roadmap_arrays` wrote."""
-    names = sorted({name.split("/")[0] for name in arrays})
-    return {name: _roadmap(arrays, name) for name in names}
+def roadmaps_of(arrays: Mapping[str, np.ndarray], file: Path) -> dict[str, Roadmap]:
+    """What `roadmap_arrays` wrote into a file.  Raises BundleError for what is no graph."""
+    found = {}
+    for name in sorted({name.split("/")[0] for name in arrays}):
+        try:
+            found[name] = _roadmap(arrays, name)
+        except (GeometryError, KeyError, ValueError) as error:
+            what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+            raise BundleError(f"{file}: the graph of {name!r}: {what}") from None
+    return found
 
 
 def open_bundle(source: str | Path | None = None) -> tuple[Bundle, str]:
@@ -127,10 +140,11 @@ def open_bundle(source: str | Path | None = None) -> tuple[Bundle, str]:
     """
     if isinstance(source, str) and ":/" in source:
         with plug(MLFLOW)(source) as folder:
-            return read_bundle(folder), f"MLflow's {source}"
+            return _from_elsewhere(folder), f"MLflow's {source}"
     folder = bundle_folder(source)
     if source is not None:
-        return read_bundle(folder), str(source)
+        own = folder.resolve() in (PIPELINE.resolve(), PACKAGED.resolve())
+        return (read_bundle if own else _from_elsewhere)(folder), str(source)
     if folder == PIPELINE:
         return read_bundle(folder), f"the pipeline's outputs in {PIPELINE.resolve()}"
     return read_bundle(folder), "the files that come with the package"
@@ -150,7 +164,7 @@ def read_bundle(folder: Path) -> Bundle:
     """
     card, arrays = read_files(folder / CARD, FORMAT, (ROADMAPS,))
     try:
-        roadmaps = roadmaps_of(arrays[ROADMAPS])
+        roadmaps = roadmaps_of(arrays[ROADMAPS], folder / ROADMAPS)
         alone = sorted(set(roadmaps) - set(card["constraints"]))
         if alone:
             strays = f"roadmaps of {alone}, which are no constraints of {CARD}"
@@ -158,24 +172,73 @@ def read_bundle(folder: Path) -> Bundle:
         return Bundle(
             RobotParams.model_validate(card["robot"]),
             WorkcellParams.model_validate(card["workcell"]),
-            {name: _CONSTRAINT.validate_python(c) for name, c in card["constraints"].items()},
+            _CONSTRAINTS.validate_python(card["constraints"]),
             PlannerParams.model_validate(card["planner"]),
             JudgeParams.model_validate(card["judge"]),
             roadmaps,
         )
     except (AttributeError, KeyError, TypeError, ValidationError) as error:
+        what = one_line(error) if isinstance(error, ValidationError) else str(error)
         raise BundleError(
-            f"{folder / CARD}: not a planner's card: {' '.join(str(error).split())[:200]}"
+            f"{folder / CARD}: not a planner's card: {' '.join(what.split())[:200]}"
         ) from None
+
+
+def _from_elsewhere(folder: Path) -> Bundle:
+    """A bundle that neither this checkout nor the package made: it may name files of its own
+    folder, of the current one and of PyBullet's alone, and no module that the caller has not
+    imported.  Raises BundleError.
+    """
+    bundle = read_bundle(folder)
+    named = [("robot.urdf", bundle.robot.urdf), ("robot.may_touch", bundle.robot.may_touch)]
+    for name, shape in bundle.workcell.shapes.items():
+        named += [
+            (f"workcell.{name}.{entry}", str(getattr(shape, entry)))
+            for entry in ("urdf", "file")
+            if hasattr(shape, entry)
+        ]
+    for entry, file in named:
+        if isinstance(file, str) and not _is_within(Path(file), folder):
+            raise BundleError(
+                f"{folder / CARD}: {entry}={file!r}: leaves the planner's folder, the current one "
+                f"and pybullet_data: name a file in one of them"
+            )
+    for name, constraint in bundle.constraints.items():
+        module = getattr(constraint, "factory", "").partition(":")[0]
+        if module and not (module in sys.modules or module.startswith(f"{__package__}.")):
+            raise BundleError(
+                f"{folder / CARD}: constraints.{name}.factory: import {module} before, if you "
+                f"trust it: no module is imported because a planner's files name it"
+            )
+    return bundle
+
+
+def _is_within(file: Path, folder: Path) -> bool:
+    """Whether a file, looked for where `find_urdf` does, lies in one of the folders that a bundle
+    may name files of.
+    """
+    places = [Path.cwd(), folder]
+    with suppress(RobotError):  # there may be no PyBullet
+        places.append(data_path())
+    looked_at = [place / file for place in places]
+    found = [one for one in looked_at if one.is_file()] or looked_at[:1]
+    try:
+        return all(
+            any(one.resolve().is_relative_to(place.resolve()) for place in places) for one in found
+        )
+    except ValueError:  # no name of a file
+        return False
 
 
 def _card(file: Path, version: int) -> dict[str, Any]:
     try:
-        card = json.loads(file.read_text())
-    except OSError:
+        card = read_json(file)
+    except OSError as error:
         what = f"there is no {file.name}: not a folder of a planner"
+        if file.exists():
+            what = f"{file.name}: {error.strerror}"
         raise BundleError(f"{file.parent}: {what}") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise BundleError(f"{file}: not JSON: {error}") from None
     written = card.get("format") if isinstance(card, dict) else None
     if written != version or not isinstance(card.get("sha256"), dict):
@@ -193,20 +256,17 @@ def card_digest(card: Mapping[str, Any]) -> str:
 
 def _arrays(file: Path, wanted: str | None) -> dict[str, np.ndarray]:
     try:
-        content = file.read_bytes()
-    except OSError:
-        raise BundleError(f"{file}: missing") from None
-    if hashlib.sha256(content).hexdigest() != wanted:
-        raise BundleError(f"{file}: altered since it was written (its checksum differs)")
-    try:
-        return load(content)
-    except SafetensorError as error:
-        raise BundleError(f"{file}: not safetensors: {error}") from None
+        return read_weights(file, wanted or "")
+    except ArrayFileError as error:
+        raise BundleError(str(error)) from None
 
 
 def _roadmap(arrays: Mapping[str, np.ndarray], name: str) -> Roadmap:
-    joints = arrays[f"{name}/joints"].astype(np.float64)
-    edges = arrays[f"{name}/edges"].astype(np.int64)
-    return Roadmap(
-        joints, edges, arrays[f"{name}/lengths"].astype(np.float64), components(len(joints), edges)
-    )
+    joints, edges, lengths = (arrays[f"{name}/{part}"] for part in ("joints", "edges", "lengths"))
+    if joints.ndim != 2 or edges.shape != (len(edges), 2) or lengths.shape != edges.shape[:1]:
+        shapes = f"joints {joints.shape}, edges {edges.shape}, lengths {lengths.shape}"
+        raise ValueError(f"{shapes}: must be (n, D), (m, 2) and (m,)")
+    if edges.dtype.kind not in "iu" or (lengths < 0.0).any():
+        raise ValueError("edges must be numbers of nodes, and lengths not negative")
+    joints, edges = joints.astype(np.float64), edges.astype(np.int64)
+    return Roadmap(joints, edges, lengths.astype(np.float64), components(len(joints), edges))

@@ -397,9 +397,10 @@ def ui(
     stopped.
     """
     require("pipeline")
-    from constraint_geodesics.tracking.store import ui_command
+    from constraint_geodesics.tracking.store import LOOPBACK, require_free, ui_command
 
-    command, address = ui_command(Path().resolve(), port), f"http://127.0.0.1:{port}"
+    command, address = ui_command(Path().resolve(), port), f"http://{LOOPBACK}:{port}"
+    require_free(port)
     text = json.dumps({"address": address}) if as_json else f"{address}  (stop with Ctrl-C)"
     print(text, flush=True)
     os.execvp(command[0], command)

@@ -1,10 +1,10 @@
 """What commonly goes wrong with a checkout and its environment, and the mend: one finding a line.
 
-Only the standard library is imported, for packages that are missing or broken are what this looks
-for; MLflow, Rerun, torch and PyBullet are known by the files they are installed as.  So it runs
-where the command `geodesics` does not start: `PYTHONPATH=src python3 -m
-constraint_geodesics.doctor`.  A wrong Python must be able to say that it is one: the module keeps
-to what Python 3.8 reads, with annotations that are never evaluated.
+Only the standard library is imported, and modules here that need no more, for packages that are
+missing or broken are what this looks for; MLflow, Rerun, torch and PyBullet are known by the files
+they are installed as.  So it runs where the command `geodesics` does not start:
+`PYTHONPATH=src python3 -m constraint_geodesics.doctor`.  A wrong Python must be able to say that it
+is one: the module keeps to what Python 3.8 reads, with annotations that are never evaluated.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
-from xml.etree import ElementTree
 
 from constraint_geodesics.tracking.left import left_runs
+from constraint_geodesics.xml_files import XmlFileError, read_xml
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -465,8 +465,8 @@ def check_robot(root: Path, here: Surroundings) -> Answers:
             continue
         packaged = data is not None and data in urdf.parents
         try:
-            meshes = [mesh.get("filename", "") for mesh in ElementTree.parse(urdf).iter("mesh")]
-        except ElementTree.ParseError as error:
+            meshes = [mesh.get("filename", "") for mesh in read_xml(urdf).iter("mesh")]
+        except (OSError, XmlFileError) as error:
             yield _problem(f"{urdf}: not XML: {error}", reinstall if packaged else "mend the file")
             continue
         missing = list(dict.fromkeys(mesh for mesh in meshes if not _mesh_found(mesh, urdf)))

@@ -2,13 +2,16 @@
 all.
 """
 
+import io
 import json
 import os
 import select
 import stat
 import tempfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from gzip import BadGzipFile, GzipFile
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,7 @@ MOST_BYTES = 256 * 2**20
 PATIENCE_S = 60.0
 """For so long a pipe may say nothing: longer than a planner takes that writes to it."""
 _BLOCK = 2**20
+_GZIP = b"\x1f\x8b"
 
 
 def read_text(
@@ -84,7 +88,7 @@ def kept_json(file: Path) -> Any:
     """What was kept in a file of JSON; None where it is missing or damaged, and is made again."""
     try:
         with reading(file):
-            return json.loads(file.read_text("utf-8"))
+            return read_json(file)
     except (DamagedFileError, OSError):
         return None
 
@@ -125,3 +129,38 @@ def write_bytes(file: Path, content: bytes) -> None:
     """Bytes, whole or not at all, as `written` does."""
     with written(file) as part:
         part.write_bytes(content)
+
+
+def read_json(file: Path) -> Any:
+    """What a JSON file holds.  Raises OSError as `read_content`, ValueError for what is no JSON or
+    is nested too deeply.
+    """
+    return parse_json(read_content(file))
+
+
+def parse_json(content: bytes | str) -> Any:
+    """What JSON holds.  Raises ValueError, one line, for what is none or is nested too deeply."""
+    try:
+        return json.loads(content)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def unpacked(content: bytes, file: Path) -> bytes:
+    """The content of a file, unpacked where it is gzipped.  Raises OSError, with a `strerror`, for
+    a damaged one, and one that grows beyond MOST_BYTES.
+    """
+    if not content.startswith(_GZIP):
+        return content
+    try:
+        with GzipFile(fileobj=io.BytesIO(content)) as data:
+            return _bounded(data, file)
+    except (BadGzipFile, EOFError, zlib.error) as error:
+        raise OSError(None, f"gzipped, and damaged: {error}", str(file)) from None
+
+
+def _bounded(data: GzipFile, file: Path) -> bytes:
+    content = data.read(MOST_BYTES + 1)
+    if len(content) > MOST_BYTES:
+        raise OSError(None, f"longer than {MOST_BYTES // 2**20} MiB", str(file))
+    return content

@@ -12,14 +12,9 @@ Dimensions are MoveIt's: a box's edge lengths, a cylinder's length along z and i
 sphere's radius [m]; poses are in the base frame.  In place of "robot" stand "urdf" and "tool_link".
 """
 
-import gzip
-import json
 import re
-import xml.etree.ElementTree as ElementTree
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from io import BytesIO
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any
@@ -42,13 +37,13 @@ from constraint_geodesics.moveit import (
 from constraint_geodesics.params import one_line
 from constraint_geodesics.robot.arm_file import digest_of
 from constraint_geodesics.robot.description import find_mesh
-from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
+from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, urdf_root
 from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.names import require_names
 from constraint_geodesics.scene.point_cloud import PointCloud
 from constraint_geodesics.scene.scene import Scene, SceneError
 from constraint_geodesics.scene.shape import Shape
-from constraint_geodesics.text_files import MOST_BYTES, read_content
+from constraint_geodesics.text_files import parse_json, read_content, unpacked
 
 NOTHING_HELD = Constraint((0,) * 6)
 FREE = "free"
@@ -57,7 +52,6 @@ OF_REQUEST = "held orientation"
 """Name of what MoveIt's requests hold."""
 ROBOTS = {"panda": ("franka_panda/panda.urdf", "panda_hand")}
 """URDF in pybullet_data and tool link, by the names that files have for robots."""
-_GZIP = b"\x1f\x8b"
 _YAML = (".yaml", ".yml")
 
 
@@ -146,28 +140,14 @@ def require_different(problems: Sequence[Problem]) -> None:
 
 def _read(file: Path) -> _FileRecord:
     try:
-        content = read_content(file)
-        text = _unzipped(content) if content.startswith(_GZIP) else content
-        return _FileRecord.model_validate(json.loads(text))
+        return _FileRecord.model_validate(parse_json(unpacked(read_content(file), file)))
     except OSError as error:
-        if isinstance(error, gzip.BadGzipFile):
-            raise ProblemFileError(f"{file}: gzipped, and damaged: {error}") from None
         raise ProblemFileError(f"{file}: {error.strerror}") from None
-    except (EOFError, zlib.error) as error:
-        raise ProblemFileError(f"{file}: gzipped, and damaged: {error}") from None
     except ValidationError as error:
         raise ProblemFileError(f"{file}: {one_line(error)}") from None
-    except (UnicodeError, RecursionError, ValueError) as error:
+    except ValueError as error:
         what = " ".join(str(error).split())
         raise ProblemFileError(f"{file}: neither JSON nor MoveIt's YAML: {what}") from None
-
-
-def _unzipped(content: bytes) -> bytes:
-    with gzip.GzipFile(fileobj=BytesIO(content)) as whole:
-        text = whole.read(MOST_BYTES + 1)
-    if len(text) > MOST_BYTES:
-        raise OSError(None, f"gzipped, and longer than {MOST_BYTES // 2**20} MiB")
-    return text
 
 
 def _record_problems(file: Path, record: _FileRecord, given: UrdfArm | None) -> Iterator[Problem]:
@@ -341,7 +321,7 @@ def told_of_arm(robot: SerialRobot) -> Mapping[str, Any]:
     """What answers depend on in the arm's files: its URDF, the meshes that are collided, and the
     links that may touch, whoever says so.
     """
-    meshes = ElementTree.parse(robot.urdf).iterfind("link/collision/geometry/mesh")
+    meshes = urdf_root(robot.urdf).iterfind("link/collision/geometry/mesh")
     files = (find_mesh(mesh.get("filename", ""), robot.urdf) for mesh in meshes)
     contents = [digest_of(file.read_bytes()) for file in files if file is not None]
     return {

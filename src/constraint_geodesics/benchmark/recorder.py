@@ -88,7 +88,7 @@ class PathKeeper:
         file = self._file(str(row["planner"]), int(row["query"]), int(row["seed"]))
         found = np.isfinite(row["length_rad"]) and file.is_file()
         with reading(file):
-            return np.load(file) if found else np.empty((0, dof))
+            return np.load(file, allow_pickle=False) if found else np.empty((0, dof))
 
     def _file(self, planner: str, query: int, seed: int) -> Path:
         return self.folder / f"{planner}-{query}-{seed}.npy"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from constraint_geodesics.certification.certificate import CertificationError
 from constraint_geodesics.scene.world import LoadedChain, LoadedLink
+from constraint_geodesics.xml_files import read_xml
 
 _ORIGIN, _NO_TURN = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 _ROUNDING = 1e-6
@@ -22,7 +23,7 @@ def chain_of_urdf(urdf: Path, tool_link: str, joint_names: Sequence[str]) -> Loa
 
     Raises CertificationError if an entry can't be read.
     """
-    root = ElementTree.parse(urdf).getroot()
+    root = read_xml(urdf)
     above = {}
     for joint in root.findall("joint"):
         child = joint.find("child")

@@ -109,7 +109,15 @@ def read_learned(folder: Path) -> LearnedFiles:
         about = " ".join(str(error).split())[:200]
         raise BundleError(f"{folder / CARD}: not a learned method's card: {about}") from None
     manifold, policy, graphs = (arrays[name] for name in names)
-    return LearnedFiles(robot, chart, settings, manifold, policy, roadmaps_of(graphs))
+    readers = {MANIFOLD: LearnedManifold.from_arrays, POLICY: MeanPolicy.from_arrays}
+    for name, reader in readers.items():
+        try:
+            reader(arrays[name])
+        except (KeyError, TypeError, ValueError) as error:
+            what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+            raise BundleError(f"{folder / name}: not what it is called: {what}") from None
+    graphs_file = folder / SUBMANIFOLDS
+    return LearnedFiles(robot, chart, settings, manifold, policy, roadmaps_of(graphs, graphs_file))
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from safetensors.numpy import load_file
 
+from constraint_geodesics.array_files import read_weights
 from constraint_geodesics.geodesics.descent import beginning, descended
 from constraint_geodesics.geodesics.episodes import (
     CurveStates,
@@ -20,7 +20,6 @@ from constraint_geodesics.geodesics.episodes import (
 )
 from constraint_geodesics.geodesics.problem import Costs, Ends, GeodesicProblem, Phi, repeated
 from constraint_geodesics.params import GeodesicParams
-from constraint_geodesics.text_files import reading
 
 
 @dataclass(frozen=True)
@@ -49,15 +48,24 @@ class MeanPolicy:
     @classmethod
     def load(cls, folder: Path, seed: int) -> "MeanPolicy":
         """Read what `policy_search.save_policy` wrote."""
-        file = folder / f"policy-{seed}.safetensors"
-        with reading(file):
-            return cls.from_arrays(load_file(file))
+        return cls.from_arrays(read_weights(folder / f"policy-{seed}.safetensors"))
 
     @classmethod
     def from_arrays(cls, weights: Mapping[str, np.ndarray]) -> "MeanPolicy":
-        """From the actor's state: body.0, body.2, … (a tanh stands between two) and mean."""
+        """From the actor's state: body.0, body.2, … (a tanh stands between two) and mean.  Raises
+        KeyError or ValueError where a layer is missing or does not fit the one before.
+        """
         hidden = sum(name.startswith("body.") and name.endswith(".weight") for name in weights)
-        names = [f"body.{2 * k}" for k in range(hidden)] + ["mean"]
+        names, width = [f"body.{2 * k}" for k in range(hidden)] + ["mean"], None
+        for name in names:
+            weight, bias = weights[f"{name}.weight"], weights[f"{name}.bias"]
+            if (
+                weight.ndim != 2
+                or bias.shape != (len(weight),)
+                or width not in (None, *weight.shape[1:])
+            ):
+                raise ValueError(f"layer {name!r}: {weight.shape} and {bias.shape} after {width}")
+            width = len(weight)
         return cls(tuple((weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names))
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from safetensors.numpy import load_file
+
+from constraint_geodesics.array_files import read_weights
 
 Arrays = Mapping[str, np.ndarray]
 SPREAD = 0.3
@@ -31,7 +32,7 @@ class FrozenManifold:
     @classmethod
     def load(cls, folder: Path) -> "FrozenManifold":
         """From the weights that `LearnedManifold.save` wrote."""
-        return cls(load_file(folder / WEIGHTS))
+        return cls(read_weights(folder / WEIGHTS))
 
     @property
     def dim(self) -> int:

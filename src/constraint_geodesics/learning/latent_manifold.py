@@ -12,15 +12,16 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from torch import Tensor, nn
 
+from constraint_geodesics.array_files import ArrayFileError, read_weights
 from constraint_geodesics.geometry.manifold import pullback_metric
 from constraint_geodesics.learning.inference import CARD, WEIGHTS, ManifoldFileError
 from constraint_geodesics.learning.learned_manifold import PIECE
+from constraint_geodesics.learning.vae import network_of
 from constraint_geodesics.robot.kinematics import SerialRobot
-from constraint_geodesics.text_files import write_bytes, write_text
+from constraint_geodesics.text_files import read_json, write_bytes, write_text
 
 
 class JointDecoder(nn.Module, ABC):
@@ -143,20 +144,18 @@ class LatentManifold:
         Raises ManifoldFileError if a file is missing or altered, or it is of another kind.
         """
         try:
-            card = json.loads((folder / CARD).read_text())
-            if hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest() != card["sha256"]:
-                raise ManifoldFileError(
-                    f"{folder / WEIGHTS}: altered since it was written (its checksum differs)"
-                )
+            card = read_json(folder / CARD)
+            weights = read_weights(folder / WEIGHTS, card["sha256"])
             if card["kind"] != kind.__name__:
                 raise ManifoldFileError(
                     f"{folder}: kind = {card['kind']!r}: must be {kind.__name__!r}"
                 )
-            decoder = kind(**card["sizes"]).double()
-            decoder.load_state_dict(load_file(folder / WEIGHTS))
-        except (OSError, KeyError, TypeError, json.JSONDecodeError) as error:
+            decoder = network_of(lambda: kind(**card["sizes"]).double(), weights)
+        except ArrayFileError as error:
             raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None
-        except (SafetensorError, RuntimeError) as error:
+        except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+            if isinstance(error, ManifoldFileError):
+                raise
             raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None
         return cls(decoder.eval().requires_grad_(False))
 

@@ -11,16 +11,15 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.numpy import load_file
 from safetensors.torch import save
 from torch import Tensor
 
+from constraint_geodesics.array_files import ArrayFileError, read_weights
 from constraint_geodesics.geometry.manifold import pullback_metric
 from constraint_geodesics.learning.inference import CARD, WEIGHTS, ManifoldFileError
-from constraint_geodesics.learning.vae import JointVae
+from constraint_geodesics.learning.vae import JointVae, network_of
 from constraint_geodesics.robot.kinematics import SerialRobot
-from constraint_geodesics.text_files import write_bytes, write_text
+from constraint_geodesics.text_files import read_json, write_bytes, write_text
 
 PIECE = 1024
 """Points embedded at once: the temporaries of many more leave the processor's cache."""
@@ -114,7 +113,9 @@ class LearnedManifold:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> "LearnedManifold":
-        """From the arrays of a network's state, whose shapes say how large it is."""
+        """From the arrays of a network's state, whose shapes say how large it is.  Raises
+        KeyError, TypeError or ValueError where these do not fit each other.
+        """
         layers = sorted(
             int(name.split(".")[2])
             for name in arrays
@@ -122,27 +123,19 @@ class LearnedManifold:
         )
         hidden = [len(arrays[f"encoder.nonlinear.{layer}.bias"]) for layer in layers[:-1]]
         centres, latent_dim = arrays["precision.centres"].shape
-        vae = JointVae(len(arrays["centre"]), latent_dim, hidden, centres)
-        vae.load_state_dict(
-            {name: torch.from_numpy(np.array(values)) for name, values in arrays.items()}
-        )
+        sizes = len(arrays["centre"]), latent_dim, hidden, centres
+        vae = network_of(lambda: JointVae(*sizes), arrays)
         return cls(vae.eval().requires_grad_(False))
 
     @classmethod
     def load(cls, folder: Path) -> "LearnedManifold":
         """Read what `save` wrote.  Raises ManifoldFileError if a file is missing or altered."""
         try:
-            card = json.loads((folder / CARD).read_text())
-            found = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
-            if found != card["sha256"]:
-                raise ManifoldFileError(
-                    f"{folder / WEIGHTS}: altered since it was written (its checksum differs)"
-                )
-            return cls.from_arrays(load_file(folder / WEIGHTS))
-        except (
-            *(OSError, KeyError, TypeError, UnicodeDecodeError),
-            *(json.JSONDecodeError, SafetensorError, RuntimeError),
-        ) as error:
+            card = read_json(folder / CARD)
+            return cls.from_arrays(read_weights(folder / WEIGHTS, card["sha256"]))
+        except ArrayFileError as error:
+            raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None
+        except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
             raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from constraint_geodesics.array_files import read_npz
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction
 from constraint_geodesics.geometry.graph import (
@@ -21,7 +22,7 @@ from constraint_geodesics.geometry.graph import (
 )
 from constraint_geodesics.learning.lift import Chart, corrected, jump_excess, retracted
 from constraint_geodesics.params import SubmanifoldParams
-from constraint_geodesics.text_files import reading, write_text, written
+from constraint_geodesics.text_files import read_json, reading, write_text, written
 
 Free = Callable[[Float[np.ndarray, "m D"]], Bool[np.ndarray, "m"]]
 """Which configurations touch neither the arm itself nor the workcell."""
@@ -197,8 +198,7 @@ def save_submanifold(submanifold: Submanifold, folder: Path) -> None:
 def load_submanifold(folder: Path) -> Submanifold:
     """Read what `save_submanifold` wrote.  Raises DamagedFileError."""
     with reading(folder / CARD):
-        kind = {"grid": GridSubmanifold, "graph": GraphSubmanifold}[
-            json.loads((folder / CARD).read_text())["form"]
-        ]
-    with reading(folder / ARRAYS), np.load(folder / ARRAYS, allow_pickle=False) as arrays:
-        return kind(**arrays)
+        form = read_json(folder / CARD)["form"]
+        kind = {"grid": GridSubmanifold, "graph": GraphSubmanifold}[form]
+    with reading(folder / ARRAYS):
+        return kind(**read_npz(folder / ARRAYS))

@@ -202,7 +202,7 @@ def _fit(
     order = torch.Generator().manual_seed(params.seed)
     shuffled, fixed = _batches(rows, params.batch_size, order), _batches(held_out, 8192, None)
     trainer.fit(phase, shuffled, fixed)
-    phase.load_state_dict(torch.load(best.best_model_path, weights_only=False)["state_dict"])
+    phase.load_state_dict(torch.load(best.best_model_path, weights_only=True)["state_dict"])
     return history.rows
 
 

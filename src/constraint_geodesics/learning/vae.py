@@ -5,11 +5,15 @@ Joints are scaled to [−1, 1] by the robot's limits inside.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+Network = TypeVar("Network", bound=nn.Module)
 
 
 class Perceptron(nn.Module):
@@ -134,3 +138,18 @@ def variance_loss(vae: JointVae, q: Float[Tensor, "b D"]) -> Float[Tensor, ""]:
         error = (vae.mean(z) - q).square()
     precision = vae.precision(z)
     return 0.5 * (error * precision - precision.log()).sum(-1).mean()
+
+
+def network_of(make: Callable[[], Network], arrays: Mapping[str, np.ndarray]) -> Network:
+    """The network that `make` makes, with the weights of a file.  Raises ValueError where these are
+    of other names or sizes, before memory is taken for the network: a file may name any size.
+    """
+    with torch.device("meta"):
+        wanted = {name: tuple(own.shape) for name, own in make().state_dict().items()}
+    for name in sorted(wanted.keys() | arrays.keys()):
+        shape = arrays[name].shape if name in arrays else None
+        if shape != wanted.get(name):
+            raise ValueError(f"weights {name!r} are {shape}: must be {wanted.get(name)}")
+    network = make()
+    network.load_state_dict({n: torch.from_numpy(np.array(v)) for n, v in arrays.items()})
+    return network

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.text_files import reading, written
+from constraint_geodesics.array_files import read_npz
+from constraint_geodesics.text_files import written
 
 Row = Mapping[str, Any]
 
@@ -39,8 +40,8 @@ def save_paths(
 
 def read_paths(rows: Sequence[Row], folder: Path) -> list[Float[np.ndarray, "T D"]]:
     """The paths of some rows of the table that `save_paths` kept."""
-    with reading(folder / "paths.npz"), np.load(folder / "paths.npz") as kept:
-        return [kept[_name(row)] for row in rows]
+    kept = read_npz(folder / "paths.npz")
+    return [kept[_name(row)] for row in rows]
 
 
 def _name(row: Row) -> str:

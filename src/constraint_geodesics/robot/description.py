@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from constraint_geodesics.robot.kinematics import RobotError
+from constraint_geodesics.xml_files import XmlFileError, read_xml
 
 MOVABLE = ("revolute", "continuous", "prismatic")
 _KINDS = (*MOVABLE, "fixed", "floating", "planar")
@@ -145,9 +146,12 @@ class _Reader:
             what = "is a folder" if self.urdf.is_dir() else "does not exist"
             raise self.fault("the file", what, "give the path of a URDF file")
         try:
-            tree = ElementTree.parse(self.urdf).getroot()
-        except (ElementTree.ParseError, UnicodeDecodeError, ValueError) as error:
+            tree = read_xml(self.urdf)
+        except XmlFileError as error:
             raise self.fault("the file", f"is no XML ({error})", "export it again") from None
+        except OSError as error:
+            what = f"can't be read ({error.strerror})"
+            raise self.fault("the file", what, "give the path of a URDF file") from None
         for element in tree.iter():
             if _XACRO in element.tag or any("${" in value for value in element.attrib.values()):
                 mend = f"run `xacro {self.urdf.name} > arm.urdf` and take what it writes"

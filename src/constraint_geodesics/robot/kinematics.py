@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.robot import kernels
+from constraint_geodesics.xml_files import XmlFileError, read_xml
 
 
 class RobotError(ValueError):
@@ -114,9 +115,11 @@ class SerialRobot:
 def urdf_root(urdf: Path) -> ElementTree.Element:
     """The root element of a URDF; raises RobotError where it is no XML."""
     try:
-        return ElementTree.parse(urdf).getroot()
-    except (ElementTree.ParseError, ValueError) as error:
+        return read_xml(urdf)
+    except XmlFileError as error:
         raise RobotError(f"{urdf}: no URDF: it is no XML ({error})") from None
+    except OSError as error:
+        raise RobotError(f"{urdf}: no URDF: {error.strerror}") from None
 
 
 def load_robot(

@@ -15,7 +15,7 @@ import numpy as np
 from constraint_geodesics.robot.description import Description, read_description
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
 from constraint_geodesics.scene.world import World, physics
-from constraint_geodesics.text_files import read_content
+from constraint_geodesics.xml_files import XmlFileError, read_xml
 
 SAMPLES = 2000
 """Configurations that are looked at."""
@@ -70,8 +70,8 @@ def allowed_by_srdf(srdf: Path, description: Description) -> tuple[AllowedPair, 
     enables again.  Raises RobotError for a file that is none, and for links that the robot has not.
     """
     try:
-        root = ElementTree.fromstring(read_content(srdf))
-    except (OSError, ElementTree.ParseError, ValueError) as error:
+        root = read_xml(srdf)
+    except (OSError, XmlFileError) as error:
         raise RobotError(f"{srdf}: no SRDF: {error}: give the path of one") from None
     if root.tag != "robot":
         raise RobotError(f"{srdf}: no SRDF: <{root.tag}> is the root element: it must be <robot>")

@@ -7,7 +7,6 @@ cache under a name that tells its content.
 
 import json
 import tempfile
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -24,6 +23,7 @@ from constraint_geodesics.robot.kinematics import (
     SerialRobot,
     load_robot,
     rotation_from_rpy,
+    urdf_root,
 )
 from constraint_geodesics.scene import allowed_collisions
 from constraint_geodesics.scene.allowed_collisions import (
@@ -117,7 +117,7 @@ def _allowed(
 def _sampled_digest(robot: SerialRobot) -> str:
     """Of all that sampling depends on, beside the URDF."""
     own = allowed_collisions
-    meshes = ElementTree.parse(robot.urdf).iterfind("link/collision/geometry/mesh")
+    meshes = urdf_root(robot.urdf).iterfind("link/collision/geometry/mesh")
     files = dict.fromkeys(mesh.get("filename", "") for mesh in meshes)
     settings = (own.SAMPLES, own.ALWAYS, own.NEAR_M, own.OFTEN)
     parts = [np.stack([robot.lower, robot.upper]).tobytes().hex(), repr(settings)]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.robot.kinematics import RobotError, rotation_about
-from constraint_geodesics.text_files import read_content
+from constraint_geodesics.xml_files import XmlFileError, read_xml
 
 _UPRIGHT = {
     "Z_UP": np.eye(3),
@@ -47,8 +47,8 @@ def as_obj(mesh: Path) -> str:
 
 def _parts(mesh: Path) -> Iterator[tuple[Float[np.ndarray, "n 3"], list[list[int]]]]:
     try:
-        root = ElementTree.fromstring(read_content(mesh))
-    except ElementTree.ParseError as error:
+        root = read_xml(mesh)
+    except XmlFileError as error:
         raise ValueError(f"no XML: {error}") from None
     for element in root.iter():  # Collada's own names carry its address
         element.tag = element.tag.rsplit("}", 1)[-1]

@@ -3,7 +3,6 @@
 The only importer of pybullet.  Every world is a client of its own; nothing is simulated here.
 """
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from jaxtyping import Bool, Float
 
-from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
+from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, urdf_root
 from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.names import require_names
 from constraint_geodesics.scene.shape import Placement, Shape
@@ -341,7 +340,7 @@ class World:
 
     def _check_shapes(self) -> None:
         """PyBullet goes on without a shape that it can't read, and nothing would touch it."""
-        for link in ElementTree.parse(self.robot.urdf).getroot().iterfind("link"):
+        for link in urdf_root(self.robot.urdf).iterfind("link"):
             name = link.get("name", "")
             shapes = self._bullet.getCollisionShapeData(self._body, self._link_index[name])
             if len(shapes) < len(link.findall("collision")):

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from constraint_geodesics.array_files import read_npz
 from constraint_geodesics.benchmark.judge import polyline_length
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.geometry.braking import Pace
@@ -221,5 +222,6 @@ def save_execution(file: Path, execution: Execution) -> None:
 
 def load_execution(file: Path) -> Execution:
     """An execution that was kept in a file."""
-    with reading(file), np.load(file) as kept:
+    with reading(file):
+        kept: Any = read_npz(file)
         return Execution(**{n: v if v.ndim else v.item() for n, v in kept.items()})

@@ -16,6 +16,7 @@ import math
 import os
 import re
 import shutil
+import socket
 import subprocess
 import sys
 import tempfile
@@ -39,6 +40,7 @@ DIGITS = 9
 """Of a reported number: enough to compare runs, too few to show the last bits of another processor.
 """
 FIRST_ANSWER_S = 5
+LOOPBACK, DATABASE = "127.0.0.1", "mlflow.db"
 PLANNER_MODEL, CHAMPION = "constraint_geodesics", "champion"
 """The registered planner's name, and the alias of the version that people load."""
 
@@ -60,7 +62,7 @@ class TrackingError(RuntimeError):
 
 def tracking_uri(root: Path) -> str:
     """MLFLOW_TRACKING_URI, or the SQLite file at the root of the checkout; never relative."""
-    uri = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{root / 'mlflow.db'}"
+    uri = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{root / DATABASE}"
     file = _sqlite_file(uri)
     return uri if file is None or file.is_absolute() else f"sqlite:///{file.resolve()}"
 
@@ -73,24 +75,65 @@ def store_name(uri: str, root: Path) -> str:
 def ui_command(root: Path, port: int) -> list[str]:
     """The command that opens the dashboard, for this machine only.
 
-    Raises TrackingError if the runs are on a server, which has a dashboard of its own.
+    root: a folder in or below the checkout.  Raises TrackingError if there is no store, or
+    the runs are on a server, which has a dashboard of its own.
     """
-    uri = tracking_uri(root)
+    found = next((own for own in (root, *root.parents) if _has_store(own)), root)
+    uri = tracking_uri(found)
     if uri.startswith("http"):
         raise TrackingError(
             f"MLFLOW_TRACKING_URI={_without_password(uri)}: this server shows its runs "
             f"itself, open it in a browser"
         )
     database = _sqlite_file(uri)
+    if database is not None and not database.is_file():
+        raise TrackingError(
+            f"{database}: there are no runs here: go to a checkout, and `dvc repro`, or name a "
+            f"store in MLFLOW_TRACKING_URI"
+        )
     artifacts = _artifact_folder(database) if database else root.resolve() / "mlartifacts"
     # the job runner serves language models; without it the dashboard starts and stops in half the
     # time
     quiet = ["env", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false"]
     server = [
         sys.executable,
-        *f"-m mlflow server --host 127.0.0.1 --port {port} --workers 1".split(),
+        *f"-m mlflow server --host {LOOPBACK} --port {port} --workers 1".split(),
     ]
     return [*quiet, *server, "--backend-store-uri", uri, "--artifacts-destination", str(artifacts)]
+
+
+def _has_store(folder: Path) -> bool:
+    return (folder / "params.yaml").is_file() and (folder / DATABASE).is_file()
+
+
+def require_free(port: int) -> None:
+    """Raises TrackingError, which names a free one, for a port that is taken."""
+    if not _is_free(port):
+        raise TrackingError(
+            f"port {port} of {LOOPBACK} is taken: add --port {_free_port(port)}, which is free"
+        )
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server does
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError:
+            return False
+    return True
+
+
+def _free_port(above: int) -> int:
+    """The first free one above a port, else any."""
+    near = (port for port in range(above + 1, min(above + 100, 65536)) if _is_free(port))
+    return next(near, 0) or _any_port()
+
+
+def _any_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return int(probe.getsockname()[1])
 
 
 @contextmanager
@@ -132,7 +175,11 @@ def _beside_store(uri: str, address: str) -> Path | None:
     source = "" if database is None else _stored_at(uri, address)
     if database is None or not source.startswith("mlflow-artifacts:"):
         return None
-    return _artifact_folder(database) / urlsplit(source).path.lstrip("/")
+    kept = _artifact_folder(database)
+    found = kept / urlsplit(source).path.lstrip("/")
+    if not found.resolve().is_relative_to(kept.resolve()):
+        raise TrackingError(f"{address}: leaves {kept}")
+    return found
 
 
 def _stored_at(uri: str, address: str) -> str:

@@ -1,0 +1,79 @@
+"""Files of arrays that others wrote, read with an end in sight.  Nothing in them is code: pickled
+objects are refused.
+"""
+
+import hashlib
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load
+
+from constraint_geodesics.text_files import MOST_BYTES, DamagedFileError, read_content
+
+
+class ArrayFileError(DamagedFileError):
+    """A file's arrays can't be used; the message is one line with the file and what is wrong."""
+
+
+def read_weights(file: Path, sha256: str | None = None) -> dict[str, np.ndarray]:
+    """The arrays of a safetensors file, all of finite numbers.
+
+    sha256: what its bytes must hash to, where that is known.  Raises ArrayFileError for a file that
+    is missing, altered, none, or holds a number that is not finite.
+    """
+    try:
+        content = read_content(file)
+    except FileNotFoundError:
+        raise ArrayFileError(f"{file}: missing") from None
+    except OSError as error:
+        raise ArrayFileError(f"{file}: {error.strerror}") from None
+    if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
+        raise ArrayFileError(f"{file}: altered since it was written (its checksum differs)")
+    try:
+        arrays: dict[str, np.ndarray] = load(content)
+    except (SafetensorError, KeyError, TypeError, ValueError, OverflowError, MemoryError) as error:
+        raise ArrayFileError(f"{file}: not safetensors: {_first_line(error)}") from None
+    require_finite(arrays, file)
+    return arrays
+
+
+def read_npz(file: Path) -> dict[str, np.ndarray]:
+    """The arrays of an npz file.  Raises ArrayFileError for a file that is missing, none, holds
+    objects, or grows beyond MOST_BYTES.
+    """
+    try:
+        with zipfile.ZipFile(file) as members:
+            if sum(member.file_size for member in members.infolist()) > MOST_BYTES:
+                raise ArrayFileError(f"{file}: longer than {MOST_BYTES // 2**20} MiB, unpacked")
+        with np.load(file, allow_pickle=False) as kept:
+            return {name: kept[name] for name in kept.files}
+    except FileNotFoundError:
+        raise ArrayFileError(f"{file}: missing") from None
+    except ArrayFileError:
+        raise
+    except (
+        *(OSError, EOFError, ValueError, KeyError, TypeError, MemoryError, OverflowError),
+        *(RuntimeError, SyntaxError, zipfile.BadZipFile, zlib.error),
+    ) as error:
+        raise ArrayFileError(f"{file}: no npz file of arrays: {_first_line(error)}") from None
+
+
+def require_finite(arrays: Mapping[str, np.ndarray], file: Path) -> None:
+    """Raises ArrayFileError with the first number that is not finite, or an array of no numbers."""
+    for name, values in arrays.items():
+        if values.dtype.kind not in "fiub":
+            raise ArrayFileError(f"{file}: {name!r} is of type {values.dtype}: must be numbers")
+        bad = np.argwhere(~np.isfinite(values)) if values.dtype.kind == "f" else np.empty((0, 1))
+        if len(bad):
+            place = tuple(bad[0].tolist())
+            raise ArrayFileError(
+                f"{file}: {name!r} has {values[place]} at {list(place)}: must be finite"
+            )
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]
