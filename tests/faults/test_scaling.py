@@ -2,12 +2,12 @@
 docs/scaling.md.
 """
 
-import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from statistics import fmean
 
 import cloudpickle
 import pytest
@@ -28,7 +28,7 @@ pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
 
 ROOT = Path(__file__).resolve().parents[2]
 TWO = ComputeParams(backend="loky", workers=2)
-TASKS, RUNS, REPORTS, STAGES = 1000, 20, 100, 10
+TASKS, RUNS, REPORTS, STAGES, OF_EACH = 1000, 20, 100, 10, 20
 FIRST_PLAN = """
 import sys
 from constraint_geodesics import Planner
@@ -61,10 +61,9 @@ def test_what_is_paid_beside_the_work(
         "sent_query_batch_kb": sent(list(batches(scene, params, tmp_path, 2))),
         **_runs(tmp_path),
         "dvc_stage_s": _stages(tmp_path),
-        "query_ms": _query_ms(),
+        **_queries(),
     }
-    assert figures["loky_task_ms"] < 20.0, "a query takes some milliseconds"
-    assert figures["dask_task_ms"] < 20.0
+    assert max(figures["loky_task_ms"], figures["dask_task_ms"]) < 100.0, "a batch takes a second"
     assert figures["sent_query_batch_kb"] < 10_000.0
     assert figures["dvc_stage_s"] < 5.0
     count("scaling", effort, **figures)
@@ -123,13 +122,20 @@ def _stages(folder: Path) -> float:
     return round((seconds[1] - seconds[0]) / STAGES, 3)
 
 
-def _query_ms() -> float:
-    """Mean of the benchmark's queries without an obstacle, of all the planner's constraints."""
-    planner, found = packaged_planner(), []
+def _queries() -> dict[str, float]:
+    """Means over the benchmark's queries without an obstacle, of all the planner's constraints."""
+    planner, found = packaged_planner(), list[tuple[bool, float]]()
     for name in planner.constraints:
+        planner.prepare(name)
         for query in read_queries(ROOT / "data/benchmark_queries" / f"{name}.csv"):
-            if query.obstacle is None and query.number < 10:
+            if query.obstacle is None and query.number < OF_EACH:
                 began = time.perf_counter()
-                planner.plan(query.start, query.goal, name)
-                found.append(time.perf_counter() - began)
-    return round(1e3 * statistics.fmean(found), 2)
+                path = planner.plan(query.start, query.goal, name)
+                found.append((path.status == "solved", 1e3 * (time.perf_counter() - began)))
+    solved = [own for good, own in found if good]
+    return {
+        "query_ms": round(fmean(own for _, own in found), 2),
+        "query_solved_ms": round(fmean(solved), 2),
+        "query_unsolved_ms": round(fmean(own for good, own in found if not good), 2),
+        "query_solved_share": round(len(solved) / len(found), 3),
+    }
