@@ -117,7 +117,7 @@ def with_numbers(text: str) -> str:
 
 
 PAGES = {README: with_planners, RESULTS: filled, EXPERIMENTS: with_stage_times}
-PAGES |= {ROOT / "docs" / page: with_numbers for page in ("scenes.md", "problems.md")}
+PAGES |= {ROOT / "docs" / page: with_numbers for page in ("scenes.md", "problems.md", "scaling.md")}
 """What brings each page up to date."""
 
 if __name__ == "__main__":

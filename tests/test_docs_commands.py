@@ -32,6 +32,7 @@ test of its own.
 """
 EXPERIMENT = "tests/end_to_end/test_experiment.py"
 REGISTRY = "tests/tracking/test_registry.py"
+SERVERS = "tests/faults/test_servers.py"
 COVERED: dict[str, str | tuple[str, str]] = {
     "geodesics constraints": HERE,
     "geodesics warmup": HERE,
@@ -66,6 +67,11 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "dvc repro": ("tests/end_to_end/smoke.py", '"repro"'),
     "git restore": (EXPERIMENT, '"git", "restore"'),
     "git status": (EXPERIMENT, '"git", "status"'),
+    "mlflow server": (SERVERS, '"mlflow", "server"'),
+    "dvc remote": (SERVERS, '"remote"'),
+    "dvc push": (SERVERS, '"push"'),
+    "dvc pull": (SERVERS, '"pull"'),
+    "dask": ("tests/pipeline/cluster.py", '"-m", "dask"'),
     "curl": (REGISTRY, "curl"),
     "source": ("tests/test_doctor.py", "source .venv/bin/activate"),
 }

@@ -227,17 +227,17 @@ def _on_two_processes(root: Path, asked: Asked, effort: Effort) -> dict[str, flo
         warmed(address, asked)
         load = loaded(address, asked, 8, effort.load_s)
         assert (load.wrong, load.lost) == (0, 0)
-        killed = next(own for own in processes(address)[1:] if "spawn_main" in str(own.cmdline()))
         with ThreadPoolExecutor(1) as pool:
             under = pool.submit(loaded, address, asked, 8, 10.0)
             time.sleep(2.0)
-            killed.send_signal(signal.SIGKILL)
+            busiest = max(processes(address)[1:], key=lambda own: len(own.net_connections()))
+            busiest.send_signal(signal.SIGKILL)
             after = under.result()
         assert after.wrong == 0
-        assert after.lost <= 8, "those that it was answering"
+        assert 1 <= after.lost <= 8, "those that it was answering"
         warmed(address, asked)
     figures = load.figures("workers_2_clients_8")
-    return figures | {"killed_worker_lost": after.lost}
+    return figures | {"killed_worker_unanswered": after.lost}
 
 
 def slow_of(asked: Asked) -> bytes:

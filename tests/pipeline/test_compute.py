@@ -67,11 +67,6 @@ def die_at_three(item: int) -> int:
     return item
 
 
-def pause(item: int) -> int:
-    time.sleep(0.2)
-    return item
-
-
 def overwrite(values: np.ndarray) -> float:
     values[0] = 1.0
     return float(values.sum())
@@ -161,12 +156,20 @@ def test_large_arrays_arrive_writable() -> None:
     assert parallel_map(overwrite, items, TWO) == [1.0, 1.0]
 
 
-def test_workers_are_where_the_caller_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("before", "now"):
-        (tmp_path / name).mkdir()
-        monkeypatch.chdir(tmp_path / name)
-        parallel_map(touch, [Path("0"), Path("1")], TWO)
-        assert {file.name for file in (tmp_path / name).iterdir()} == {"0", "1"}
+def test_workers_are_where_the_caller_is(
+    dask: ComputeParams, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files that a task names from there must not be written elsewhere."""
+    for settings in (TWO, dask):
+        for name in ("before", "now"):
+            folder = tmp_path / settings.backend / name
+            folder.mkdir(parents=True)
+            monkeypatch.chdir(folder)
+            parallel_map(touch, [Path("0"), Path("1")], settings)
+            assert {file.name for file in folder.iterdir()} == {"0", "1"}
+    monkeypatch.setattr(os, "getcwd", lambda: "/on/no/other/machine")
+    with pytest.raises(ComputeError, match="touch: the Dask worker on .* does not see /on/no"):
+        parallel_map(touch, [Path("0"), Path("1")], dask)
 
 
 def test_the_failing_item_is_named_in_one_line(dask: ComputeParams) -> None:
@@ -188,11 +191,11 @@ def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
     handler.emit = logged.append
     logging.getLogger("distributed").addHandler(handler)
     with cluster(tmp_path, workers=1) as machines:
-        outcomes = as_finished(pause, range(20), machines.compute)
+        outcomes = as_finished(time.sleep, [0.2] * 20, machines.compute)
         next(outcomes)
         machines.scheduler.kill()
         began = time.monotonic()
-        with pytest.raises(ComputeError, match="pause: lost the Dask scheduler at tcp") as caught:
+        with pytest.raises(ComputeError, match="sleep: lost the Dask scheduler at tcp") as caught:
             list(outcomes)
         assert time.monotonic() - began < 20
     logging.getLogger("distributed").removeHandler(handler)

@@ -9,6 +9,7 @@ import asyncio
 import logging
 import os
 import reprlib
+import socket
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -55,7 +56,7 @@ def parallel_map(
     worker or one item needs no second process.  `description` names the work in the progress on
     standard error; without it there is none. `settings.workers` counts processes on this machine
     (0: one per core this process may use); on Dask all of the scheduler's workers take part, which
-    need this package installed.
+    need this package installed and the caller's folder under the same name.
     Raises ComputeError, one line, for the first item that fails, a worker that dies, or a scheduler
     that does not answer; the tasks that have not started are dropped.
     """
@@ -110,6 +111,17 @@ class _Task(Generic[Item, Result]):
         """In a worker on this machine, which may be left from work in another folder."""
         _end_after(parent)
         os.chdir(folder)
+        return self.in_worker(index, item)
+
+    def elsewhere(self, folder: str, index: int, item: Item) -> tuple[int, Result]:
+        """In a Dask worker, which sees the caller's folder too: files are named from there, and
+        written into another they would be lost.
+        """
+        try:
+            os.chdir(folder)
+        except OSError as error:
+            where = f"the Dask worker on {socket.gethostname()} does not see {folder}"
+            raise ComputeError(f"{self.name}: {where}: {error.strerror}") from None
         return self.in_worker(index, item)
 
 
@@ -174,7 +186,8 @@ def _on_dask(
     from distributed import CancelledError, KilledWorker, as_completed
 
     with _dask_client(address) as client:
-        futures = client.map(task.in_worker, range(len(items)), items, pure=False)
+        places = [os.getcwd()] * len(items), range(len(items)), items
+        futures = client.map(task.elsewhere, *places, pure=False)
         try:
             for future in as_completed(futures, loop=client.loop):
                 yield future.result()
