@@ -60,7 +60,9 @@ def read_rows(file: Path, wanted: Mapping[str, str]) -> list[dict[str, Any]]:
             continue
         if not isinstance(row, dict) or row.pop(SEAL, None) not in (None, _seal(row)):
             continue  # damaged since: asked again
-        if "started" not in row and wanted.get(row.get("planner"), "") == row.get("fingerprint"):
+        if "started" not in row and wanted.get(str(row.get("planner")), "") == row.get(
+            "fingerprint"
+        ):
             found[key_of(row)] = row
     return list(found.values())
 
