@@ -12,6 +12,7 @@ import resource
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -81,6 +82,17 @@ class Artifact:
     read: Callable[[Path], dict[str, Any]]
     sealed: bool = True
     flips: bool = True
+
+
+TRIED: Counter[str] = Counter()
+"""Faults injected, and those of tests that passed."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _counted(effort: Effort) -> Iterator[None]:
+    yield
+    lost = TRIED["injected"] - TRIED["survived"]
+    count("faults", effort, **TRIED, results_lost=lost)
 
 
 def _rows(number: int) -> np.ndarray:
@@ -290,14 +302,14 @@ def test_a_write_that_fails_leaves_the_previous_file_whole(
     old, new = contents(folder), contents(tmp_path / "new")
     assert set(own.files) == set(old)
     before, after, read = own.read(folder), own.read(tmp_path / "new"), list[dict[str, Any]]()
-    injected = 0
+    began = TRIED["injected"]
     sizes = [len(content) for content in new.values()]
     for size in sorted({0, 1, *(int(share * max(sizes)) for share in (0.3, 0.99))}):
         for place in (folder, fresh):
             with pytest.raises((OSError, RuntimeError)) as caught, full_at(size):
                 own.write(place, 1)
             assert is_one_line(caught.value, place)
-            injected += 1
+            TRIED["injected"] += 1
         assert contents(folder) == old
         assert not contents(fresh)
     for first in range(1 if effort == QUICK else len(ERRORS)):  # else by turns
@@ -307,7 +319,7 @@ def test_a_write_that_fails_leaves_the_previous_file_whole(
             assert failed is None or isinstance(failed, MemoryError) or is_one_line(failed, folder)
             if made[0] < number:
                 break
-            injected += 1
+            TRIED["injected"] += 1
             now = error_of(lambda: read.append(own.read(folder)))
             if now is None:  # all of the one or all of the other
                 assert same(read[-1], before) or same(read[-1], after)
@@ -315,11 +327,8 @@ def test_a_write_that_fails_leaves_the_previous_file_whole(
                 assert len(own.files) > 1
                 assert is_one_line(now, folder)
             own.write(folder, 0)
-    INJECTED.append(injected)
+    TRIED["survived"] += TRIED["injected"] - began
     assert contents(folder).keys() == old.keys()
-
-
-INJECTED: list[int] = []
 
 
 @pytest.mark.parametrize("name", ARTIFACTS)
@@ -328,20 +337,21 @@ def test_a_file_that_was_damaged_is_refused_or_says_what_it_said(
 ) -> None:
     own, rng = ARTIFACTS[name], random.Random(name)
     own.write(tmp_path, 0)
-    right, whole, injected = own.read(tmp_path), contents(tmp_path), 0
+    right, whole, began = own.read(tmp_path), contents(tmp_path), TRIED["injected"]
     for file, content in whole.items():
         cuts = [content[:place] for place in cut_at(len(content), rng, effort.faults)]
         flips = [flipped(content, rng) for _ in range(effort.faults * own.flips)]
         for changed in (*cuts, *flips):
             (tmp_path / file).write_bytes(changed)
-            injected, found = injected + 1, dict[str, Any]()
+            TRIED["injected"] += 1
+            found = dict[str, Any]()
             refused = error_of(lambda found=found: found.update(own.read(tmp_path)))
             if refused is not None:
                 assert is_one_line(refused, tmp_path)
             elif own.sealed:
                 assert same(found, right), f"{file}: {len(changed)} of {len(content)} bytes"
         (tmp_path / file).write_bytes(content)
-    INJECTED.append(injected)
+    TRIED["survived"] += TRIED["injected"] - began
 
 
 def test_a_kept_row_that_was_damaged_is_asked_again(tmp_path: Path, effort: Effort) -> None:
@@ -354,23 +364,19 @@ def test_a_kept_row_that_was_damaged_is_asked_again(tmp_path: Path, effort: Effo
     whole = "".join(row_line(row) + "\n" for row in rows).encode()
     file.write_bytes(whole)
     assert read_rows(file, {"p": "0"}) == rows
+    began = TRIED["injected"]
     cuts = [whole[:place] for place in cut_at(len(whole), rng, effort.faults)]
     for changed in (*cuts, *(flipped(whole, rng) for _ in range(10 * effort.faults))):
         file.write_bytes(changed)
+        TRIED["injected"] += 1
         assert all(row in rows for row in told_of(read_rows(file, {"p": "0"})))
-    INJECTED.append(len(cuts) + 10 * effort.faults)
+    TRIED["survived"] += TRIED["injected"] - began
 
 
 def told_of(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """What is read of rows: another column that a changed letter makes of the seal is not."""
     names = (*KEY, "fingerprint", "length_rad", "status")
     return [{name: row[name] for name in names} for row in rows]
-
-
-def test_faults_are_counted(effort: Effort) -> None:
-    whole = sum(INJECTED)
-    count("faults", effort, injected=whole, survived=whole, results_lost=0)
-    assert whole > 100
 
 
 def cut_at(length: int, rng: random.Random, number: int) -> list[int]:

@@ -401,10 +401,11 @@ def _system_metrics(uri: str, run_id: str) -> Iterator[None]:
             yield
     finally:
         timer.cancel()
-        if timer.is_alive():
-            timer.join()
-        for monitor in monitors:
-            monitor.finish()
+        with impatient():
+            if timer.is_alive():
+                timer.join()
+            for monitor in monitors:
+                monitor.finish()
 
 
 def _named(name: str, tags: Mapping[str, str]) -> str:
