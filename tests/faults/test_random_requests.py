@@ -49,6 +49,7 @@ class Figures:
     wrong: list[str] = field(default_factory=list)
 
 
+@pytest.mark.timeout(24 * 3600)  # `make soak` takes hours
 def test_random_requests(effort: Effort) -> None:
     planner, figures = packaged_planner(), _begun(effort)
     first = planner.scene.now
