@@ -217,9 +217,8 @@ class FunctionsConstraintParams(_Record):
 
 
 def _kind(entry: Any) -> str | None:
-    if isinstance(entry, dict):
-        return f"<{entry.get('kind', 'pose')}>"
-    return f"<{entry.kind}>" if isinstance(entry, _Record) else None
+    kind = entry.get("kind", "pose") if isinstance(entry, dict) else getattr(entry, "kind", None)
+    return None if kind is None else f"<{kind}>"
 
 
 ConstraintParams = Annotated[

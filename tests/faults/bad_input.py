@@ -1,6 +1,5 @@
 """What bad input must come to: one line of a typed error that names the culprit, soon."""
 
-import re
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -68,13 +67,15 @@ def _in_time() -> Iterator[None]:
     def stop(*_: object) -> None:
         raise _HangsError
 
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(SECONDS)
+    before, left = (
+        signal.signal(signal.SIGALRM, stop),
+        signal.setitimer(signal.ITIMER_REAL, SECONDS),
+    )
     try:
         yield
     finally:
-        signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
+        signal.setitimer(signal.ITIMER_REAL, *left)  # the test's own time
 
 
 def written(folder: Path, name: str, content: str | bytes) -> Path:
@@ -83,8 +84,3 @@ def written(folder: Path, name: str, content: str | bytes) -> Path:
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(content.encode() if isinstance(content, str) else content)
     return file
-
-
-def told(text: str) -> str:
-    """A text in one line, as shells compare it."""
-    return re.sub(r"\s+", " ", text).strip()

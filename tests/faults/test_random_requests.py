@@ -49,6 +49,7 @@ class Figures:
     wrong: list[str] = field(default_factory=list)
 
 
+@pytest.mark.timeout(24 * 3600)  # `make soak` takes hours
 def test_random_requests(effort: Effort) -> None:
     planner, figures = packaged_planner(), _begun(effort)
     first = planner.scene.now
@@ -122,7 +123,9 @@ def _ask(planner: Planner, asked: Request, judge: Judge, figures: Figures, step:
         return
     figures.answered += 1
     figures.statuses[path.status] = figures.statuses.get(path.status, 0) + 1
-    faults = list(_answer_faults(path))
+    faults = _answer_faults(path)
+    if asked.kind == "corrupt":
+        faults.append(f"a corrupt request is answered: {path.status}")
     if path.status == "solved":
         only = asked.words.get("scene")
         if only:

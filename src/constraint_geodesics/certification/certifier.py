@@ -36,7 +36,6 @@ from constraint_geodesics.certification.motion import MotionLimits, check_times
 from constraint_geodesics.certification.urdf_chain import chain_of_urdf
 from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.values import shown
 
 __all__ = ["Certificate", "CertificationError", "Certifier", "Limits", "Violation"]
 
@@ -169,7 +168,8 @@ class Certifier:
         began = time.perf_counter()
         for own, name in ((constraint, "constraint"), (region, "region")):
             if not isinstance(own, Constraint) and (own is not None or name == "constraint"):
-                raise CertificationError(f"{name} = {shown(own)}: must be a Constraint")
+                what = f"{name} = {type(own).__name__}"
+                raise CertificationError(f"{what}: must be a Constraint")
         moving = self._moving(start_velocity, times)
         ends = self._end(start, "start"), self._end(goal, "goal")
         rows, violation = self._as_rows(joints)
