@@ -36,7 +36,7 @@ from constraint_geodesics.fields import (
 )
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.shapes import AnyShape
-from constraint_geodesics.text_files import read_text
+from constraint_geodesics.text_files import read_text, require_few_entries
 
 
 class _Record(BaseModel):
@@ -800,6 +800,7 @@ def read_yaml(path: Path) -> Any:
 
     try:
         documents = list(YAML(typ="safe", pure=True).load_all(read_text(path)))
+        require_few_entries(documents)
     except OSError as error:
         raise ParamsError(f"{path}: {error.strerror}") from None
     except (UnicodeError, RecursionError) as error:

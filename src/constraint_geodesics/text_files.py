@@ -11,6 +11,8 @@ from typing import Any, BinaryIO
 
 MOST_BYTES = 256 * 2**20
 """Of a file: a million waypoints are less."""
+MOST_ENTRIES = 10**7
+"""Of a file of YAML, its aliases unfolded."""
 _GZIP = b"\x1f\x8b"
 
 
@@ -58,6 +60,25 @@ def unpacked(content: bytes, file: Path) -> bytes:
             return _bounded(data, file)
     except (BadGzipFile, EOFError, zlib.error) as error:
         raise OSError(None, f"gzipped, and damaged: {error}", str(file)) from None
+
+
+def require_few_entries(value: Any) -> None:
+    """Raises ValueError for lists and mappings that hold more than MOST_ENTRIES in all, each as
+    often as it is named: a few lines of YAML name one another until nothing could print them.
+    """
+    counts: dict[int, int] = {}
+
+    def entries(own: Any) -> int:
+        if not isinstance(own, (dict, list, tuple, set)):
+            return 1
+        if id(own) not in counts:
+            counts[id(own)] = MOST_ENTRIES + 1  # of what is within itself
+            inner = own.values() if isinstance(own, dict) else own
+            counts[id(own)] = 1 + sum(entries(each) for each in inner)
+        return counts[id(own)]
+
+    if entries(value) > MOST_ENTRIES:
+        raise ValueError(f"its aliases unfold to more than {MOST_ENTRIES} entries")
 
 
 def _bounded(data: BinaryIO | GzipFile, file: Path) -> bytes:
