@@ -224,5 +224,5 @@ def save_execution(file: Path, execution: Execution) -> None:
 
 def load_execution(file: Path) -> Execution:
     """An execution that was kept in a file."""
-    kept = read_npz(file)
+    kept: dict[str, Any] = read_npz(file)
     return Execution(**{n: v if v.ndim else v.item() for n, v in kept.items()})
