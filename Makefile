@@ -29,6 +29,9 @@ HASHED := $(INSTALL) --no-compile --require-hashes --no-deps --no-build-isolatio
 	@touch $@
 
 .venv/installed: .venv/planning
+	@# where pip finds one, torch's build for processors alone, of 190 MB and not 3 GB; its hash is listed with the others
+	@sed -n '/^torch==/,/[^\\]$$/s/^torch==[^ ]*/&+cpu/p;/^torch==/,/[^\\]$$/{/--hash/p}' requirements.hashes > .venv/torch.txt
+	@.venv/bin/python $(HASHED) -r .venv/torch.txt 2> /dev/null || true
 	.venv/bin/python $(HASHED) -r requirements.hashes
 	@# torch's build for graphics cards pins libraries of its own, which other machines need not have: they are in no lock
 	@.venv/bin/python -m pip check > /dev/null || .venv/bin/python $(INSTALL) torch

@@ -551,8 +551,8 @@ def test_a_page_that_loads_something_from_the_net_fails_the_build(bad, tmp_path)
 
 
 def pins(file: str) -> dict[str, str]:
-    lines = (ROOT / file).read_text().lower().splitlines()
-    return dict(line.split("==") for line in lines if line and not line.startswith("#"))
+    found = re.findall(r"^([\w.-]+)==(\S+)", (ROOT / file).read_text(), re.M)
+    return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in found}
 
 
 def test_the_documentation_s_packages_are_pinned_and_agree_with_the_project_s() -> None:

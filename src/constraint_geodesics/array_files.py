@@ -67,7 +67,7 @@ def require_finite(arrays: Mapping[str, np.ndarray], file: Path) -> None:
     for name, values in arrays.items():
         if values.dtype.kind not in "fiub":
             raise ArrayFileError(f"{file}: {name!r} is of type {values.dtype}: must be numbers")
-        bad = np.argwhere(~np.isfinite(values)) if values.dtype.kind == "f" else np.empty((0, 1))
+        bad = np.argwhere(~np.isfinite(values))
         if len(bad):
             place = tuple(bad[0].tolist())
             raise ArrayFileError(

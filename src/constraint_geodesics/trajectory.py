@@ -579,5 +579,5 @@ def _is_number(text: str) -> bool:
 def _constraint_of(file: Path, number: int, text: str, robot: SerialRobot | None) -> Constraint:
     try:
         return constraint_from_json(json.loads(text), robot)
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise PlannerError(f"{file}, line {number}: not a constraint: {error}") from None

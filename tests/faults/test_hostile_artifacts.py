@@ -42,15 +42,18 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.submanifold import ARRAYS, load_submanifold
 from constraint_geodesics.moveit import add_moveit_scene
 from constraint_geodesics.params import load_params
+from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.paths import read_paths
 from constraint_geodesics.recording.recording import read_recording
+from constraint_geodesics.report.page import Section, Table, write_page
 from constraint_geodesics.robot.description import read_description
 from constraint_geodesics.robot.kinematics import load_robot
 from constraint_geodesics.scene.allowed_collisions import allowed_by_srdf
 from constraint_geodesics.scene.collada import as_obj
-from constraint_geodesics.scene.pieces import read_mesh, read_pieces
+from constraint_geodesics.scene.pieces import read_pieces
 from constraint_geodesics.scene.scene import robot_from
 from constraint_geodesics.scene.scene_file import read_scene
+from constraint_geodesics.scene.triangles import read_triangles
 from constraint_geodesics.studies.execution import load_execution
 from constraint_geodesics.trajectory import read_trajectory
 from tests.faults.effort import Effort, count
@@ -74,6 +77,12 @@ class Bomb:
         return os.system, (f"touch {self.canary}",)
 
 
+_WATCHED = (
+    *("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen"),
+    *("pickle.find_class", "socket.connect", "socket.getaddrinfo"),
+)
+
+
 class Watch:
     """What the process does while a hostile file is opened."""
 
@@ -85,18 +94,12 @@ class Watch:
     def _look(self, event: str, arguments: tuple[Any, ...]) -> None:
         if self.folder is None:
             return
-        if event in (
-            "os.system",
-            "os.exec",
-            "os.posix_spawn",
-            "subprocess.Popen",
-            "os.fork",
-        ) or event in ("pickle.find_class", "socket.connect", "socket.getaddrinfo"):
+        if event in _WATCHED:
             self.seen.append(f"{event} {arguments}")
         elif event == "open" and isinstance(arguments[0], str):
             writes = isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR)
             file = Path(arguments[0]).absolute()
-            if writes and not file.is_relative_to(self.folder) and file.suffix != ".pyc":
+            if writes and not file.is_relative_to(self.folder) and str(file) != os.devnull:
                 self.seen.append(f"{event} {arguments}")
 
     @contextmanager
@@ -392,7 +395,7 @@ def _(folder: Path) -> Any:
 
 
 def npz(file: Path, **members: bytes) -> Path:
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as whole:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as whole:
         for name, content in members.items():
             whole.writestr(f"{name}.npy", content)
     return file
@@ -445,9 +448,7 @@ def text(name: str, content: str, read: Open) -> Open:
 
 
 def packed(file: Path) -> Path:
-    with gzip.open(file, "wb", compresslevel=1) as whole:
-        for _ in range(40):
-            whole.write(bytes(2**24))
+    file.write_bytes(40 * gzip.compress(bytes(2**24), compresslevel=1))
     return file
 
 
@@ -456,7 +457,10 @@ ANCHORS = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
 )
 CALL = '!!python/object/apply:os.system ["touch canary"]'
 PARAMS = (ROOT / "params.yaml").read_text()
-ASKED = '{"urdf": "%s", "tool_link": "x", "joints": ["a"], "scenes": {"s": [{"start": [0], "goal": [0]}]}}'
+ASKED = (
+    '{"urdf": "%s", "tool_link": "x", "joints": ["a"],'
+    ' "scenes": {"s": [{"start": [0], "goal": [0]}]}}'
+)
 
 case("problems: 10^5 lists deep")(
     text("p.json", '{"scenes": ' + "[" * 10**5 + "]" * 10**5 + "}", read_problems)
@@ -488,7 +492,9 @@ for _name, _stage in (("a command", "free; touch canary"), ("a substitution", "$
     case(f"params: {_name} for a constraint's name")(
         text(
             "params.yaml",
-            PARAMS.replace("\nconstraints:\n", f'\nconstraints:\n  "{_stage}": {{kind: pose}}\n'),
+            PARAMS.replace(
+                "\n  free:\n", f'\n  "{_stage}": {{axes: [0, 0, 0, 0, 0, 0]}}\n  free:\n', 1
+            ),
             load_params,
         )
     )
@@ -539,20 +545,22 @@ for _name in ("../" * 12 + "etc/passwd", "/etc/passwd", "file:///etc/passwd", "/
 for _name in ("http://192.0.2.1/x.stl", "package://../../../etc/passwd", "\\\\192.0.2.1\\x.stl"):
     case(f"urdf: the mesh {_name}")(meshed(_name))
 case("obj: numbers of corners without end")(
-    text("mesh.obj", "v 0 0 0\nf 1 99999999999999999999 -5\n", read_mesh)
+    text(
+        "mesh.obj", "v 0 0 0\nf 1 99999999999999999999 -5\n", lambda file: read_triangles(file, "")
+    )
 )
 
 
 @case("stl: 2^32 triangles that are not there")
 def _(folder: Path) -> Any:
     (folder / "mesh.stl").write_bytes(bytes(80) + struct.pack("<I", 2**32 - 1) + bytes(50))
-    return read_mesh(folder / "mesh.stl")
+    return read_triangles(folder / "mesh.stl", "")
 
 
 # paths, demonstrations and recordings
 
 case("csv: a device without end")(lambda folder: read_trajectory(Path("/dev/zero")))
-case("csv: a line of 20 MB")(text("path.csv", "a,b\n" + "1," * 10**7, read_trajectory))
+case("csv: a line of 4 MB")(text("path.csv", "a,b\n" + "1," * 2 * 10**6, read_trajectory))
 case("csv: a constraint 10^5 lists deep")(
     text("path.csv", f"# constraint: {'[' * 10**5}\na,b\n1,2\n2,3\n", read_trajectory)
 )
@@ -576,10 +584,7 @@ for _name, _bytes in {
         return read_recording(folder / "path.rrd")
 
 
-HARMLESS = {
-    "npz: names that leave the folder": "they name no files",
-    "scene: anchors without end": "",
-}
+HARMLESS = {"npz: names that leave the folder": "they name no files"}
 """What is read, and why that harms nothing."""
 
 
@@ -623,3 +628,35 @@ def test_a_hostile_file_is_refused_in_one_line_or_harms_nothing(
 
 def test_there_are_enough_of_them() -> None:
     assert len(CASES) >= 30
+
+
+HOSTILE_NAME = "\x1b[2J\x1b]0;owned\x07<script>alert(1)</script>\r\nerror: none"
+
+
+def test_an_error_says_no_more_than_a_line_and_moves_no_cursor(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    complain(ValueError(f"{HOSTILE_NAME}: there is no such file"))
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.rstrip("\n").isprintable()
+    assert "\\x1b[2J" in err
+
+
+def test_a_page_shows_names_and_runs_none(tmp_path: Path) -> None:
+    (tmp_path / "reports").mkdir()
+    hostile = HOSTILE_NAME + "\"'><img src=x onerror=alert(2)>"
+    table = Table(hostile, hostile, [hostile], [[hostile]], planners=[hostile])
+    section = Section("one", hostile, hostile, tables=[table])
+    page = write_page(
+        Layout(tmp_path),
+        "benchmark",
+        about={hostile: hostile},
+        planners=1,
+        rows=1,
+        sections=[section],
+    ).read_text()
+    assert "<script>alert" not in page
+    assert "<img src=x" not in page
+    assert "&lt;script&gt;alert(1)" in page

@@ -106,6 +106,25 @@ def test_files_that_were_deleted_are_missed_by_name(copy: Path) -> None:
         pass
 
 
+def test_a_model_s_code_is_not_run_to_load_its_planner(
+    copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (code,) = (copy / "mlartifacts").rglob("served_model.py")
+    code.write_text(f"open({str(copy / 'canary')!r}, 'w')\n")
+    monkeypatch.chdir(copy)
+    Planner.load(ADDRESS).close()
+    assert not (copy / "canary").exists()
+
+
+def test_an_address_that_leaves_the_store_s_files_is_refused(root: Path) -> None:
+    client = client_of(tracking_uri(root))
+    run = client.get_model_version_by_alias(PLANNER_MODEL, CHAMPION).run_id
+    address = f"runs:/{run}/../../../.."
+    with pytest.raises(TrackingError, match="leaves") as caught, fetch_artifacts(address, root):
+        pass
+    assert "\n" not in str(caught.value)
+
+
 def test_other_files_are_a_new_version_and_equal_ones_are_not(
     copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

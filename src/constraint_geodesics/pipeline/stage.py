@@ -60,10 +60,16 @@ def note_stage_time(file: Path, stage: str, names: Sequence[str], seconds: float
 
 def complain(error: Exception, code: int | None = None) -> int:
     """Print an error in one line; returns the exit code, by default that of its kind."""
-    print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+    print(f"error: {_plain(str(error))}", file=sys.stderr)
     if code is not None:
         return code
     return WRONG_USAGE if isinstance(error, ParamsError | MissingExtraError) else 1
+
+
+def _plain(text: str) -> str:
+    """In one line, without what a terminal would obey: a file's name may hold anything."""
+    shown = (c if c.isprintable() or c.isspace() else ascii(c)[1:-1] for c in text)
+    return " ".join("".join(shown).split())
 
 
 def _check_names(params: "Params", stage: Callable[..., None], arguments: Sequence[str]) -> None:
