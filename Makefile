@@ -51,6 +51,7 @@ plan: .venv/planning  ## plan one path that keeps a cup level, at once: CSV, pic
 
 repro: env  ## run all stages that are out of date, then print the results
 	geodesics params
+	geodesics recover
 	dvc repro
 	geodesics results
 
@@ -170,4 +171,5 @@ replay: .venv/planning  ## replay a path in Rerun: make replay FILE=data/recordi
 	geodesics replay $(FILE)
 
 clean:  ## remove unfinished work, not results
+	@test ! -e .geodesics/runs || geodesics recover  # what MLflow has not got yet lies there
 	rm -rf .geodesics
