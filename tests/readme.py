@@ -117,7 +117,8 @@ def with_numbers(text: str) -> str:
 
 
 PAGES = {README: with_planners, RESULTS: filled, EXPERIMENTS: with_stage_times}
-PAGES |= {ROOT / "docs" / page: with_numbers for page in ("scenes.md", "problems.md", "scaling.md")}
+NUMBERED = ("scenes.md", "problems.md", "scaling.md", "reliability.md")
+PAGES |= {ROOT / "docs" / page: with_numbers for page in NUMBERED}
 """What brings each page up to date."""
 
 if __name__ == "__main__":

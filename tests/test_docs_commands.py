@@ -44,6 +44,7 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "geodesics ik": HERE,
     "geodesics identify": HERE,
     "geodesics package": ("tests/test_bundle.py", "package"),
+    "geodesics recover": ("tests/faults/test_kills.py", "recover"),
     "geodesics results": HERE,
     "geodesics results --experiments": (
         "tests/end_to_end/test_sweep.py",

@@ -68,7 +68,10 @@ def run(program: str, folder: Path, text: str = "") -> subprocess.CompletedProce
 
 def test_a_path_is_planned_drawn_and_certified_round_an_obstacle(tmp_path) -> None:
     post = POST.centre_m, POST.size_m
-    given = {"urdf": str(ROBOT), "post": post, "start": START, "goal": GOAL}
+    for file in ROBOT.parent.iterdir():  # a planner's files name what lies beside them
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    own = tmp_path / ROBOT.name
+    given = {"urdf": str(own), "post": post, "start": START, "goal": GOAL}
     done = run(PLANS, tmp_path, json.dumps(given))
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)

@@ -12,7 +12,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
-from constraint_geodesics.text_files import MOST_BYTES, DamagedFileError, read_content
+from constraint_geodesics.text_files import MOST_BYTES, DamagedFileError, read_kept
 
 
 class ArrayFileError(DamagedFileError):
@@ -26,7 +26,7 @@ def read_weights(file: Path, sha256: str | None = None) -> dict[str, np.ndarray]
     is missing, altered, none, or holds a number that is not finite.
     """
     try:
-        content = read_content(file)
+        content = read_kept(file)
     except FileNotFoundError:
         raise ArrayFileError(f"{file}: missing") from None
     except OSError as error:

@@ -131,11 +131,20 @@ def write_bytes(file: Path, content: bytes) -> None:
         part.write_bytes(content)
 
 
-def read_json(file: Path) -> Any:
-    """What a JSON file holds.  Raises OSError as `read_content`, ValueError for what is no JSON or
-    is nested too deeply.
+def read_kept(file: Path) -> bytes:
+    """All of a file that this project wrote.  Raises OSError as `read_content`, also for a pipe or
+    device, which nobody keeps anything in.
     """
-    return parse_json(read_content(file))
+    if file.exists() and not file.is_file():
+        raise OSError(None, "is no regular file", str(file))
+    return read_content(file)
+
+
+def read_json(file: Path) -> Any:
+    """What a JSON file holds that this project wrote.  Raises OSError as `read_kept`, ValueError for
+    what is no JSON or is nested too deeply.
+    """
+    return parse_json(read_kept(file))
 
 
 def parse_json(content: bytes | str) -> Any:

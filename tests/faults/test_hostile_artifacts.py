@@ -44,6 +44,7 @@ from constraint_geodesics.moveit import add_moveit_scene
 from constraint_geodesics.params import load_params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.paths import read_paths
+from constraint_geodesics.pipeline.stage import complain
 from constraint_geodesics.recording.recording import read_recording
 from constraint_geodesics.report.page import Section, Table, write_page
 from constraint_geodesics.robot.description import read_description

@@ -11,7 +11,7 @@ import pytest
 
 from constraint_geodesics.bundle import PACKAGED, read_bundle
 from constraint_geodesics.constraints.constraint import ConstraintManifold, constraint_manifold
-from constraint_geodesics.geometry.timing import time_parametrisation
+from constraint_geodesics.geometry.braking import Pace
 from constraint_geodesics.learning.dataset import Queries, draw_queries
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.params import ExecutionParams, Params
@@ -129,7 +129,7 @@ def test_both_are_executed_at_their_own_times(
     start, goal = found.queries.starts[0], found.queries.goals[0]
     path = planner.plan(start, goal, LEVEL)
     line = densify(np.stack([start, goal]), ROW_SPACING_RAD)
-    times = time_parametrisation(line, scene.robot.velocity, np.full(6, ACCELERATION))
+    times = Pace(scene.robot.velocity, np.full(6, ACCELERATION)).times(line, None)
     assert table["duration_s"].tolist() == pytest.approx([path.times[-1], times[-1]])
     assert table["length_rad"].tolist() == pytest.approx(
         [path.length_rad, np.linalg.norm(goal - start)]

@@ -20,6 +20,7 @@ from constraint_geodesics.geodesics.episodes import (
 )
 from constraint_geodesics.geodesics.problem import Costs, Ends, GeodesicProblem, Phi, repeated
 from constraint_geodesics.params import GeodesicParams
+from constraint_geodesics.text_files import reading
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,9 @@ class MeanPolicy:
     @classmethod
     def load(cls, folder: Path, seed: int) -> "MeanPolicy":
         """Read what `policy_search.save_policy` wrote."""
-        return cls.from_arrays(read_weights(folder / f"policy-{seed}.safetensors"))
+        file = folder / f"policy-{seed}.safetensors"
+        with reading(file):
+            return cls.from_arrays(read_weights(file))
 
     @classmethod
     def from_arrays(cls, weights: Mapping[str, np.ndarray]) -> "MeanPolicy":

@@ -62,7 +62,8 @@ class EpisodeRecord:
     def joints(self, at_s: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n D"]:
         """Configurations [rad] at times [s]."""
         begins = np.array([one.begins_s for one in self.stretches])
-        owner = np.maximum(np.searchsorted(begins, at_s, side="right") - 1, 0)
+        # a recording keeps a time to the microsecond: where a stretch begins it is that stretch's
+        owner = np.maximum(np.searchsorted(begins, at_s + 1e-6, side="right") - 1, 0)
         rows = []
         for moment, k in zip(at_s, owner, strict=True):
             begin, times, joints = self.stretches[k]

@@ -32,17 +32,23 @@ _SINGLE = ("radius_m", "length_m", "scale")
 """Fields of shapes that are one number and positive."""
 _SIZES = ("size_m", *_SINGLE)
 """All that must be positive."""
+_TRIPLES = ("centre_m", "size_m", "from_m", "to_m", "position_m", "rpy_rad")
+"""Those that are three; what further fields of shapes of one's own are, one or three, only they
+know.
+"""
 
 
 def _numbers(shape: str, name: str, value: Any) -> Any:
     """A field as a float, or a tuple of three."""
+    dimensions = [()] if name in _SINGLE else [(3,)] if name in _TRIPLES else [(), (3,)]
     least = 0.0 if name in _SIZES else -inf
     is_triple = type(value) is tuple and [type(own) for own in value] == [float] * 3
     usable = is_triple and all(least < own and abs(own) <= LARGEST for own in value)
     if usable and name not in _SINGLE:  # soon seen, as of most
         return value
-    given, count = numbers(value), "a number" if name in _SINGLE else "three numbers"
-    if given is None or given.shape != (() if name in _SINGLE else (3,)):
+    given = numbers(value)
+    if given is None or given.shape not in dimensions:
+        count = " or ".join("three numbers" if own else "a number" for own in dimensions)
         raise ShapeError(f"{shape!r}: {name} = {shown(value)}: must be {count}")
     if not are_usable(given) or not (given > least).all():
         what = "positive and finite" if name in _SIZES else "finite"
