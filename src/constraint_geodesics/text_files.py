@@ -141,8 +141,9 @@ def read_kept(file: Path) -> bytes:
 
 
 def read_json(file: Path) -> Any:
-    """What a JSON file holds that this project wrote.  Raises OSError as `read_kept`, ValueError for
-    what is no JSON or is nested too deeply.
+    """What a JSON file holds that this project wrote.
+
+    Raises OSError as `read_kept`, ValueError for what is no JSON or is nested too deeply.
     """
     return parse_json(read_kept(file))
 

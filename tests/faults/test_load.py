@@ -276,12 +276,13 @@ def test_who_is_too_many_is_told_to_come_again(asked: Asked, served: str) -> Non
 @pytest.mark.parametrize(
     ("body", "headers", "status", "words"),
     [
-        (b"x" * 1_000_001, {}, 413, "1000001 bytes: at most 1000000"),
+        (b"", {"Content-Length": "1000001"}, 413, "1000001 bytes: at most 1000000"),
         (iter([b"x"]), {}, 411, "Content-Length"),
         (b"[", {}, 400, ""),
         (b'{"dataframe_records": [{}]}', {}, 400, ""),
         (b'{"dataframe_records": [{"start": null, "goal": [], "constraint": 3}]}', {}, 400, ""),
     ],
+    ids=["too long", "no length", "no JSON", "nothing asked", "no query"],
 )
 def test_what_is_no_request_is_said(
     served: str, body: Any, headers: dict[str, str], status: int, words: str

@@ -197,13 +197,11 @@ def write_joints(shards: Sequence[Shard], file: Path, about: dict[str, str]) -> 
 
 
 def read_joints(file: Path) -> JointSet:
-    """Read and check one set.  Raises FileNotFoundError, DatasetError with file and column of a bad
-    row.
-    """
+    """Read and check one set.  Raises DatasetError with file and column of a bad row."""
     try:
         table = pq.read_table(file, page_checksum_verification=True).to_pandas()
-    except FileNotFoundError as error:
-        raise FileNotFoundError(error.errno, "missing", str(file)) from None
+    except FileNotFoundError:
+        raise DatasetError(f"{file}: missing") from None
     except (OSError, ValueError, pa.ArrowException) as error:
         raise DatasetError(f"{file}: no table of configurations: {_said(error)}") from None
     if table.empty:
@@ -224,15 +222,11 @@ def write_queries(queries: Queries, file: Path) -> None:
 
 
 def read_queries(file: Path) -> Queries:
-    """Read what `write_queries` wrote.  Raises FileNotFoundError, DatasetError, one line, for what
-    is none.
-    """
+    """Read what `write_queries` wrote.  Raises DatasetError, one line, for what is none."""
     try:
         text = StringIO(read_text(file))
         frame = pd.read_csv(text, index_col="query", float_precision="round_trip")
         first, last = (frame.filter(like=f"{end}_").to_numpy(float) for end in ("start", "goal"))
-    except FileNotFoundError:
-        raise
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"{file}: no table of queries: {_said(error)}") from None
     if first.shape != last.shape or not first.size:

@@ -46,7 +46,7 @@ def is_whole(file: Path) -> bool:
     """Whether DVC can read all of a lock file."""
     text = file.read_text("utf-8", "replace")
     try:
-        stages = yaml.load(text, _LOADER)["stages"]
+        stages = _LOADER(text).get_single_data()["stages"]
         return text.endswith("\n") and all(map(_is_entry, _paths(stages)))
     except (yaml.YAMLError, KeyError, TypeError, AttributeError):
         return False

@@ -7,6 +7,7 @@ from typing import Any
 
 import pandas as pd
 
+from constraint_geodesics.learning.dataset import DatasetError
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.recording.png import save_png
@@ -46,6 +47,8 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
         cards, drawn = draw_data_cards(params, layout), draw_figures(params, layout, table)
     except FileNotFoundError as error:
         raise ReportError(f"{error.filename or error}: missing; `dvc repro` makes it") from None
+    except DatasetError as error:
+        raise ReportError(f"{error}; `dvc repro` makes it") from None
     reports = layout.root / "reports"
     with written(reports / "table.csv") as part:
         table.to_csv(part, index=False, float_format="%.6g")
