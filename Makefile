@@ -7,7 +7,7 @@ CONSTRAINT ?=
 FIRST_START = 1.329923 -0.584036 -3.766650 -2.008429 0.728803 -2.581396
 FIRST_GOAL = 1.071549 -0.217480 -1.682647 -2.906655 -0.337949 1.348704
 
-.PHONY: help env plan repro pretrained dag smoke bench bench-quick draw-queries bench-geometry test test-pipeline test-faults soak lint format audit lock results readme \
+.PHONY: help env plan repro pretrained dag smoke bench bench-quick draw-queries bench-geometry test test-experiments test-faults soak lint format audit lock results readme \
 	docs notebook plots experiments sweep ui replay clean test-browser screenshots
 
 help:  ## list the targets
@@ -81,11 +81,14 @@ bench-geometry: env  ## time the geometry core again, after whatever it needs; w
 	dvc repro label_joints train_manifold train_analytic
 	dvc repro --single-item --force stages/dvc.yaml:benchmark_geometry
 
-test: env  ## run the tests of every part
-	python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder --ignore tests/end_to_end
+TESTS := python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
+EXPERIMENTS := end_to_end peers studies
 
-test-pipeline: env  ## run the whole pipeline, its studies, an experiment and a sweep on small parameters
-	python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder tests/end_to_end
+test: env  ## run the tests of what people call and of what it is made of
+	$(TESTS) $(EXPERIMENTS:%=--ignore tests/%)
+
+test-experiments: env  ## run those of the experiments: baselines, studies, and the whole pipeline on small parameters
+	$(TESTS) $(EXPERIMENTS:%=tests/%)
 
 test-faults: env  ## break things on purpose: kills, full disks, bad input, hostile files, load (half an hour); writes reports/reliability.json
 	GEODESICS_RELIABILITY=reports/reliability.json python -m pytest tests/faults --faults
