@@ -2,6 +2,7 @@
 
 import json
 import os
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,7 +42,7 @@ def count(part: str, effort: Effort, **figures: float | int | str) -> None:
     if COUNTS not in os.environ:
         return
     file = Path(os.environ[COUNTS])
-    with FileLock(f"{file}.lock"):
+    with FileLock(Path(tempfile.gettempdir()) / f"{file.name}.lock"):
         counts = json.loads(file.read_text()) if file.exists() else {}
         before = counts.get(part)
         if before and _order(before["effort"]) > _order(effort.name):
