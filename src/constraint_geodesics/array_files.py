@@ -12,7 +12,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
-from constraint_geodesics.text_files import MOST_BYTES, DamagedFileError, read_kept
+from constraint_geodesics.text_files import DamagedFileError, read_content, require_short
 
 
 class ArrayFileError(DamagedFileError):
@@ -26,7 +26,7 @@ def read_weights(file: Path, sha256: str | None = None) -> dict[str, np.ndarray]
     is missing, altered, none, or holds a number that is not finite.
     """
     try:
-        content = read_kept(file)
+        content = read_content(file, piped=False)
     except FileNotFoundError:
         raise ArrayFileError(f"{file}: missing") from None
     except OSError as error:
@@ -43,20 +43,20 @@ def read_weights(file: Path, sha256: str | None = None) -> dict[str, np.ndarray]
 
 def read_npz(file: Path) -> dict[str, np.ndarray]:
     """The arrays of an npz file.  Raises ArrayFileError for a file that is missing, none, holds
-    objects, or grows beyond MOST_BYTES.
+    objects, or grows beyond what is read of one.
     """
     try:
         with zipfile.ZipFile(file) as members:
-            if sum(member.file_size for member in members.infolist()) > MOST_BYTES:
-                raise ArrayFileError(f"{file}: longer than {MOST_BYTES // 2**20} MiB, unpacked")
+            unpacked = sum(member.file_size for member in members.infolist())
+        require_short(unpacked, file, what=", unpacked")
         with np.load(file, allow_pickle=False) as kept:
             return {name: kept[name] for name in kept.files}
     except FileNotFoundError:
         raise ArrayFileError(f"{file}: missing") from None
-    except ArrayFileError:
-        raise
+    except OSError as error:
+        raise ArrayFileError(f"{file}: {error.strerror or _first_line(error)}") from None
     except (
-        *(OSError, EOFError, ValueError, KeyError, TypeError, MemoryError, OverflowError),
+        *(EOFError, ValueError, KeyError, TypeError, MemoryError, OverflowError),
         *(RuntimeError, SyntaxError, zipfile.BadZipFile, zlib.error),
     ) as error:
         raise ArrayFileError(f"{file}: no npz file of arrays: {_first_line(error)}") from None

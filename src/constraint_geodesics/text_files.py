@@ -30,18 +30,28 @@ def read_text(
     return read_content(file, most).decode(encoding, errors)
 
 
-def read_content(file: Path, most: int = MOST_BYTES) -> bytes:
-    """All of a file.  Raises OSError, with a `strerror`, for one that can't be read, has more than
-    `most` bytes, or is a pipe that nothing comes from for PATIENCE_S.
+def read_content(file: Path, most: int = MOST_BYTES, *, piped: bool = True) -> bytes:
+    """All of a file.
+
+    piped: whether it may come out of a pipe or a device, which nobody keeps anything in.  Raises
+    OSError, with a `strerror`, for one that can't be read, has more than `most` bytes, or is a pipe
+    that nothing comes from for PATIENCE_S.
     """
     with open(file, "rb", opener=_at_once) as data:
         if stat.S_ISREG(os.fstat(data.fileno()).st_mode):
             content = data.read(most + 1)
-        else:
+        elif piped:
             content = _from_pipe(data.fileno(), file, most)
-    if len(content) > most:
-        raise OSError(None, f"longer than {most / 2**20:g} MiB", str(file))
+        else:
+            raise OSError(None, "is no regular file", str(file))
+    require_short(len(content), file, most)
     return content
+
+
+def require_short(size: int, file: Path, most: int = MOST_BYTES, what: str = "") -> None:
+    """Raises OSError, with a `strerror`, where a file has more bytes than are read."""
+    if size > most:
+        raise OSError(None, f"longer than {most / 2**20:g} MiB{what}", str(file))
 
 
 def _at_once(name: str, flags: int) -> int:
@@ -131,21 +141,12 @@ def write_bytes(file: Path, content: bytes) -> None:
         part.write_bytes(content)
 
 
-def read_kept(file: Path) -> bytes:
-    """All of a file that this project wrote.  Raises OSError as `read_content`, also for a pipe or
-    device, which nobody keeps anything in.
-    """
-    if file.exists() and not file.is_file():
-        raise OSError(None, "is no regular file", str(file))
-    return read_content(file)
-
-
 def read_json(file: Path) -> Any:
     """What a JSON file holds that this project wrote.
 
-    Raises OSError as `read_kept`, ValueError for what is no JSON or is nested too deeply.
+    Raises OSError as `read_content`, ValueError for what is no JSON or is nested too deeply.
     """
-    return parse_json(read_kept(file))
+    return parse_json(read_content(file, piped=False))
 
 
 def parse_json(content: bytes | str) -> Any:
@@ -164,13 +165,8 @@ def unpacked(content: bytes, file: Path) -> bytes:
         return content
     try:
         with GzipFile(fileobj=io.BytesIO(content)) as data:
-            return _bounded(data, file)
+            plain = data.read(MOST_BYTES + 1)
     except (BadGzipFile, EOFError, zlib.error) as error:
         raise OSError(None, f"gzipped, and damaged: {error}", str(file)) from None
-
-
-def _bounded(data: GzipFile, file: Path) -> bytes:
-    content = data.read(MOST_BYTES + 1)
-    if len(content) > MOST_BYTES:
-        raise OSError(None, f"longer than {MOST_BYTES // 2**20} MiB", str(file))
-    return content
+    require_short(len(plain), file, what=", unpacked")
+    return plain

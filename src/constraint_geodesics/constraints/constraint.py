@@ -273,11 +273,11 @@ def constraint_from_json(about: Mapping[str, Any], robot: SerialRobot | None = N
     kind = kind_named(about.get("kind", "pose"))
     try:
         return kind.from_json(about, robot)
+    except ConstraintError:
+        raise
     except KeyError as error:
         raise ConstraintError(f"{kind.kind}: {error} is missing") from None
     except (AttributeError, IndexError, OverflowError, TypeError, ValueError) as error:
-        if isinstance(error, ConstraintError):
-            raise
         raise ConstraintError(f"{kind.kind}: {' '.join(str(error).split())}") from None
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from constraint_geodesics.array_files import ArrayFileError, read_weights
+from constraint_geodesics.array_files import read_weights
 from constraint_geodesics.geometry.manifold import pullback_metric
 from constraint_geodesics.learning.inference import CARD, WEIGHTS, ManifoldFileError
 from constraint_geodesics.learning.learned_manifold import PIECE
@@ -151,11 +151,9 @@ class LatentManifold:
                     f"{folder}: kind = {card['kind']!r}: must be {kind.__name__!r}"
                 )
             decoder = network_of(lambda: kind(**card["sizes"]).double(), weights)
-        except ArrayFileError as error:
-            raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None
+        except ManifoldFileError:
+            raise
         except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
-            if isinstance(error, ManifoldFileError):
-                raise
             raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None
         return cls(decoder.eval().requires_grad_(False))
 

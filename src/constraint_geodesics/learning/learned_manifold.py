@@ -14,7 +14,7 @@ from jaxtyping import Float
 from safetensors.torch import save
 from torch import Tensor
 
-from constraint_geodesics.array_files import ArrayFileError, read_weights
+from constraint_geodesics.array_files import read_weights
 from constraint_geodesics.geometry.manifold import pullback_metric
 from constraint_geodesics.learning.inference import CARD, WEIGHTS, ManifoldFileError
 from constraint_geodesics.learning.vae import JointVae, network_of
@@ -133,8 +133,6 @@ class LearnedManifold:
         try:
             card = read_json(folder / CARD)
             return cls.from_arrays(read_weights(folder / WEIGHTS, card["sha256"]))
-        except ArrayFileError as error:
-            raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None
         except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
             raise ManifoldFileError(f"{folder}: not a saved manifold: {error}") from None
 
