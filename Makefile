@@ -8,7 +8,7 @@ FIRST_START = 1.329923 -0.584036 -3.766650 -2.008429 0.728803 -2.581396
 FIRST_GOAL = 1.071549 -0.217480 -1.682647 -2.906655 -0.337949 1.348704
 
 .PHONY: help env plan repro pretrained dag smoke bench bench-quick draw-queries bench-geometry test test-experiments test-faults soak lint format audit lock results readme \
-	docs notebook plots experiments sweep ui replay clean test-browser screenshots
+	docs notebook plots experiments sweep ui replay clean test-browser screenshots first-screens
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
@@ -107,6 +107,10 @@ test-browser: env .venv/browser  ## MLflow's dashboard, Rerun's viewer and the r
 screenshots: env .venv/browser  ## make the documentation's pictures again, from this checkout's runs and recordings
 	@python tests/browser/chromium.py
 	python -m tests.browser.screenshots
+
+first-screens: env .venv/browser  ## pictures of the first screens that people see, to be looked at: .geodesics/screens
+	@python tests/browser/chromium.py
+	python -m tests.browser.first_screens
 
 lint: env  ## format, lint, types, import directions
 	ruff format --check .
