@@ -21,6 +21,7 @@ from safetensors.numpy import save
 
 from constraint_geodesics.array_files import ArrayFileError, read_weights
 from constraint_geodesics.fields import Name
+from constraint_geodesics.formats import PLANNER, Format, FormatError
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.graph import components
 from constraint_geodesics.params import (
@@ -37,7 +38,6 @@ from constraint_geodesics.scene.urdf import data_path
 from constraint_geodesics.search.roadmap import Roadmap
 from constraint_geodesics.text_files import read_json, written
 
-FORMAT = 2
 _CONSTRAINTS: TypeAdapter[dict[Name, ConstraintParams]] = TypeAdapter(dict[Name, ConstraintParams])
 CARD, ROADMAPS = "planner.json", "roadmaps.safetensors"
 PIPELINE = Path("data/planner")
@@ -72,12 +72,12 @@ class Bundle:
             "planner": self.planner.model_dump(mode="json"),
             "judge": self.judge.model_dump(mode="json"),
         }
-        write_files(folder / CARD, FORMAT, card, {ROADMAPS: roadmap_arrays(self.roadmaps)})
+        write_files(folder / CARD, PLANNER, card, {ROADMAPS: roadmap_arrays(self.roadmaps)})
 
 
 def write_files(
     card_file: Path,
-    version: int,
+    written_as: Format,
     card: Mapping[str, Any],
     arrays: Mapping[str, Mapping[str, np.ndarray]],
 ) -> None:
@@ -86,7 +86,7 @@ def write_files(
     """
     contents = {name: save(dict(values)) for name, values in arrays.items()}
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
-    whole: dict[str, Any] = {"format": version, **card, "sha256": digests}
+    whole: dict[str, Any] = {**written_as.entries, **card, "sha256": digests}
     digests[card_file.name] = card_digest(whole)
     with ExitStack() as files:  # the card, which was entered first, takes its place last
         part = files.enter_context(written(card_file))
@@ -96,13 +96,14 @@ def write_files(
 
 
 def read_files(
-    card_file: Path, version: int, names: Sequence[str]
+    card_file: Path, read_as: Format, names: Sequence[str]
 ) -> tuple[dict[str, Any], dict[str, dict[str, np.ndarray]]]:
-    """The card and the arrays that `write_files` wrote.
+    """The card and the arrays that `write_files` wrote, brought up to date.
 
-    Raises BundleError if a file is missing, altered (its checksum differs), or of another format.
+    Raises BundleError if a file is missing, altered (its checksum differs), or of a format that
+    this release can't read.
     """
-    card = _card(card_file, version)
+    card = _card(card_file, read_as)
     return card, {
         name: _arrays(card_file.parent / name, card["sha256"].get(name)) for name in names
     }
@@ -160,9 +161,10 @@ def bundle_folder(source: str | Path | None) -> Path:
 def read_bundle(folder: Path) -> Bundle:
     """Read what `Bundle.write` wrote.
 
-    Raises BundleError if a file is missing, altered (its checksum differs), or of another format.
+    Raises BundleError if a file is missing, altered (its checksum differs), or of a format that
+    this release can't read.
     """
-    card, arrays = read_files(folder / CARD, FORMAT, (ROADMAPS,))
+    card, arrays = read_files(folder / CARD, PLANNER, (ROADMAPS,))
     try:
         roadmaps = roadmaps_of(arrays[ROADMAPS], folder / ROADMAPS)
         alone = sorted(set(roadmaps) - set(card["constraints"]))
@@ -230,7 +232,7 @@ def _is_within(file: Path, folder: Path) -> bool:
         return False
 
 
-def _card(file: Path, version: int) -> dict[str, Any]:
+def _card(file: Path, read_as: Format) -> dict[str, Any]:
     try:
         card = read_json(file)
     except OSError as error:
@@ -240,12 +242,17 @@ def _card(file: Path, version: int) -> dict[str, Any]:
         raise BundleError(f"{file.parent}: {what}") from None
     except ValueError as error:
         raise BundleError(f"{file}: not JSON: {error}") from None
-    written = card.get("format") if isinstance(card, dict) else None
-    if written != version or not isinstance(card.get("sha256"), dict):
-        raise BundleError(f"{file}: format {written}: this version reads format {version}")
+    if not isinstance(card, dict):
+        raise BundleError(f"{file}: not a planner's card: must be entries by name")
+    try:
+        found = read_as.updated(card)
+    except FormatError as error:
+        raise BundleError(f"{file}: {error}") from None
+    if not isinstance(card.get("sha256"), dict):
+        raise BundleError(f"{file}: not a planner's card: sha256 is missing")
     if card["sha256"].get(file.name) != card_digest(card):
         raise BundleError(f"{file}: altered since it was written (its checksum differs)")
-    return card
+    return found
 
 
 def card_digest(card: Mapping[str, Any]) -> str:
