@@ -16,6 +16,7 @@ from constraint_geodesics.identification.demonstrations import demonstrations_fr
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.recording.recording import read_recording
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.scene import robot_from
 from constraint_geodesics.scene.scene_file import read_attached, read_scene
 from constraint_geodesics.trajectory import read_trajectory
 from tests.golden.write import (
@@ -28,7 +29,6 @@ from tests.golden.write import (
     planner_facts,
     shape_facts,
 )
-from tests.planner_fixtures import packaged_planner
 
 RELEASES = sorted(file.parent for file in HERE.glob(f"*/{FACTS}"))
 MOST_BYTES = 200_000
@@ -46,8 +46,9 @@ def facts(release: Path) -> dict[str, Any]:
 
 
 @pytest.fixture
-def robot() -> SerialRobot:
-    return packaged_planner().robot
+def robot(release: Path) -> SerialRobot:
+    """That of the release's planner."""
+    return robot_from(read_bundle(release / "planner").robot)
 
 
 def same(found: Any, told: Any) -> None:
@@ -67,8 +68,8 @@ def same(found: Any, told: Any) -> None:
 
 def same_constraint(found: Constraint | None, told: dict[str, Any], robot: SerialRobot) -> None:
     assert found is not None
-    now = constraint_facts(found, robot)
-    same(now, {name: told[name] for name in ("q_rad", "residual", "units")})
+    now = constraint_facts(found, robot, np.array(told["q_rad"]))
+    same(now, {name: told[name] for name in ("residual", "units")})
 
 
 def test_the_release_that_is_made_here_has_its_files() -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from constraint_geodesics import bundle
 from constraint_geodesics.bundle import Bundle, read_bundle
@@ -135,12 +136,13 @@ def trajectory_facts(trajectory: Trajectory) -> dict[str, Any]:
         "mean_rad": trajectory.joints.mean(axis=0).tolist(),
         "duration_s": float(trajectory.times[-1]),
         "start_velocity": None if start is None else start.tolist(),
-    } | constraint_facts(trajectory.constraint, trajectory.scene.robot)
+    } | constraint_facts(trajectory.constraint, trajectory.scene.robot, trajectory.joints[::20])
 
 
-def constraint_facts(constraint: Constraint, robot: SerialRobot) -> dict[str, Any]:
-    """Residuals at some configurations [rad], in each row's unit."""
-    q = robot.sample(3, np.random.default_rng(0))
+def constraint_facts(
+    constraint: Constraint, robot: SerialRobot, q: Float[np.ndarray, "n D"]
+) -> dict[str, Any]:
+    """Residuals at configurations [rad], in each row's unit."""
     residual = ConstraintManifold(robot, constraint).residual(q)
     units = list(constraint.units)
     return {"q_rad": q.tolist(), "residual": residual.tolist(), "units": units}
@@ -187,14 +189,15 @@ def identification_files(folder: Path, robot: SerialRobot) -> dict[str, Any]:
     assert found.supported is not None
     found.save(folder / "constraint.yaml")
     found.save(folder / "constraint_where_shown.yaml", where_shown=True)
+    q = np.concatenate([shown[0][:2], robot.sample(2, np.random.default_rng(0))])
     return {
         "demonstrations.csv": {
             "rows": [len(rows) for rows in shown],
             "first_rad": np.round(shown[0][0], 5).tolist(),
             "last_rad": np.round(shown[-1][-1], 5).tolist(),
         },
-        "constraint.yaml": constraint_facts(found.constraint, robot),
-        "constraint_where_shown.yaml": constraint_facts(found.supported, robot),
+        "constraint.yaml": constraint_facts(found.constraint, robot, q),
+        "constraint_where_shown.yaml": constraint_facts(found.supported, robot, q),
     }
 
 
