@@ -1,14 +1,17 @@
 """The planner's files: robot, workcell, constraints, settings and roadmaps, small enough to travel
 with the package; nothing in them is trained.
 
-A folder with planner.json (the SHA-256 of every other file in it too) and roadmaps.safetensors.
+A folder with planner.json (the SHA-256 of every other file in it too), roadmaps.safetensors, and
+the URDFs and meshes that are not PyBullet's (`taken_along.py`).
 Nothing in it is code, nothing is unpickled.  Checksums tell what was altered by accident, not who
 wrote it: what a folder names (URDFs, meshes, modules) and holds (graphs) is looked at as well.
 """
 
 import hashlib
 import json
+import shutil
 import sys
+import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -16,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from platformdirs import user_cache_path
 from pydantic import TypeAdapter, ValidationError
 from safetensors.numpy import save
 
@@ -36,7 +40,8 @@ from constraint_geodesics.plugs import MLFLOW, plug
 from constraint_geodesics.robot.kinematics import RobotError
 from constraint_geodesics.scene.urdf import data_path
 from constraint_geodesics.search.roadmap import Roadmap
-from constraint_geodesics.text_files import read_json, written
+from constraint_geodesics.taken_along import FILES, MissingFileError, put_back, taken_along
+from constraint_geodesics.text_files import read_json, read_kept, written
 
 _CONSTRAINTS: TypeAdapter[dict[Name, ConstraintParams]] = TypeAdapter(dict[Name, ConstraintParams])
 CARD, ROADMAPS = "planner.json", "roadmaps.safetensors"
@@ -81,10 +86,12 @@ def write_files(
     card: Mapping[str, Any],
     arrays: Mapping[str, Mapping[str, np.ndarray]],
 ) -> None:
-    """Write arrays as safetensors files and the card beside them with their checksums, all of them
-    or none; who is killed between two of them leaves what the card does not fit.
+    """Write arrays as safetensors files, files that the card names, and the card beside them with
+    their checksums, all of them or none; who is killed between two of them leaves what the card
+    does not fit.
     """
-    contents = {name: save(dict(values)) for name, values in arrays.items()}
+    card, contents = taken_along(card)
+    contents |= {name: save(dict(values)) for name, values in arrays.items()}
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
     whole: dict[str, Any] = {**written_as.entries, **card, "sha256": digests}
     digests[card_file.name] = card_digest(whole)
@@ -104,6 +111,10 @@ def read_files(
     this release can't read.
     """
     card = _card(card_file, read_as)
+    try:
+        put_back(card, card_file.parent)
+    except MissingFileError as error:
+        raise BundleError(str(error)) from None
     return card, {
         name: _arrays(card_file.parent / name, card["sha256"].get(name)) for name in names
     }
@@ -141,7 +152,7 @@ def open_bundle(source: str | Path | None = None) -> tuple[Bundle, str]:
     """
     if isinstance(source, str) and ":/" in source:
         with plug(MLFLOW)(source) as folder:
-            return _from_elsewhere(folder), f"MLflow's {source}"
+            return _from_elsewhere(_lasting(folder)), f"MLflow's {source}"
     folder = bundle_folder(source)
     if source is not None:
         own = folder.resolve() in (PIPELINE.resolve(), PACKAGED.resolve())
@@ -184,6 +195,22 @@ def read_bundle(folder: Path) -> Bundle:
         raise BundleError(
             f"{folder / CARD}: not a planner's card: {' '.join(what.split())[:200]}"
         ) from None
+
+
+def _lasting(folder: Path) -> Path:
+    """A folder that MLflow takes away again; a copy of it in the user's cache where the planner
+    goes on reading files of it.
+    """
+    if not ((folder / FILES).is_dir() and (folder / CARD).is_file()):
+        return folder
+    digest = hashlib.sha256(read_kept(folder / CARD)).hexdigest()[:16]
+    place = user_cache_path("constraint_geodesics") / "planners" / digest
+    if not place.is_dir():
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=place.parent) as part, suppress(FileExistsError):
+            # links stay links, so that they are seen; another process may be first
+            shutil.copytree(folder, Path(part) / digest, symlinks=True).rename(place)
+    return place
 
 
 def _from_elsewhere(folder: Path) -> Bundle:

@@ -47,6 +47,7 @@ from constraint_geodesics.search.candidates import (
 )
 from constraint_geodesics.search.curve_kernels import CHECK_STEP
 from constraint_geodesics.search.roadmap import Roadmap
+from constraint_geodesics.taken_along import as_taken
 
 FOLDER = "learned"
 """Beside the planner's folder, or in it, as in the package."""
@@ -172,7 +173,7 @@ class LearnedMethod:
         inside = folder / FOLDER
         place = inside if inside.is_dir() else folder.parent / FOLDER
         files = read_learned(place)
-        if files.robot != bundle.robot:
+        if as_taken(files.robot) != as_taken(bundle.robot):
             raise BundleError(f"{place / CARD}: trained for another robot than the planner's")
         return cls(files)
 
