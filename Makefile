@@ -150,8 +150,8 @@ $(DOCS)/installed: docs/requirements.lock | .venv/installed
 	$(DOCS)/bin/python $(HASHED) -r docs/requirements.lock
 	@touch $@
 
-docs: $(DOCS)/installed  ## the documentation as a site that opens offline: .geodesics/site/index.html
-	$(DOCS)/bin/mkdocs build --strict --quiet
+docs: $(DOCS)/installed  ## the documentation as a site with a search and the API, which opens offline: .geodesics/site/index.html
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict --quiet
 	@echo "Open .geodesics/site/index.html"
 
 notebook: env $(DOCS)/installed  ## run docs/first_path.ipynb again and store what it prints and draws

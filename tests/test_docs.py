@@ -4,6 +4,7 @@ names exist.
 That its commands run is in tests/test_docs_commands.py.
 """
 
+import inspect
 import json
 import re
 import shlex
@@ -11,8 +12,10 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from functools import cache
 from html.parser import HTMLParser
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,7 @@ from dvc.repo import Repo
 from dvc.utils.hydra import apply_overrides
 from mlflow.utils.search_utils import SearchUtils
 
+import constraint_geodesics
 from constraint_geodesics import cli
 from constraint_geodesics.bundle import PACKAGED
 from constraint_geodesics.params import load_params
@@ -33,6 +37,7 @@ from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.search_space import read_space
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 from constraint_geodesics.tracking.registry import register_planner
+from tests.docs_site import MKDOCS, NO_MKDOCS, NOTEBOOK_PAGE, built
 from tests.readme import EXPERIMENTS as TIMES_PAGE
 from tests.readme import with_stage_times
 
@@ -454,10 +459,6 @@ def test_every_filter_is_one_that_mlflow_understands(page) -> None:
 # The site
 
 
-MKDOCS = ROOT / ".geodesics" / "docs-venv" / "bin" / "mkdocs"
-NOTEBOOK_PAGE = "first_path_notebook.md"
-
-
 def test_the_site_has_every_page_and_loads_nothing_from_the_net() -> None:
     text = (ROOT / "mkdocs.yml").read_text()
     site = yaml.safe_load(text)
@@ -472,8 +473,7 @@ def test_the_site_has_every_page_and_loads_nothing_from_the_net() -> None:
         ]
 
     assert sorted(pages(site["nav"])) == sorted([*PAGES, NOTEBOOK_PAGE])
-    assert site["theme"]["highlightjs"] is False
-    assert site["plugins"] == []
+    assert site["theme"]["font"] is False
     assert "//" not in text
     for page, content in PAGES.items():
         assert "<script" not in content, page
@@ -496,58 +496,123 @@ class Loaded(HTMLParser):
         self.text += data
 
 
-@pytest.mark.skipif(not MKDOCS.is_file(), reason="no mkdocs: `make docs` installs it")
-def test_the_site_builds_strictly_and_opens_from_disk(tmp_path) -> None:
-    command = [str(MKDOCS), "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
-    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert built.returncode == 0, built.stderr
-    assert {page.with_suffix(".md").name for page in tmp_path.glob("*.html")} == {
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    """The pages as `make docs` makes them."""
+    return built(tmp_path_factory.mktemp("site"))
+
+
+@NO_MKDOCS
+def test_the_site_opens_from_disk(site: Path) -> None:
+    assert {page.with_suffix(".md").name for page in site.glob("*.html")} == {
         *PAGES,
         NOTEBOOK_PAGE,
         "404.md",
     }
-    for page in tmp_path.glob("*.html"):
+    for page in site.glob("*.html"):
         if page.name == "404.html":  # for servers
             continue
         parsed = Loaded()
         parsed.feed(page.read_text())
         for address in parsed.addresses:
             inside = address.partition("#")[0].partition("?")[0]
-            assert address.startswith("data:image/") or (tmp_path / inside).is_file(), (
+            assert address.startswith("data:image/") or (site / inside).is_file(), (
                 page.name,
                 address,
             )
-    for style in tmp_path.rglob("*.css"):
+    for style in site.rglob("*.css"):
         for address in re.findall(r"""(?:url\(|@import)\s*["']?([^"')\s]+)""", style.read_text()):
             inside = style.parent / address.partition("#")[0].partition("?")[0]
             assert address.startswith(("data:", "#")) or inside.is_file(), (style.name, address)
     parsed = Loaded()
-    parsed.feed((tmp_path / "method.html").read_text())
+    parsed.feed((site / "method.html").read_text())
     assert "σ(z)⁻² = Σ_k w_k exp(−½ ‖z − c_k‖² / h_k²)" in parsed.text, (
         "equations are text: nothing renders them"
     )
 
 
-@pytest.mark.skipif(not MKDOCS.is_file(), reason="no mkdocs: `make docs` installs it")
+@NO_MKDOCS
+def test_the_search_has_every_page_and_lies_in_a_script(site: Path) -> None:
+    """A page from disk may load a script, and nothing else."""
+    index = (site / "search" / "search_index.js").read_text()
+    found = json.loads(index.removeprefix("var __index = "))
+    pages = {entry["location"].partition("#")[0] for entry in found["docs"]}
+    assert pages == {page.replace(".md", ".html") for page in [*PAGES, NOTEBOOK_PAGE]}
+    titles = {re.sub(r"<[^>]+>", "", entry["title"]).strip() for entry in found["docs"]}
+    assert {"replan", "When a format changes", "constraint_geodesics.Planner"} <= titles
+
+
+API = {page: text for page, text in PAGES.items() if page.startswith("api")}
+DOCUMENTED = re.findall(r"^::: (constraint_geodesics\.[\w.]+)$", "\n".join(API.values()), re.M)
+
+
+def test_the_api_names_all_that_the_package_exports() -> None:
+    assert {f"constraint_geodesics.{name}" for name in constraint_geodesics.__all__} <= set(
+        DOCUMENTED
+    )
+    assert len(set(DOCUMENTED)) == len(DOCUMENTED)
+    assert all(f"`{name}`" in API["api.md"] for name in constraint_geodesics.__all__)
+
+
+def documented(path: str) -> Iterator[tuple[str, str]]:
+    """An object and its public members that have a docstring of their own, by their paths."""
+    module, _, name = path.rpartition(".")
+    found = getattr(import_module(module), name)
+    if not isinstance(found, type) and not inspect.isfunction(found):
+        return
+    yield path, inspect.getdoc(found) or ""
+    if isinstance(found, type) and not re.search(
+        rf"^::: {re.escape(path)}\n(?:    .*\n)*      members: false", "\n".join(API.values()), re.M
+    ):
+        for member, own in vars(found).items():
+            own = getattr(own, "__func__", own)  # of a class's method
+            is_own = inspect.isfunction(own) or isinstance(own, property)
+            if is_own and own.__doc__ and not member.startswith("_"):
+                yield f"{path}.{member}", inspect.getdoc(own) or ""
+
+
+@NO_MKDOCS
+@pytest.mark.parametrize("path", DOCUMENTED)
+def test_a_docstring_stands_on_its_page_word_for_word(path: str, site: Path) -> None:
+    """It is plain text: no asterisk or bracket of it may turn into a form of Markdown."""
+    (page,) = (page for page, text in API.items() if re.search(rf"^::: {path}$", text, re.M))
+    html = (site / page.replace(".md", ".html")).read_text()
+    parsed = Loaded()
+    parsed.feed(html)
+    text = " ".join(parsed.text.split())
+    assert f'id="{path}"' in html
+    for name, docstring in documented(path):
+        assert f'id="{name}"' in html, name
+        for part in re.split(r"\n\s*\n", docstring):
+            assert " ".join(part.replace("`", "").split()) in text, name
+
+
+@NO_MKDOCS
+def test_every_error_that_the_api_names_is_on_its_page(site: Path) -> None:
+    named = set()
+    for page in API:
+        parsed = Loaded()
+        parsed.feed((site / page.replace(".md", ".html")).read_text())
+        named |= set(re.findall(r"\b[A-Z]\w+Error\b", parsed.text))
+    assert len(named) > 5
+    assert named <= {path.rpartition(".")[2] for path in DOCUMENTED} | {"KeyError", "TypeError"}
+
+
+@NO_MKDOCS
 @pytest.mark.parametrize(
     "bad",
     ["<script src='//host/x.js'></script>", "<style>a {background: url(//host/x.png)}</style>"],
 )
 def test_a_page_that_loads_something_from_the_net_fails_the_build(bad, tmp_path) -> None:
-    for folder in ("docs", "reports"):
-        shutil.copytree(ROOT / folder, tmp_path / folder)
-    shutil.copy(ROOT / "mkdocs.yml", tmp_path)
+    shutil.copytree(ROOT / "docs", tmp_path / "docs")
+    for name in ("mkdocs.yml", "reports", "src"):
+        (tmp_path / name).symlink_to(ROOT / name)
     with (tmp_path / "docs" / "limits.md").open("a") as page:
         page.write(f"\n{bad}\n")
-    built = subprocess.run(
-        [str(MKDOCS), "build", "--strict"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert built.returncode != 0
-    assert "would load //host/x" in built.stderr
+    command = [str(MKDOCS), "build", "--strict"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "would load //host/x" in done.stderr
 
 
 def pins(file: str) -> dict[str, str]:

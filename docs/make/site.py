@@ -1,5 +1,5 @@
-"""MkDocs calls this: the notebook becomes a page, and a page that would load something from the net
-is an error.
+"""MkDocs calls this: the notebook becomes a page, and a file of the site that would load something
+from the net is an error.
 """
 
 import base64

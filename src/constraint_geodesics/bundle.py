@@ -1,14 +1,17 @@
 """The planner's files: robot, workcell, constraints, settings and roadmaps, small enough to travel
 with the package; nothing in them is trained.
 
-A folder with planner.json (the SHA-256 of every other file in it too) and roadmaps.safetensors.
+A folder with planner.json (the SHA-256 of every other file in it too), roadmaps.safetensors, and
+the URDFs and meshes that are not PyBullet's (`taken_along.py`).
 Nothing in it is code, nothing is unpickled.  Checksums tell what was altered by accident, not who
 wrote it: what a folder names (URDFs, meshes, modules) and holds (graphs) is looked at as well.
 """
 
 import hashlib
 import json
+import shutil
 import sys
+import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -16,11 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from platformdirs import user_cache_path
 from pydantic import TypeAdapter, ValidationError
 from safetensors.numpy import save
 
 from constraint_geodesics.array_files import ArrayFileError, read_weights
 from constraint_geodesics.fields import Name
+from constraint_geodesics.formats import PLANNER, Format, FormatError
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.geometry.graph import components
 from constraint_geodesics.params import (
@@ -35,9 +40,9 @@ from constraint_geodesics.plugs import MLFLOW, plug
 from constraint_geodesics.robot.kinematics import RobotError
 from constraint_geodesics.scene.urdf import data_path
 from constraint_geodesics.search.roadmap import Roadmap
-from constraint_geodesics.text_files import read_json, written
+from constraint_geodesics.taken_along import FILES, MissingFileError, put_back, taken_along
+from constraint_geodesics.text_files import read_json, read_kept, written
 
-FORMAT = 2
 _CONSTRAINTS: TypeAdapter[dict[Name, ConstraintParams]] = TypeAdapter(dict[Name, ConstraintParams])
 CARD, ROADMAPS = "planner.json", "roadmaps.safetensors"
 PIPELINE = Path("data/planner")
@@ -72,21 +77,23 @@ class Bundle:
             "planner": self.planner.model_dump(mode="json"),
             "judge": self.judge.model_dump(mode="json"),
         }
-        write_files(folder / CARD, FORMAT, card, {ROADMAPS: roadmap_arrays(self.roadmaps)})
+        write_files(folder / CARD, PLANNER, card, {ROADMAPS: roadmap_arrays(self.roadmaps)})
 
 
 def write_files(
     card_file: Path,
-    version: int,
+    written_as: Format,
     card: Mapping[str, Any],
     arrays: Mapping[str, Mapping[str, np.ndarray]],
 ) -> None:
-    """Write arrays as safetensors files and the card beside them with their checksums, all of them
-    or none; who is killed between two of them leaves what the card does not fit.
+    """Write arrays as safetensors files, files that the card names, and the card beside them with
+    their checksums, all of them or none; who is killed between two of them leaves what the card
+    does not fit.
     """
-    contents = {name: save(dict(values)) for name, values in arrays.items()}
+    card, contents = taken_along(card)
+    contents |= {name: save(dict(values)) for name, values in arrays.items()}
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
-    whole: dict[str, Any] = {"format": version, **card, "sha256": digests}
+    whole: dict[str, Any] = {**written_as.entries, **card, "sha256": digests}
     digests[card_file.name] = card_digest(whole)
     with ExitStack() as files:  # the card, which was entered first, takes its place last
         part = files.enter_context(written(card_file))
@@ -96,13 +103,18 @@ def write_files(
 
 
 def read_files(
-    card_file: Path, version: int, names: Sequence[str]
+    card_file: Path, read_as: Format, names: Sequence[str]
 ) -> tuple[dict[str, Any], dict[str, dict[str, np.ndarray]]]:
-    """The card and the arrays that `write_files` wrote.
+    """The card and the arrays that `write_files` wrote, brought up to date.
 
-    Raises BundleError if a file is missing, altered (its checksum differs), or of another format.
+    Raises BundleError if a file is missing, altered (its checksum differs), or of a format that
+    this release can't read.
     """
-    card = _card(card_file, version)
+    card = _card(card_file, read_as)
+    try:
+        put_back(card, card_file.parent)
+    except MissingFileError as error:
+        raise BundleError(str(error)) from None
     return card, {
         name: _arrays(card_file.parent / name, card["sha256"].get(name)) for name in names
     }
@@ -140,7 +152,7 @@ def open_bundle(source: str | Path | None = None) -> tuple[Bundle, str]:
     """
     if isinstance(source, str) and ":/" in source:
         with plug(MLFLOW)(source) as folder:
-            return _from_elsewhere(folder), f"MLflow's {source}"
+            return _from_elsewhere(_lasting(folder)), f"MLflow's {source}"
     folder = bundle_folder(source)
     if source is not None:
         own = folder.resolve() in (PIPELINE.resolve(), PACKAGED.resolve())
@@ -160,9 +172,10 @@ def bundle_folder(source: str | Path | None) -> Path:
 def read_bundle(folder: Path) -> Bundle:
     """Read what `Bundle.write` wrote.
 
-    Raises BundleError if a file is missing, altered (its checksum differs), or of another format.
+    Raises BundleError if a file is missing, altered (its checksum differs), or of a format that
+    this release can't read.
     """
-    card, arrays = read_files(folder / CARD, FORMAT, (ROADMAPS,))
+    card, arrays = read_files(folder / CARD, PLANNER, (ROADMAPS,))
     try:
         roadmaps = roadmaps_of(arrays[ROADMAPS], folder / ROADMAPS)
         alone = sorted(set(roadmaps) - set(card["constraints"]))
@@ -182,6 +195,22 @@ def read_bundle(folder: Path) -> Bundle:
         raise BundleError(
             f"{folder / CARD}: not a planner's card: {' '.join(what.split())[:200]}"
         ) from None
+
+
+def _lasting(folder: Path) -> Path:
+    """A folder that MLflow takes away again; a copy of it in the user's cache where the planner
+    goes on reading files of it.
+    """
+    if not ((folder / FILES).is_dir() and (folder / CARD).is_file()):
+        return folder
+    digest = hashlib.sha256(read_kept(folder / CARD)).hexdigest()[:16]
+    place = user_cache_path("constraint_geodesics") / "planners" / digest
+    if not place.is_dir():
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=place.parent) as part, suppress(FileExistsError):
+            # links stay links, so that they are seen; another process may be first
+            shutil.copytree(folder, Path(part) / digest, symlinks=True).rename(place)
+    return place
 
 
 def _from_elsewhere(folder: Path) -> Bundle:
@@ -230,7 +259,7 @@ def _is_within(file: Path, folder: Path) -> bool:
         return False
 
 
-def _card(file: Path, version: int) -> dict[str, Any]:
+def _card(file: Path, read_as: Format) -> dict[str, Any]:
     try:
         card = read_json(file)
     except OSError as error:
@@ -240,12 +269,17 @@ def _card(file: Path, version: int) -> dict[str, Any]:
         raise BundleError(f"{file.parent}: {what}") from None
     except ValueError as error:
         raise BundleError(f"{file}: not JSON: {error}") from None
-    written = card.get("format") if isinstance(card, dict) else None
-    if written != version or not isinstance(card.get("sha256"), dict):
-        raise BundleError(f"{file}: format {written}: this version reads format {version}")
+    if not isinstance(card, dict):
+        raise BundleError(f"{file}: not a planner's card: must be entries by name")
+    try:
+        found = read_as.updated(card)
+    except FormatError as error:
+        raise BundleError(f"{file}: {error}") from None
+    if not isinstance(card.get("sha256"), dict):
+        raise BundleError(f"{file}: not a planner's card: sha256 is missing")
     if card["sha256"].get(file.name) != card_digest(card):
         raise BundleError(f"{file}: altered since it was written (its checksum differs)")
-    return card
+    return found
 
 
 def card_digest(card: Mapping[str, Any]) -> str:

@@ -21,6 +21,7 @@ from constraint_geodesics.constraints.constraint import (
     constraint_from_json,
 )
 from constraint_geodesics.extras import require
+from constraint_geodesics.formats import NUMBER, TABLE, FormatError
 from constraint_geodesics.geometry.braking import (
     Motion,
     Pace,
@@ -207,8 +208,8 @@ class Trajectory:
         return points[0] if np.ndim(s) == 0 else points
 
     def save(self, file: str | Path) -> None:
-        """Write it as CSV: a comment line with the constraint, one with the velocity at the start
-        where it does not rest there, then time_s and the joints [rad], a line a waypoint.
+        """Write it as CSV: comment lines with the constraint, the velocity at the start where it
+        does not rest there, and the format, then time_s and the joints [rad], a line a waypoint.
 
         Raises PlannerError without a path.
         """
@@ -461,13 +462,13 @@ def _shares(s: Any) -> Float[np.ndarray, "n"]:
 def write_trajectory(
     file: Path, motion: Motion, constraint: Constraint, names: Sequence[str]
 ) -> None:
-    """Write waypoints and times as CSV, the constraint in a comment line before the header, and the
-    velocity at the first waypoint unless it rests; numbers to the last bit.
+    """Write waypoints and times as CSV, before the header comment lines of the constraint, of the
+    velocity at the first waypoint unless it rests, and of the format; numbers to the last bit.
     """
     lines = [f"# {CONSTRAINT}: {json.dumps(constraint.to_json())}"]
     if motion.start_velocity.any():
         lines.append(f"# {VELOCITY}: {json.dumps(motion.start_velocity.tolist())}")
-    lines.append(",".join(("time_s", *names)))
+    lines += [f"# {NUMBER}: {TABLE.line}", ",".join(("time_s", *names))]
     for t, row in zip(motion.times, motion.joints, strict=True):
         lines.append(",".join(repr(float(x)) for x in (t, *row)))
     write_text(file, "\n".join(lines) + "\n")
@@ -509,8 +510,9 @@ def read_trajectory(
         name, _, text = (part.strip() for part in line.removeprefix("#").partition(":"))
         if name in said:
             raise PlannerError(f"{file}, line {number}: a second {name}")
-        if name in (CONSTRAINT, VELOCITY):
+        if name in (CONSTRAINT, VELOCITY, NUMBER):
             said[name] = number, text
+    _require_format(file, *said.pop(NUMBER, (0, TABLE.line)))
     if len(table) < 2:
         raise PlannerError(f"{file}: a header line and at least one row are needed")
     header = _header(file, table[0][1].split(","), names)
@@ -522,6 +524,13 @@ def read_trajectory(
     if start is not None and not timed:
         raise PlannerError(f"{file}: a {VELOCITY} goes with times: there is no column time_s")
     return Read(joints, times, constraint, start)
+
+
+def _require_format(file: Path, number: int, text: str) -> None:
+    try:
+        TABLE.require_line(text)
+    except FormatError as error:
+        raise PlannerError(f"{file}, line {number}: {error}") from None
 
 
 def _velocity_of(file: Path, number: int, text: str, dof: int) -> Float[np.ndarray, "D"]:

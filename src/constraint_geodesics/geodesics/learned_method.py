@@ -26,6 +26,7 @@ from constraint_geodesics.bundle import (
     write_files,
 )
 from constraint_geodesics.constraints.projection import Retraction, retract
+from constraint_geodesics.formats import LEARNED
 from constraint_geodesics.geodesics.learned_problem import LearnedProblem
 from constraint_geodesics.geodesics.problem import Ends
 from constraint_geodesics.geodesics.proposals import MeanPolicy, Met, rounds
@@ -46,8 +47,8 @@ from constraint_geodesics.search.candidates import (
 )
 from constraint_geodesics.search.curve_kernels import CHECK_STEP
 from constraint_geodesics.search.roadmap import Roadmap
+from constraint_geodesics.taken_along import as_taken
 
-FORMAT = 2
 FOLDER = "learned"
 """Beside the planner's folder, or in it, as in the package."""
 CARD, MANIFOLD, POLICY, SUBMANIFOLDS = (
@@ -92,16 +93,17 @@ class LearnedFiles:
             POLICY: self.policy,
             SUBMANIFOLDS: roadmap_arrays(self.submanifolds),
         }
-        write_files(folder / CARD, FORMAT, card, arrays)
+        write_files(folder / CARD, LEARNED, card, arrays)
 
 
 def read_learned(folder: Path) -> LearnedFiles:
     """Read what `LearnedFiles.write` wrote.
 
-    Raises BundleError if a file is missing, altered (its checksum differs), or of another format.
+    Raises BundleError if a file is missing, altered (its checksum differs), or of a format that
+    this release can't read.
     """
     names = (MANIFOLD, POLICY, SUBMANIFOLDS)
-    card, arrays = read_files(folder / CARD, FORMAT, names)
+    card, arrays = read_files(folder / CARD, LEARNED, names)
     try:
         robot, chart = RobotParams.model_validate(card["robot"]), str(card["chart"])
         settings = GeodesicParams.model_validate(card["policy"])
@@ -171,7 +173,7 @@ class LearnedMethod:
         inside = folder / FOLDER
         place = inside if inside.is_dir() else folder.parent / FOLDER
         files = read_learned(place)
-        if files.robot != bundle.robot:
+        if as_taken(files.robot) != as_taken(bundle.robot):
             raise BundleError(f"{place / CARD}: trained for another robot than the planner's")
         return cls(files)
 

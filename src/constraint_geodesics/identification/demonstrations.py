@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics import values
+from constraint_geodesics.formats import NUMBER, TABLE, FormatError
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.text_files import read_text
 
@@ -127,9 +128,21 @@ def _read(file: Path, robot: SerialRobot) -> Any:
     except (OSError, ValueError, csv.Error) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise DemonstrationError(f"{file}: not a table of numbers: {why}") from None
+    _require_format(file, [line for line in stream if line.startswith("#")])
     if table.ndim != 2 or not table.size:
         raise DemonstrationError(f"{file}: no rows of numbers")
     return _told_apart(file, [name.strip() for name in names], table, robot)
+
+
+def _require_format(file: Path, comments: Sequence[str]) -> None:
+    """Of a line as a trajectory has it, where there is one."""
+    for line in comments:
+        name, _, text = line.removeprefix("#").partition(":")
+        try:
+            if name.strip() == NUMBER:
+                TABLE.require_line(text)
+        except FormatError as error:
+            raise DemonstrationError(f"{file}: {error}") from None
 
 
 def _told_apart(file: Path, names: list[str], table: np.ndarray, robot: SerialRobot) -> Any:

@@ -8,12 +8,12 @@ from constraint_geodesics.constraints.constraint import (
     ConstraintError,
     constraint_from_json,
 )
+from constraint_geodesics.formats import CONSTRAINT, FormatError
 from constraint_geodesics.identification.identify import Identified
 from constraint_geodesics.params import ParamsError, read_yaml
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.text_files import written
 
-FORMAT = 1
 SUFFIXES = (".yaml", ".yml")
 
 
@@ -34,7 +34,7 @@ def save_constraint(identified: Identified, file: str | Path, where_shown: bool 
     if file.suffix not in SUFFIXES:
         raise ConstraintError(f"{file}: the name must end in {' or '.join(SUFFIXES)}")
     about = {
-        "format": FORMAT,
+        **CONSTRAINT.entries,
         "explanation": identified.explanation,
         "robot": {"name": identified.robot[0], "tool_link": identified.robot[1]},
         "found_in": {
@@ -60,9 +60,10 @@ def load_constraint(file: str | Path, robot: SerialRobot | None = None) -> Const
         about: Any = read_yaml(Path(file))
     except (ParamsError, UnicodeDecodeError) as error:
         raise ConstraintError(str(error)) from None
-    if not isinstance(about, dict) or about.get("format") != FORMAT:
-        raise ConstraintError(f"{file}: not a constraint's file of format {FORMAT}")
+    if not isinstance(about, dict):
+        raise ConstraintError(f"{file}: not a constraint's file: must be entries by name")
     try:
+        about = CONSTRAINT.updated(about)
         own = about["robot"]["name"], about["robot"]["tool_link"]
         if robot is not None and own != (robot.name, robot.tool_link):
             raise ConstraintError(
@@ -70,7 +71,7 @@ def load_constraint(file: str | Path, robot: SerialRobot | None = None) -> Const
                 f"{robot.tool_link}"
             )
         return constraint_from_json(about["constraint"])
-    except ConstraintError as error:
+    except (ConstraintError, FormatError) as error:
         raise ConstraintError(f"{file}: {error}") from None
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ConstraintError(f"{file}: not a constraint: {type(error).__name__} {error}") from None

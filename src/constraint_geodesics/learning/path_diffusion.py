@@ -22,6 +22,7 @@ from jaxtyping import Float
 from constraint_geodesics.bundle import read_files, write_files
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
+from constraint_geodesics.formats import PATH_DIFFUSION
 from constraint_geodesics.learning.inference import Arrays
 
 Coefficients = Float[np.ndarray, "*batch k D"]
@@ -29,7 +30,7 @@ Curves = Float[np.ndarray, "*batch n D"]
 Correction = Callable[[Curves], Curves]
 """Moves curves (B, n, D) to where they should be, their ends left alone."""
 
-CARD, WEIGHTS, FORMAT = "path_diffusion.json", "path_diffusion.safetensors", 1
+CARD, WEIGHTS = "path_diffusion.json", "path_diffusion.safetensors"
 SHOWN = 7
 """Inner points of the retracted straight line that the network sees."""
 FURTHEST = 3.0
@@ -103,13 +104,13 @@ class PathDiffusion:
     @classmethod
     def load(cls, folder: Path) -> "PathDiffusion":
         """Read what `save` wrote.  Raises BundleError if a file is missing or altered."""
-        _, arrays = read_files(folder / CARD, FORMAT, [WEIGHTS])
+        _, arrays = read_files(folder / CARD, PATH_DIFFUSION, [WEIGHTS])
         return cls(arrays[WEIGHTS])
 
     def save(self, folder: Path) -> None:
         """Write the arrays (safetensors) and a card (JSON: sizes and their SHA-256)."""
         about = {"dof": self.dof, "modes": self.modes}
-        write_files(folder / CARD, FORMAT, about, {WEIGHTS: self.arrays})
+        write_files(folder / CARD, PATH_DIFFUSION, about, {WEIGHTS: self.arrays})
 
     @property
     def dof(self) -> int:

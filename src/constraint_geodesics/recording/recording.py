@@ -28,6 +28,7 @@ from rerun.urdf import UrdfTree
 from constraint_geodesics import palette
 from constraint_geodesics.certification.certifier import Limits
 from constraint_geodesics.constraints.constraint import ConstraintManifold, Series
+from constraint_geodesics.formats import NUMBER, RECORDING, SINCE, FormatError
 from constraint_geodesics.recording.goal import GoalView, goal_drawings
 from constraint_geodesics.recording.shown import ENTITIES, shown_drawings
 from constraint_geodesics.robot.kinematics import SerialRobot
@@ -217,9 +218,9 @@ def digest(sampled: Frames) -> str:
 
 
 def about_chunk(about: About) -> Chunk:
-    """Where the recording comes from."""
+    """Where the recording comes from, and its format."""
     known = {name: value for name, value in vars(about).items() if value is not None}
-    return static(ABOUT, rr.AnyValues(**known))
+    return static(ABOUT, rr.AnyValues(**known, **RECORDING.entries))
 
 
 def write_recording(
@@ -261,24 +262,39 @@ def read_recording(file: Path) -> RecordingSummary:
 def read_chunks(file: Path) -> tuple[Any, list[Chunk], bool]:
     """The one store of a file, its chunks, and whether there is a blueprint.
 
-    Raises RecordingError if it is not a recording, or holds several.
+    Raises RecordingError if it is not a recording, holds several, or is of a format that this
+    release can't read.
     """
     try:
         reader = RrdReader(existing(file))
         stores = reader.recordings()
         if len(stores) != 1:
             raise RecordingError(f"{file}: holds {len(stores)} recordings, not one")
-        return stores[0], reader.stream().to_chunks(), bool(reader.blueprints())
+        chunks, blueprint = reader.stream().to_chunks(), bool(reader.blueprints())
     except RuntimeError as error:
         raise RecordingError(f"{file}: not a recording: {error}") from None
+    about = _about_row(chunks)
+    number, since = ((about.get(name) or [None])[0] for name in (NUMBER, SINCE))
+    try:
+        RECORDING.require(1 if number is None else number, since)
+    except FormatError as error:
+        raise RecordingError(f"{file}: {error}") from None
+    return stores[0], chunks, blueprint
+
+
+def _about_row(chunks: Sequence[Chunk]) -> dict[str, list[Any]]:
+    """What the recording says of itself, each value in a list; nothing if it does not."""
+    for chunk in chunks:
+        if chunk.entity_path == f"/{ABOUT}":
+            row: dict[str, list[Any]] = chunk.to_record_batch().to_pylist()[0]
+            return row
+    return {}
 
 
 def about_of(recording_id: str, chunks: Sequence[Chunk]) -> About:
     """What a recording says of itself; of one from before it did, what its id says."""
-    for chunk in chunks:
-        if chunk.entity_path == f"/{ABOUT}":
-            row = chunk.to_record_batch().to_pylist()[0]
-            return About(**{name: row[name][0] for name in vars(About()) if name in row})
+    if row := _about_row(chunks):
+        return About(**{name: row[name][0] for name in vars(About()) if name in row})
     if found := _OLD_ID.match(recording_id):
         query, seed = (
             None if found[name] is None else int(found[name]) for name in ("query", "seed")

@@ -1,5 +1,6 @@
 """Scenes in files: shapes around the robot, shapes that it carries, and what may touch.
 
+format: 1
 shapes:
   crate: {kind: box, centre_m: [0.4, 0.2, 0.1], size_m: [0.2, 0.2, 0.2]}
 attached:
@@ -17,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from constraint_geodesics.errors import ParamsError
 from constraint_geodesics.fields import Name
+from constraint_geodesics.formats import NUMBER, SCENE, FormatError
 from constraint_geodesics.params import one_line, read_yaml
 from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.mesh import Mesh
@@ -87,9 +89,13 @@ def _read(file: Path, checked: Callable[[Any], SceneFile]) -> SceneFile:
         raw = read_yaml(file)
         if not isinstance(raw, dict):
             raise SceneError(f"{file}: no scene: must be entries by name")
+        if not isinstance(raw.get(NUMBER), dict):  # else a shape of that name
+            raw = SCENE.updated(raw)
         return _beside(file, checked(raw))
     except ParamsError as error:
         raise SceneError(str(error)) from None
+    except FormatError as error:
+        raise SceneError(f"{file}: {error}") from None
     except ValidationError as error:
         raise SceneError(f"{file}: {one_line(error)}") from None
 
