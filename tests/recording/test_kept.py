@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.planner_fixtures import packaged_planner
-from tests.recording.files import HELD_AT, column, seconds
+from tests.recording.files import HELD_AT, TABLE, column, seconds
 
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.recording.colours import CARRIED, GROUND, OTHER
 from constraint_geodesics.recording.kept import LEVEL_M, UPRIGHT_M
 from constraint_geodesics.recording.recording import PathRecord, read_recording, record_path
 from constraint_geodesics.scene.sphere import Sphere
-from constraint_geodesics.studies.episodes import carrying
+from constraint_geodesics.studies import episodes as study
 
 FRAMES, TOLERANCE = 12, 0.17
 LINE = "LineStrips3D:strips"
@@ -43,11 +43,10 @@ def drawn(file):
 
 def test_a_planned_path_shows_the_cup_that_it_was_planned_with(tmp_path):
     planner = packaged_planner()
-    start, goal = planner.nodes("level_cup")[[0, 1]]
-    with carrying(planner, "level_cup"):
-        cup = planner.scene.now.attached[0].shape
-        path = planner.plan(start, goal, "level_cup", scene=[Sphere("ball", (2.0, 0.0, 1.0), 0.1)])
+    with study.carrying(planner, "level_cup"):
+        path = study.drawn(planner, "level_cup", 1, 0).first
     assert path.status == "solved"
+    cup = path.scene.attached[0].shape
     path.record(tmp_path / "path.rrd", frames=FRAMES)
     shown = tmp_path / "path.rrd"
     assert column(shown, "/attached/cup", "CoordinateFrame:frame") == [["link6"]]
@@ -57,7 +56,6 @@ def test_a_planned_path_shows_the_cup_that_it_was_planned_with(tmp_path):
     centres = column(shown, "/attached/cup", "Cylinders3D:centers")
     np.testing.assert_allclose(centres, [[cup.pose.position_m]], atol=1e-7)
     assert column(shown, "/attached/cup", "Cylinders3D:colors") == [[packed(CARRIED)]]
-    assert column(shown, "/workcell/ball", "Ellipsoids3D:colors") == [[packed(OTHER)]]
     assert column(shown, "/workcell/table", "Boxes3D:colors") == [[packed(GROUND)]]
     # the cup's axis and the level plane's stay upright
     turns = np.array(column(shown, "/tool/frame", "Transform3D:quaternion"))[:, 0]
@@ -65,6 +63,17 @@ def test_a_planned_path_shows_the_cup_that_it_was_planned_with(tmp_path):
     upright = Rotation.from_quat(turns).apply(up)
     np.testing.assert_allclose(upright, np.tile([0, 0, UPRIGHT_M], (FRAMES, 1)), atol=1e-3)
     assert column(shown, "/tool/place/level", "Cylinders3D:radii")[0] == pytest.approx([LEVEL_M])
+
+
+def test_what_the_arm_stands_on_is_light_and_what_it_must_not_touch_dark(tmp_path):
+    robot, joints = straight()
+    ground, ball = replace(TABLE, exempt_links=("link_base",)), Sphere("ball", (0.5, 0.0, 0.5), 0.1)
+    path = PathRecord("planner", "free", 0, 0, joints, "", meshes=False)
+    manifold = ConstraintManifold(robot, Constraint((0,) * 6))
+    record_path(tmp_path / "path.rrd", path, manifold, [ground, ball], frames=FRAMES)
+    for entity, kind, colour in (("table", "Boxes3D", GROUND), ("ball", "Ellipsoids3D", OTHER)):
+        found = column(tmp_path / "path.rrd", f"/workcell/{entity}", f"{kind}:colors")
+        assert found == [[packed(colour)]]
 
 
 def test_without_a_load_no_cup_is_drawn(tmp_path):
@@ -107,7 +116,7 @@ def test_the_direction_that_is_kept_stands_on_its_plane_within_its_limit(free, t
     tips = Rotation.from_quat(turns).apply(arrow)
     angle = np.arccos(np.clip(tips[:, free] / UPRIGHT_M, -1.0, 1.0))
     size = np.linalg.norm(held.residual(shown)[:, 3:], axis=1)
-    np.testing.assert_allclose(angle, size, atol=1e-4)
+    np.testing.assert_allclose(angle, size, atol=1e-3)  # single precision, near upright
     (circle,) = column(file, "/tool/place/limit", LINE)[0]
     np.testing.assert_allclose(np.linalg.norm(circle, axis=1), UPRIGHT_M, atol=1e-6)
     np.testing.assert_allclose(np.array(circle)[:, free], UPRIGHT_M * np.cos(TOLERANCE), atol=1e-6)

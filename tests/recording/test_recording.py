@@ -191,7 +191,7 @@ def test_a_path_without_times_goes_as_fast_as_the_planner_would(robot, tmp_path)
     assert times[-1] == pytest.approx(planned[-1], abs=1e-9)
     np.testing.assert_array_equal(shown[[0, -1]], joints[[0, -1]])
     speeds = np.abs(np.diff(shown, axis=0)) / np.diff(times)[:, None]
-    assert (speeds <= manifold.robot.velocity * (1.0 + 1e-6)).all()
+    assert (speeds <= manifold.robot.velocity * (1.0 + 1e-5)).all()
 
 
 def test_an_arm_that_stands_still_is_shown_for_a_second(xarm, tmp_path):
