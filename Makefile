@@ -106,6 +106,7 @@ test-browser: env .venv/browser  ## MLflow's dashboard, Rerun's viewer and the r
 
 screenshots: env .venv/browser  ## make the documentation's pictures again, from this checkout's runs and recordings
 	@python tests/browser/chromium.py
+	python -m tests.browser.hero
 	python -m tests.browser.screenshots
 
 first-screens: env .venv/browser  ## pictures of the first screens that people see, to be looked at: .geodesics/screens

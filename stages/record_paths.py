@@ -66,16 +66,18 @@ def record_table(table: Recordable) -> None:
 
 def record_executed(params: Params, layout: Layout, constraint: str) -> None:
     """Record what became of executed paths."""
+    from constraint_geodesics.constraints.constraint import constraint_from
     from constraint_geodesics.recording.execution_recording import ExecutionRecord, record_execution
     from constraint_geodesics.scene.scene import Scene
     from constraint_geodesics.studies.cup import CupSettings
     from constraint_geodesics.studies.execution import load_execution
 
     cup, scene = CupSettings(spheres=params.execution.spheres), Scene.from_params(params)
+    kept = constraint_from(params.constraints[constraint], scene.robot)
     for row in named_rows(layout.report("execute_paths", constraint, "csv")):
         file = Path(row["recording"])
         execution = load_execution(layout.executions(constraint) / f"{file.stem}.npz")
-        record = ExecutionRecord(row["kind"], constraint, row["query"], execution, cup)
+        record = ExecutionRecord(row["kind"], constraint, row["query"], execution, cup, kept)
         record_execution(file, record, scene.robot, scene.workcell, meshes=False)
 
 

@@ -77,7 +77,8 @@ def _record_of(
     ]
     text = f"**{controller}**, constraint `{constraint}`: {own['outcome']}"
     about = controller, constraint, episode.number, episode.first.scene, episode.obstacles
-    return EpisodeRecord(*about, own["seen"], stretches, own["over_s"], text)
+    kept = episode.first.constraint
+    return EpisodeRecord(*about, own["seen"], stretches, own["over_s"], text, kept)
 
 
 if __name__ == "__main__":

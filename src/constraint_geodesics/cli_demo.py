@@ -132,7 +132,8 @@ def _write(file: Path, episode: "Episode", happenings: "list[Happening]") -> Non
     seen = {one.obstacle.name: one.at_s for one in found.seen}
     about = "replan", first.constraint_name, episode.number, first.scene, episode.obstacles
     text = f"**replan**, constraint `{first.constraint_name}`\n\n- {_ending(found)}"
-    record_episode(file, EpisodeRecord(*about, seen, stretches, found.duration_s, text))
+    ended = found.duration_s, text
+    record_episode(file, EpisodeRecord(*about, seen, stretches, *ended, kept=first.constraint))
 
 
 def _show(planner: "Planner", episode: "Episode", web: bool) -> None:
@@ -143,7 +144,7 @@ def _show(planner: "Planner", episode: "Episode", web: bool) -> None:
     first = episode.first
     with live_viewer(web=web) as stream:
         stretch = Stretch(0.0, first.times, first.joints)
-        view = LiveEpisode(stream, first.scene, episode.obstacles, stretch)
+        view = LiveEpisode(stream, first.scene, episode.obstacles, stretch, first.constraint)
         _stream(view, _told(episode, _happenings(planner, episode)))
 
 

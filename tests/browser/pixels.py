@@ -29,7 +29,7 @@ def having(shown: Picture, colour: str) -> Bool[np.ndarray, "height width"]:
 
 def scene_of(shown: Picture) -> Picture:
     """Rerun's 3D view of a recording: the left half of the page below its bars, above the
-    status.
+    timeline.
     """
     height, width, _ = shown.shape
-    return shown[round(0.1 * height) : round(0.65 * height), : round(0.55 * width)]
+    return shown[round(0.1 * height) : round(0.92 * height), : round(0.55 * width)]

@@ -14,6 +14,7 @@ import io
 import json
 import re
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -25,7 +26,11 @@ from typing import TYPE_CHECKING, Any
 import yaml
 from PIL import Image
 
+from constraint_geodesics.constraints.constraint import Pose
+from constraint_geodesics.goals.region import GoalRegion
 from constraint_geodesics.palette import BLUE, VERMILION, planner_colour
+from constraint_geodesics.planner import Planner
+from tests.browser import hero
 from tests.browser.chromium import ROOT, chromium, free_port, served, until, visit
 from tests.browser.dashboard import (
     FLAT,
@@ -47,6 +52,8 @@ DOCS = ROOT / "docs"
 IMAGES = DOCS / "images"
 MARKER = re.compile(r"<!-- screenshot: (\w+) -->")
 WIDTH, LARGEST_BYTES = 1400, 150_000
+LAPTOP = {"width": 1280, "height": 800}
+"""The window that Rerun is shown in."""
 COLOURS = (256, 128, 64, 32)
 """Of the palette: the most that stay below the size."""
 CURVE_PIXELS = 60
@@ -194,7 +201,7 @@ def dashboard_page(browser: "Browser", dashboard: str, view: View) -> "Iterator[
 
 def settled(page: "Page") -> bytes:
     """The page when it has stopped changing."""
-    page.mouse.move(WIDTH - 2, 2)
+    page.mouse.move((page.viewport_size or LAPTOP)["width"] - 2, 2)
     before = b""
     for _ in range(20):
         time.sleep(0.7)
@@ -327,9 +334,7 @@ def copied_dashboard() -> Iterator[str]:
 # Rerun
 
 
-def rerun(
-    files: Sequence[str | Path], colours: Sequence[str], height: int = 800
-) -> Callable[["Browser", str], bytes]:
+def rerun(files: Sequence[str | Path], colours: Sequence[str]) -> Callable[["Browser", str], bytes]:
     """The viewer with some recordings, paused on the way; files: their paths, or words that choose
     them.
     """
@@ -348,7 +353,7 @@ def rerun(
         ]
         with (
             served(command, ROOT, smoke.environment(ROOT)) as address,
-            visit(browser, viewport={"width": WIDTH, "height": height}) as (page, _),
+            visit(browser, viewport=LAPTOP) as (page, _),
         ):
             page.goto(f"{address}&renderer=webgl")
             until(lambda: all(drawn(page, colour) for colour in colours), "the curves are drawn")
@@ -359,11 +364,39 @@ def rerun(
     return take
 
 
+def written_here(write: Callable[[Path], None], colour: str) -> Callable[["Browser", str], bytes]:
+    """The viewer with a recording that needs no stage's results: it is written here."""
+
+    def take(browser: "Browser", dashboard: str) -> bytes:
+        with tempfile.TemporaryDirectory() as folder:
+            write(Path(folder) / "path.rrd")
+            return rerun([Path(folder) / "path.rrd"], [colour])(browser, dashboard)
+
+    return take
+
+
+def cup_path(file: Path) -> None:
+    """README's cup, carried past the pillar."""
+    hero.planned(hero.carried_cup())[0].record(file)
+
+
+def region_path(file: Path) -> None:
+    """README's other arm, to a region."""
+    above = GoalRegion(Pose.from_rpy([0.4, 0.2, 0.4], [3.14159265, 0.0, 0.5]), free=["yaw"])
+    with Planner.from_urdf("franka_panda/panda.urdf", tool_link="panda_grasptarget") as panda:
+        panda.plan([0.0, -0.3, 0.0, -2.0, 0.0, 1.8, 0.5], above, "free").record(file)
+
+
+def episode(file: Path) -> None:
+    """What `geodesics demo --out` writes."""
+    command = [sys.executable, "-m", "constraint_geodesics.cli", "demo", "--out", str(file)]
+    subprocess.run(command, cwd=ROOT, env=smoke.environment(ROOT), check=True)
+
+
 def drawn(page: "Page", colour: str) -> bool:
     return int(having(scene_of(picture(page)), colour).sum()) >= CURVE_PIXELS
 
 
-LEARNED = RECORDINGS / "train_geodesics" / "planner-level_cup" / "query1-learned_geodesic-seed0.rrd"
 EXECUTED = RECORDINGS / "execute_paths" / "level_cup" / "query0-planned-path.rrd"
 BOTH = re.findall(
     r"^geodesics replay (--constraint .*birrt)$", (ROOT / "docs" / "rerun.md").read_text(), re.M
@@ -390,10 +423,19 @@ SHOTS = {
         constraints,
     ),
     "rerun_path": Shot(
-        "Rerun with one learned geodesic of the level cup: the arm and its tool's way, the "
-        "latent space, the "
-        "constraint's residual and the joints",
-        rerun([LEARNED], [planner_colour("learned_geodesic")]),
+        "Rerun with a planned path of the level cup past a pillar: the arm with its cup, the level "
+        "plane and the tool's way, what the constraint allows, and the joints",
+        written_here(cup_path, planner_colour("planner")),
+    ),
+    "rerun_region": Shot(
+        "Rerun with a path of a Panda to a region of poses: the region, the configurations that "
+        "were looked at in grey, and the joints",
+        written_here(region_path, planner_colour("planner")),
+    ),
+    "rerun_episode": Shot(
+        "Rerun with an arm that carries a cup among obstacles that it sees when they are near: the "
+        "path that it follows in blue, those before in grey",
+        written_here(episode, BLUE),
     ),
     "rerun_execution": Shot(
         "Rerun with an executed path: the arm, the cup with its spheres from near by, the "

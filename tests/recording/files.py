@@ -41,6 +41,12 @@ def column(file: Path, entity: str, component: str) -> list[Any]:
     return rows
 
 
+def seconds(file: Path, entity: str, component: str) -> list[float]:
+    """When the rows of one component of one entity are [s]."""
+    times = columns(file, entity, component).column("time").to_pylist()
+    return [time.total_seconds() for time in times]
+
+
 def timelines(file: Path) -> set[str]:
     return {name for chunk, _ in batches(file) for name in chunk.timeline_names}
 

@@ -24,7 +24,8 @@ def record() -> EpisodeRecord:
     stretches = [Stretch(begins, path.times, path.joints) for begins, path in report.legs]
     seen = {one.obstacle.name: one.at_s for one in report.seen}
     about = "replan", "level_cup", 1, episode.first.scene, episode.obstacles
-    return EpisodeRecord(*about, seen, stretches, report.duration_s, "**replan**")
+    ended = report.duration_s, "**replan**"
+    return EpisodeRecord(*about, seen, stretches, *ended, kept=episode.first.constraint)
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +54,20 @@ def test_the_motion_is_in_seconds(file: Path, record: EpisodeRecord) -> None:
     at_s = np.array(begins_s(file, "/joints"))
     np.testing.assert_allclose(summary.joints, record.joints(at_s), atol=1e-6)
     assert at_s[-1] == pytest.approx(record.over_s)
+
+
+def test_the_tool_and_the_cup_s_level_plane_move_with_the_arm(
+    file: Path, record: EpisodeRecord
+) -> None:
+    (cup,) = record.scene.attached
+    assert f"/attached/{cup.name}" in read_recording(file).entity_paths
+    tool = record.scene.robot.forward(read_recording(file).joints)[0]
+    for entity in ("/tool/frame", "/tool/place"):
+        places = np.array(column(file, entity, "Transform3D:translation"))[:, 0]
+        np.testing.assert_allclose(places, tool, atol=1e-6)
+    share = np.array(column(file, "/share/tilt", "Scalars:scalars"))
+    assert 0.0 < share[:, 0].max() < 100.0
+    np.testing.assert_array_equal(share[:, 1], 100.0)
 
 
 def test_an_obstacle_is_a_shadow_until_it_is_seen(file: Path, record: EpisodeRecord) -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.recording.files import column, columns, same_recordings, timelines
+from tests.recording.files import column, same_recordings, seconds, timelines
 
-from constraint_geodesics.constraints.constraint import constraint_manifold
+from constraint_geodesics.constraints.constraint import constraint_from, constraint_manifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.params import Params
@@ -34,7 +34,8 @@ def record(scene: Scene, params: Params) -> ExecutionRecord:
     path = start + np.linspace(0.0, -2.6, 100)[:, None] * np.eye(6)[5]
     times = time_parametrisation(path, scene.robot.velocity, np.full(6, 4.0))
     execution = execute(scene, path, times, AXIS, CUP)
-    return ExecutionRecord("straight joint line", "level_cup", 2, execution, CUP)
+    kept = constraint_from(params.constraints["level_cup"], scene.robot)
+    return ExecutionRecord("straight joint line", "level_cup", 2, execution, CUP, kept)
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +58,8 @@ def test_recording_reads_back_as_the_execution(
     assert {
         "/cup",
         "/cup/wall",
+        "/tool/frame/upright",
+        "/tool/place/level",
         "/spheres",
         "/cup_tilt",
         "/cup_spheres",
@@ -65,6 +68,7 @@ def test_recording_reads_back_as_the_execution(
     } <= set(summary.entity_paths)
     assert summary.has_blueprint
     np.testing.assert_array_equal(summary.joints, execution.joints)
+    np.testing.assert_allclose(summary.times, execution.times, atol=1e-6)
     ends = scene.robot.forward(execution.joints[[0, -1]])[0]
     np.testing.assert_allclose(summary.tool_ends, ends, atol=1e-6)
     assert file.stat().st_size < 2.5e6
@@ -82,10 +86,8 @@ def test_everything_moves_over_the_seconds_of_the_execution(
         ("/cup_spheres", "Scalars:scalars"),
         ("/joints", "Scalars:scalars"),
     ):
-        times = columns(file, entity, component).column("time").to_pylist()
-        assert [time.total_seconds() for time in times] == pytest.approx(
-            record.execution.times.tolist(), abs=1e-6
-        )
+        times = record.execution.times.tolist()
+        assert seconds(file, entity, component) == pytest.approx(times, abs=1e-6)
 
 
 def test_spheres_and_cup_are_where_the_simulation_had_them(

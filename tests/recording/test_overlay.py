@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun as rr
 from rerun.chunk import RrdReader
-from tests.recording.files import CHANGE, HELD_AT, START, TABLE, TRAY, batches, column
+from tests.recording.files import CHANGE, HELD_AT, START, TABLE, TRAY, batches, column, timelines
 
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.palette import planner_colour
+from constraint_geodesics.recording.colours import rgb
+from constraint_geodesics.recording.goal import GoalView
 from constraint_geodesics.recording.overlay import (
     OTHERS_OPACITY,
     labels_of,
@@ -23,12 +26,12 @@ from constraint_geodesics.recording.overlay import (
 )
 from constraint_geodesics.recording.recording import (
     About,
+    Frames,
     LatentView,
     PathRecord,
     RecordingError,
     read_recording,
     record_path,
-    rgb,
 )
 from constraint_geodesics.recording.viewer import prepared, save_recordings
 from constraint_geodesics.robot.kinematics import load_robot
@@ -50,6 +53,7 @@ class Writer:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.written = folder, 0
+        self.goal: GoalView | None = None
         self.manifold = ConstraintManifold(
             load_robot(data_path() / "xarm/xarm6_robot.urdf", "link6"), LEVEL
         )
@@ -75,7 +79,9 @@ class Writer:
         )
         view = LatentView(grid, np.zeros(25, int), curve, ("z1", "z2")) if latent else None
         text = f"text of {planner} {seed}"
-        record = PathRecord(planner, constraint, 0, seed, joints, text, view, meshes=meshes)
+        record = PathRecord(
+            planner, constraint, 0, seed, joints, text, view, goal=self.goal, meshes=meshes
+        )
         self.written += 1
         file = self.folder / f"{self.written}.rrd"
         record_path(file, record, self.manifold, bodies, frames=frames)
@@ -152,7 +158,7 @@ def test_every_series_has_one_line_a_planner(write: Writer, tmp_path: Path) -> N
             axis=1,
         )
         np.testing.assert_array_equal(own, joints)
-        for series in ("constraint/deg/tilt", "violation"):
+        for series in ("constraint/deg/tilt", "share/tilt"):
             before = np.array(column(source, f"/{series}", "Scalars:scalars"))
             np.testing.assert_array_equal(
                 column(file, f"/{series}/{entity}", "Scalars:scalars"), before[:, :1]
@@ -277,19 +283,43 @@ def test_what_can_not_be_laid_over_each_other_is_refused(write: Writer, tmp_path
         prepared([plain, other], tmp_path, apart=False)
 
 
-def test_executed_paths_are_neither_laid_over_each_other_nor_mixed_with_paths(
-    write: Writer,
+def test_executed_paths_are_shown_beside_paths_and_not_over_each_other(
+    write: Writer, tmp_path: Path
 ) -> None:
     planned = opened(write("planner"))
     executed = replace(planned, file=Path("run.rrd"), about=replace(planned.about, executed=True))
-    for put_together in (overlaid, side_by_side):
-        with pytest.raises(
-            RecordingError,
-            match=r"run\.rrd is an executed path, in seconds, and .*1\.rrd is a path",
-        ):
-            put_together([planned, executed])
     with pytest.raises(RecordingError, match="executed paths are not laid over each other"):
         overlaid([executed, executed])
+    beside = {chunk.entity_path for chunk in side_by_side([planned, executed]).chunks}
+    assert sum(entity.endswith("/tool/frame/axes") for entity in beside) == 2
+
+
+def test_recordings_of_an_earlier_release_are_opened_among_themselves(
+    write: Writer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They have frames instead of seconds."""
+    new = write("planner")
+    counted = property(lambda self: rr.TimeColumn("frame", sequence=range(len(self.joints))))
+    monkeypatch.setattr(Frames, "time", counted)
+    old = write("planner"), write("birrt")
+    assert timelines(old[0]) == {"frame"}
+    assert read_recording(old[0]).times is None
+    assert timelines(together(tmp_path, *old)) == {"frame"}
+    with pytest.raises(
+        RecordingError, match=r"1\.rrd is in seconds, and .*2\.rrd, of an earlier .* in frames"
+    ):
+        prepared([new, old[0]], tmp_path, apart=True)
+
+
+def test_of_paths_over_each_other_the_goal_is_drawn_once(write: Writer, tmp_path: Path) -> None:
+    write.goal = GoalView(np.stack([START, START + CHANGE]), (LEVEL,))
+    sources = write("planner"), write("birrt", 1)
+    over = entities(together(tmp_path, *sources))
+    (tmp_path / "apart").mkdir()
+    apart = entities(together(tmp_path / "apart", *sources, apart=True))
+    for found, count in ((over, 1), (apart, 2)):
+        assert sum(entity.endswith("/goal/looked_at") for entity in found) == count
+        assert sum(entity.endswith("/tool/frame/axes") for entity in found) == 2
 
 
 def test_series_with_spaces_in_their_name_keep_it(write: Writer, tmp_path: Path) -> None:

@@ -29,6 +29,8 @@ from tests.recording.files import (
 
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.constraints.projection import retract
+from constraint_geodesics.geometry.braking import Pace
+from constraint_geodesics.params import PlannerParams
 from constraint_geodesics.recording.goal import GoalView
 from constraint_geodesics.recording.recorder import status_text
 from constraint_geodesics.recording.recording import (
@@ -93,7 +95,7 @@ def pose_of_link(file, link, frame):
     for chunk, batch in batches(file):
         if "Transform3D:child_frame" not in batch.schema.names:
             continue
-        row = 0 if chunk.is_static else batch.column("frame").to_pylist().index(frame)
+        row = 0 if chunk.is_static else frame
         values = {
             name.split(":")[1]: batch.column(name)[row].as_py()[0]
             for name in batch.schema.names
@@ -166,14 +168,36 @@ def test_body_of_the_workcell_stands_at_its_pose(xarm, tmp_path):
     np.testing.assert_allclose(half, [[[1.2, 1.2, 0.05]]])
 
 
-def test_frames_are_equally_far_apart_and_on_the_path(xarm, tmp_path):
+def test_frames_are_at_the_path_s_own_seconds(xarm, tmp_path):
     manifold, _ = xarm
     corner = np.zeros((4, 6))
-    corner[2:, 0], corner[1:, 4] = 0.6, 0.2  # lengths 0.2 and 0.6, then a point twice
-    file = recorded(tmp_path, manifold, path_of(corner), frames=9)
-    shown = read_recording(file).joints
-    np.testing.assert_allclose(np.linalg.norm(np.diff(shown, axis=0), axis=1), 0.1, atol=1e-12)
-    np.testing.assert_allclose(shown[2], corner[1], atol=1e-12)
+    corner[2:, 0], corner[1:, 4] = 0.6, 0.2  # a corner, then a point twice: the arm waits there
+    times = np.array([0.0, 0.5, 2.0, 3.0])
+    file = recorded(tmp_path, manifold, path_of(corner, times=times), frames=7)
+    summary = read_recording(file)
+    np.testing.assert_allclose(summary.times, np.arange(7) / 2.0, atol=1e-9)
+    np.testing.assert_allclose(summary.joints[[0, 1, 4, 6]], corner[[0, 1, 2, 3]], atol=1e-12)
+    np.testing.assert_allclose(summary.joints[2], [0.2, 0.0, 0.0, 0.0, 0.2, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("robot", [XARM, KUKA], ids=["xarm6", "kuka"])
+def test_a_path_without_times_goes_as_fast_as_the_planner_would(robot, tmp_path):
+    manifold, joints = manifold_and_joints(*robot)
+    twice = np.insert(joints, [4, len(joints)], joints[[4, -1]], axis=0)  # rows that take no time
+    file = recorded(tmp_path, manifold, path_of(twice), frames=400)
+    times, shown = read_recording(file).times, read_recording(file).joints
+    acceleration = np.full(manifold.robot.dof, PlannerParams().acceleration_rad_s2)
+    planned = Pace(manifold.robot.velocity, acceleration).times(joints, None)
+    assert times[-1] == pytest.approx(planned[-1], abs=1e-9)
+    np.testing.assert_array_equal(shown[[0, -1]], joints[[0, -1]])
+    speeds = np.abs(np.diff(shown, axis=0)) / np.diff(times)[:, None]
+    assert (speeds <= manifold.robot.velocity * (1.0 + 1e-5)).all()
+
+
+def test_an_arm_that_stands_still_is_shown_for_a_second(xarm, tmp_path):
+    manifold, joints = xarm
+    file = recorded(tmp_path, manifold, path_of(joints[[0, 0]]), frames=3)
+    np.testing.assert_allclose(read_recording(file).times, [0.0, 0.5, 1.0], atol=1e-9)
 
 
 def test_residuals_are_shown_in_people_s_units_with_their_limits(xarm, tmp_path):
@@ -236,16 +260,30 @@ def test_joints_are_shown_within_their_limits(xarm, tmp_path):
     np.testing.assert_array_equal(column(file, "/joints", "upper")[0], robot.upper)
 
 
-def test_the_violation_is_shown_as_a_power_of_ten_with_the_judges_limit(xarm, tmp_path):
+def test_what_is_kept_is_shown_as_a_share_of_what_the_judge_grants(xarm, tmp_path):
     manifold, joints = xarm
-    held = replace(manifold, constraint=replace(SLIDE, tolerance=(0.0,) * 6))
+    exact = replace(SLIDE, tolerance=(0.0,) * 6)
     off = joints + np.linspace(0.0, 1e-3, len(joints))[:, None] * np.eye(6)[1]
-    file = recorded(tmp_path, held, path_of(off, tolerance=1e-3))
-    shown = np.array(column(file, "/violation", "Scalars:scalars"))
-    expected = np.maximum(held.violation(read_recording(file).joints), 1e-12)
-    np.testing.assert_allclose(10.0 ** shown[:, 0], expected)
-    assert expected.max() > 1e-4
-    np.testing.assert_allclose(shown[:, 1], -3.0)
+    for kept, granted in ((exact, 1e-3), (SLIDE, 1e-4)):
+        held = replace(manifold, constraint=kept)
+        file = recorded(tmp_path, held, path_of(off, tolerance=granted))
+        shown = held.violation(read_recording(file).joints)
+        shares = []
+        for name, own, unit in (("z", LIMIT_M, "mm"), ("tilt", LIMIT_RAD, "deg")):
+            limit = granted + (own if kept is SLIDE else 0.0)
+            values = np.array(column(file, f"/constraint/{unit}/{name}", "Scalars:scalars"))[:, 0]
+            share = np.array(column(file, f"/share/{name}", "Scalars:scalars"))
+            in_si = 1e-3 * values if unit == "mm" else np.radians(values)
+            np.testing.assert_allclose(share[:, 0], 100.0 * in_si / limit, atol=1e-9)
+            np.testing.assert_array_equal(share[:, 1], 100.0)
+            words = column(file, f"/share/{name}", "SeriesLines:names")[0]
+            assert words[0] == name
+            assert words[1].startswith("limit, ")
+            assert words[1].endswith(f" {unit}")
+            shares.append(share[:, 0])
+        broken = np.max(shares, axis=0) > 100.0
+        np.testing.assert_array_equal(broken, shown > granted)
+        assert np.max(shares) > 1.0, "seen beside its limit"
 
 
 def test_the_status_says_what_the_judge_allows():
@@ -307,7 +345,7 @@ def test_equal_paths_give_equal_recordings(xarm, tmp_path):
     record_path(first, path, manifold, [TABLE], frames=FRAMES)
     record_path(second, path, manifold, [TABLE], frames=FRAMES)
     assert same_recordings(first, second)
-    assert timelines(first) == {"frame"}
+    assert timelines(first) == {"time"}
 
 
 @pytest.mark.parametrize("change", ["seed", "text", "joints", "latent"])
@@ -373,6 +411,9 @@ def test_paths_that_do_not_fit_are_refused(xarm, tmp_path):
         (path_of(joints[:1]), FRAMES, "T of 2 or more"),
         (path_of(holed), FRAMES, "not finite"),
         (path_of(joints), 1, "frames = 1: must be 2 or more"),
+        (path_of(joints, times=np.arange(29.0)), FRAMES, r"times of shape \(29,\): .* \(30,\)"),
+        (path_of(joints, times=np.arange(30.0) + 1.0), FRAMES, "times must be finite and rise"),
+        (path_of(joints, times=np.full(30, np.nan)), FRAMES, "times must be finite and rise"),
         (
             path_of(joints, latent=latent),
             FRAMES,

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import rerun as rr
 from jaxtyping import Float
 
-from constraint_geodesics import palette
+from constraint_geodesics.constraints.constraint import ConstraintManifold, Series
 from constraint_geodesics.identification.identify import Identified
-from constraint_geodesics.recording import recording
+from constraint_geodesics.recording import panels, recording
+from constraint_geodesics.recording.colours import OTHER
 from constraint_geodesics.recording.recording import About, Frames, static
 from constraint_geodesics.recording.shown import ENTITIES, shown_drawings
 from constraint_geodesics.robot.kinematics import SerialRobot
@@ -34,20 +34,25 @@ def record_demonstrations(
     """
     longest = max(shown, key=len)
     joints = longest[np.unique(np.linspace(0, len(longest) - 1, FRAMES).astype(int))]
-    time = rr.TimeColumn(recording.TIMELINE, sequence=range(len(joints)))
-    frames = Frames(joints, robot.forward(joints)[0], None, time)
+    frames = Frames.of(robot, joints, recording.paced(robot, joints))
+    series: list[Series] = []
+    if found.constraint is not None:
+        kept = ConstraintManifold(robot, found.constraint)
+        series = recording.constraint_series(kept, joints)
     chunks = [
         *recording.scene_chunks(robot, workcell, frames, meshes=True),
-        *recording.tool_chunks(frames, recording.rgb(palette.GREY)),
+        *recording.tool_chunks(frames, OTHER, found.constraint),
         *(static(*own) for own in shown_drawings(robot, shown, found.supported)),
+        *recording.series_chunks(series, frames),
         *recording.joint_chunks(robot, frames),
         recording.about_chunk(About("demonstrations")),
         *recording.text_chunks(_status(found)),
     ]
-    blueprint = recording.arranged(
-        recording.scene_panel(frames, *ENTITIES),
-        recording.joint_panel(),
-        recording.time_panel(timeline=recording.TIMELINE, fps=30.0),
+    rows = [(panels.status_panel(), 1.2)]
+    rows += [(panel, 1.0) for panel in recording.constraint_panel(series, [])]
+    rows.append((panels.joint_panel(), 1.2))
+    blueprint = panels.arranged(
+        recording.scene_panel(frames, *ENTITIES), rows, recording.path_time(frames)
     )
     name = f"demonstrations-{recording.digest(frames)}"
     recording.write_recording(file, name, "demonstrations", chunks, blueprint)

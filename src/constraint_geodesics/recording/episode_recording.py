@@ -11,15 +11,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 from jaxtyping import Float
 from rerun.chunk import Chunk
 from rerun.urdf import UrdfTree
 
-from constraint_geodesics.palette import BLACK, BLUE, GREY, VERMILION
-from constraint_geodesics.recording import recording
-from constraint_geodesics.recording.execution_recording import TIME, execution_time
-from constraint_geodesics.recording.recording import About, Frames, static
+from constraint_geodesics.certification.certifier import Limits
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Series
+from constraint_geodesics.palette import BLUE, VERMILION
+from constraint_geodesics.recording import panels, recording
+from constraint_geodesics.recording.colours import INK, OTHER, Colour, rgb
+from constraint_geodesics.recording.recording import TIME, About, Frames, static
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.shape import Shape
 
@@ -27,8 +28,8 @@ RATE_HZ = 50.0
 """Of the frames."""
 LINE_POINTS = 60
 """Of the tool's line on a path."""
-_SHADOW, _SEEN = (*recording.rgb(GREY), 40), recording.rgb(VERMILION)
-_NOW, _OLD = recording.rgb(BLUE), recording.rgb(GREY)
+_SHADOW, _SEEN = (*OTHER, 40), rgb(VERMILION)
+_NOW, _OLD = rgb(BLUE), OTHER
 _WIDTH = rr.Radius.ui_points(2.0)
 
 
@@ -46,7 +47,7 @@ class Stretch(NamedTuple):
 class EpisodeRecord:
     """An episode with one controller.  scene: what was known at first.  seen_s: when an obstacle
     was seen, by its name; those that never were are missing.  over_s: when it ended; text: how, in
-    markdown.
+    markdown.  kept: the constraint itself, to be drawn.
     """
 
     controller: str
@@ -58,6 +59,7 @@ class EpisodeRecord:
     stretches: Sequence[Stretch]
     over_s: float
     text: str
+    kept: Constraint | None = None
 
     def joints(self, at_s: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n D"]:
         """Configurations [rad] at times [s]."""
@@ -80,17 +82,17 @@ def record_episode(file: Path, record: EpisodeRecord, *, meshes: bool = True) ->
     robot, scene = record.scene.robot, record.scene
     at_s = np.append(np.arange(0.0, record.over_s, 1.0 / RATE_HZ), record.over_s)
     joints = record.joints(at_s)
-    frames = Frames(
-        joints, robot.forward(joints)[0], None, rr.TimeColumn(TIME, duration=at_s.tolist())
-    )
+    frames = Frames.of(robot, joints, at_s)
+    shares = _shares(_manifold(scene, record.kept), joints)
     chunks = [
         *recording.scene_chunks(
             robot, scene.workcell, frames, meshes=meshes, attached=scene.attached
         ),
-        *recording.tool_chunks(frames, recording.rgb(BLACK)),
+        *recording.tool_chunks(frames, INK, record.kept),
         *(static(_shadow(shape), _drawn(shape, _SHADOW)) for shape in record.obstacles),
         *_obstacle_chunks(record),
         *_path_chunks(record),
+        *recording.share_chunks(shares, frames),
         *recording.joint_chunks(robot, frames),
         recording.about_chunk(
             About(record.controller, record.constraint, query=record.number, executed=True)
@@ -99,7 +101,7 @@ def record_episode(file: Path, record: EpisodeRecord, *, meshes: bool = True) ->
     ]
     name = f"{record.constraint}, episode {record.number}: {record.controller}"
     own = f"{record.constraint}-episode{record.number}-{recording.digest(frames)}"
-    recording.write_recording(file, own, name, chunks, _blueprint(frames))
+    recording.write_recording(file, own, name, chunks, _blueprint(frames, shares))
 
 
 def _obstacle_chunks(record: EpisodeRecord) -> Iterator[Chunk]:
@@ -130,7 +132,7 @@ def _line(scene: Scene, stretch: Stretch) -> Float[np.ndarray, "n 3"]:
     return np.asarray(scene.robot.forward(np.stack(columns, axis=1))[0])
 
 
-def _strip(line: Float[np.ndarray, "n 3"], colour: tuple[int, int, int]) -> Any:
+def _strip(line: Float[np.ndarray, "n 3"], colour: Colour) -> Any:
     return rr.LineStrips3D([line], colors=[colour], radii=[_WIDTH])
 
 
@@ -148,35 +150,55 @@ def _solid(shape: Shape) -> str:
     return str(rr.new_entity_path(["workcell", shape.name]))
 
 
-def _blueprint(frames: Frames) -> Any:
-    right = rrb.Vertical(recording.status_panel(), recording.joint_panel(), row_shares=[1.0, 2.0])
-    panels = rrb.Horizontal(
-        recording.scene_panel(frames, "hidden"), right, column_shares=[3.0, 1.5]
-    )
-    return recording.blueprint(panels, execution_time())
+def _manifold(scene: Scene, kept: Constraint | None) -> ConstraintManifold | None:
+    return None if kept is None else ConstraintManifold(scene.robot, kept)
+
+
+def _shares(manifold: ConstraintManifold | None, joints: Float[np.ndarray, "n D"]) -> list[Series]:
+    """Of the constraint's limits, where there is a constraint."""
+    if manifold is None:
+        return []
+    return recording.share_series(manifold, joints, Limits.violation_tolerance)
+
+
+def _blueprint(frames: Frames, shares: Sequence[Series]) -> Any:
+    rows = [(panels.status_panel(), 1.0)]
+    rows += [(panel, 1.0) for panel in recording.constraint_panel([], shares)]
+    rows.append((panels.joint_panel(), 1.2))
+    # an episode is watched as fast as it happened
+    time = panels.time_panel(TIME, max(frames.duration_s, panels.SHORT_S))
+    return panels.arranged(recording.scene_panel(frames, "hidden"), rows, time)
 
 
 class LiveEpisode:
     """Draws an episode into a stream while it happens; its scene and obstacles at once."""
 
     def __init__(
-        self, stream: rr.RecordingStream, scene: Scene, obstacles: Sequence[Shape], first: Stretch
+        self,
+        stream: rr.RecordingStream,
+        scene: Scene,
+        obstacles: Sequence[Shape],
+        first: Stretch,
+        kept: Constraint | None = None,
     ) -> None:
         self._stream, self._scene, self._followed, self._old = stream, scene, first, 0
-        robot, at_first = scene.robot, first.joints[:1]
+        robot, self._manifold = scene.robot, _manifold(scene, kept)
         tree = UrdfTree.from_file_path(robot.urdf)
         self._joints = [joint for joint in tree.joints() if joint.name in robot.joint_names]
-        time = rr.TimeColumn(TIME, duration=[0.0])
-        frames = Frames(at_first, robot.forward(at_first)[0], None, time)
+        planned = Frames.of(robot, first.joints, first.times)
+        stream.send_blueprint(_blueprint(planned, _shares(self._manifold, first.joints)))
+        begin = Frames.of(robot, first.joints[:1], np.zeros(1))
         chunks = [
             *recording.scene_chunks(
-                robot, scene.workcell, frames, meshes=True, attached=scene.attached
+                robot, scene.workcell, begin, meshes=True, attached=scene.attached
             ),
-            *recording.joint_chunks(robot, frames),
+            *recording.tool_axes(planned, kept),
+            *recording.tool_moves(begin),
+            *recording.share_chunks(_shares(self._manifold, begin.joints), begin),
+            *recording.joint_chunks(robot, begin),
             *(static(_shadow(shape), _drawn(shape, _SHADOW)) for shape in obstacles),
             *recording.text_chunks(""),
         ]
-        stream.send_blueprint(_blueprint(Frames(first.joints, _line(scene, first), None, time)))
         rr.send_chunks(chunks, recording=stream)
         self.follows(first)
 
@@ -188,8 +210,10 @@ class LiveEpisode:
             value = float(joints[robot.joint_names.index(joint.name)])
             entity = str(rr.new_entity_path(["transforms", joint.name]))
             self._stream.log(entity, joint.compute_transform(value, clamp=False))
-        place = robot.forward(joints)[0]
-        self._stream.log("tool/position", rr.Points3D([place], radii=[rr.Radius.ui_points(5.0)]))
+        now = Frames.of(robot, joints[None], np.array([at_s]))
+        shares = _shares(self._manifold, now.joints)
+        moved = [*recording.tool_moves(now), *recording.share_moves(shares, now)]
+        rr.send_chunks(moved, recording=self._stream)
         share = recording.range_share(joints[None], robot.lower, robot.upper)[0]
         self._stream.log("joints", rr.Scalars(joints))
         self._stream.log("joint_range", rr.Scalars([*share, 1.0, -1.0]))

@@ -17,19 +17,18 @@ from jaxtyping import Float
 from rerun.chunk import Chunk
 from scipy.spatial.transform import Rotation
 
-from constraint_geodesics.palette import BLUE, SKY, VERMILION, planner_colour
-from constraint_geodesics.recording import recording
+from constraint_geodesics.constraints.constraint import Constraint
+from constraint_geodesics.palette import BLUE, VERMILION, planner_colour
+from constraint_geodesics.recording import panels, recording
+from constraint_geodesics.recording.colours import CARRIED, colours, rgb
 from constraint_geodesics.recording.recording import About, Frames, moving, static
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.studies.cup import CupSettings, Execution, execution_name, inside
 
-TIME = "time"
-"""The timeline, in seconds from the start of the path."""
-
-_EYE_M = (0.25, -0.25, 0.15)
+_EYE_M = np.array([0.25, -0.25, 0.15])
 """From where the cup is looked at, seen from its centre."""
-_CUP, _TILT, _KEPT = (*recording.rgb(SKY), 60), recording.rgb(VERMILION), recording.rgb(BLUE)
+_CUP, _TILT, _KEPT = (*CARRIED, 60), rgb(VERMILION), rgb(BLUE)
 
 
 @dataclass(frozen=True)
@@ -44,6 +43,8 @@ class ExecutionRecord:
     execution: Execution
     cup: CupSettings
     """What it was executed with."""
+    kept: Constraint | None = None
+    """The constraint itself, to be drawn."""
 
 
 def record_execution(
@@ -60,11 +61,11 @@ def record_execution(
     Raises RecordingError if a mesh that is to be written is missing.
     """
     execution, cup = record.execution, record.cup
-    time = rr.TimeColumn(TIME, duration=execution.times)
-    frames = Frames(execution.joints, robot.forward(execution.joints)[0], None, time)
+    frames = Frames.of(robot, execution.joints, execution.times)
+    time = frames.time
     chunks = [
         *recording.scene_chunks(robot, workcell, frames, meshes=meshes),
-        *recording.tool_chunks(frames, recording.rgb(planner_colour(record.kind))),
+        *recording.tool_chunks(frames, rgb(planner_colour(record.kind)), record.kept),
         *_cup_chunks(execution, cup, time),
         *_sphere_chunks(execution, cup, time),
         *_series_chunks(execution, cup, time),
@@ -76,7 +77,7 @@ def record_execution(
     ]
     name = f"{record.constraint}, query {record.query}: {record.kind}, executed"
     own = f"{record.constraint}-{execution_name(record.query, record.kind)}-executed"
-    blueprint = _blueprint(frames, execution.spheres)
+    blueprint = _blueprint(frames, execution)
     recording.write_recording(file, f"{own}-{recording.digest(frames)}", name, chunks, blueprint)
 
 
@@ -108,7 +109,7 @@ def _cup_chunks(execution: Execution, cup: CupSettings, time: rr.TimeColumn) -> 
 
 
 def _sphere_chunks(execution: Execution, cup: CupSettings, time: rr.TimeColumn) -> Iterator[Chunk]:
-    own = recording.colours(np.arange(execution.spheres))
+    own = colours(np.arange(execution.spheres))
     yield static("spheres", rr.Points3D.from_fields(colors=own, radii=[cup.sphere_radius_m]))
     columns = rr.Points3D.columns(positions=execution.sphere_positions.reshape(-1, 3))
     yield moving("spheres", columns.partition([execution.spheres] * len(execution.times)), time)
@@ -135,27 +136,13 @@ def _status(record: ExecutionRecord) -> str:
     )
 
 
-def _blueprint(frames: Frames, spheres: int) -> Any:
+def _blueprint(frames: Frames, execution: Execution) -> Any:
     # it follows the cup but does not turn with it; the arm is left out, it would often hide the cup
     follow = rrb.SpatialInformation(target_frame="tf#/cup")
     shown = ("workcell", "cup", "spheres")
-    cup = recording.space_view("Cup", shown, _EYE_M, (0.0, 0.0, 0.0), spatial_information=follow)
-    right = rrb.Vertical(
-        cup, *cup_panels(spheres), recording.joint_panel(), row_shares=[2.5, 1.0, 1.0, 1.5]
-    )
-    return recording.arranged(
-        recording.scene_panel(frames, "cup", "spheres"), right, execution_time()
-    )
-
-
-def cup_panels(spheres: float) -> list[Any]:
-    """The cup's tilt, and how many of its spheres are still in it."""
-    return [
-        recording.series_view("cup_tilt", "Tilt of the cup [deg]", (0.0, 180.0)),
-        recording.series_view("cup_spheres", "Spheres in the cup", (0.0, 1.1 * spheres)),
-    ]
-
-
-def execution_time() -> Any:
-    """The time panel of executions: they play as fast as they were executed."""
-    return recording.time_panel(timeline=TIME, playback_speed=1.0)
+    cup = panels.space_view("Cup", shown, _EYE_M, np.zeros(3), spatial_information=follow)
+    tilted, left = panels.cup_panels(execution.spheres, float(np.degrees(tilt(execution)).max()))
+    more = rrb.Tabs(left, panels.range_panel(), active_tab=0)
+    rows = [(cup, 1.6), (panels.status_panel(), 0.8), (tilted, 1.0), (more, 1.0)]
+    scene = recording.scene_panel(frames, "cup", "spheres")
+    return panels.arranged(scene, rows, recording.path_time(frames))

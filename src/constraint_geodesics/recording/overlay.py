@@ -21,18 +21,22 @@ from jaxtyping import Float
 from rerun.chunk import Chunk
 
 from constraint_geodesics.palette import planner_colour
-from constraint_geodesics.recording import recording
-from constraint_geodesics.recording.execution_recording import TIME, cup_panels, execution_time
-from constraint_geodesics.recording.recording import About, RecordingError, static
+from constraint_geodesics.recording import panels, recording
+from constraint_geodesics.recording.colours import LIMIT, Colour, rgb
+from constraint_geodesics.recording.kept import REGION
+from constraint_geodesics.recording.recording import TIME, About, RecordingError, static
 from constraint_geodesics.scene.urdf import find_urdf
 
 OTHERS_OPACITY = 0.45
 """Of the robots over the first one."""
 
-_IN_SPACE = ("robot", "transforms", "tool", "attached", "cup", "spheres", "workcell")
-_LIMITED = ("constraint/", "violation")
-
-Colour = tuple[int, int, int]
+_IN_SPACE = (
+    *("robot", "transforms", "tool", "attached", "cup", "spheres", "workcell", "hidden"),
+    *("goal", "demonstrations", "identified"),
+)
+_ASKED = ("/goal/", "/demonstrations", "/identified", f"/{REGION}")
+"""What was asked: of paths over each other, that of the first is drawn."""
+_LIMITED = ("constraint/", "share/")
 
 
 @dataclass(frozen=True)
@@ -125,12 +129,15 @@ def overlaid(sources: Sequence[Opened]) -> Composed:
         for k, part in enumerate(parts)
         for chunk in _in_space(part, 1.0 if k == 0 else OTHERS_OPACITY)
         if not _is_surroundings(chunk, part.entity)
+        and not (k and chunk.entity_path.startswith(tuple(f"/{part.entity}{e}" for e in _ASKED)))
     ]
     return _composed(parts, shared + _ends_once(own), apart=False)
 
 
 def side_by_side(sources: Sequence[Opened]) -> Composed:
-    """Paths, or executed ones, each in its own view.  Raises RecordingError for a mix of both."""
+    """Paths, executed ones among them, each in its own view.  Raises RecordingError for what is no
+    recording of one path.
+    """
     _of_one_kind(sources)
     parts = _parts(sources)
     own = [chunk for part in parts for chunk in _in_space(part, 1.0)]
@@ -141,13 +148,18 @@ def _of_one_kind(sources: Sequence[Opened]) -> None:
     for source in sources:
         if not any(chunk.entity_path == "/joints" for chunk in source.chunks):
             raise RecordingError(f"{source.file}: not a recording of one path: open it by itself")
-    executed = [source.file for source in sources if source.about.executed]
-    planned = [source.file for source in sources if not source.about.executed]
-    if executed and planned:
-        both = (
-            f"{executed[0]} is an executed path, in seconds, and {planned[0]} is a path, in frames"
-        )
-        raise RecordingError(f"{both}: open them one after another")
+    timed = [source.file for source in sources if TIME in _timelines(source)]
+    counted = [source.file for source in sources if TIME not in _timelines(source)]
+    if timed and counted:
+        both = f"{timed[0]} is in seconds, and {counted[0]}, of an earlier release, in frames"
+        raise RecordingError(f"{both}: open them one after another, or record it again")
+
+
+def _timelines(source: Opened) -> list[str]:
+    moving = (chunk for chunk in source.chunks if not chunk.is_static)
+    return [
+        name for chunk in moving if chunk.entity_path == "/joints" for name in chunk.timeline_names
+    ]
 
 
 def _same_surroundings(sources: Sequence[Opened]) -> None:
@@ -237,7 +249,7 @@ def shades(colours: Sequence[str]) -> list[Colour]:
     found = []
     for colour in colours:
         white = 1.0 - 0.6 ** seen[colour]
-        red, green, blue = (round(value + white * (255 - value)) for value in recording.rgb(colour))
+        red, green, blue = (round(value + white * (255 - value)) for value in rgb(colour))
         found.append((red, green, blue))
         seen[colour] += 1
     return found
@@ -306,7 +318,8 @@ def _coloured(chunk: Chunk, kind: Any, colour: Colour) -> Iterator[Chunk]:
 def _composed(parts: Sequence[_Part], in_space: Sequence[Chunk], *, apart: bool) -> Composed:
     series = [_series_of(part.source.chunks) for part in parts]
     latent, latent_view = _latent(parts)
-    panels = ([] if latent_view is None else [latent_view]) + _panels(series)
+    shown = ([] if latent_view is None else [(latent_view, 1.6)]) + _panels(series)
+    time = _clock(series)
     texts = [
         recording.component(chunk, "TextDocument:text")[0][0]
         for part in parts
@@ -320,7 +333,7 @@ def _composed(parts: Sequence[_Part], in_space: Sequence[Chunk], *, apart: bool)
         f"together-{hashlib.sha256(ids.encode()).hexdigest()[:12]}",
         name,
         [*in_space, *own],
-        _side_by_side(parts, panels) if apart else _over(parts, panels),
+        _side_by_side(parts, shown, time) if apart else _over(parts, shown, time),
     )
 
 
@@ -340,9 +353,10 @@ def _series_of(chunks: Sequence[Chunk]) -> dict[str, _Lines]:
 
 def _time(chunk: Chunk) -> rr.TimeColumn:
     (timeline,) = chunk.timeline_names
-    times = recording.component(chunk, timeline)
-    how = {"duration": times} if timeline == TIME else {"sequence": times}
-    return rr.TimeColumn(timeline, **how)
+    seconds = recording.seconds_of(chunk)
+    if seconds is None:
+        return rr.TimeColumn(timeline, sequence=recording.component(chunk, timeline))
+    return rr.TimeColumn(timeline, duration=seconds.tolist())
 
 
 def _series_chunks(parts: Sequence[_Part], series: Sequence[dict[str, _Lines]]) -> Iterator[Chunk]:
@@ -363,7 +377,7 @@ def _series_chunks(parts: Sequence[_Part], series: Sequence[dict[str, _Lines]]) 
                     level = np.full((len(lines.values), 1), value)
                     limits[shown] = _Lines([f"{name}{what}"], level, lines.time)
     for shown, lines in limits.items():
-        yield from _lines(shown, recording.LIMIT, lines, width=1.0)
+        yield from _lines(shown, LIMIT, lines, width=1.0)
 
 
 def _own_lines(
@@ -406,59 +420,59 @@ def _lines(entity: str, colour: Colour, lines: _Lines, width: float = 2.0) -> It
     yield recording.scalars(entity, lines.values, lines.time)
 
 
-def _panels(series: Sequence[dict[str, _Lines]]) -> list[Any]:
-    """A panel for each quantity that any of the recordings has."""
+def _panels(series: Sequence[dict[str, _Lines]]) -> list[tuple[Any, float]]:
+    """A panel for each quantity that any of the recordings has, with its share of the height."""
     found: dict[str, list[_Lines]] = defaultdict(list)
     for own in series:
         for entity, lines in own.items():
             found[entity].append(lines)
 
-    def top(begin: str) -> float | None:
+    def top(begin: str, columns: slice = slice(None)) -> float | None:
         own = [one for entity, lines in found.items() if entity.startswith(begin) for one in lines]
-        return max((float(lines.values.max()) for lines in own), default=None)
+        return max((float(lines.values[:, columns].max()) for lines in own), default=None)
 
     tops = {unit: top(f"constraint/{unit}/") for unit in ("deg", "mm")}
-    panels = [
-        recording.residual_panel(unit, most) for unit, most in tops.items() if most is not None
-    ]
-    panels += [recording.violation_panel(legend=not panels)] if "violation" in found else []
+    residuals = {unit: most for unit, most in tops.items() if most is not None}
+    rows = [(one, 1.0) for one in panels.constraint_panel(top("share/", slice(1)), residuals)]
     if (spheres := top("cup_spheres")) is not None:
-        panels += cup_panels(spheres)
+        rows += [(one, 1.0) for one in panels.cup_panels(spheres, top("cup_tilt") or 0.0)]
     joints = sorted({joint for lines in found["joints"] for joint in lines.names})
     single = [
         rrb.TimeSeriesView(origin=f"joint/{joint}", name=f"{joint} [rad or m]") for joint in joints
     ]
-    together = [recording.range_panel(legend=False)] if "joint_range" in found else []
-    return [*panels, rrb.Tabs(*together, *single, active_tab=0)]
+    together = [panels.range_panel(legend=False)] if "joint_range" in found else []
+    return [*rows, (rrb.Tabs(*together, *single, active_tab=0), 1.2)]
 
 
-def _over(parts: Sequence[_Part], panels: Sequence[Any]) -> Any:
+def _over(parts: Sequence[_Part], rows: Sequence[tuple[Any, float]], time: Any) -> Any:
     entities = ["workcell", "transforms", *(part.entity for part in parts)]
-    shares = [2.0 if isinstance(panel, rrb.Spatial2DView) else 1.0 for panel in panels[:-1]] + [1.3]
-    scene = recording.scene_view("Robots", entities, _reach(parts))
-    return recording.arranged(scene, rrb.Vertical(*panels, row_shares=shares), _clock(parts))
+    scene = panels.scene_view("Robots", entities, _traces(parts))
+    return panels.arranged(scene, [(panels.status_panel(), 0.8), *rows], time)
 
 
-def _side_by_side(parts: Sequence[_Part], panels: Sequence[Any]) -> Any:
-    reach = _reach(parts)
-    scenes = rrb.Grid(*(recording.scene_view(part.label, [part.entity], reach) for part in parts))
-    below = rrb.Horizontal(recording.status_panel(), *panels)
-    return recording.blueprint(rrb.Vertical(scenes, below, row_shares=[3.0, 1.5]), _clock(parts))
+def _side_by_side(parts: Sequence[_Part], rows: Sequence[tuple[Any, float]], time: Any) -> Any:
+    seen = _traces(parts)
+    scenes = rrb.Grid(*(panels.scene_view(part.label, [part.entity], seen) for part in parts))
+    below = rrb.Horizontal(panels.status_panel(), *(panel for panel, _ in rows))
+    return panels.blueprint(rrb.Vertical(scenes, below, row_shares=[3.0, 1.5]), time)
 
 
-def _clock(parts: Sequence[_Part]) -> Any:
-    return execution_time() if parts[0].source.about.executed else recording.path_time()
+def _clock(series: Sequence[dict[str, _Lines]]) -> Any:
+    """The time panel of the longest."""
+    columns = [lines.time for own in series for lines in own.values()]
+    times = np.concatenate([np.asarray(column.times.cast(pa.int64())) for column in columns])
+    return panels.time_panel(columns[0].timeline, 1e-9 * float(times.max()))
 
 
-def _reach(parts: Sequence[_Part]) -> float:
-    """The farthest that any of the tools gets from the base [m]."""
+def _traces(parts: Sequence[_Part]) -> Float[np.ndarray, "n 3"]:
+    """Where the tools go [m]."""
     traces = [
         recording.component(chunk, "LineStrips3D:strips")[0][0]
         for part in parts
         for chunk in part.source.chunks
         if chunk.entity_path == "/tool/trace"
     ]
-    return max((float(np.linalg.norm(trace, axis=1).max()) for trace in traces), default=1.0)
+    return np.concatenate([np.zeros((1, 3)), *(np.array(trace, dtype=float) for trace in traces)])
 
 
 def _latent(parts: Sequence[_Part]) -> tuple[list[Chunk], Any]:
@@ -478,7 +492,7 @@ def _latent(parts: Sequence[_Part]) -> tuple[list[Chunk], Any]:
     strips = recording.component(axes, "LineStrips2D:strips")[0]
     corners = np.array(strips[0] + strips[1]) * [1.0, -1.0]  # the plane's second axis points down
     names = recording.component(axes, "LineStrips2D:labels")[0]
-    return chunks, recording.latent_view_of(names, corners.min(axis=0), corners.max(axis=0))
+    return chunks, panels.latent_view_of(names, corners.min(axis=0), corners.max(axis=0))
 
 
 def _latent_chunks(source: Opened) -> dict[str, list[Chunk]]:

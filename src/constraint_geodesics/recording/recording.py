@@ -17,19 +17,33 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
+import pyarrow as pa
 import rerun as rr
-import rerun.blueprint as rrb
 from jaxtyping import Float, Shaped
 from rerun.chunk import Chunk, RrdReader
 from rerun.urdf import UrdfTree
+from scipy.spatial.transform import Rotation
 
 from constraint_geodesics import palette
 from constraint_geodesics.certification.certifier import Limits
-from constraint_geodesics.constraints.constraint import ConstraintManifold, Series
+from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Series
 from constraint_geodesics.formats import NUMBER, RECORDING, SINCE, FormatError
+from constraint_geodesics.geometry.braking import Pace
+from constraint_geodesics.params import PlannerParams
+from constraint_geodesics.recording import panels
+from constraint_geodesics.recording.colours import (
+    AXES,
+    CARRIED,
+    GROUND,
+    INK,
+    LIMIT,
+    OTHER,
+    colours,
+    rgb,
+)
 from constraint_geodesics.recording.goal import GoalView, goal_drawings
+from constraint_geodesics.recording.kept import AXIS_M, FRAME, PLACE, kept_drawings
 from constraint_geodesics.recording.shown import ENTITIES, shown_drawings
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.attached import Attached
@@ -38,29 +52,22 @@ from constraint_geodesics.scene.urdf import urdf_name
 from constraint_geodesics.text_files import write_bytes
 
 APPLICATION = "constraint_geodesics"
-TIMELINE = "frame"
+TIME = "time"
+"""The timeline, in seconds from the start of the path."""
 ABOUT = "about"
 """The entity that says where a recording comes from."""
-LOWEST_VIOLATION = 1e-12
-"""Violations below this [rad or m] are shown as this, as there is no logarithm of 0."""
+SHARE = "share"
+"""What the constraint bounds, as shares of what the judge grants [%]."""
+_IN_UNIT = {"mm": 1e3, "deg": math.degrees(1.0)}
+"""Units that series are drawn in, of a metre and of a radian."""
+_APART = 1e-6
+"""Rows that are closer than this share of a path take no time."""
 
 ROOT_FRAME = "tf#/"
 """Rerun's name for the frame of the root entity."""
 
 
-def rgb(colour: str) -> tuple[int, int, int]:
-    """A colour of the palette as Rerun takes it."""
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
-
-
-LIMIT = rgb(palette.VERMILION)
-"""Of the lines that a series must not cross."""
-_START, _GOAL, _NOW, _INK = (
-    rgb(colour) for colour in (palette.START, palette.GOAL, palette.BLUE, palette.BLACK)
-)
-_BOX, _OUTSIDE, _PAPER = (150, 150, 150), (200, 200, 200), (255, 255, 255)
-_CARRIED = rgb(palette.SKY)
-_PALETTE = tuple(rgb(colour) for colour in palette.SERIES)
+_START, _GOAL, _NOW = (rgb(own) for own in (palette.START, palette.GOAL, palette.BLUE))
 _WIDTH, _THIN, _POINT, _END = (rr.Radius.ui_points(size) for size in (2.0, 0.8, 5.0, 7.0))
 """Of lines, of those of other ways, moving points and a path's ends, in points of the screen."""
 _OLD_ID = re.compile(
@@ -101,6 +108,10 @@ class PathRecord:
     """Configurations along the path [rad or m], the latent curve's points in the same order."""
     text: str
     latent: LatentView | None = None
+    times: Float[np.ndarray, "T"] | None = None
+    """When the arm is there [s], from 0; None where nobody said: as fast as the arm's limits
+    allow.
+    """
     scene: str = ""
     """What stands round the robot besides its workcell, where that has a name."""
     tolerance: float = Limits.violation_tolerance
@@ -146,6 +157,8 @@ class RecordingSummary:
     """Number of meshes: the robot's visual ones and those of the workcell's bodies."""
     joints: Float[np.ndarray, "frames D"]
     """Joint positions [rad or m] over the timeline."""
+    times: Float[np.ndarray, "frames"] | None
+    """Of the frames [s]; None in a recording from before there were times."""
     tool_ends: Float[np.ndarray, "2 3"]
     """First and last point of the tool's trace in the base frame [m]."""
     has_blueprint: bool
@@ -154,16 +167,37 @@ class RecordingSummary:
 
 @dataclass(frozen=True)
 class Frames:
-    """A path as it is shown: joints [rad or m], tool in the base frame [m] and latent point of each
-    frame.
-
-    time: the timeline, with one entry a frame.
+    """A path as it is shown: times [s], joints [rad or m], pose of the tool in the base frame [m],
+    points of the arm [m] and latent point of each frame.
     """
 
+    at_s: Float[np.ndarray, "frames"]
     joints: Float[np.ndarray, "frames D"]
     tool: Float[np.ndarray, "frames 3"]
-    curve: Float[np.ndarray, "frames 2"] | None
-    time: rr.TimeColumn
+    turn: Float[np.ndarray, "frames 3 3"]
+    arm: Float[np.ndarray, "frames n 3"]
+    curve: Float[np.ndarray, "frames 2"] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        robot: SerialRobot,
+        joints: Float[np.ndarray, "frames D"],
+        at_s: Float[np.ndarray, "frames"],
+        curve: Float[np.ndarray, "frames 2"] | None = None,
+    ) -> "Frames":
+        """Those of a robot's configurations."""
+        return cls(at_s, joints, *robot.forward(joints), robot.skeleton(joints), curve)
+
+    @property
+    def time(self) -> rr.TimeColumn:
+        """The timeline, with one entry a frame."""
+        return rr.TimeColumn(TIME, duration=np.asarray(self.at_s, float).tolist())
+
+    @property
+    def duration_s(self) -> float:
+        """Until the last frame."""
+        return float(self.at_s[-1])
 
 
 def record_path(
@@ -182,27 +216,26 @@ def record_path(
     written is missing.
     """
     robot, sampled = manifold.robot, sample(path, manifold, frames)
-    series = [
-        *manifold.constraint.series(manifold.residual(sampled.joints)),
-        *_violations(manifold, sampled.joints, path.tolerance),
-    ]
+    series = constraint_series(manifold, sampled.joints)
+    shares = share_series(manifold, sampled.joints, path.tolerance)
     chunks = [
         *scene_chunks(robot, workcell, sampled, meshes=path.meshes, attached=attached),
-        *tool_chunks(sampled, rgb(palette.planner_colour(path.planner))),
+        *tool_chunks(sampled, rgb(palette.planner_colour(path.planner)), manifold.constraint),
         *_way_chunks(robot, path.ways),
         *(static(*drawing) for drawing in goal_drawings(robot, path.goal)),
         *(
             static(*drawing)
             for drawing in shown_drawings(robot, path.demonstrations, manifold.constraint)
         ),
-        *_series_chunks(series, sampled),
+        *series_chunks(series, sampled),
+        *share_chunks(shares, sampled),
         *joint_chunks(robot, sampled),
         *_latent_chunks(path.latent, sampled),
         about_chunk(About(path.planner, path.constraint, path.scene, path.query, path.seed)),
         *text_chunks(path.text),
     ]
     name = f"{path.constraint}, query {path.query}: {path.planner}, seed {path.seed}"
-    blueprint = _blueprint(path, sampled, series)
+    blueprint = _blueprint(path, sampled, series, shares)
     write_recording(file, f"{path.name}-{digest(sampled)}", name, chunks, blueprint)
 
 
@@ -245,14 +278,17 @@ def read_recording(file: Path) -> RecordingSummary:
     Raises RecordingError if it is not a recording of one path.
     """
     stored, chunks, blueprint = read_chunks(file)
-    joints = _column(file, chunks, "/joints", "Scalars:scalars")
-    trace = _column(file, chunks, "/tool/trace", "LineStrips3D:strips")[0][0]
+    moving_joints = _chunk(file, chunks, "/joints", "Scalars:scalars")
+    joints = component(moving_joints, "Scalars:scalars")
+    line = _chunk(file, chunks, "/tool/trace", "LineStrips3D:strips")
+    trace = component(line, "LineStrips3D:strips")[0][0]
     return RecordingSummary(
         application_id=stored.application_id,
         recording_id=stored.recording_id,
         entity_paths=tuple(sorted({chunk.entity_path for chunk in chunks})),
         meshes=sum(has(chunk, "Asset3D:blob") for chunk in chunks),
         joints=np.array(joints, dtype=float),
+        times=seconds_of(moving_joints),
         tool_ends=np.array([trace[0], trace[-1]], dtype=float),
         has_blueprint=blueprint,
         about=about_of(stored.recording_id, chunks),
@@ -304,10 +340,21 @@ def about_of(recording_id: str, chunks: Sequence[Chunk]) -> About:
     return About()
 
 
+def seconds_of(chunk: Chunk) -> Float[np.ndarray, "frames"] | None:
+    """When its rows are [s]; None where they are counted."""
+    if chunk.timeline_names != [TIME]:
+        return None
+    column = chunk.to_record_batch().column(TIME)
+    return 1e-9 * np.asarray(column.cast(pa.int64()).to_numpy(zero_copy_only=False), float)
+
+
 def sample(path: PathRecord, manifold: ConstraintManifold, frames: int) -> Frames:
-    """The path at points of equal joint length.  Raises RecordingError if it is not the robot's."""
-    joints = np.asarray(path.joints, dtype=float)
-    name, dof, shape = path.name, manifold.robot.dof, joints.shape
+    """The path at times that are equally far apart.
+
+    Raises RecordingError if it is not the robot's, or its times are none.
+    """
+    joints, robot = np.asarray(path.joints, dtype=float), manifold.robot
+    name, dof, shape = path.name, robot.dof, joints.shape
     if joints.ndim != 2 or len(joints) < 2 or shape[1] != dof:
         must = f"must be (T, {dof}) with T of 2 or more"
         raise RecordingError(f"{name}: joints of shape {shape}: {must}")
@@ -318,16 +365,35 @@ def sample(path: PathRecord, manifold: ConstraintManifold, frames: int) -> Frame
     if path.latent is not None and (curve := path.latent.curve).shape != (shape[0], 2):
         must = f"must be {(shape[0], 2)}"
         raise RecordingError(f"{name}: latent curve of shape {curve.shape}: {must}")
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(joints, axis=0), axis=1))])
-    at = np.linspace(0.0, length[-1], frames)
-    sampled = _interpolate(at, length, joints)
-    latent = None if path.latent is None else _interpolate(at, length, path.latent.curve)
-    time = rr.TimeColumn(TIMELINE, sequence=range(frames))
-    return Frames(sampled, manifold.robot.forward(sampled)[0], latent, time)
+    times = paced(robot, joints) if path.times is None else np.asarray(path.times, dtype=float)
+    if times.shape != shape[:1]:
+        raise RecordingError(f"{name}: times of shape {times.shape}: must be {shape[:1]}")
+    if not np.isfinite(times).all() or times[0] != 0.0 or (np.diff(times) < 0.0).any():
+        raise RecordingError(f"{name}: times must be finite and rise from 0")
+    at_s = np.linspace(0.0, times[-1], frames)
+    latent = None if path.latent is None else _interpolate(at_s, times, path.latent.curve)
+    return Frames.of(robot, _interpolate(at_s, times, joints), at_s, latent)
 
 
-def _interpolate(at: np.ndarray, length: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(at, length, column) for column in values.T], axis=1)
+def paced(robot: SerialRobot, joints: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "T"]:
+    """Times [s] of a path that has none: from rest to rest within the arm's velocity limits and the
+    planner's accelerations.  One that stands still takes a second.
+    """
+    steps = np.linalg.norm(np.diff(joints, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    if along[-1] == 0.0:
+        return np.linspace(0.0, 1.0, len(joints))
+    moved = np.concatenate([[True], steps > _APART * along[-1]])
+    limits = PlannerParams()
+    sliding = robot.chain.prismatic
+    acceleration = np.where(sliding, limits.acceleration_m_s2, limits.acceleration_rad_s2)
+    velocity = np.where(robot.velocity > 0.0, robot.velocity, np.inf)  # some URDFs say 0
+    times = Pace(velocity, acceleration).times(joints[moved], None)
+    return np.interp(along, along[moved], times)
+
+
+def _interpolate(at_s: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(at_s, times, column) for column in values.T], axis=1)
 
 
 def scene_chunks(
@@ -377,7 +443,9 @@ def _robot_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
 def _shape_chunks(shape: Shape, entity: str, frame: str) -> Iterator[Chunk]:
     """A shape at its place in a frame: the base's, or that of the link that carries it."""
     placed = shape.urdf_model()
-    colour = _BOX if frame == ROOT_FRAME else _CARRIED
+    # what links may touch is what the arm stands on
+    around = GROUND if shape.exempt_links else OTHER
+    colour = around if frame == ROOT_FRAME else CARRIED
     style = {"colors": [colour], "fill_mode": "solid", "labels": [shape.name], "show_labels": False}
     archetype = shape.drawn(rr, style)
     if archetype is not None:
@@ -438,41 +506,92 @@ def _way_chunks(robot: SerialRobot, ways: Sequence[Float[np.ndarray, "T D"]]) ->
     """The tool's lines on other ways, thin and grey."""
     if ways:
         lines = [robot.forward(points)[0] for points in ways]
-        grey = rgb(palette.GREY)
-        yield static("tool/ways", rr.LineStrips3D(lines, colors=[grey], radii=[_THIN]))
+        yield static("tool/ways", rr.LineStrips3D(lines, colors=[OTHER], radii=[_THIN]))
 
 
-def tool_chunks(sampled: Frames, colour: tuple[int, int, int]) -> Iterator[Chunk]:
-    """The tool's trace with its ends, and where it is."""
+def tool_chunks(
+    sampled: Frames, colour: tuple[int, int, int], kept: Constraint | None = None
+) -> Iterator[Chunk]:
+    """The tool's trace with its ends, where it is with its axes, and what a constraint keeps."""
     yield static("tool/trace", rr.LineStrips3D([sampled.tool], colors=[colour], radii=[_WIDTH]))
     for name, point, own in _ends(sampled.tool):
         marker = rr.Points3D([point], colors=[own], radii=[_END], labels=[name])
         yield static(f"tool/{name}", marker)
-    yield static("tool/position", rr.Points3D.from_fields(colors=[_INK], radii=[_POINT]))
+    yield from tool_axes(sampled, kept)
+    yield from tool_moves(sampled)
+
+
+def tool_axes(sampled: Frames, kept: Constraint | None) -> Iterator[Chunk]:
+    """The tool's place and axes, and what a constraint keeps: what moves with `tool_moves`."""
+    yield static("tool/position", rr.Points3D.from_fields(colors=[INK], radii=[_POINT]))
+    axes = rr.Arrows3D(vectors=AXIS_M * np.eye(3), colors=AXES, radii=[0.003])
+    yield static(f"{FRAME}/axes", axes)
+    for drawing in kept_drawings(kept, sampled.tool):
+        yield static(*drawing)
+
+
+def tool_moves(sampled: Frames) -> Iterator[Chunk]:
+    """Where the tool is, its frame, and the place where what does not turn with it is drawn."""
     yield moving("tool/position", rr.Points3D.columns(positions=sampled.tool), sampled.time)
+    turn = Rotation.from_matrix(sampled.turn).as_quat()
+    frame = rr.Transform3D.columns(translation=sampled.tool, quaternion=turn)
+    yield moving(FRAME, frame, sampled.time)
+    yield moving(PLACE, rr.Transform3D.columns(translation=sampled.tool), sampled.time)
 
 
 def _ends(points: np.ndarray) -> tuple[tuple[str, np.ndarray, tuple[int, int, int]], ...]:
     return ("start", points[0], _START), ("goal", points[-1], _GOAL)
 
 
-def _violations(manifold: ConstraintManifold, joints: np.ndarray, tolerance: float) -> list[Series]:
-    """What is beyond the constraint's own tolerance, as a power of ten: the judge's limit is far
-    below a pixel else.
+def constraint_series(
+    manifold: ConstraintManifold, joints: Float[np.ndarray, "frames D"]
+) -> list[Series]:
+    """What the constraint bounds, in mm and degrees."""
+    return manifold.constraint.series(manifold.residual(joints))
+
+
+def share_series(
+    manifold: ConstraintManifold, joints: Float[np.ndarray, "frames D"], tolerance: float
+) -> list[Series]:
+    """The same in percent of its limit: what the judge grants [rad or m], beyond the constraint's
+    own tolerance.
     """
-    if manifold.constraint.is_free:
-        return []
-    values = np.log10(np.maximum(manifold.violation(joints), LOWEST_VIOLATION))
-    return [Series("violation", "log10 rad or m", values, math.log10(tolerance))]
+    found = []
+    for one in constraint_series(manifold, joints):
+        limit = one.limit + _IN_UNIT[one.unit] * tolerance
+        found.append(Series(one.name, one.unit, 100.0 * one.values / limit, limit))
+    return found
 
 
-def _series_chunks(series: Sequence[Series], sampled: Frames) -> Iterator[Chunk]:
+def series_chunks(series: Sequence[Series], sampled: Frames) -> Iterator[Chunk]:
+    """Series with their limits."""
     for one in series:
-        entity = one.name if one.name == "violation" else _entity("constraint", one.unit, one.name)
-        names = [one.name, f"limit of {one.name}"]  # the panel says the unit
-        yield static(entity, rr.SeriesLines(names=names, colors=[_NOW, LIMIT], widths=[2.0, 1.0]))
-        limit = np.full_like(one.values, one.limit)
-        yield scalars(entity, np.stack([one.values, limit], axis=1), sampled.time)
+        entity = _entity("constraint", one.unit, one.name)
+        yield _limited(entity, one.name, f"limit of {one.name}")  # the panel says the unit
+        yield _with_limit(entity, one.values, one.limit, sampled)
+
+
+def share_chunks(shares: Sequence[Series], sampled: Frames) -> Iterator[Chunk]:
+    """Shares of limits with the line at 100 %, whose name says what that is."""
+    for one in shares:
+        yield _limited(_entity(SHARE, one.name), one.name, f"limit, {one.limit:.3g} {one.unit}")
+    yield from share_moves(shares, sampled)
+
+
+def share_moves(shares: Sequence[Series], sampled: Frames) -> Iterator[Chunk]:
+    """The shares over the timeline."""
+    for one in shares:
+        yield _with_limit(_entity(SHARE, one.name), one.values, 100.0, sampled)
+
+
+def _limited(entity: str, *names: str) -> Chunk:
+    lines = rr.SeriesLines(names=list(names), colors=[_NOW, LIMIT], widths=[2.0, 1.0])
+    return static(entity, lines)
+
+
+def _with_limit(entity: str, values: np.ndarray, limit: float, sampled: Frames) -> Chunk:
+    both = np.stack([values, np.full_like(values, limit)], axis=1)
+    return scalars(entity, both, sampled.time)
 
 
 def joint_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
@@ -506,12 +625,12 @@ def _latent_chunks(latent: LatentView | None, sampled: Frames) -> Iterator[Chunk
     shown = rr.Points2D(points, colors=own, radii=radii, draw_order=0.0)
     yield static("latent/submanifold", shown)
     yield static("latent/axes", _axes(low, high, latent.axis_names))
-    line = rr.LineStrips2D([curve], colors=[_INK], radii=[_WIDTH], draw_order=20.0)
+    line = rr.LineStrips2D([curve], colors=[INK], radii=[_WIDTH], draw_order=20.0)
     yield static("latent/curve", line)
     for name, point, colour in _ends(curve):
         marker = rr.Points2D([point], colors=[colour], radii=[_END], labels=[name], draw_order=30.0)
         yield static(f"latent/{name}", marker)
-    now = rr.Points2D.from_fields(colors=[_INK], radii=[_POINT], draw_order=40.0)
+    now = rr.Points2D.from_fields(colors=[INK], radii=[_POINT], draw_order=40.0)
     yield static("latent/position", now)
     yield moving("latent/position", rr.Points2D.columns(positions=curve), sampled.time)
 
@@ -524,7 +643,7 @@ def _upright(points: np.ndarray) -> np.ndarray:
 def _axes(low: np.ndarray, high: np.ndarray, names: tuple[str, str]) -> Any:
     corner = [[[low[0], low[1]], [high[0], low[1]]], [[low[0], low[1]], [low[0], high[1]]]]
     strips = [_upright(np.array(line)) for line in corner]
-    thin = {"colors": [_INK], "radii": [rr.Radius.ui_points(1.0)], "draw_order": 10.0}
+    thin = {"colors": [INK], "radii": [rr.Radius.ui_points(1.0)], "draw_order": 10.0}
     return rr.LineStrips2D(strips, labels=list(names), show_labels=True, **thin)
 
 
@@ -535,131 +654,43 @@ def _latent_bounds(latent: LatentView) -> tuple[np.ndarray, np.ndarray]:
     return low - margin, high + margin
 
 
-def colours(values: np.ndarray) -> np.ndarray:
-    """Colours that the colour-blind can tell apart: one a component for integers, a scale (dark is
-    high) for floats.
-    """
-    if np.issubdtype(values.dtype, np.integer):
-        palette = np.array([*_PALETTE, _OUTSIDE], dtype=np.uint8)
-        return palette[np.where(values < 0, len(_PALETTE), values % len(_PALETTE))]
-    finite = values[np.isfinite(values)]
-    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
-    scaled = np.nan_to_num((values - low) / max(high - low, 1e-12), nan=1.0, posinf=1.0, neginf=0.0)
-    return np.asarray(matplotlib.colormaps["cividis_r"](scaled, bytes=True))[:, :3]
-
-
 def component(chunk: Chunk, name: str) -> list[Any]:
     """One component of a chunk, row by row, as lists."""
     return list(chunk.to_record_batch().column(name).to_pylist())
 
 
-def _blueprint(path: PathRecord, sampled: Frames, series: Sequence[Series]) -> Any:
-    right: list[Any] = []
+def _blueprint(
+    path: PathRecord, sampled: Frames, series: Sequence[Series], shares: Sequence[Series]
+) -> Any:
+    rows: list[tuple[Any, float]] = []
     if path.latent is not None:
-        right.append(latent_view_of(path.latent.axis_names, *_latent_bounds(path.latent)))
-    for unit in ("deg", "mm"):
-        if shown := [one for one in series if one.unit == unit]:
-            top = max(max(one.limit, float(one.values.max())) for one in shown)
-            right.append(residual_panel(unit, top))
-    right += [violation_panel() for one in series if one.name == "violation"]
-    shares = [2.5 if isinstance(panel, rrb.Spatial2DView) else 1.0 for panel in right]
-    right.append(joint_panel())
-    shares.append(1.8)  # its legend names every joint
+        plane = panels.latent_view_of(path.latent.axis_names, *_latent_bounds(path.latent))
+        rows.append((plane, 1.6))
+    rows.append((panels.status_panel(), 0.8))
+    rows += [(panel, 1.0) for panel in constraint_panel(series, shares)]
+    rows.append((panels.joint_panel(), 1.2))
     more = ("goal",) * (path.goal is not None) + ENTITIES * bool(path.demonstrations)
-    return arranged(
-        scene_panel(sampled, *more), rrb.Vertical(*right, row_shares=shares), path_time()
-    )
+    return panels.arranged(scene_panel(sampled, *more), rows, path_time(sampled))
 
 
-def path_time() -> Any:
-    """The time panel of paths."""
-    return time_panel(timeline=TIMELINE, fps=30.0)
+def constraint_panel(series: Sequence[Series], shares: Sequence[Series]) -> list[Any]:
+    """What the constraint bounds; nothing where it bounds nothing."""
+    residuals: dict[str, float] = {}
+    for one in series:
+        most = max(one.limit, float(one.values.max()))
+        residuals[one.unit] = max(residuals.get(one.unit, 0.0), most)
+    largest = max((float(one.values.max()) for one in shares), default=None)
+    return panels.constraint_panel(largest, residuals)
 
 
-def time_panel(**how: Any) -> Any:
-    """A time panel that plays from the start, again and again."""
-    return rrb.TimePanel(state="collapsed", play_state="playing", loop_mode="all", **how)
-
-
-def arranged(scene: Any, right: Any, time: Any) -> Any:
-    """A blueprint: the scene, the status below it, the other panels to its right."""
-    left = rrb.Vertical(scene, status_panel(), row_shares=[3.0, 1.0])
-    return blueprint(rrb.Horizontal(left, right, column_shares=[3.0, 2.0]), time)
-
-
-def status_panel() -> Any:
-    """The path's status as text."""
-    return rrb.TextDocumentView(origin="status", name="Status")
-
-
-def blueprint(panels: Any, time: Any) -> Any:
-    """Some panels and a time panel, and nothing else open."""
-    closed = [kind(state="collapsed") for kind in (rrb.BlueprintPanel, rrb.SelectionPanel)]
-    return rrb.Blueprint(panels, *closed, time, auto_views=False, auto_layout=False)
+def path_time(sampled: Frames) -> Any:
+    """The time panel of a path."""
+    return panels.time_panel(TIME, sampled.duration_s)
 
 
 def scene_panel(sampled: Frames, *more: str) -> Any:
     """The robot in its workcell with its tool's trace, and what lies below more entities."""
-    shown = ("robot", "workcell", "attached", "tool", "transforms", *more)
-    return scene_view("Robot", shown, float(np.linalg.norm(sampled.tool, axis=1).max()))
-
-
-def scene_view(name: str, entities: Sequence[str], reach_m: float) -> Any:
-    """What lies below some entities, seen from beyond the robot's reach."""
-    eye = [1.2 * reach_m, -1.2 * reach_m, 0.9 * reach_m]
-    return space_view(name, entities, eye, (0.0, 0.0, 0.45 * reach_m))
-
-
-def space_view(
-    name: str, entities: Sequence[str], eye: Sequence[float], target: Sequence[float], **more: Any
-) -> Any:
-    """What lies below some entities, seen from the eye to the target [m]; the third axis is up."""
-    eyes = rrb.EyeControls3D(position=eye, look_target=target, eye_up=(0.0, 0.0, 1.0))
-    contents = [f"+ /{entity}/**" for entity in entities]
-    # a grid at z = 0 would flicker with the top of a table there
-    grid = rrb.LineGrid3D(visible=False)
-    shown = {"contents": contents, "eye_controls": eyes, "line_grid": grid, **more}
-    return rrb.Spatial3DView(origin="/", name=name, **shown)
-
-
-def residual_panel(unit: str, largest: float) -> Any:
-    """What the constraint bounds, on a scale of at least one unit: an exactly held axis has
-    rounding errors only.
-    """
-    top = 1.2 * max(1.0, largest)
-    return series_view(f"constraint/{unit}", f"Constraint residual [{unit}]", (0.0, top))
-
-
-def violation_panel(*, legend: bool = True) -> Any:
-    """Powers of ten, up to ten rad."""
-    name, low = "Violation beyond the tolerance [log10 rad or m]", math.log10(LOWEST_VIOLATION)
-    return series_view("violation", name, (low - 0.5, 1.0), legend=legend)
-
-
-def joint_panel() -> Any:
-    """All joints as shares of their range, and behind that in their own units."""
-    own = rrb.TimeSeriesView(origin="joints", name="Joint positions [rad or m]")
-    return rrb.Tabs(range_panel(), own, active_tab=0)
-
-
-def range_panel(*, legend: bool = True) -> Any:
-    """All joints as shares of their range."""
-    return series_view("joint_range", "Joints within their limits (±1)", (-1.1, 1.1), legend=legend)
-
-
-def series_view(origin: str, name: str, limits: tuple[float, float], *, legend: bool = True) -> Any:
-    """The series below an entity between two values."""
-    axis, words = rrb.ScalarAxis(range=limits), rrb.PlotLegend(visible=legend)
-    return rrb.TimeSeriesView(origin=origin, name=name, axis_y=axis, plot_legend=words)
-
-
-def latent_view_of(axis_names: Sequence[str], low: np.ndarray, high: np.ndarray) -> Any:
-    """The latent plane between two corners."""
-    room = 0.1 * (high - low)  # for the axes' names
-    low, high = low - room, high + room
-    bounds = rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1]))
-    name = f"Latent space: {', '.join(axis_names)}"
-    return rrb.Spatial2DView(origin="latent", name=name, background=_PAPER, visual_bounds=bounds)
+    return panels.scene_view("Robot", (*panels.ROOTS, *more), sampled.arm.reshape(-1, 3))
 
 
 def _entity(*parts: str) -> str:
@@ -689,11 +720,11 @@ def has(chunk: Chunk, *components: str) -> bool:
     return any(name.startswith(component) for name in names for component in components)
 
 
-def _column(file: Path, chunks: Sequence[Chunk], entity: str, name: str) -> list[Any]:
-    """One component of one entity, row by row, as lists."""
+def _chunk(file: Path, chunks: Sequence[Chunk], entity: str, name: str) -> Chunk:
+    """The chunk with one component of one entity."""
     for chunk in chunks:
         if chunk.entity_path == entity and has(chunk, name):
-            return component(chunk, name)
+            return chunk
     raise RecordingError(f"{file}: has no {name} at {entity}: not a recording of a path")
 
 

@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from constraint_geodesics import palette
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
+from constraint_geodesics.recording.colours import OTHER, rgb
 from constraint_geodesics.robot.kinematics import SerialRobot
 
 ENTITIES = ("demonstrations", "identified")
@@ -18,9 +19,7 @@ BESIDE_RAD, NEAR_M, POINTS = 0.15, 0.05, 3000
 """How far from the rows configurations of the identified set are drawn, how near a demonstrated
 place they end, and how many.
 """
-_SHOWN, _SET = (
-    tuple(int(own[i : i + 2], 16) for i in (1, 3, 5)) for own in (palette.GREY, palette.BLUE)
-)
+_SHOWN, _SET = OTHER, rgb(palette.BLUE)
 _POINT, _LINE = rr.Radius.ui_points(2.0), rr.Radius.ui_points(1.5)
 
 
