@@ -26,7 +26,10 @@ from constraint_geodesics.studies.arm_parts import (
 )
 from constraint_geodesics.studies.arms import robots_folder
 from constraint_geodesics.text_files import write_text
+from constraint_geodesics.tracking.comparison import of_summary
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
+STAGE = "benchmark_arms"
 MEASURED_BY = "studies.arm_parts"
 """The module that measures: every row depends on what it imports."""
 
@@ -34,13 +37,29 @@ MEASURED_BY = "studies.arm_parts"
 def main(params: Params, layout: Layout) -> None:
     """Write data/arm_rows/ as the parts finish, then reports/arms.csv and arms.json."""
     robots_folder()  # what is missing is said before anything is measured
-    parts = fingerprinted(params, layout)
-    left = [part for part in parts if kept(part) is None]
-    parallel_map(measure, left, params.compute, description="arms and goals")
-    rows = table_of([row for part in parts for row in kept(part) or ()])
-    reports = layout.root / "reports"
-    write_table(rows, reports / "arms.csv", run_header(layout.root))
-    write_text(reports / "arms.json", json.dumps(figures(rows), indent=1) + "\n")
+    work = Work(STAGE, STAGE, {"seed": SEED}, [layout.planner])
+    with tracked_stage(work, params.tracking.experiment, layout.root) as run:
+        parts = fingerprinted(params, layout)
+        left = [part for part in parts if kept(part) is None]
+        parallel_map(measure, left, params.compute, description="arms and goals")
+        rows = table_of([row for part in parts for row in kept(part) or ()])
+        reports, found = layout.root / "reports", figures(rows)
+        write_table(rows, reports / "arms.csv", run_header(layout.root))
+        write_text(reports / "arms.json", json.dumps(found, indent=1) + "\n")
+        run.mirror({table: own["all"] for table, own in found.items()}, reports / "arms.json")
+        run.cells(
+            {
+                f"{table}, {arm}, {constraint}": (
+                    {"arm": arm, "constraint": constraint, "planner": "planner"},
+                    of_summary(row, "success", "ratio_median", "time_ms_median"),
+                )
+                for table, own in found.items()
+                for (arm, _, constraint), row in (
+                    (name.rpartition(", "), row) for name, row in own.items()
+                )
+                if arm and "success" in row
+            }
+        )
 
 
 def fingerprinted(params: Params, layout: Layout) -> list[Part]:

@@ -1,11 +1,15 @@
 """Stage: the result table, the figures, and the page that opens offline."""
 
 import sys
+from typing import Any
+
+import pandas as pd
 
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.pipeline_page import write_report
+from constraint_geodesics.tracking.comparison import of_summary
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "report"
@@ -21,6 +25,18 @@ def main(params: Params, layout: Layout) -> None:
     ) as run:
         for figure in write_report(params, layout):
             run.figure(figure)
+        table = pd.read_csv(layout.root / "reports" / "table.csv")
+        shown = table[table["manifold"] == params.geodesics.searched[0]]
+        rows: Any = shown.to_dict("records")
+        run.cells(
+            {
+                f"{row['constraint']}, {row['planner']}": (
+                    {"constraint": row["constraint"], "planner": row["planner"]},
+                    of_summary(row, "success", "over_best_median", "time_median_s", 1e3),
+                )
+                for row in rows
+            }
+        )
 
 
 if __name__ == "__main__":
