@@ -4,7 +4,9 @@ earlier run of it stopped.
 
 import json
 import sys
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 from constraint_geodesics.benchmark.entries import code_digest, data_digest
 from constraint_geodesics.benchmark.queries import TABLE, read_queries
@@ -26,7 +28,7 @@ from constraint_geodesics.studies.arm_parts import (
 )
 from constraint_geodesics.studies.arms import robots_folder
 from constraint_geodesics.text_files import write_text
-from constraint_geodesics.tracking.comparison import of_summary
+from constraint_geodesics.tracking.comparison import ARMS, cells_of
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "benchmark_arms"
@@ -47,19 +49,17 @@ def main(params: Params, layout: Layout) -> None:
         write_table(rows, reports / "arms.csv", run_header(layout.root))
         write_text(reports / "arms.json", json.dumps(found, indent=1) + "\n")
         run.mirror({table: own["all"] for table, own in found.items()}, reports / "arms.json")
-        run.cells(
-            {
-                f"{table}, {arm}, {constraint}": (
-                    {"arm": arm, "constraint": constraint, "planner": "planner"},
-                    of_summary(row, "success", "ratio_median", "time_ms_median"),
-                )
-                for table, own in found.items()
-                for (arm, _, constraint), row in (
-                    (name.rpartition(", "), row) for name, row in own.items()
-                )
-                if arm and "success" in row
-            }
-        )
+        run.cells(cells_of(compared(found), ("table", "arm", "constraint", "planner"), ARMS))
+
+
+def compared(found: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Iterator[dict[str, Any]]:
+    """The rows of figures that say how often the planner succeeds, by what they are of."""
+    for table, own in found.items():
+        for name, row in own.items():
+            arm, _, constraint = name.rpartition(", ")
+            if arm and "success" in row:
+                about = {"table": table, "arm": arm, "constraint": constraint}
+                yield {**about, "planner": "planner", **row}
 
 
 def fingerprinted(params: Params, layout: Layout) -> list[Part]:

@@ -15,7 +15,7 @@ from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.problems_page import write_problem_report
 from constraint_geodesics.studies.problem_runs import MEASURED_BY, Asked, answered
 from constraint_geodesics.studies.problems import TILTED, tilted
-from constraint_geodesics.tracking.comparison import of_problems
+from constraint_geodesics.tracking.comparison import problem_cells
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "benchmark_problems"
@@ -51,7 +51,7 @@ def main(params: Params, layout: Layout) -> None:
         found = write_problem_report(
             reports, "problems", title, about, table, run_header(layout.root)
         )
-        run.cells(of_problems(found))
+        run.cells(problem_cells(found))
         run.mirror({"rows": len(table)}, reports / "problems.json")
 
 

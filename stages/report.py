@@ -9,7 +9,7 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.pipeline_page import write_report
-from constraint_geodesics.tracking.comparison import of_summary
+from constraint_geodesics.tracking.comparison import REPORT, cells_of
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "report"
@@ -28,15 +28,7 @@ def main(params: Params, layout: Layout) -> None:
         table = pd.read_csv(layout.root / "reports" / "table.csv")
         shown = table[table["manifold"] == params.geodesics.searched[0]]
         rows: Any = shown.to_dict("records")
-        run.cells(
-            {
-                f"{row['constraint']}, {row['planner']}": (
-                    {"constraint": row["constraint"], "planner": row["planner"]},
-                    of_summary(row, "success", "over_best_median", "time_median_s", 1e3),
-                )
-                for row in rows
-            }
-        )
+        run.cells(cells_of(rows, ("constraint", "planner"), REPORT))
 
 
 if __name__ == "__main__":

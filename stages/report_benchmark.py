@@ -27,7 +27,7 @@ from constraint_geodesics.report import benchmark_figures as figures
 from constraint_geodesics.report import benchmark_tables as tables
 from constraint_geodesics.report.cells import markdown_table
 from constraint_geodesics.text_files import write_text, written
-from constraint_geodesics.tracking.comparison import of_summary
+from constraint_geodesics.tracking.comparison import BENCHMARK, cells_of
 from constraint_geodesics.tracking.experiment import StageRun, Work, tracked_stage
 
 STAGE = "report_benchmark"
@@ -85,16 +85,7 @@ def write(params: Params, layout: Layout, run: StageRun) -> None:
         *overview[overview["planner"].isin(drawn)].to_dict("records"),
         *summary[summary["planner"] == next(iter(settings))].to_dict("records"),
     ]
-    asked = ("planner", "constraint", "scene")
-    run.cells(
-        {
-            ", ".join(row[name] for name in asked): (
-                {name: row[name] for name in asked},
-                of_summary(row, "success_of_solvable", "ratio_median", "time_median_s", 1e3),
-            )
-            for row in shown
-        }
-    )
+    run.cells(cells_of(shown, ("planner", "constraint", "scene"), BENCHMARK))
 
 
 def write_tables(

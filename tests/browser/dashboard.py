@@ -13,7 +13,7 @@ from urllib.parse import quote
 import pandas as pd
 
 from constraint_geodesics.params import Params
-from constraint_geodesics.tracking.comparison import of_seeds, of_summary
+from constraint_geodesics.tracking.comparison import REPORT, cells_of, of_seeds
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 from constraint_geodesics.tracking.views import View, page_of
 from tests.browser.chromium import ROOT, free_port, served
@@ -54,29 +54,21 @@ def log_committed_rows(params: Params, folder: Path) -> None:
     """
     name, reports = params.tracking.experiment, ROOT / "reports"
     for constraint in params.constraints:
-        rows = pd.read_csv(reports / "train_geodesics" / f"planner-{constraint}.csv")
+        file = reports / "train_geodesics" / f"planner-{constraint}"
+        rows: Any = pd.read_csv(file.with_suffix(".csv")).to_dict("records")
         about = subject_of(params, constraint=constraint, manifold="planner")
-        work = Work("train_geodesics", f"planner-{constraint}", {}, [], about)
+        work = Work("train_geodesics", file.name, {}, [], about)
         with tracked_stage(work, name, folder) as run:
-            seeds = sorted(rows.loc[rows["planner"] == LEARNED, "seed"].unique())
+            seeds = sorted({row["seed"] for row in rows if row["planner"] == LEARNED})
             for seed in seeds:
                 with run.child(f"seed {seed}", {"seed": seed, "planner": LEARNED}):
                     pass
-            run.compared(of_seeds(rows.to_dict("records"), LEARNED, seeds))
-            told = json.loads((reports / "train_geodesics" / f"{work.item}.json").read_text())
-            run.mirror(told)
+            run.compared(of_seeds(rows, LEARNED, seeds))
+            run.mirror(json.loads(file.with_suffix(".json").read_text()))
     table = pd.read_csv(reports / "table.csv").query("manifold == 'planner'")
     cells: Any = table.to_dict("records")
     with tracked_stage(Work("report", "report"), name, folder) as run:
-        run.cells(
-            {
-                f"{row['constraint']}, {row['planner']}": (
-                    {"constraint": row["constraint"], "planner": row["planner"]},
-                    of_summary(row, "success", "over_best_median", "time_median_s", 1e3),
-                )
-                for row in cells
-            }
-        )
+        run.cells(cells_of(cells, ("constraint", "planner"), REPORT))
 
 
 def asked(dashboard: str, call: str, body: Mapping[str, Any] | None = None) -> dict[str, Any]:

@@ -3,18 +3,25 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
 
-from constraint_geodesics.tracking.comparison import of_problems, of_seeds, of_summary
+from constraint_geodesics.tracking.comparison import (
+    BENCHMARK,
+    REPORT,
+    Columns,
+    cells_of,
+    of_seeds,
+    of_summary,
+    problem_cells,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def row(
-    planner: str, query: int, seed: int, length: float, valid: bool = True
-) -> dict[str, object]:
+def row(planner: str, query: int, seed: int, length: float, valid: bool = True) -> dict[str, Any]:
     """One answer, which took as many milliseconds as its length."""
     about = {"planner": planner, "query": query, "seed": seed}
     return {**about, "valid": valid, "length_rad": length, "time_s": length / 1e3}
@@ -37,7 +44,7 @@ def test_a_seed_that_solves_nothing_has_no_ratio() -> None:
 
 def test_committed_rows_give_the_committed_success() -> None:
     folder = ROOT / "reports" / "train_geodesics"
-    rows = pd.read_csv(folder / "planner-level_cup.csv").to_dict("records")
+    rows: Any = pd.read_csv(folder / "planner-level_cup.csv").to_dict("records")
     seeds = sorted({own["seed"] for own in rows if own["planner"] == "learned_geodesic"})
     found = of_seeds(rows, "learned_geodesic", seeds)
     told = json.loads((folder / "planner-level_cup.json").read_text())
@@ -47,19 +54,30 @@ def test_committed_rows_give_the_committed_success() -> None:
 
 
 def test_a_summary_s_seconds_become_milliseconds_and_what_it_lacks_stays_out() -> None:
-    told = {"share": 0.5, "ratio": 1.1, "spent_s": 0.002}
-    found = of_summary(told, "share", "ratio", "spent_s", 1e3)
+    columns = Columns("share", "ratio", "spent_s", 1e3)
+    found = of_summary({"share": 0.5, "ratio": 1.1, "spent_s": 0.002}, columns)
     assert found == {"success": 0.5, "median_ratio": 1.1, "median_ms": 2.0}
-    assert of_summary({"share": 0.0}, "share", "ratio", "spent_s") == {
-        "success": 0.0,
-        "median_ratio": None,
-        "median_ms": None,
-    }
+    lacking = {"success": 0.0, "median_ratio": None, "median_ms": None}
+    assert of_summary({"share": 0.0}, columns) == lacking
+
+
+def test_rows_of_the_committed_tables_are_cells() -> None:
+    for file, told_by, columns in (
+        ("table.csv", ("manifold", "constraint", "planner"), REPORT),
+        ("benchmark/overview.csv", ("planner", "constraint", "scene"), BENCHMARK),
+    ):
+        rows: Any = pd.read_csv(ROOT / "reports" / file).to_dict("records")
+        cells = cells_of(rows, told_by, columns)
+        assert len(cells) == len(rows), "each has a name of its own"
+        about, figures = cells[", ".join(rows[0][name] for name in told_by)]
+        assert about == {name: rows[0][name] for name in told_by}
+        assert figures["success"] == rows[0][columns.success]
+        assert figures["median_ms"] == pytest.approx(1e3 * rows[0][columns.time])
 
 
 def test_problems_are_a_cell_for_each_constraint_and_planner() -> None:
     found = json.loads((ROOT / "reports" / "problems.json").read_text())["figures"]
-    cells = of_problems(found)
+    cells = problem_cells(found)
     assert len(cells) == sum(len(scenes["all"]) for scenes in found.values())
     about, figures = cells["free, planner"]
     assert about == {"constraint": "free", "planner": "planner"}

@@ -1,11 +1,31 @@
 """Figures by which runs of different stages are compared, from the rows of their tables."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from statistics import fmean, median
 from typing import Any
 
 from constraint_geodesics.tracking.views import COMPARED
+
+Cell = tuple[dict[str, Any], dict[str, Any]]
+"""What sets a run apart, and its figures."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Where a table has what runs are compared by.  per_ms: milliseconds of its unit of time."""
+
+    success: str
+    ratio: str
+    time: str
+    per_ms: float = 1.0
+
+
+REPORT = Columns("success", "over_best_median", "time_median_s", 1e3)
+BENCHMARK = Columns("success_of_solvable", "ratio_median", "time_median_s", 1e3)
+PROBLEMS = Columns("share", "ratio_median", "time_ms_median")
+ARMS = Columns("success", "ratio_median", "time_ms_median")
 
 
 def of_seeds(
@@ -34,31 +54,37 @@ def of_seeds(
     return found
 
 
-def of_summary(
-    row: Mapping[str, Any], success: str, ratio: str, time: str, per_ms: float = 1.0
-) -> dict[str, Any]:
-    """The same from a row of figures, under their names there.
-
-    per_ms: milliseconds of one unit of its time, 1000 for seconds.
-    """
-    spent = row.get(time)
-    figures = row.get(success), row.get(ratio), None if spent is None else per_ms * float(spent)
+def of_summary(row: Mapping[str, Any], columns: Columns) -> dict[str, Any]:
+    """COMPARED of a row of figures; None where it has none."""
+    spent = row.get(columns.time)
+    spent_ms = None if spent is None else columns.per_ms * spent
+    figures = row.get(columns.success), row.get(columns.ratio), spent_ms
     return dict(zip(COMPARED, figures, strict=True))
 
 
-def of_problems(
+def cells_of(
+    rows: Iterable[Mapping[str, Any]], told_by: Sequence[str], columns: Columns
+) -> dict[str, Cell]:
+    """A cell for each row, by what tells the rows apart.  told_by: names of these columns."""
+    return {
+        ", ".join(str(row[name]) for name in told_by): (
+            {name: row[name] for name in told_by},
+            of_summary(row, columns),
+        )
+        for row in rows
+    }
+
+
+def problem_cells(
     found: Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]],
-) -> dict[str, tuple[dict[str, str], dict[str, Any]]]:
-    """Cells of a run: of each constraint and planner, what tells them apart and COMPARED of all
-    scenes together.
+) -> dict[str, Cell]:
+    """A cell for each constraint and planner, of all scenes together.
 
     found: by constraint, scene or "all", and planner.
     """
-    return {
-        f"{constraint}, {planner}": (
-            {"constraint": constraint, "planner": planner},
-            of_summary(row, "share", "ratio_median", "time_ms_median"),
-        )
+    rows = (
+        {"constraint": constraint, "planner": planner, **row}
         for constraint, scenes in found.items()
         for planner, row in scenes["all"].items()
-    }
+    )
+    return cells_of(rows, ("constraint", "planner"), PROBLEMS)
