@@ -172,8 +172,13 @@ def test_a_stage_without_items_names_its_runs_once_and_a_cell_is_a_run(
         stage.mirror({"rows": 2, "of": {"BiRRT, atlas": 0.5}, "list": [1]}, file)
         cells = {"cup, ours": ({"planner": "ours"}, {"success": 1.0, "median_ms": None})}
         stage.cells(cells)
+        by_method = {"formula": {"deg": 0.0}, "VAE, policy": {"deg": 7.5}}
+        stage.cells({"door": ({"task": "door"}, by_method)})
     runs = runs_of(tracking_uri(root), "cells")
-    assert set(runs) == {"bench", "cup, ours"}
+    assert set(runs) == {"bench", "cup, ours", "door, formula", "door, VAE, policy"}
+    learned = runs["door, VAE, policy"]
+    assert figures_of(learned) == {"deg": 7.5}
+    assert learned.data.tags.items() >= {"task": "door", "method": "VAE, policy"}.items()
     assert figures_of(runs["bench"]) == {"rows": 2.0, "of/BiRRT_ atlas": 0.5}
     assert figures_of(runs["cup, ours"]) == {"success": 1.0}
     assert runs["cup, ours"].data.tags["planner"] == "ours"

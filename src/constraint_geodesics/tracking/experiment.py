@@ -191,10 +191,14 @@ class StageRun:
         return ChildRun(self.send, self.experiment_id, tags, {**self.params, **params})
 
     def cells(self, table: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]]) -> None:
-        """A child for each cell of a table: by its name, what sets it apart and its figures."""
+        """A child for each cell of a table: by its name, what sets it apart and its figures; where
+        these are records by method, a child for each of them.
+        """
         for name, (params, figures) in table.items():
-            with self.child(name, params) as own:
-                own.log(0, _numbers(stable(figures)))
+            for method, own in _methods(figures).items():
+                apart = {**params, "method": method} if method else params
+                with self.child(f"{name}, {method}" if method else name, apart) as child:
+                    child.log(0, _numbers(stable(own)))
 
     def summarise(
         self,
@@ -456,6 +460,12 @@ def _numbers(plain: Mapping[str, Any]) -> dict[str, float]:
     """Numbers among nested figures, under names that MLflow takes."""
     named = {re.sub(r"[^\w\-. :/]", "_", name): v for name, v in flat(plain, "/").items()}
     return {name: v for name, v in named.items() if isinstance(v, int | float)}
+
+
+def _methods(figures: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
+    """Figures by method; those that are no records are of one without a name."""
+    are_records = bool(figures) and all(isinstance(own, Mapping) for own in figures.values())
+    return figures if are_records else {"": figures}
 
 
 def _spread(figures: Sequence[Mapping[str, float]]) -> dict[str, float]:

@@ -114,12 +114,9 @@ VIEWS = (
         "constraints from demonstrations: how far paths leave the hidden formula, and what solves",
         "tags.task LIKE '%'",
         "tags.`task`",
-        ("stage", "task", "demonstrations", "noise_deg"),
-        (
-            *("identified/solved", "identified/ratio_median", "identified/ms_median"),
-            *("identified/deg", "identified/mm", "formula/solved"),
-        ),
-        [("BAR", "identified/solved"), ("BAR", "identified/deg"), ("BAR", "identified/mm")],
+        ("task", "method", "demonstrations", "noise_deg"),
+        ("solved", "deg", "mm", "ratio_median", "ms_median"),
+        [("BAR", "solved"), ("BAR", "deg"), ("BAR", "mm")],
     ),
     View(
         "planners",
