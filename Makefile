@@ -172,7 +172,7 @@ sweep: env  ## try settings of policies, ranked by `geodesics results --experime
 	python stages/run_sweep.py $(SPACE)
 	geodesics results --experiments
 
-ui: env  ## MLflow's dashboard, on this machine only
+ui: env  ## compare the runs in MLflow's dashboard, on this machine only
 	geodesics ui
 
 replay: .venv/planning  ## replay a path in Rerun: make replay FILE=data/recordings/...

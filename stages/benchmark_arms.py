@@ -4,7 +4,9 @@ earlier run of it stopped.
 
 import json
 import sys
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 from constraint_geodesics.benchmark.entries import code_digest, data_digest
 from constraint_geodesics.benchmark.queries import TABLE, read_queries
@@ -26,7 +28,10 @@ from constraint_geodesics.studies.arm_parts import (
 )
 from constraint_geodesics.studies.arms import robots_folder
 from constraint_geodesics.text_files import write_text
+from constraint_geodesics.tracking.comparison import ARMS, cells_of
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
+STAGE = "benchmark_arms"
 MEASURED_BY = "studies.arm_parts"
 """The module that measures: every row depends on what it imports."""
 
@@ -34,13 +39,27 @@ MEASURED_BY = "studies.arm_parts"
 def main(params: Params, layout: Layout) -> None:
     """Write data/arm_rows/ as the parts finish, then reports/arms.csv and arms.json."""
     robots_folder()  # what is missing is said before anything is measured
-    parts = fingerprinted(params, layout)
-    left = [part for part in parts if kept(part) is None]
-    parallel_map(measure, left, params.compute, description="arms and goals")
-    rows = table_of([row for part in parts for row in kept(part) or ()])
-    reports = layout.root / "reports"
-    write_table(rows, reports / "arms.csv", run_header(layout.root))
-    write_text(reports / "arms.json", json.dumps(figures(rows), indent=1) + "\n")
+    work = Work(STAGE, STAGE, {"seed": SEED}, [layout.planner])
+    with tracked_stage(work, params.tracking.experiment, layout.root) as run:
+        parts = fingerprinted(params, layout)
+        left = [part for part in parts if kept(part) is None]
+        parallel_map(measure, left, params.compute, description="arms and goals")
+        rows = table_of([row for part in parts for row in kept(part) or ()])
+        reports, found = layout.root / "reports", figures(rows)
+        write_table(rows, reports / "arms.csv", run_header(layout.root))
+        write_text(reports / "arms.json", json.dumps(found, indent=1) + "\n")
+        run.mirror({table: own["all"] for table, own in found.items()}, reports / "arms.json")
+        run.cells(cells_of(compared(found), ("table", "arm", "constraint", "planner"), ARMS))
+
+
+def compared(found: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Iterator[dict[str, Any]]:
+    """The rows of figures that say how often the planner succeeds, by what they are of."""
+    for table, own in found.items():
+        for name, row in own.items():
+            arm, _, constraint = name.rpartition(", ")
+            if arm and "success" in row:
+                about = {"table": table, "arm": arm, "constraint": constraint}
+                yield {**about, "planner": "planner", **row}
 
 
 def fingerprinted(params: Params, layout: Layout) -> list[Part]:

@@ -13,6 +13,10 @@ from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.problems_page import write_problem_report
 from constraint_geodesics.studies.clutter import cluttered
 from constraint_geodesics.studies.problem_runs import MEASURED_BY, Asked, answered
+from constraint_geodesics.tracking.comparison import problem_cells
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
+
+STAGE = "benchmark_clutter"
 
 
 def main(params: Params, layout: Layout) -> None:
@@ -25,20 +29,24 @@ def main(params: Params, layout: Layout) -> None:
             own.scenes,
             own.queries,
             own.seed,
-            layout.scratch("benchmark_clutter", "shapes"),
+            layout.scratch(STAGE, "shapes"),
         )
     )
     code = f"{code_digest(*MEASURED_BY)} {data_digest(layout.planner)}"
     of = Asked(params, params.problems.planners, own.limit_s, {}, rows, code)
-    table = answered(drawn, of, "clutter")
     about = [
         f"the arm of params.yaml in its workcell among random shapes, {own.scenes} scenes of each "
         f"kind, {own.queries} queries of each kind and constraint; {own.limit_s:g} s for a query"
     ]
-    title = "Queries among clutter"
-    write_problem_report(
-        layout.root / "reports", "clutter", title, about, table, run_header(layout.root)
-    )
+    title, reports = "Queries among clutter", layout.root / "reports"
+    work = Work(STAGE, STAGE, own, [layout.planner])
+    with tracked_stage(work, params.tracking.experiment, layout.root) as run:
+        table = answered(drawn, of, "clutter")
+        found = write_problem_report(
+            reports, "clutter", title, about, table, run_header(layout.root)
+        )
+        run.cells(problem_cells(found))
+        run.mirror({"rows": len(table)}, reports / "clutter.json")
 
 
 if __name__ == "__main__":

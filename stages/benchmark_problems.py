@@ -15,6 +15,10 @@ from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.problems_page import write_problem_report
 from constraint_geodesics.studies.problem_runs import MEASURED_BY, Asked, answered
 from constraint_geodesics.studies.problems import TILTED, tilted
+from constraint_geodesics.tracking.comparison import problem_cells
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
+
+STAGE = "benchmark_problems"
 
 
 def main(params: Params, layout: Layout) -> None:
@@ -33,17 +37,22 @@ def main(params: Params, layout: Layout) -> None:
         layout.problem_rows,
         code_digest(*MEASURED_BY),
     )
-    table = answered(asked, of, "problems")
     each = "" if own.every == 1 else f", of each scene one in {own.every}"
     about = [
         f"the problems of {file.name} (SHA-256 {digest(file)}…){each}",
         f"{own.limit_s:g} s for a query, {own.held_limit_s:g} s with a held tilt",
         *held_beyond(problems),
     ]
-    title = "Problems of MotionBenchMaker"
-    write_problem_report(
-        layout.root / "reports", "problems", title, about, table, run_header(layout.root)
-    )
+    title, reports = "Problems of MotionBenchMaker", layout.root / "reports"
+    settings = own.model_dump(mode="json", exclude={"planners"})
+    work = Work(STAGE, STAGE, settings, [file])
+    with tracked_stage(work, params.tracking.experiment, layout.root) as run:
+        table = answered(asked, of, "problems")
+        found = write_problem_report(
+            reports, "problems", title, about, table, run_header(layout.root)
+        )
+        run.cells(problem_cells(found))
+        run.mirror({"rows": len(table)}, reports / "problems.json")
 
 
 def held_beyond(problems: list[Problem]) -> list[str]:

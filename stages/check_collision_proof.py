@@ -5,6 +5,7 @@ paths of two robots, and ways among thin shapes; about a quarter of an hour on t
 import json
 import sys
 from dataclasses import asdict
+from typing import Any
 
 from constraint_geodesics.benchmark.queries import TABLE, read_queries
 from constraint_geodesics.bundle import read_bundle
@@ -27,7 +28,9 @@ from constraint_geodesics.studies.collision_proof import (
 )
 from constraint_geodesics.studies.thin_shapes import Thicket, try_thicket
 from constraint_geodesics.text_files import write_text
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
+STAGE = "check_collision_proof"
 SEVEN_JOINTS = ("kuka_iiwa/model.urdf", "lbr_iiwa_link_7", "lbr_iiwa_link_0")
 """A robot of pybullet_data: its URDF, its tool's link and the one that stands on the table."""
 SCENES, LINES, GRAZED = 10, 230, 650
@@ -38,6 +41,19 @@ AMONG_THIN, THICKETS, THIN_QUERIES = ("free", "level_cup"), 25, 5
 
 def main(params: Params, layout: Layout) -> None:
     """Write reports/collision_proof.json."""
+    settings = {"scenes": SCENES, "lines": LINES, "grazed": GRAZED, "thickets": THICKETS}
+    work = Work(STAGE, STAGE, settings, [layout.planner])
+    with tracked_stage(work, params.tracking.experiment, layout.root) as run:
+        report = proved(params, layout)
+        file = layout.root / "reports" / "collision_proof.json"
+        write_text(file, json.dumps(report, indent=1) + "\n")
+        counts = ("paths", "free", "certified", "wrongly_certified", "undecided", "refused")
+        totals = {name: sum(row[name] for row in report["paths"]) for name in counts}
+        run.mirror({**report, "all_paths": totals}, file)
+
+
+def proved(params: Params, layout: Layout) -> dict[str, Any]:
+    """What stands in the report."""
     scene = Scene.from_params(params)
     urdf, tool, base = SEVEN_JOINTS
     table = Box("table", (0.0, 0.0, -0.05), (2.4, 2.4, 0.1), (base,))
@@ -64,7 +80,7 @@ def main(params: Params, layout: Layout) -> None:
     among = parallel_map(
         try_thicket, thickets, params.compute, description="ways among thin shapes"
     )
-    report = {
+    return {
         "paths": [asdict(each) for each in summed([each for own in counts for each in own])],
         "grazed": len(grazed),
         "certified_beside_smaller": sum(each.beside_smaller for each in grazed),
@@ -76,8 +92,6 @@ def main(params: Params, layout: Layout) -> None:
             "by_planner": sum(each.planned for each in among),
         },
     }
-    file = layout.root / "reports" / "collision_proof.json"
-    write_text(file, json.dumps(report, indent=1) + "\n")
 
 
 if __name__ == "__main__":

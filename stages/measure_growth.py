@@ -3,9 +3,11 @@ thread.
 """
 
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 
 from constraint_geodesics.benchmark.row import write_table
@@ -32,6 +34,7 @@ from constraint_geodesics.studies.growth import (
     slopes,
 )
 from constraint_geodesics.text_files import write_text
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "measure_growth"
 SEVEN_JOINTS = ("kuka_iiwa/model.urdf", "lbr_iiwa_link_7")
@@ -51,11 +54,23 @@ def configurations(file: Path, robot: SerialRobot, count: int) -> Float[np.ndarr
 
 def main(params: Params, layout: Layout) -> None:
     """Write growth.csv, slopes.csv, growth.md and growth.png in reports/growth/."""
-    folder, sizes, scene = (
-        layout.root / "reports" / "growth",
-        GrowthSizes(),
-        Scene.from_params(params),
-    )
+    folder, sizes = layout.root / "reports" / "growth", GrowthSizes()
+    work = Work(STAGE, STAGE, asdict(sizes), [layout.planner], watched=False)
+    with tracked_stage(work, params.tracking.experiment, layout.root) as run:
+        table = measured(params, layout, sizes)
+        fits, about = slopes(table), run_header(layout.root)
+        write_table(table, folder / "growth.csv", about)
+        write_table(fits, folder / "slopes.csv", about)
+        write_text(folder / "growth.md", slopes_markdown(fits))
+        save_png(growth_figure(table, fits), folder / "growth.png")
+        run.figure(folder / "growth.png")
+        slope = {f"{row['axis']}/{row['what']}": row["slope"] for row in fits.to_dict("records")}
+        run.mirror({"slope": slope}, folder / "slopes.csv")
+
+
+def measured(params: Params, layout: Layout, sizes: GrowthSizes) -> pd.DataFrame:
+    """The rows of growth.csv."""
+    scene = Scene.from_params(params)
     manifold = constraint_manifold(scene.robot, params.constraints[CONSTRAINT])
     with (
         Planner(read_bundle(layout.planner), str(layout.planner)) as planner,
@@ -82,12 +97,7 @@ def main(params: Params, layout: Layout) -> None:
             configurations(layout.joints("free"), scene.robot, max(sizes.rows)),
             layout.scratch(STAGE, CONSTRAINT),
         )
-        table = measure_growth(subject, sizes)
-    fits, about = slopes(table), run_header(layout.root)
-    write_table(table, folder / "growth.csv", about)
-    write_table(fits, folder / "slopes.csv", about)
-    write_text(folder / "growth.md", slopes_markdown(fits))
-    save_png(growth_figure(table, fits), folder / "growth.png")
+        return measure_growth(subject, sizes)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,8 @@ cup that is carried, spheres that come up while the arm moves.
 
 import json
 import sys
+from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -17,7 +19,9 @@ from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies import changing_scenes as study
 from constraint_geodesics.text_files import write_text
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
+STAGE = "measure_scenes"
 SEED, SPHERES, CUPS, SUDDEN, CHANGES = 0, 100, 200, 100, 20
 LOADED = "level_cup"
 AMONG = (1, 100)
@@ -25,6 +29,16 @@ AMONG = (1, 100)
 
 def main(params: Params, layout: Layout) -> None:
     """Write reports/scenes.csv.gz and reports/scenes.json."""
+    settings = {"seed": SEED, "spheres": SPHERES, "cups": CUPS, "sudden": SUDDEN}
+    settings |= {"changes": CHANGES}
+    work = Work(STAGE, STAGE, settings, [layout.planner], watched=False)
+    with tracked_stage(work, params.tracking.experiment, layout.root) as run:
+        file = layout.root / "reports" / "scenes.json"
+        run.mirror(measured(params, layout, file), file)
+
+
+def measured(params: Params, layout: Layout, file: Path) -> dict[str, Any]:
+    """Write the rows, and their figures to a file; returns these."""
     carrying = Scene.from_params(params, LOADED)
     with Planner(read_bundle(layout.planner), str(layout.planner)) as planner:
         for name in params.constraints:
@@ -49,9 +63,9 @@ def main(params: Params, layout: Layout) -> None:
         "beside_a_sphere": study.sphere_figures(frames["sphere"]),
     }
     rows = pd.concat([frame.assign(study=name) for name, frame in frames.items()])
-    reports = layout.root / "reports"
-    write_table(rows, reports / "scenes.csv.gz", run_header(layout.root))
-    write_text(reports / "scenes.json", json.dumps(found, indent=1) + "\n")
+    write_table(rows, file.with_name("scenes.csv.gz"), run_header(layout.root))
+    write_text(file, json.dumps(found, indent=1) + "\n")
+    return found
 
 
 if __name__ == "__main__":

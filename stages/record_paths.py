@@ -11,6 +11,10 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
+
+STAGE = "record_paths"
+WHOSE = ("train_geodesics", "benchmark_planners", "execute_paths")
 
 
 @dataclass(frozen=True)
@@ -30,8 +34,12 @@ def main(params: Params, layout: Layout) -> None:
     pairs += [(m, c) for m in searched.illustrated for c in shown]
     tables = [Recordable(params, layout, constraint, manifold) for manifold, constraint in pairs]
     tables += [Recordable(params, layout, constraint) for constraint in params.constraints]
-    record_executed(params, layout, params.studies.constraint)
-    parallel_map(record_table, tables, params.compute, description="record")
+    work = Work(STAGE, STAGE, {"frames": params.recording.frames})
+    with tracked_stage(work, params.tracking.experiment, layout.root) as run:
+        record_executed(params, layout, params.studies.constraint)
+        parallel_map(record_table, tables, params.compute, description="record")
+        folders = {own: layout.root / "data" / "recordings" / own for own in WHOSE}
+        run.mirror({own: len(list(f.rglob("*.rrd"))) for own, f in folders.items()})
 
 
 def record_table(table: Recordable) -> None:

@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Mapping
+from typing import Any
 
 import pandas as pd
 
@@ -26,7 +27,10 @@ from constraint_geodesics.report import benchmark_figures as figures
 from constraint_geodesics.report import benchmark_tables as tables
 from constraint_geodesics.report.cells import markdown_table
 from constraint_geodesics.text_files import write_text, written
+from constraint_geodesics.tracking.comparison import BENCHMARK, cells_of
+from constraint_geodesics.tracking.experiment import StageRun, Work, tracked_stage
 
+STAGE = "report_benchmark"
 BUDGETS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 20.0)
 """Time budgets at which the planner is held against its baselines [s]."""
 SERVES = 0.5
@@ -37,6 +41,16 @@ Settings = Mapping[str, BaselineSettings]
 
 def main(params: Params, layout: Layout) -> None:
     """Write reports/benchmark/ and data/benchmark.db."""
+    drawn = {"drawn": params.benchmark.drawn}
+    work = Work(STAGE, STAGE, drawn, [layout.benchmark_table])
+    with tracked_stage(work, params.tracking.experiment, layout.root) as run:
+        write(params, layout, run)
+
+
+def write(params: Params, layout: Layout, run: StageRun) -> None:
+    """Write all of it; MLflow gets a run for each planner that is drawn, and for the first one's
+    constraints.
+    """
     folder, settings = layout.root / "reports" / "benchmark", all_settings(params)
     rows, about = read_table(layout.benchmark_table)
     orders = {
@@ -50,7 +64,8 @@ def main(params: Params, layout: Layout) -> None:
         kind="stable",
     )
     folder.mkdir(parents=True, exist_ok=True)
-    costs = write_tables(params, layout, settings, rows)
+    found = write_tables(params, layout, settings, rows)
+    costs = found["break_even"]
     drawn = [name for name in params.benchmark.drawn if name in settings]
     styles = figures.styles_of(drawn, colours(settings))
     for name, figure in (
@@ -61,15 +76,22 @@ def main(params: Params, layout: Layout) -> None:
         ("break_even", figures.break_even(costs[costs["success"] >= SERVES], styles)),
     ):
         save_png(figure, folder / f"{name}.png")
+        run.figure(folder / f"{name}.png")
     told = {name: json.dumps(own.model_dump(mode="json")) for name, own in settings.items()}
     export_arena(rows, layout.root / "data" / "benchmark.db", about, told)
     write_text(folder / "about.json", json.dumps(about, indent=2) + "\n")
+    summary, overview = found["summary"], found["overview"]
+    shown: list[Any] = [
+        *overview[overview["planner"].isin(drawn)].to_dict("records"),
+        *summary[summary["planner"] == next(iter(settings))].to_dict("records"),
+    ]
+    run.cells(cells_of(shown, ("planner", "constraint", "scene"), BENCHMARK))
 
 
 def write_tables(
     params: Params, layout: Layout, settings: Settings, rows: pd.DataFrame
-) -> pd.DataFrame:
-    """Write every table as CSV and Markdown; returns what training costs."""
+) -> dict[str, pd.DataFrame]:
+    """Write every table as CSV and Markdown; returns them by name."""
     folder, reference = layout.root / "reports" / "benchmark", next(iter(settings))
     in_python = tables.asks_in_python(settings)
     summary = benchmark_summary(rows, reference)
@@ -80,7 +102,7 @@ def write_tables(
     ours, own = own_names(settings)
     ahead = ours_against_baselines(rows, ours, own, BUDGETS)
     costs = break_even_table(rows, training_times(params, layout, settings), reference)
-    for name, table, text in (
+    written_tables = (
         ("summary", summary, tables.benchmark_markdown(summary)),
         ("overview", overview, tables.overview_markdown(overview, in_python)),
         ("drawn", None, tables.overview_markdown(shown, in_python)),
@@ -91,12 +113,13 @@ def write_tables(
         ),
         ("budgets", ahead, tables.ahead_markdown(ahead)),
         ("break_even", costs, f"{markdown_table(tables.break_even_cells(costs))}\n"),
-    ):
+    )
+    for name, table, text in written_tables:
         write_text(folder / f"{name}.md", text)
         if table is not None:
             with written(folder / f"{name}.csv") as part:
                 table.to_csv(part, index=False, float_format="%.6g")
-    return costs
+    return {name: table for name, table, _ in written_tables if table is not None}
 
 
 def own_names(settings: Settings) -> tuple[dict[str, float], list[str]]:

@@ -8,12 +8,21 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.tracking.experiment import Work, tracked_stage
+
+STAGE = "run_benchmark"
 
 
 def main(params: Params, layout: Layout) -> None:
     """Write data/benchmark_rows/ as they come, then reports/benchmark.csv, and some recordings."""
-    run = committed_run(params, layout, layout.benchmark_rows, layout.benchmark_recordings)
-    write_table(answered(run), layout.benchmark_table, run_header(layout.root))
+    asked = params.benchmark.model_dump(mode="json", exclude={"planners"})
+    work = Work(STAGE, STAGE, asked, [layout.planner])
+    with tracked_stage(work, params.tracking.experiment, layout.root) as run:
+        own = committed_run(params, layout, layout.benchmark_rows, layout.benchmark_recordings)
+        table = answered(own)
+        write_table(table, layout.benchmark_table, run_header(layout.root))
+        counts = table["planner"].nunique(), len(table), table["valid"].sum()
+        run.mirror(dict(zip(("planners", "rows", "valid"), counts, strict=True)))
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from constraint_geodesics.studies.geodesic_search import (
     straight_rows,
     write_rows,
 )
+from constraint_geodesics.tracking.comparison import of_seeds
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "train_geodesics"
@@ -82,7 +83,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
                 connection_s,
                 seed,
                 layout.scratch(STAGE, f"{item}-{seed}"),
-                run.child(f"seed {seed}", {"seed": seed}),
+                run.child(f"seed {seed}", {"seed": seed, "planner": PLANNER}),
                 policies.get(seed),
             )
             for seed in settings.seeds
@@ -99,6 +100,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         folder = layout.recordings(STAGE, item)
         rows = named_recordings(rows, paths, folder, params.recording.queries)
         run.recordings(rows, shown=PLANNER)
+        run.compared(of_seeds(rows, PLANNER, settings.seeds))
         write_rows(
             rows, layout.report(STAGE, item, "csv"), manifold=manifold, constraint=constraint
         )

@@ -21,7 +21,9 @@ def main(params: Params, layout: Layout, manifold: str) -> None:
     source = layout.joints("free")
     settings, about = params.manifolds[manifold], subject_of(params, manifold=manifold)
     with tracked_stage(
-        Work(STAGE, manifold, {}, [source], about), params.tracking.experiment, layout.root
+        Work(STAGE, manifold, {"manifold": settings}, [source], about),
+        params.tracking.experiment,
+        layout.root,
     ) as run:
         joints = read_joints(source).free_joints
         trained = train_manifold(

@@ -391,18 +391,29 @@ def _chosen(listed: "list[Listed]", wanted: "Filter") -> list[Path]:
 @app.command("ui")
 def ui(
     port: int = typer.Option(5000, help="Port on 127.0.0.1.", min=1, max=65535),
+    browser: bool | None = typer.Option(
+        None, "--open/--no-open", help="Open it in a browser; by default where there is a desktop."
+    ),
     as_json: bool = JSON,
 ) -> None:
-    """Open MLflow's dashboard for this checkout, on this machine only; it runs until it is
+    """Compare this checkout's runs in MLflow's dashboard, on this machine only; it runs until it is
     stopped.
     """
     require("pipeline")
-    from constraint_geodesics.tracking.store import LOOPBACK, require_free, ui_command
+    from constraint_geodesics.tracking.dashboard import serve_and_open
+    from constraint_geodesics.tracking.store import require_free, runs_page, ui_command
 
-    command, address = ui_command(Path().resolve(), port), f"http://{LOOPBACK}:{port}"
+    root = Path().resolve()
+    command = ui_command(root, port)
     require_free(port)
-    text = json.dumps({"address": address}) if as_json else f"{address}  (stop with Ctrl-C)"
-    print(text, flush=True)
+    page = runs_page(root, port)
+    print(json.dumps({"address": page}) if as_json else f"{page}  (stop with Ctrl-C)", flush=True)
+    if browser is None:
+        from constraint_geodesics.recording.viewer import display
+
+        browser = display() and not as_json
+    if browser:
+        raise SystemExit(serve_and_open(command, page))
     os.execvp(command[0], command)
 
 

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.browser.chromium import ROOT, chromium, free_port, missing, served
+from constraint_geodesics.params import load_params
+from tests.browser.chromium import ROOT, chromium, missing
+from tests.browser.dashboard import base_of, dashboard_of, log_committed_rows
 from tests.end_to_end import smoke
 
 if TYPE_CHECKING:
@@ -55,15 +57,22 @@ def own_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def small_dashboard(small_checkout: Path) -> Iterator[str]:
-    yield from _dashboard(small_checkout)
+    with dashboard_of(small_checkout) as page:
+        yield base_of(page)
 
 
 @pytest.fixture(scope="session")
 def own_dashboard(own_runs: Path) -> Iterator[str]:
-    yield from _dashboard(own_runs)
+    with dashboard_of(own_runs) as page:
+        yield base_of(page)
 
 
-def _dashboard(folder: Path) -> Iterator[str]:
-    command = [sys.executable, "-m", "constraint_geodesics.cli", "ui", "--port", str(free_port())]
-    with served(command, folder, smoke.environment(ROOT)) as address:
-        yield address
+@pytest.fixture(scope="session")
+def compared_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """What `geodesics ui` prints for a store with the runs that the committed rows are of."""
+    folder = tmp_path_factory.mktemp("compared")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("MLFLOW_TRACKING_URI", raising=False)
+        log_committed_rows(load_params(ROOT / "params.yaml"), folder)
+    with dashboard_of(folder) as page:
+        yield page

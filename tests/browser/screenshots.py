@@ -11,7 +11,6 @@ after a first `make repro`, and two that are compared have colours that can be t
 
 import contextlib
 import io
-import json
 import re
 import shutil
 import subprocess
@@ -19,28 +18,28 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import yaml
 from PIL import Image
 
 from constraint_geodesics.constraints.constraint import Pose
 from constraint_geodesics.goals.region import GoalRegion
 from constraint_geodesics.palette import BLUE, VERMILION, planner_colour
 from constraint_geodesics.planner import Planner
+from constraint_geodesics.tracking.views import VIEWS, View
 from tests.browser import hero
-from tests.browser.chromium import ROOT, chromium, free_port, served, until, visit
+from tests.browser.chromium import ROOT, chromium, served, until, visit
 from tests.browser.dashboard import (
-    FLAT,
     SIDE_PANEL_CLOSED,
     asked,
-    experiment_id,
+    base_of,
+    dashboard_of,
     line_colours,
     row,
-    runs_address,
     runs_found,
+    view_address,
 )
 from tests.browser.pixels import having, picture, scene_of
 from tests.end_to_end import smoke
@@ -60,8 +59,8 @@ CURVE_PIXELS = 60
 SETTLE_S = 4.0
 """Until the arm has left the start."""
 RECORDINGS = ROOT / "data" / "recordings"
-SEEDS_CURVE = "seeds/saving_mean"
-CUP = "tags.stage = 'train_geodesics' and tags.item = 'planner-level_cup'"
+POLICIES = "tags.stage = 'train_policies'"
+VIEW = {view.key: view for view in VIEWS}
 
 Run = Mapping[str, Any]
 
@@ -86,116 +85,21 @@ class Shot:
 # MLflow
 
 
-@dataclass(frozen=True)
-class View:
-    """How the dashboard shows runs."""
-
-    search: str
-    columns: Sequence[str] = ()
-    charts: Sequence[tuple[str, str]] = ()
-    """Kind and metric of each."""
-    shown: Sequence[str] | None = None
-    """Ids of the runs in the charts."""
-    grouped_by: str | None = None
-    """A parameter: the charts have a line and a bar for each of its values."""
-    sort: Mapping[str, str] = field(default_factory=lambda: FLAT)
-    height: int = 640
-
-
-def remembered(view: View) -> dict[str, Any]:
-    """What the dashboard keeps in the browser when somebody has chosen columns and charts by
-    hand.
-    """
-    widths = {
-        "attributes.`Run Name`": 260,
-        "runDateAndNestInfo": 115,
-        **dict.fromkeys(view.columns, 168),
-    }
-    return {
-        "selectedColumns": list(view.columns),
-        "columnOrder": list(widths),
-        "columnWidths": widths,
-        "runsHiddenMode": "FIRST_10_RUNS" if view.shown is None else "CUSTOM",
-        "runsVisibilityMap": {},
-        "compareRunCharts": [
-            _chart(k, kind, metric) for k, (kind, metric) in enumerate(view.charts)
-        ]
-        or None,
-        "compareRunSections": [
-            {
-                "uuid": "chosen",
-                "name": "Charts",
-                "display": True,
-                "isReordered": False,
-                "deleted": False,
-                "isGenerated": False,
-            }
-        ],
-        "isAccordionReordered": True,
-        "useGroupedValuesInCharts": True,
-        "hideEmptyCharts": True,
-        "groupBy": None
-        if view.grouped_by is None
-        else {
-            "aggregateFunction": "average",
-            "groupByKeys": [{"mode": "param", "groupByData": view.grouped_by}],
-        },
-        "autoRefreshEnabled": False,
-        "globalLineChartConfig": {
-            "xAxisKey": "step",
-            "lineSmoothness": 0,
-            "selectedXAxisMetricKey": "",
-        },
-    }
-
-
-def _chart(number: int, kind: str, metric: str) -> dict[str, Any]:
-    chart = {
-        "uuid": f"chart{number}",
-        "type": kind,
-        "metricKey": metric,
-        "displayName": metric,
-        "metricSectionId": "chosen",
-        "runsCountToCompare": 10,
-        "deleted": False,
-        "isGenerated": False,
-    }
-    line = {
-        "lineSmoothness": 0,
-        "xAxisScaleType": "linear",
-        "scaleType": "linear",
-        "range": {},
-        "xAxisKey": "step",
-        "selectedXAxisMetricKey": "",
-        "yAxisKey": "metric",
-        "yAxisExpressions": [],
-        "ignoreOutliers": False,
-        "useGlobalXaxisKey": True,
-        "useGlobalLineSmoothing": True,
-        "selectedMetricKeys": [metric],
-    }
-    return chart | (line if kind == "LINE" else {})
-
-
 @contextlib.contextmanager
-def dashboard_page(browser: "Browser", dashboard: str, view: View) -> "Iterator[Page]":
-    """The page of a view."""
-    number = experiment_id(dashboard)
-    key = f'MLflowLocalStorage-1.1-ExperimentPage-["{number}"]-ReactComponentState'
-    state = remembered(view)
-    if view.shown is not None:
-        found = [run["info"]["run_id"] for run in runs_found(dashboard, view.search)]
-        state["runsVisibilityMap"] = {name: name in view.shown for name in found}
-    with visit(browser, viewport={"width": WIDTH, "height": view.height}) as (page, _):
+def shown_view(
+    browser: "Browser", dashboard: str, view: View, *, search: str = "", mode: str = "TABLE"
+) -> "Iterator[Page]":
+    """The page of a view, narrowed by a search of one's own."""
+    with visit(browser, viewport={"width": WIDTH, "height": 700}) as (page, _):
         page.add_init_script(SIDE_PANEL_CLOSED)
-        page.add_init_script(
-            f"localStorage.getItem({json.dumps(key)}) || "
-            f"localStorage.setItem({json.dumps(key)}, {json.dumps(json.dumps(state))})"
-        )
-        mode = "CHART" if view.charts else "TABLE"
-        page.goto(runs_address(dashboard, view.search, compareRunsMode=mode, **view.sort))
+        page.goto(view_address(dashboard, view, mode))
         page.get_by_role("button", name="Toggle sidebar").click()
         page.add_style_tag(content="[data-assistant-ui] { display: none !important; }")
+        if search:
+            box = page.get_by_test_id("search-box")
+            until(lambda: box.input_value() == view.search, "the view's own search")
+            box.fill(search)
+            page.keyboard.press("Enter")
         yield page
 
 
@@ -212,50 +116,39 @@ def settled(page: "Page") -> bytes:
     return before
 
 
+def results(browser: "Browser", dashboard: str) -> bytes:
+    with shown_view(browser, dashboard, VIEW["results"]) as page:
+        row(page, "planner-").wait_for()
+        return settled(page)
+
+
 def two_seeds(browser: "Browser", dashboard: str) -> bytes:
-    search = f"{CUP} and tags.child LIKE 'seed %'"
-    first, second = (of_child(runs_found(dashboard, search), f"seed {seed}") for seed in (0, 1))
-    paint(dashboard, first, second)
-    charts = [("LINE", "saving"), ("BAR", "final/success"), ("BAR", "final/length_median_rad")]
-    view = View(search, charts=charts, shown=[first["info"]["run_id"], second["info"]["run_id"]])
-    with dashboard_page(browser, dashboard, view) as page:
+    found = runs_found(dashboard, f"{POLICIES} and tags.child LIKE 'seed %'")
+    two = [of_child(found, f"seed {seed}") for seed in (0, 1)]
+    paint(dashboard, *two)
+    names = ", ".join(repr(run["info"]["run_name"]) for run in two)
+    search = f"{POLICIES} and attributes.run_name IN ({names})"
+    with shown_view(browser, dashboard, VIEW["seeds"], search=search, mode="CHART") as page:
         until(lambda: len(line_colours(page)) == 2, "the learning curves of two seeds")
-        for run in (first, second):
-            row(page, run["info"]["run_name"]).locator("input[type=checkbox]").first.click()
         return settled(page)
 
 
 def constraints(browser: "Browser", dashboard: str) -> bytes:
-    search = "tags.stage = 'train_geodesics' and tags.manifold = 'planner' and tags.child IS NULL"
-    figures = ("success_mean", "success_at_random_mean", "queries_connected", "seeds/success_std")
-    columns = ["tags.`constraint`", *(f"metrics.`{name}`" for name in figures)]
-    sort = {"orderByKey": columns[1], "orderByAsc": "false"}
-    with dashboard_page(browser, dashboard, View(search, columns, sort=sort, height=510)) as page:
+    with shown_view(browser, dashboard, VIEW["constraints"]) as page:
         row(page, "train_geodesics planner-").wait_for()
         return settled(page)
 
 
 def two_rewards(browser: "Browser", dashboard: str) -> bytes:
-    search = f"{CUP} and tags.child IS NULL"
-    has_curve = {
-        form_of(run) for run in runs_found(dashboard, search) if SEEDS_CURVE in figures_of(run)
-    }
-    for form in ("corrected", "printed"):
-        if form not in has_curve:
-            raise MissingRunError(
-                f"no run of train_geodesics planner-level_cup with "
-                f"policies.reward.form={form} and {SEEDS_CURVE}: "
-                + (
-                    "dvc repro"
-                    if form == own_form()
-                    else f"dvc exp run -S policies.reward.form={form}"
-                )
-                + " "
-                "--force --single-item train_geodesics@planner-level_cup"
-            )
-    charts = [("LINE", SEEDS_CURVE), ("BAR", "success_mean"), ("BAR", "final_saving_mean")]
-    view = View(search, charts=charts, grouped_by="reward.form", height=700)
-    with dashboard_page(browser, dashboard, view) as page:
+    search = f"{POLICIES} and tags.child IS NULL"
+    by_reward = {tags_of(run)["reward"]: run for run in runs_found(dashboard, search)}
+    if len(by_reward) < 2:
+        raise MissingRunError(
+            "no run of train_policies with another reward: "
+            "dvc exp run -n printed-cup -S policies.reward.form=printed train_policies"
+        )
+    paint(dashboard, *list(by_reward.values())[:2])
+    with shown_view(browser, dashboard, VIEW["rewards"], search=search, mode="CHART") as page:
         until(lambda: len(line_colours(page)) == 2, "the learning curves of two rewards")
         return settled(page)
 
@@ -264,21 +157,11 @@ def of_child(found: Sequence[Run], child: str) -> Run:
     for run in found:
         if tags_of(run).get("child") == child:
             return run
-    raise MissingRunError(f"no run of train_geodesics planner-level_cup, {child}: make repro")
+    raise MissingRunError(f"no run of train_policies, {child}: make repro")
 
 
 def tags_of(run: Run) -> dict[str, str]:
     return {entry["key"]: entry["value"] for entry in run["data"].get("tags", [])}
-
-
-def figures_of(run: Run) -> set[str]:
-    return {entry["key"] for entry in run["data"].get("metrics", [])}
-
-
-def form_of(run: Run) -> str | None:
-    """The reward's form."""
-    params = {entry["key"]: entry["value"] for entry in run["data"].get("params", [])}
-    return params.get("reward.form")
 
 
 def paint(dashboard: str, first: Run, second: Run) -> None:
@@ -288,47 +171,27 @@ def paint(dashboard: str, first: Run, second: Run) -> None:
         asked(dashboard, "runs/set-tag", body)
 
 
-def own_form() -> str:
-    """The form of the reward that this checkout's params.yaml asks for."""
-    return str(yaml.safe_load((ROOT / "params.yaml").read_text())["policies"]["reward"]["form"])
-
-
-def keep_newest(dashboard: str, form: str | None = None) -> None:
-    """Remove from the copy what repeats another run, those of the pipeline before those of an
-    experiment and newer before older ones, and (form given) experiments and what has another form
-    of the reward.
-    """
-    found = runs_found(dashboard, "tags.stage = 'train_geodesics'")
-    forms = {run["info"]["run_id"]: form_of(run) for run in found}
+def keep_newest(dashboard: str) -> None:
+    """Remove from the copy what an older run of the same settings left."""
+    told = ("stage", "item", "child", "reward", "dvc_experiment")
     seen = set()
-    for run in sorted(found, key=lambda run: "dvc_experiment" in tags_of(run)):
-        tags, name = tags_of(run), run["info"]["run_id"]
-        own = forms[name] or forms.get(
-            tags.get("mlflow.parentRunId", "")
-        )  # children of old runs do not say it
-        key = (tags["item"], tags.get("child"), own)
-        if key in seen or (form is not None and (form != own or "dvc_experiment" in tags)):
-            asked(dashboard, "runs/delete", {"run_id": name})
+    for run in runs_found(dashboard, ""):
+        key = tuple(tags_of(run).get(name) for name in told)
+        if key in seen:
+            asked(dashboard, "runs/delete", {"run_id": run["info"]["run_id"]})
         seen.add(key)
 
 
 @contextlib.contextmanager
 def copied_dashboard() -> Iterator[str]:
-    """The dashboard of a copy of this checkout's runs."""
+    """The dashboard of a copy of this checkout's runs, the newest of each setting."""
     if not (ROOT / "mlflow.db").is_file():
         raise MissingRunError("mlflow.db: this checkout has no runs yet: make repro")
     with tempfile.TemporaryDirectory() as folder:
         shutil.copy2(ROOT / "mlflow.db", folder)
-        command = [
-            sys.executable,
-            "-m",
-            "constraint_geodesics.cli",
-            "ui",
-            "--port",
-            str(free_port()),
-        ]
-        with served(command, Path(folder), smoke.environment(ROOT)) as address:
-            yield address
+        with dashboard_of(Path(folder)) as page:
+            keep_newest(base_of(page))
+            yield base_of(page)
 
 
 # Rerun
@@ -404,22 +267,24 @@ BOTH = re.findall(
 """What docs/rerun.md tells to open."""
 
 SHOTS = {
+    "mlflow_results": Shot(
+        "MLflow's table of runs as geodesics ui opens it: constraint, planner, seed, success, "
+        "median ratio and median time of each",
+        results,
+    ),
     "mlflow_two_rewards": Shot(
-        "MLflow's charts of two runs of train_geodesics planner-level_cup with different "
-        "rewards: the mean saving of "
-        "their seeds over the steps, success_mean and final_saving_mean as bars",
+        "MLflow's charts of two runs of train_policies with different rewards: the mean saving of "
+        "their seeds over the steps, and what it ends with as bars",
         two_rewards,
     ),
     "mlflow_two_seeds": Shot(
-        "MLflow's charts of seeds 0 and 1 of train_geodesics planner-level_cup: saving over "
-        "the steps as two lines, "
-        "final/success and final/length_median_rad as bars",
+        "MLflow's charts of seeds 0 and 1 of train_policies: saving and return over the steps, a "
+        "line each",
         two_seeds,
     ),
     "mlflow_constraints": Shot(
-        "MLflow's table of train_geodesics on the planner's manifold, a row a constraint, "
-        "with success_mean, "
-        "success_at_random_mean, queries_connected and seeds/success_std",
+        "MLflow's table of train_geodesics, a row a constraint, with success, median ratio, median "
+        "time and the success without a policy",
         constraints,
     ),
     "rerun_path": Shot(
@@ -501,7 +366,6 @@ def main(wanted: Sequence[str]) -> int:
             try:
                 if name.startswith("mlflow"):
                     dashboard = dashboard or open_until_end.enter_context(copied_dashboard())
-                    keep_newest(dashboard, None if shot.take is two_rewards else own_form())
                 (IMAGES / f"{name}.png").write_bytes(compressed(shot.take(browser, dashboard)))
                 print(f"docs/images/{name}.png  {time.monotonic() - began:.0f} s", flush=True)
             except (

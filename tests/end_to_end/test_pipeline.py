@@ -17,7 +17,8 @@ from mlflow.tracking import MlflowClient
 
 from constraint_geodesics.benchmark.row import read_table
 from constraint_geodesics.recording.recording import read_recording
-from constraint_geodesics.tracking.store import fetch_artifacts
+from constraint_geodesics.tracking.store import fetch_artifacts, flat
+from constraint_geodesics.tracking.views import VIEWS
 from tests.end_to_end import smoke
 from tests.recording.files import same_recordings
 
@@ -178,6 +179,35 @@ def test_runs_are_grouped_in_mlflow(finished: Path) -> None:
     assert len(client.get_metric_history(shared.info.run_id, "seeds/saving_mean")) > 1
     assert parent.data.tags["dvc_stage"] == "train_geodesics@planner-level_cup"
     assert {run.info.status for run in runs} == {"FINISHED"}
+
+
+def test_every_stage_has_a_run_with_its_own_parameters_alone(finished: Path) -> None:
+    client = MlflowClient(f"sqlite:///{finished / 'mlflow.db'}")
+    experiment = client.get_experiment_by_name("constraint_geodesics")
+    search = "tags.child IS NULL"
+    parents = client.search_runs([experiment.experiment_id], search, max_results=1000)
+    stages = yaml.safe_load((finished / "dvc.yaml").read_text())["stages"]
+    scripts = {Path(own["cmd"].split()[1]).stem for own in stages.values()}
+    assert {run.data.tags["stage"] for run in parents} == scripts - {"digest_code"}
+    lock = yaml.safe_load((finished / "dvc.lock").read_text())["stages"]
+    other_names = {"rows", "steps", "episode_steps", "heads"}  # of params.yaml's, or fixed there
+    for run in parents:
+        known = flat(lock[run.data.tags["dvc_stage"]].get("params", {}).get("params.yaml", {}), ".")
+        for name in set(run.data.params) - other_names:
+            for own in ("constraint", "manifold"):
+                if name.startswith(f"{own}."):
+                    name = name.replace(own, f"{own}s.{run.data.tags[own]}", 1)
+            assert any(f".{key}".endswith(f".{name}") for key in known), (run.info.run_name, name)
+
+
+def test_what_the_first_view_shows_is_there(finished: Path) -> None:
+    client = MlflowClient(f"sqlite:///{finished / 'mlflow.db'}")
+    experiment = client.get_experiment_by_name("constraint_geodesics")
+    for view in VIEWS:
+        found = client.search_runs([experiment.experiment_id], view.search)
+        shown = set[str]().union(*({*run.data.tags, *run.data.metrics} for run in found))
+        if view.key != "demonstrations":  # of the stages of stages/dvc.yaml
+            assert shown >= {*view.tags, *view.metrics} - {"scene", "dvc_experiment"}, view.key
 
 
 def test_the_same_seeds_give_the_same_figures_and_recordings(finished: Path) -> None:

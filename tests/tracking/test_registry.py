@@ -191,7 +191,7 @@ def test_what_cannot_be_served_is_one_line(root: Path, tmp_path: Path) -> None:
         taken.listen()
         port = taken.getsockname()[1]
         for folder, address, words in (
-            (root, ADDRESS, f"127.0.0.1:{port}: Address already in use; --port takes another"),
+            (root, ADDRESS, f"port {port} of 127.0.0.1 is taken: add --port "),
             (root, f"models:/{PLANNER_MODEL}@nobody", "nobody"),
             (tmp_path, ADDRESS, "mlflow.db is missing"),
         ):

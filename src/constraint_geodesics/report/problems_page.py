@@ -37,8 +37,9 @@ def write_problem_report(
     about: Sequence[str],
     table: pd.DataFrame,
     run: Mapping[str, str],
-) -> None:
+) -> Figures:
     """Write the rows, gzipped, their figures and the tables: name.csv.gz, name.json, name.md.
+    Returns the figures.
 
     about: sentences to know before the tables.  run: where the rows are from.
     """
@@ -47,6 +48,7 @@ def write_problem_report(
     told = {"about": list(about), "figures": found}
     write_text(folder / f"{name}.json", json.dumps(told, indent=1) + "\n")
     write_text(folder / f"{name}.md", problems_markdown(title, about, found))
+    return found
 
 
 def problems_markdown(title: str, about: Sequence[str], found: Figures) -> str:

@@ -64,8 +64,8 @@ def subject_of(
     manifold: str | None = None,
     reward: RewardParams | None = None,
 ) -> Subject:
-    """The names of constraint, manifold and reward as tags; their entries in params.yaml as
-    `constraint.*` and `manifold.*`.
+    """The names of constraint, manifold and reward as tags; the constraint's entry in params.yaml
+    as `constraint.*`.
 
     A reward has no name: its tag is what it is made of, eq. 15.
     """
@@ -75,8 +75,6 @@ def subject_of(
         tags["constraint"], values["constraint"] = constraint, params.constraints[constraint]
     if manifold is not None:
         tags["manifold"] = manifold
-    if manifold in params.manifolds:  # an analytic one is in no file
-        values["manifold"] = params.manifolds[manifold]
     if reward is not None:
         weights = f"K_L={reward.length_weight:g} K_Δ={reward.reduction_weight:g}"
         tags["reward"] = f"{reward.form} b={reward.b:g} c={reward.c:g} {weights}"
@@ -164,8 +162,15 @@ class StageRun:
         plain = stable(metrics)
         text = json.dumps(plain, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False)
         write_text(file, text + "\n")
-        self.metric_logger()(0, _numbers(plain))
-        self._keep(file, "reports")
+        self.mirror(plain, file)
+
+    def mirror(self, metrics: Mapping[str, Any], *files: Path) -> None:
+        """Log the numbers among figures as `report` does, and keep copies of files that hold them,
+        written already.
+        """
+        self.metric_logger()(0, _numbers(stable(metrics)))
+        for file in files:
+            self._keep(file, "reports")
 
     def metric_logger(self) -> MetricLogger:
         """Where a training loop reports."""
@@ -181,17 +186,19 @@ class StageRun:
             raise ValueError(f"there is already a child run {name!r}")
         self.children.append(name)
         tags = {**self.tags, **{key: str(value) for key, value in params.items()}, "child": name}
-        tags |= {
-            "mlflow.runName": _named(f"{self.tags['item']} {name}", self.tags),
-            "mlflow.parentRunId": self.run_id,
-        }
+        shown = name if self.tags["item"] == self.tags["stage"] else f"{self.tags['item']} {name}"
+        tags |= {"mlflow.runName": _named(shown, self.tags), "mlflow.parentRunId": self.run_id}
         return ChildRun(self.send, self.experiment_id, tags, {**self.params, **params})
 
     def cells(self, table: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]]) -> None:
-        """A child for each cell of a table: by its name, what sets it apart and its figures."""
+        """A child for each cell of a table: by its name, what sets it apart and its figures; where
+        these are records by method, a child for each of them.
+        """
         for name, (params, figures) in table.items():
-            with self.child(name, params) as own:
-                own.log(0, _numbers(stable(figures)))
+            for method, own in _methods(figures).items():
+                apart = {**params, "method": method} if method else params
+                with self.child(f"{name}, {method}" if method else name, apart) as child:
+                    child.log(0, _numbers(stable(own)))
 
     def summarise(
         self,
@@ -214,6 +221,18 @@ class StageRun:
         for step, rows in _together(curves):
             spread = _spread(rows).items()
             self.metric_logger()(step, {n: v for n, v in spread if not n.endswith("_count")})
+
+    def compared(self, figures: Sequence[Mapping[str, float]]) -> None:
+        """Log what runs of all stages are compared by: the children's figures, in their order, each
+        on its child, and their means on this run.
+
+        figures: as `comparison.of_seeds` gives them.
+        """
+        for name, row in zip(self.children, figures, strict=True):
+            MetricLogger(self.send, CHILD + name)(0, row)
+        spread = _spread(figures)
+        means = {name: spread.get(f"seeds/{name}_mean", math.nan) for name in figures[0]}
+        self.metric_logger()(0, means)
 
     def recordings(self, rows: Sequence[Mapping[str, Any]], shown: str = "") -> None:
         """Tell where paths are recorded: all of them in a file of this run and in its description;
@@ -263,7 +282,8 @@ class Work:
 
     settings: what it was asked, flattened to names joined by ".".  inputs: files and folders it
     reads, linked by DVC's MD5.  subject: what else to find the run and compare it by, as
-    `subject_of` makes it.
+    `subject_of` makes it.  watched: whether the machine is, which takes time of a stage that
+    measures its own.
     """
 
     stage: str
@@ -271,6 +291,12 @@ class Work:
     settings: BaseModel | Mapping[str, Any] = field(default_factory=dict)
     inputs: Sequence[Path] = ()
     subject: Subject = Subject()
+    watched: bool = True
+
+    @property
+    def name(self) -> str:
+        """Of its run; a stage that has no items is its own."""
+        return self.stage if self.item == self.stage else f"{self.stage} {self.item}"
 
 
 @contextmanager
@@ -283,7 +309,7 @@ def tracked_stage(work: Work, experiment: str, root: Path) -> Iterator[StageRun]
     """
     run = begin_run(work, experiment, root)
     try:
-        with _system_metrics(run.tracking_uri, run.run_id):
+        with _system_metrics(run.tracking_uri, run.run_id) if work.watched else nullcontext():
             yield run
     except BaseException as error:
         with suppress(Exception):  # the body's error is the one to see
@@ -298,7 +324,7 @@ def begin_run(work: Work, experiment: str, root: Path) -> StageRun:
     Raises TrackingError as `tracked_stage` does.
     """
     run = _run_of(work, experiment, root)
-    shown = {"mlflow.runName": _named(f"{work.stage} {work.item}", run.tags)}
+    shown = {"mlflow.runName": _named(work.name, run.tags)}
     shown["mlflow.note.content"] = _note(work.stage, run.tags)
     try:
         with explained(run.tracking_uri):
@@ -357,7 +383,7 @@ def log_figures(uri: str, run_id: str, figures: Mapping[str, float]) -> None:
 
 def _run_of(work: Work, experiment: str, root: Path) -> StageRun:
     """Without a run in the store yet."""
-    uri, name = tracking_uri(root), f"{work.stage} {work.item}"
+    uri, name = tracking_uri(root), work.name
     tags = {"stage": work.stage, "item": work.item, **work.subject.tags, **source_tags(root)}
     params = {**stored(work.settings), **stored(work.subject.params)}
     for file in work.inputs:
@@ -421,7 +447,7 @@ def _note(stage: str, tags: Mapping[str, str]) -> str:
         if "dvc_stage" in tags
         else f"`stages/{stage}.py`"
     )
-    return f"Made by {again}; its figures are under `reports/{stage}/`."
+    return f"Made by {again}; its figures are among the artifacts, as they stand in `reports/`."
 
 
 def _status(error: BaseException | None) -> str:
@@ -434,6 +460,12 @@ def _numbers(plain: Mapping[str, Any]) -> dict[str, float]:
     """Numbers among nested figures, under names that MLflow takes."""
     named = {re.sub(r"[^\w\-. :/]", "_", name): v for name, v in flat(plain, "/").items()}
     return {name: v for name, v in named.items() if isinstance(v, int | float)}
+
+
+def _methods(figures: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
+    """Figures by method; those that are no records are of one without a name."""
+    are_records = bool(figures) and all(isinstance(own, Mapping) for own in figures.values())
+    return figures if are_records else {"": figures}
 
 
 def _spread(figures: Sequence[Mapping[str, float]]) -> dict[str, float]:

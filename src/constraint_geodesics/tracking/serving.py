@@ -8,7 +8,6 @@ no model sees, until its client has given up.
 import math
 import os
 import signal
-import socket
 import sys
 import time
 from collections.abc import Callable
@@ -21,7 +20,12 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from constraint_geodesics.bundle import read_bundle
-from constraint_geodesics.tracking.store import TrackingError, fetch_artifacts, mlflow_module
+from constraint_geodesics.tracking.store import (
+    TrackingError,
+    fetch_artifacts,
+    mlflow_module,
+    require_free,
+)
 
 RETRY_AFTER_S = 1
 MOST_BYTES = 1_000_000
@@ -104,10 +108,10 @@ def serve(address: str, root: Path, served: Served, tell: Callable[[], None]) ->
 
     address: models:/… in the store of the checkout at `root`.  tell: called when nothing stands
     against it, before planners are loaded.
-    Raises TrackingError if the store has no such planner, BundleError if its files are altered,
-    OSError if the port is taken.
+    Raises TrackingError if the store has no such planner or nobody can listen there, BundleError if
+    its files are altered.
     """
-    _check_free(served)
+    require_free(served.port, served.host)
     # uvicorn ends with the signal that stopped it: files that were fetched must go before that
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     with fetch_artifacts(address, root) as files:
@@ -125,13 +129,3 @@ def serve(address: str, root: Path, served: Served, tell: Callable[[], None]) ->
             workers=served.workers,
             log_level="warning",
         )
-
-
-def _check_free(served: Served) -> None:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((served.host, served.port))
-        except OSError as error:
-            where = f"{served.host}:{served.port}"
-            raise OSError(f"{where}: {error.strerror}; --port takes another") from None

@@ -10,6 +10,7 @@ figures.  MLflow's client can't download such files without the server; they lie
 With experiment.py and registry.py the importer of mlflow.
 """
 
+import errno
 import hashlib
 import json
 import math
@@ -21,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -30,9 +31,11 @@ from urllib.parse import urlsplit
 from filelock import FileLock
 from pydantic import BaseModel
 
+from constraint_geodesics.tracking import views
+
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities import DatasetInput
+    from mlflow.entities import DatasetInput, Experiment
 
 LONGEST_VALUE = 6000
 """Characters of a parameter: the most that MLflow takes."""
@@ -73,11 +76,46 @@ def store_name(uri: str, root: Path) -> str:
 
 
 def ui_command(root: Path, port: int) -> list[str]:
-    """The command that opens the dashboard, for this machine only.
+    """The command that serves the dashboard, for this machine only.
 
     root: a folder in or below the checkout.  Raises TrackingError if there is no store, or
     the runs are on a server, which has a dashboard of its own.
     """
+    uri = _shown_store(root)
+    database = _sqlite_file(uri)
+    artifacts = _artifact_folder(database) if database else root.resolve() / "mlartifacts"
+    # the job runner serves language models; without it the dashboard starts and stops in half the
+    # time
+    quiet = ["env", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false"]
+    server = [
+        sys.executable,
+        *f"-m mlflow server --host {LOOPBACK} --port {port} --workers 1".split(),
+    ]
+    return [*quiet, *server, "--backend-store-uri", uri, "--artifacts-destination", str(artifacts)]
+
+
+def runs_page(root: Path, port: int) -> str:
+    """The address at which that dashboard compares the runs of the experiment that ran last; its
+    first page where nothing ran yet.
+
+    Raises TrackingError if the store can't be read.
+    """
+    uri, address = _shown_store(root), f"http://{LOOPBACK}:{port}"
+    with explained(uri):
+        check_database(uri)
+        client = client_of(uri)
+        known = {own.experiment_id: own for own in client.search_experiments()}
+        order = ["attributes.start_time DESC"]
+        last = client.search_runs([*known], order_by=order, max_results=1)
+        if not last:
+            return address
+        number = last[0].info.experiment_id
+    with suppress(TrackingError), explained(uri):  # a store that can't be written is shown as it is
+        _show(client, known[number])
+    return views.page_of(address, number)
+
+
+def _shown_store(root: Path) -> str:
     found = next((own for own in (root, *root.parents) if _has_store(own)), root)
     uri = tracking_uri(found)
     if uri.startswith("http"):
@@ -91,48 +129,46 @@ def ui_command(root: Path, port: int) -> list[str]:
             f"{database}: there are no runs here: go to a checkout, and `dvc repro`, or name a "
             f"store in MLFLOW_TRACKING_URI"
         )
-    artifacts = _artifact_folder(database) if database else root.resolve() / "mlartifacts"
-    # the job runner serves language models; without it the dashboard starts and stops in half the
-    # time
-    quiet = ["env", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false"]
-    server = [
-        sys.executable,
-        *f"-m mlflow server --host {LOOPBACK} --port {port} --workers 1".split(),
-    ]
-    return [*quiet, *server, "--backend-store-uri", uri, "--artifacts-destination", str(artifacts)]
+    return uri
 
 
 def _has_store(folder: Path) -> bool:
     return (folder / "params.yaml").is_file() and (folder / DATABASE).is_file()
 
 
-def require_free(port: int) -> None:
-    """Raises TrackingError, which names a free one, for a port that is taken."""
-    if not _is_free(port):
-        raise TrackingError(
-            f"port {port} of {LOOPBACK} is taken: add --port {_free_port(port)}, which is free"
-        )
+def require_free(port: int, host: str = LOOPBACK) -> None:
+    """Raises TrackingError where a server can't listen: one line that names the option to change,
+    and a free port for one that is taken.
+    """
+    error = _refusal(port, host)
+    if error is None:
+        return
+    if error.errno == errno.EADDRINUSE:
+        free = _free_port(port, host)
+        raise TrackingError(f"port {port} of {host} is taken: add --port {free}, which is free")
+    option = f"--port {port}" if isinstance(error, PermissionError) else f"--host {host}"
+    raise TrackingError(f"{option}: {error.strerror}")
 
 
-def _is_free(port: int) -> bool:
+def _refusal(port: int, host: str) -> OSError | None:
     with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server does
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the servers do
         try:
-            probe.bind((LOOPBACK, port))
-        except OSError:
-            return False
-    return True
+            probe.bind((host, port))
+        except OSError as error:
+            return error
+    return None
 
 
-def _free_port(above: int) -> int:
+def _free_port(above: int, host: str) -> int:
     """The first free one above a port, else any."""
-    near = (port for port in range(above + 1, min(above + 100, 65536)) if _is_free(port))
-    return next(near, 0) or _any_port()
+    near = range(above + 1, min(above + 100, 65536))
+    return next((port for port in near if _refusal(port, host) is None), 0) or _any_port(host)
 
 
-def _any_port() -> int:
+def _any_port(host: str) -> int:
     with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
+        probe.bind((host, 0))
         return int(probe.getsockname()[1])
 
 
@@ -280,11 +316,17 @@ def impatient(tries: int = 1, answer_s: int = FIRST_ANSWER_S) -> Iterator[None]:
 def _experiment(client: "MlflowClient", name: str, in_sqlite: bool) -> str:
     found = client.get_experiment_by_name(name)
     if found is None:
-        location = (
-            f"mlflow-artifacts:/{re.sub(r'[^A-Za-z0-9_-]+', '_', name)}" if in_sqlite else None
-        )
-        return str(client.create_experiment(name, artifact_location=location))
+        folder = re.sub(r"[^A-Za-z0-9_-]+", "_", name)
+        location = f"mlflow-artifacts:/{folder}" if in_sqlite else None
+        return str(client.create_experiment(name, location, views.experiment_tags()))
+    _show(client, found)
     return str(found.experiment_id)
+
+
+def _show(client: "MlflowClient", experiment: "Experiment") -> None:
+    """Give an experiment of an older version its description and its views."""
+    for key, value in views.outdated(experiment.tags).items():
+        client.set_experiment_tag(experiment.experiment_id, key, value)
 
 
 def _sqlite_file(uri: str) -> Path | None:
