@@ -62,7 +62,8 @@ def test_every_figure_of_the_benchmark_is_on_the_page(page):
 def test_the_page_opens_with_who_is_ahead_and_where_the_planner_loses(layout, page):
     text, budgets = text_of(layout), table_of(layout, "budgets")
     rows, _ = read_table(layout.benchmark_table)
-    first = text.index(equal_time(budgets))
+    first = text.index(f"<strong>Ahead at equal time: {winner(budgets)}.</strong>")
+    assert first < text.index(equal_time(budgets))
     assert first < text.index(planner_result(table_of(layout, "overview")))
     for title, sentence in losses(rows, budgets).items():
         place = text.index(f"<strong>{title}</strong>: {sentence}")
@@ -77,11 +78,12 @@ def test_other_verdicts_give_the_page_another_winner(layout, page, params):
     try:
         turned.to_csv(file, index=False)
         write_benchmark_page(params, layout)
-        assert f"Ahead at equal time: {winner(turned)}. It is ahead" in text_of(layout)
+        assert f"Ahead at equal time: {winner(turned)}.</strong> It is ahead" in text_of(layout)
     finally:
         file.write_text(kept)
         write_benchmark_page(params, layout)
-    assert f"Ahead at equal time: {winner(table_of(layout, 'budgets'))}. Within" in text_of(layout)
+    kept_first = winner(table_of(layout, "budgets"))
+    assert f"Ahead at equal time: {kept_first}.</strong> Within" in text_of(layout)
 
 
 def test_five_curves_are_chosen_at_first_and_all_constraints_and_scenes(layout, page):

@@ -68,9 +68,9 @@ def test_the_winner_is_who_is_ahead_in_more_cases_than_behind():
     budgets = verdicts(BiRRT=["ahead", "ahead", "behind"], PRM=["ahead", "behind", "behind"])
     assert winner(budgets) == "BiRRT"
     assert equal_time(budgets).startswith(
-        "Ahead at equal time: BiRRT. It is ahead of the planner in 2 cases and behind in 1. "
+        "It is ahead of the planner in 2 cases of constraint, scene and budget, and behind in 1. "
     )
-    assert equal_time(verdicts(PRM=["behind"])).startswith("Ahead at equal time: planner. Within")
+    assert equal_time(verdicts(PRM=["behind"])).startswith("Within a time budget the planner is")
 
 
 def test_a_planner_that_nobody_beats_loses_nowhere():
@@ -100,13 +100,13 @@ def test_what_is_sooner_or_shorter_is_named_with_both_figures():
 
 def test_within_the_same_time_few_queries_are_only_counted():
     rows = pd.DataFrame(answers("planner", 0.001, 2.0) + answers("BiRRT", 0.1, 2.1))
-    budgets = verdicts(BiRRT=["ahead", "behind", "ahead"])
+    budgets = verdicts(BiRRT=["ahead", "behind", "ahead"], PRM=["ahead"])
     assert losses(rows, budgets)["Within the same time"] == (
-        "within 10 ms in the workcell, BiRRT under level_cup; within 1 s in the workcell, BiRRT "
-        "under level_cup."
+        "in 10 ms in the workcell, BiRRT under level_cup and PRM under level_cup; in 1 s in the "
+        "workcell, BiRRT under level_cup."
     )
     assert losses(rows, budgets.assign(queries=FEW - 1))["Within the same time"] == (
-        f"2 comparisons over fewer than {FEW} queries stand in a table below."
+        f"3 comparisons over fewer than {FEW} queries stand in a table below."
     )
 
 

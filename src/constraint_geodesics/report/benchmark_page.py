@@ -27,7 +27,7 @@ from constraint_geodesics.report.cells import Cells, fixed
 from constraint_geodesics.report.chooser import chooser
 from constraint_geodesics.report.page import Links, Picture, Recorded, Section, Table, write_page
 from constraint_geodesics.report.results import ReportError
-from constraint_geodesics.report.standing import equal_time, losses, planner_result
+from constraint_geodesics.report.standing import equal_time, losses, planner_result, winner
 
 Case = tuple[str, str, str]
 """Constraint, scene and planner."""
@@ -49,6 +49,7 @@ def write_benchmark_page(params: Params, layout: Layout) -> None:
     write_page(
         layout,
         "benchmark",
+        winner=winner(budgets),
         standing=equal_time(budgets),
         result=planner_result(overview),
         losses=losses(rows, budgets),

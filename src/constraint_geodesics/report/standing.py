@@ -71,16 +71,15 @@ def winner(budgets: pd.DataFrame) -> str:
 
 
 def equal_time(budgets: pd.DataFrame) -> str:
-    """How the planner and its baselines stand within the same time, the winner first."""
+    """How the planner and its baselines stand within the same time."""
     first = winner(budgets)
+    if first == PLANNER:
+        return ahead_text(budgets)
     own = budgets.loc[budgets["baseline"] == first, "verdict"].value_counts()
-    against = (
-        ""
-        if first == PLANNER
-        else f" It is ahead of the planner in {own.get('ahead', 0)} cases and behind in "
-        f"{own.get('behind', 0)}."
+    return (
+        f"It is ahead of the planner in {own.get('ahead', 0)} cases of constraint, scene and "
+        f"budget, and behind in {own.get('behind', 0)}. {ahead_text(budgets)}"
     )
-    return f"Ahead at equal time: {first}.{against} {ahead_text(budgets)}"
 
 
 def planner_result(overview: pd.DataFrame) -> str:
@@ -148,11 +147,13 @@ def _figures(own: pd.DataFrame) -> dict[str, float]:
 def _within(budgets: pd.DataFrame) -> list[str]:
     ahead = budgets[budgets["verdict"] == "ahead"]
     sure = ahead[ahead["queries"] >= FEW]
-    told = [
-        f"within {_duration(budget)} {WHERE[str(scene)]}, {baseline} under "
-        f"{', '.join(own['constraint'])}"
-        for (budget, scene, baseline), own in sure.groupby(["budget_s", "scene", "baseline"])
-    ]
+    told = []
+    for (budget, scene), case in sure.groupby(["budget_s", "scene"]):
+        names = " and ".join(
+            f"{baseline} under {', '.join(own['constraint'])}"
+            for baseline, own in case.groupby("baseline", sort=False)
+        )
+        told.append(f"in {_duration(budget)} {WHERE[str(scene)]}, {names}")
     few = len(ahead) - len(sure)
     if few:
         told.append(f"{few} comparisons over fewer than {FEW} queries stand in a table below")
