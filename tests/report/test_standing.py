@@ -91,8 +91,8 @@ def test_what_is_sooner_or_shorter_is_named_with_both_figures():
     )
     told = losses(rows, verdicts(BiRRT=["behind"], PRM=["behind"], SLSQP=["behind"]))
     assert told == {
-        "At the median": "BiRRT in the workcell, in 5 ms against 10; it solves 100.0%, the planner "
-        "100.0%; 1 more that solve less than half.",
+        "At the median": "BiRRT in the workcell, in 5 ms against 10 (it solves 100.0%, the planner "
+        "100.0%); 1 more that solve less than half.",
         "At the 95th percentile of length, whatever time it takes": "SLSQP in the workcell, 1.000 "
         "times the best known against 1.050 on 4 queries, in 2,000 ms against 10.",
     }

@@ -165,8 +165,8 @@ def _sooner(pairs: pd.DataFrame) -> list[str]:
     serving = sooner[sooner["baseline_success"] >= SERVES]
     told = [
         f"{row['baseline']} {WHERE[row['scene']]}, in {milliseconds(row['baseline_time_s'])} ms "
-        f"against {milliseconds(row['time_s'])}; it solves {share(row['baseline_success'], 1)}, "
-        f"the planner {share(row['success'], 1)}"
+        f"against {milliseconds(row['time_s'])} (it solves {share(row['baseline_success'], 1)}, "
+        f"the planner {share(row['success'], 1)})"
         for row in _rows(serving)
     ]
     rest = len(sooner) - len(serving)
