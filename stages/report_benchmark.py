@@ -69,9 +69,6 @@ def write(params: Params, layout: Layout, run: StageRun) -> None:
     drawn = [name for name in params.benchmark.drawn if name in settings]
     styles = figures.styles_of(drawn, colours(settings))
     for name, figure in (
-        ("success_over_budget", figures.success_over_budget(rows, styles)),
-        ("length_over_budget", figures.length_over_budget(rows, styles)),
-        ("ratio_distributions", figures.ratio_distributions(rows, styles)),
         ("overview", figures.overview(all_constraints(rows), styles)),
         ("break_even", figures.break_even(costs[costs["success"] >= SERVES], styles)),
     ):

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from constraint_geodesics.palette import FAMILIES, GREY, planner_colour, planner_family
+from constraint_geodesics.palette import (
+    FAMILIES,
+    GREY,
+    NIGHT,
+    by_night,
+    planner_colour,
+    planner_family,
+)
 from constraint_geodesics.params import load_params
 from constraint_geodesics.peers.registry import all_settings, colours
 from constraint_geodesics.report.benchmark_figures import DASHES, styles_of
@@ -78,3 +85,20 @@ def test_families_are_told_apart_without_red_or_green_cones(without):
     assert len(set(colours)) == len(colours)
     for one, two in itertools.combinations(colours, 2):
         assert np.abs(seen(one, without) - seen(two, without)).max() > 0.09, (one, two)
+
+
+def test_families_are_told_apart_and_seen_at_night():
+    colours = [by_night(family.colour) for family in FAMILIES.values()]
+    turned = [
+        name for name, own in FAMILIES.items() if by_night(own.colour).lower() != own.colour.lower()
+    ]
+    assert turned == ["optimisation", "other"], "the greys"
+    for one, two in itertools.combinations(colours, 2):
+        assert np.abs(seen(one, "none") - seen(two, "none")).max() > 0.09, (one, two)
+    for colour in colours:
+        assert np.abs(np.array(to_rgb(colour)) - to_rgb(NIGHT.page)).max() > 0.3, colour
+
+
+def test_black_and_white_change_places_at_night():
+    assert by_night("#000000").lower() == NIGHT.ink
+    assert by_night("#ffffff").lower() == NIGHT.page

@@ -1,5 +1,5 @@
-"""Colours that colour-blind people tell apart (Okabe and Ito's), and the one that each planner has
-everywhere: in the figures, on the report's pages and in Rerun.
+"""Colours that colour-blind people tell apart (Okabe and Ito's), the one that each planner has
+everywhere (in the figures, on the report's pages and in Rerun), and those of the pages themselves.
 """
 
 from typing import NamedTuple
@@ -11,6 +11,34 @@ SERIES = (SKY, ORANGE, PURPLE, BLUE, YELLOW, GREEN, VERMILION)
 """Of things that are counted and have no colour of their own."""
 START, GOAL = GREEN, VERMILION
 """A path's ends."""
+NEUTRAL = 16
+"""By so much do the channels of a colour differ at most that is a grey."""
+
+
+class Ground(NamedTuple):
+    """What a page is drawn with.  soft: of words that matter less; card: behind what stands out;
+    mark: behind what a link led to; shade: where more is hidden at the right.
+    """
+
+    ink: str
+    soft: str
+    page: str
+    card: str
+    line: str
+    link: str
+    mark: str
+    shade: str
+
+
+DAY = Ground(
+    *("#1d2327", "#566169", "#ffffff", "#f4f6f7", "#d5dbdf"), *("#005f98", "#fff3d6", "#00000044")
+)
+NIGHT = Ground(
+    *("#e4e8ea", "#a5b1b9", "#14181b", "#1e2428", "#38424a"), *("#7cc4f2", "#3a3116", "#ffffff55")
+)
+PAPER = Ground(
+    *("#000000", "#444444", "#ffffff", "#ffffff", "#999999"), *("#000000", "#ffffff", "#00000000")
+)
 
 
 class Family(NamedTuple):
@@ -65,3 +93,22 @@ def planner_colour(planner: str) -> str:
     """The colour of a planner; grey for one that is in no family."""
     family = planner_family(planner)
     return GREY if family is None else FAMILIES[family].colour
+
+
+def by_night(colour: str) -> str:
+    """A colour on the dark page: greys turned over between its page and its ink, as in the figures
+    there; others are what they are.
+    """
+    channels = _channels(colour)
+    if max(channels) - min(channels) > NEUTRAL:
+        return colour
+    ends = zip(_channels(NIGHT.ink), _channels(NIGHT.page), strict=True)
+    turned = (
+        round(ink + (page - ink) * value / 255.0)
+        for value, (ink, page) in zip(channels, ends, strict=True)
+    )
+    return "#" + "".join(f"{value:02X}" for value in turned)
+
+
+def _channels(colour: str) -> tuple[int, ...]:
+    return tuple(int(colour[k : k + 2], 16) for k in (1, 3, 5))

@@ -8,15 +8,15 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Locator, Page
 
 Picture = UInt8[np.ndarray, "height width 3"]
 NEAR = 24
 """By so much may a channel differ: antialiasing and shading change a colour a little."""
 
 
-def picture(page: "Page") -> Picture:
-    """The page as it is now."""
+def picture(page: "Page | Locator") -> Picture:
+    """The page, or a part of it, as it is now."""
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
 
 

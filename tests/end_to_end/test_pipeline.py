@@ -82,7 +82,7 @@ def test_the_report_opens_offline(finished: Path) -> None:
     page = re.sub(
         r'src="data:image/png;base64,[^"]*"', "", (finished / "reports/index.html").read_text()
     )
-    assert not re.search(r"src=|<link|@import|url\(", page)
+    assert not re.search(r"src=|<link|@import|url\((?!#)", page)
     # nothing but what a person may follow: the runs in the dashboard of this checkout
     assert not re.search(
         r"https?:|//", re.sub(r'<a href="http://127\.0\.0\.1:5000/#/[^"]*">', "", page)
@@ -347,6 +347,6 @@ def test_the_benchmark_has_a_row_for_every_planner_and_says_where_it_is_from(
     report = finished / "reports/benchmark"
     for name in ("overview.md", "summary.md", "table_i.md", "budgets.md", "break_even.md"):
         assert "planner" in (report / name).read_text()
-    for name in ("success_over_budget", "length_over_budget", "ratio_distributions", "break_even"):
+    for name in ("overview", "break_even"):
         assert (report / f"{name}.png").stat().st_size > 5000
     assert "Running stage" not in smoke.dvc(finished, "repro", BENCHMARK).stdout

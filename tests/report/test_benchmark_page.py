@@ -2,6 +2,7 @@
 network.
 """
 
+import html
 import shutil
 from pathlib import Path
 
@@ -14,7 +15,16 @@ from constraint_geodesics.palette import planner_colour
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.benchmark_page import write_benchmark_page
 from constraint_geodesics.report.benchmark_tables import ahead_markdown, verdict_cells
+from constraint_geodesics.report.chooser import SHOWN
 from constraint_geodesics.report.results import ReportError
+from constraint_geodesics.report.standing import (
+    CHOICE,
+    best_of_families,
+    equal_time,
+    losses,
+    planner_result,
+    winner,
+)
 
 ROOT = Path(__file__).parents[2]
 SOURCES = ("benchmark", "benchmark_repeat", "growth")
@@ -40,9 +50,51 @@ def table_of(layout, name):
     return pd.read_csv(layout.root / "reports" / "benchmark" / f"{name}.csv")
 
 
+def text_of(layout):
+    return html.unescape((layout.root / "reports" / "benchmark.html").read_text())
+
+
 def test_every_figure_of_the_benchmark_is_on_the_page(page):
-    assert len(page.sources) == 6
-    assert {"growth/growth.png", "benchmark/overview.png"} <= set(page.links)
+    assert len(page.sources) == 2
+    assert {"growth/growth.png", "benchmark/break_even.png"} <= set(page.links)
+
+
+def test_the_page_opens_with_who_is_ahead_and_where_the_planner_loses(layout, page):
+    text, budgets = text_of(layout), table_of(layout, "budgets")
+    rows, _ = read_table(layout.benchmark_table)
+    first = text.index(f"<strong>Ahead at equal time: {winner(budgets)}.</strong>")
+    assert first < text.index(equal_time(budgets))
+    assert first < text.index(planner_result(table_of(layout, "overview")))
+    for title, sentence in losses(rows, budgets).items():
+        place = text.index(f"<strong>{title}</strong>: {sentence}")
+        assert first < place < text.index('id="overview"')
+
+
+def test_other_verdicts_give_the_page_another_winner(layout, page, params):
+    file = layout.root / "reports" / "benchmark" / "budgets.csv"
+    kept, turned = file.read_text(), table_of(layout, "budgets")
+    turned["verdict"] = turned["verdict"].replace({"ahead": "behind", "behind": "ahead"})
+    assert winner(table_of(layout, "budgets")) != winner(turned)
+    try:
+        turned.to_csv(file, index=False)
+        write_benchmark_page(params, layout)
+        assert f"Ahead at equal time: {winner(turned)}.</strong> It is ahead" in text_of(layout)
+    finally:
+        file.write_text(kept)
+        write_benchmark_page(params, layout)
+    kept_first = winner(table_of(layout, "budgets"))
+    assert f"Ahead at equal time: {kept_first}.</strong> Within" in text_of(layout)
+
+
+def test_five_curves_are_chosen_at_first_and_all_constraints_and_scenes(layout, page):
+    rows, _ = read_table(layout.benchmark_table)
+    best = best_of_families(table_of(layout, "overview"))[:SHOWN]
+    chosen = [value for kind, value in page.checked if kind == "planner"]
+    assert sorted(chosen) == sorted(["planner", *best])
+    assert len(chosen) == 5
+    for column in ("constraint", "scene"):
+        assert {value for kind, value in page.checked if kind == column} == set(rows[column])
+    assert CHOICE[1:] in text_of(layout)
 
 
 def test_the_overview_says_what_its_csv_says(layout, page, params):

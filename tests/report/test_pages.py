@@ -3,8 +3,10 @@ written by hand.
 """
 
 import csv
+import html
 import json
 import re
+import shutil
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -40,6 +42,7 @@ from constraint_geodesics.pipeline.layout import Layout, in_checkout
 from constraint_geodesics.report.arms_page import arm_tables
 from constraint_geodesics.report.cells import plus_minus, short
 from constraint_geodesics.report.figures import PLANNERS
+from constraint_geodesics.report.front import NOT_RUN, learning, opening, planner_row
 from constraint_geodesics.report.page import Recorded
 from constraint_geodesics.report.pipeline_figures import latent_curves
 from constraint_geodesics.report.pipeline_page import write_report
@@ -54,6 +57,7 @@ from constraint_geodesics.report.results import (
 )
 from constraint_geodesics.scene.scene import Scene
 
+ROOT = Path(__file__).parents[2]
 CONSTRAINTS, SEEDS, QUERIES = ("free", "level_cup", "slide"), (0, 1), 3
 HELD_OUT = {
     "joint_error_mean_deg": 12.5,
@@ -154,7 +158,7 @@ HISTORY = [
 
 
 def small_params():
-    params = load_params(Path(__file__).parents[2] / "params.yaml")
+    params = load_params(ROOT / "params.yaml")
     constraints = {name: params.constraints[name] for name in CONSTRAINTS}
     geodesics = params.geodesics.model_copy(
         update={"seeds": SEEDS, "illustrated_constraints": ("level_cup",), "analytic": ("plane",)}
@@ -319,6 +323,10 @@ def run(tmp_path_factory):
     write_csv(layout.report("benchmark_planners", "removed", "csv"), sampled_rows())
     write_study_reports(params, layout)
     write_arm_report(layout)
+    benchmark = layout.root / "reports" / "benchmark"
+    benchmark.mkdir()
+    for name in ("overview.csv", "about.json"):
+        shutil.copy(ROOT / "reports" / "benchmark" / name, benchmark)
     return params, layout
 
 
@@ -341,6 +349,37 @@ def test_the_page_asks_the_network_for_nothing_and_every_figure_is_on_it(checked
     assert len(checked.sources) == len(checked.alts) == len(written)
     assert {"benchmark.html", "benchmark.html#parts", "../docs/data_card.md"} <= set(checked.links)
     assert "figures/fig2_analytic_submanifolds.png" in checked.links
+
+
+def test_the_page_opens_with_the_planner_and_the_pipelines_findings_come_later(run, page, checked):
+    row = planner_row(run[1])
+    assert checked.tables[row.title][2:] == [list(cells) for cells in row.rows]
+    assert checked.tables[row.title][1] == list(row.header)
+    lead = html.unescape(page[page.index('class="lead"') : page.index("</p>")])
+    assert " ".join(opening(run[1], measured=True)) in lead
+    about = json.loads((ROOT / "reports" / "benchmark" / "about.json").read_text())
+    assert about["commit"][:12] in page
+    places = [page.index(f'id="{name}"') for name in ("learning", "published", "findings")]
+    assert page.index('class="lead"') < places[0] < places[1] < places[2]
+    assert places[2] < page.index("The judge accepts")
+    added = learning(*run)
+    assert html.escape(added.adds[0]).replace("&#x27;", "&#39;") in page
+    assert len(checked.tables[added.table.title]) - 1 == len(added.table.rows) == 8
+
+
+def test_without_a_benchmark_the_page_says_what_makes_one(run, page) -> None:
+    params, layout = run
+    file = layout.root / "reports" / "benchmark" / "about.json"
+    aside = file.with_suffix(".aside")
+    file.rename(aside)
+    try:
+        write_report(params, layout)
+        text = (layout.root / "reports" / "index.html").read_text()
+        assert NOT_RUN in text
+        assert 'aria-label="The planner beside' not in text
+    finally:
+        aside.rename(file)
+        write_report(params, layout)
 
 
 def test_the_pages_tables_say_what_the_csv_says(run, checked):

@@ -63,10 +63,14 @@ def test_what_learning_adds_is_said_of_every_footing(reported):
     said = what_learning_adds(*reported)
     footings = ["One curve", "Constraints never trained on", "A sphere on the way"]
     assert list(said) == [*footings, "Refined paths"]
-    assert "policy 100.0% and 1.0150; random curves, same time 50.0%" in said["Refined paths"]
+    assert (
+        "policy 100.0% and 1.0150; the same search, no policy 50.0% and 1.0250; random curves, "
+        "same time 50.0%" in said["Refined paths"]
+    )
     assert said["One curve"].startswith(
         f"{params.studies.constraint}: solved, and 95th percentile of the length over the family's "
-        "shortest curve, policy 100.0% and 1.020; random curves, same time 50.0% and 1.100."
+        "shortest curve, policy 100.0% and 1.020; the same search, no policy 50.0% and 1.030; "
+        "random curves, same time 50.0% and 1.100."
     )
     for name in params.unseen:
         assert f"{name} 100%" in said["Constraints never trained on"]

@@ -4,8 +4,7 @@ when training pays.
 Planners of one family share a colour; within it they differ by line style.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -41,30 +40,6 @@ def styles_of(planners: Sequence[str], colours: Mapping[str, str]) -> Styles:
         dashes, width = DASHES[k % len(DASHES)], 2.2 if k == 0 else 1.2
         styles[planner] = {"color": colour, "linestyle": dashes, "linewidth": width}
     return styles
-
-
-def success_over_budget(rows: pd.DataFrame, styles: Styles) -> Figure:
-    """Share of solvable queries with a valid path within a time budget; a panel for each constraint
-    and scene.
-    """
-    draw = partial(_draw_budget, column="success")
-    return _by_case(rows, styles, draw, ("time budget [s]", "solved of solvable"))
-
-
-def length_over_budget(rows: pd.DataFrame, styles: Styles) -> Figure:
-    """95th percentile of length over best known within a time budget, failures counted as
-    infinite.
-    """
-    draw = partial(_draw_budget, column="ratio_p95", top=3.0)
-    return _by_case(rows, styles, draw, ("time budget [s]", "length / best known, p95"))
-
-
-def ratio_distributions(rows: pd.DataFrame, styles: Styles) -> Figure:
-    """How large a share of the solvable rows has a path within some excess over the best known
-    length.
-    """
-    labels = ("excess over best known", "share of solvable rows")
-    return _by_case(rows, styles, _draw_excess, labels)
 
 
 def overview(rows: pd.DataFrame, styles: Styles) -> Figure:
@@ -137,31 +112,6 @@ def _excess(rows: pd.DataFrame) -> Iterator[tuple[str, np.ndarray]]:
     excess = solvable["length_rad"].where(solvable["valid"]) / solvable["best_known_rad"] - 1.0
     for planner, own in excess.groupby(solvable["planner"], sort=False):
         yield str(planner), np.sort(own.to_numpy())
-
-
-def _by_case(
-    rows: pd.DataFrame,
-    styles: Styles,
-    draw: Callable[[Axes, pd.DataFrame, Styles], None],
-    labels: tuple[str, str],
-) -> Figure:
-    """A panel with the solvable rows of each constraint and scene, scenes side by side; labels
-    below and at the left, and one legend.
-    """
-    solvable = rows[rows["best_known_rad"].notna()]
-    cases = list(solvable.groupby(["constraint", "scene"], sort=False))
-    columns = 2 if rows["scene"].nunique() > 1 else 3
-    lines = -(-len(cases) // columns)
-    figure = Figure(figsize=(9.0, 1.6 + 2.0 * lines), layout="constrained")
-    for k, ((constraint, scene), case) in enumerate(cases):
-        axes = figure.add_subplot(lines, columns, k + 1)
-        axes.set_title(f"{constraint}, {scene}", fontsize=9)
-        _plain(axes)
-        draw(axes, case, styles)
-    figure.supxlabel(labels[0], fontsize=9)
-    figure.supylabel(labels[1], fontsize=9)
-    _legend(figure, figure.axes, styles)
-    return figure
 
 
 def _plain(axes: Axes) -> None:

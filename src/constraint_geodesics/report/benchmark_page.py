@@ -14,7 +14,6 @@ from constraint_geodesics.report.benchmark_tables import (
     PYTHON_NOTE,
     TABLE_I_NOTE,
     ahead_cells,
-    ahead_text,
     asks_in_python,
     break_even_cells,
     case_cells,
@@ -25,8 +24,10 @@ from constraint_geodesics.report.benchmark_tables import (
     verdict_cells,
 )
 from constraint_geodesics.report.cells import Cells, fixed
+from constraint_geodesics.report.chooser import chooser
 from constraint_geodesics.report.page import Links, Picture, Recorded, Section, Table, write_page
 from constraint_geodesics.report.results import ReportError
+from constraint_geodesics.report.standing import equal_time, losses, planner_result, winner
 
 Case = tuple[str, str, str]
 """Constraint, scene and planner."""
@@ -41,12 +42,18 @@ def write_benchmark_page(params: Params, layout: Layout) -> None:
     """
     try:
         rows, about = read_table(layout.benchmark_table)
+        overview, budgets = (_table(layout, name) for name in ("overview", "budgets"))
         sections = benchmark_sections(params, layout, rows)
     except FileNotFoundError as error:
         raise ReportError(f"{error.filename or error}: missing; `make bench` makes it") from None
     write_page(
         layout,
         "benchmark",
+        winner=winner(budgets),
+        standing=equal_time(budgets),
+        result=planner_result(overview),
+        losses=losses(rows, budgets),
+        chooser=chooser(rows, overview, list(params.benchmark.planners)),
         about=about,
         planners=rows["planner"].nunique(),
         rows=len(rows),
@@ -56,22 +63,13 @@ def write_benchmark_page(params: Params, layout: Layout) -> None:
 
 def benchmark_sections(params: Params, layout: Layout, rows: pd.DataFrame) -> list[Section]:
     """The page's parts in their order.  rows: of reports/benchmark.csv."""
-    folder = layout.root / "reports" / "benchmark"
     summary, overview, budgets, costs = (
-        pd.read_csv(folder / f"{name}.csv")
-        for name in ("summary", "overview", "budgets", "break_even")
+        _table(layout, name) for name in ("summary", "overview", "budgets", "break_even")
     )
     return [
-        *_overview_sections(params, layout, overview),
-        _budget_section(layout, budgets),
+        *_overview_sections(params, overview),
+        _budget_section(budgets),
         _published_section(params, rows),
-        Section(
-            "lengths",
-            "How lengths spread",
-            "The higher a curve is at the left, the more of the planner's paths are as short "
-            "as any that is known.",
-            [_picture(layout, "ratio_distributions")],
-        ),
         _break_even_section(layout, costs),
         _growth_section(layout),
         _repeat_section(layout),
@@ -79,7 +77,11 @@ def benchmark_sections(params: Params, layout: Layout, rows: pd.DataFrame) -> li
     ]
 
 
-def _overview_sections(params: Params, layout: Layout, overview: pd.DataFrame) -> list[Section]:
+def _table(layout: Layout, name: str) -> pd.DataFrame:
+    return pd.read_csv(layout.root / "reports" / "benchmark" / f"{name}.csv")
+
+
+def _overview_sections(params: Params, overview: pd.DataFrame) -> list[Section]:
     settings = all_settings(params)
     in_python = asks_in_python(settings)
     parts = [name for name, one in settings.items() if isinstance(one, PlannerSettings)]
@@ -91,9 +93,8 @@ def _overview_sections(params: Params, layout: Layout, overview: pd.DataFrame) -
             "overview",
             "Overview",
             f"All constraints together, a table for each scene. {PYTHON_NOTE}",
-            [_picture(layout, "overview")],
-            _overview_blocks(drawn, in_python, "planners that are drawn"),
-            _overview_blocks(overview, in_python, "all planners"),
+            tables=_overview_blocks(drawn, in_python, "planners that are drawn"),
+            folded=_overview_blocks(overview, in_python, "all planners"),
         ),
         Section(
             "parts",
@@ -104,14 +105,15 @@ def _overview_sections(params: Params, layout: Layout, overview: pd.DataFrame) -
     ]
 
 
-def _budget_section(layout: Layout, budgets: pd.DataFrame) -> Section:
-    pictures = [_picture(layout, name) for name in ("success_over_budget", "length_over_budget")]
+def _budget_section(budgets: pd.DataFrame) -> Section:
     note = "a case is a constraint in a scene; from reports/benchmark/budgets.csv"
     cases = Table("Cases by budget", note, *_parted(verdict_cells(budgets)))
     behind = Table("Baselines that are ahead", note, *_parted(ahead_cells(budgets)))
-    return Section(
-        "budgets", "Within a time budget", ahead_text(budgets), pictures, [cases], [behind]
+    told = (
+        "How often the planner is first within the same time, over the queries that it and a "
+        "baseline were both asked."
     )
+    return Section("budgets", "Within a time budget", told, tables=[cases], folded=[behind])
 
 
 def _published_section(params: Params, rows: pd.DataFrame) -> Section:
@@ -225,31 +227,6 @@ def _parted(cells: Cells) -> tuple[Sequence[str], Cells]:
 
 
 CAPTIONS: Mapping[str, tuple[str, str, str]] = {
-    "overview": (
-        "benchmark",
-        "Success, length and spread, all constraints together",
-        "Left: share of the queries that any planner solved. Middle: 95th percentile of length "
-        "over best known, failures infinite. Right: share of rows within some excess over the "
-        "best known length.",
-    ),
-    "success_over_budget": (
-        "benchmark",
-        "Success within a time budget",
-        "Share of the queries that any planner solved with a valid path within the budget, by "
-        "constraint and scene.",
-    ),
-    "length_over_budget": (
-        "benchmark",
-        "Length within a time budget",
-        "95th percentile of length over best known; a line begins where 95 % of the rows have "
-        "a path.",
-    ),
-    "ratio_distributions": (
-        "benchmark",
-        "Excess over the best known length",
-        "Share of the rows of solvable queries whose path is within some excess; failures never "
-        "are.",
-    ),
     "break_even": (
         "benchmark",
         "Training and planning, in all",

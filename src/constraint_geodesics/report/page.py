@@ -13,7 +13,7 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
-from constraint_geodesics.palette import FAMILIES, planner_colour, planner_family
+from constraint_geodesics.palette import DAY, FAMILIES, NIGHT, PAPER, by_night, planner_family
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.results import ReportError
 from constraint_geodesics.text_files import write_text
@@ -44,7 +44,9 @@ class Links(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One row as the page shows it.  colour: of its planner, empty where it is of none."""
+    """One row as the page shows it.  colour: of its planner, by the page's name for it, empty where
+    it is of none.
+    """
 
     cells: Sequence[str]
     colour: str
@@ -71,7 +73,7 @@ class Table:
     def shown(self) -> Iterator[Row]:
         """The rows with their colours and links."""
         none = [""] * len(self.rows)
-        colours = [planner_colour(n) if planner_family(n) else "" for n in self.planners] or none
+        colours = [family_colour(name) for name in self.planners] or none
         links = self.links or [Links()] * len(self.rows)
         return (Row(*row) for row in zip(self.rows, colours, links, strict=True))
 
@@ -84,6 +86,14 @@ class Table:
     def recorded(self) -> int:
         """How many of its paths are recorded."""
         return sum(len(own.recordings) for own in self.links)
+
+
+def family_colour(planner: str) -> str:
+    """A planner's colour as a style names it, the same by day and by night; empty for one that is
+    in no family.
+    """
+    family = planner_family(planner)
+    return f"var(--family-{family})" if family else ""
 
 
 def runs_link(stage: str, item: str) -> str:
@@ -135,9 +145,17 @@ def write_page(layout: Layout, name: str, **content: Any) -> Path:
     environment.filters["png"] = _embedded
     environment.filters["size"] = _size
     environment.filters["link"] = lambda target: target.relative_to(file.parent).as_posix()
-    page = environment.get_template(f"{name}.html.j2").render(content, families=FAMILIES.values())
+    environment.globals.update(
+        families=FAMILIES, by_night=by_night, day=DAY, night=NIGHT, paper=PAPER, channels=_channels
+    )
+    page = environment.get_template(f"{name}.html.j2").render(content)
     write_text(file, page)
     return file
+
+
+def _channels(colour: str) -> list[str]:
+    """Red, green and blue from 0 to 1, as a filter takes them."""
+    return [f"{int(colour[k : k + 2], 16) / 255:.4f}" for k in (1, 3, 5)]
 
 
 def _size(file: Path) -> str:

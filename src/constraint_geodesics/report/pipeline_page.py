@@ -16,6 +16,7 @@ from constraint_geodesics.report.arms_page import arm_tables, arms_markdown
 from constraint_geodesics.report.charts_page import charts_markdown
 from constraint_geodesics.report.demonstrations_page import demonstrations_markdown
 from constraint_geodesics.report.figures import PLANNERS
+from constraint_geodesics.report.front import learning, opening, planner_row
 from constraint_geodesics.report.manifolds_page import manifolds_markdown
 from constraint_geodesics.report.page import Picture, write_page
 from constraint_geodesics.report.pipeline_figures import Drawn, draw_data_cards, draw_figures
@@ -89,6 +90,9 @@ def page_content(params: Params, layout: Layout, table: pd.DataFrame) -> dict[st
     studies = studies_at_hand(params, layout)
     return {
         "params": params,
+        "opening": opening(layout, "benchmark" in studies),
+        "ahead": [planner_row(layout)] if "benchmark" in studies else [],
+        "learning": learning(params, layout) if "policies" in studies else None,
         "learned": PLANNERS[LEARNED].label,
         "findings": findings(params, table, metrics),
         "published": [

@@ -156,6 +156,9 @@ def studies_at_hand(params: Params, layout: Layout) -> frozenset[str]:
             *(layout.report("ablate_manifold", name) for name in params.manifolds),
         ],
         "policies": [layout.report("benchmark_policies", "policies")],
+        "benchmark": [
+            layout.root / "reports" / "benchmark" / name for name in ("overview.csv", "about.json")
+        ],
         "arms": [layout.root / "reports" / "arms.json"],
         "manifolds": [layout.root / "reports" / "compare_manifolds.json"],
         "charts": [layout.root / "reports" / "compare_charts.json"],

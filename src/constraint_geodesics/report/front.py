@@ -1,0 +1,188 @@
+"""What the report's first page opens with: what the project does, the planner's row of the
+benchmark beside the best of the rest, and what learning adds to a search and what it does not.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.report.cells import fixed, milliseconds, share
+from constraint_geodesics.report.page import Links, Table, runs_link
+from constraint_geodesics.report.results import read_metrics
+from constraint_geodesics.report.standing import (
+    CHOICE,
+    PLANNER,
+    WHERE,
+    best_of_families,
+    planner_result,
+)
+from constraint_geodesics.studies.proposals import POLICY, STILL
+
+PURPOSE = (
+    "Given a start, a goal and a constraint, such as a cup that stays level, the planner finds the "
+    "shortest robot path that keeps the constraint, and certifies it on the whole path, not only "
+    "at its samples."
+)
+BELOW = (
+    "Below stand its row beside the best of the rest, what learning adds to a search and what it "
+    "does not, and every table and figure of the pipeline, which learns one manifold for all "
+    "constraints and searches it by policies."
+)
+NOT_RUN = "How it stands beside others is measured by make bench, which has left no rows here."
+COLUMNS = ("queries × seeds", "solved", "length, p95", "median [ms]")
+FOOTINGS = {"trained on": "constraints it was trained on", "never seen": "constraints never seen"}
+"""Groups of constraints in the figures of the policies, in words."""
+QUESTIONS = (
+    ("solved", "solved with one curve", 1),
+    ("ratio_p95", "length of that curve, p95", -1),
+    ("refined", "solved once the planner's band has refined it", 1),
+)
+"""Columns in which a policy and the same search without one are compared: name, words, and whether
+more of it is better or less.
+"""
+
+
+def opening(layout: Layout, measured: bool) -> list[str]:
+    """Three sentences: what the planner does, what it reaches, and what stands below.
+
+    measured: whether the benchmark has left its tables.
+    """
+    return [PURPOSE, planner_result(_overview(layout)) if measured else NOT_RUN, BELOW]
+
+
+def planner_row(layout: Layout) -> Table:
+    """The planner's row of the benchmark in both scenes, and that of the best of the rest."""
+    overview = _overview(layout)
+    about = json.loads((layout.root / "reports" / "benchmark" / "about.json").read_text())
+    scenes = {scene: words for scene, words in WHERE.items() if scene in set(overview["scene"])}
+    found = {(row["planner"], row["scene"]): row for row in overview.to_dict("records")}
+    planners = [PLANNER, *best_of_families(overview)[:1]]
+    rows = [
+        [name, *(cell for scene in scenes for cell in _row_cells(found[name, scene]))]
+        for name in planners
+    ]
+    note = (
+        "All constraints together; solved: of what any planner solved; length: over the best "
+        f"known, failures infinite. The best of the rest is the first by this rule: {CHOICE} Rows "
+        f"of commit {about['commit'][:12]}, {about['date']}, one thread of {about['processor']}."
+    )
+    return Table(
+        "The planner beside the best of the rest",
+        note,
+        ("planner", *COLUMNS * len(scenes)),
+        rows,
+        groups=[(words, len(COLUMNS)) for words in scenes.values()],
+        planners=planners,
+    )
+
+
+def _row_cells(row: Mapping[Any, Any]) -> tuple[str, ...]:
+    return (
+        f"{row['queries']} × {row['seeds']}",
+        share(row["success_of_solvable"], 1),
+        fixed(row["ratio_p95_all"], 3),
+        milliseconds(row["time_median_s"]),
+    )
+
+
+def _overview(layout: Layout) -> pd.DataFrame:
+    return pd.read_csv(layout.root / "reports" / "benchmark" / "overview.csv")
+
+
+class Learning(NamedTuple):
+    """What a policy adds to the same search without one, what it does not, and the figures."""
+
+    adds: Sequence[str]
+    lacks: Sequence[str]
+    table: Table
+
+
+def learning(params: Params, layout: Layout) -> Learning | None:
+    """A policy against the same search without one, on constraints it was trained on and on others,
+    in both scenes; None where the study has none of these.
+
+    One is better than the other where their 95 % intervals over the seeds are apart.
+    """
+    found = read_metrics(layout.report("benchmark_policies", "policies"))
+    compared = {
+        f"{words}, {where}": found[group][scene]
+        for group, words in FOOTINGS.items()
+        for scene, where in WHERE.items()
+        if {POLICY, STILL} <= set(found.get(group, {}).get(scene, ()))
+    }
+    if not compared:
+        return None
+    adds, lacks = [], []
+    for column, words, sign in QUESTIONS:
+        places: dict[int, list[str]] = {1: [], 0: [], -1: []}
+        for footing, rows in compared.items():
+            told = f"{footing} ({_number(rows[POLICY], column)} against "
+            told += f"{_number(rows[STILL], column)})"
+            places[sign * _apart(rows[POLICY], rows[STILL], column)].append(told)
+        said = words[:1].upper() + words[1:]
+        adds += [f"{said}: better on {'; '.join(places[1])}."] if places[1] else []
+        for verdict, judged in ((0, "no difference that the intervals show"), (-1, "worse")):
+            lacks += [f"{said}: {judged} on {'; '.join(places[verdict])}."] * bool(places[verdict])
+    footing, rows = next(iter(compared.items()))
+    if PLANNER in rows:
+        lacks.append(
+            f"The planner, in which nothing is learned, solves {_number(rows[PLANNER], 'solved')} "
+            f"on {footing}, in {rows[PLANNER]['time_ms_iqm']:.3g} ms against the policy's "
+            f"{rows[POLICY]['time_ms_iqm']:.3g}."
+        )
+    nothing = "Nothing that the intervals over the seeds show."
+    return Learning(adds or [nothing], lacks, _learning_table(params, compared))
+
+
+def _learning_table(params: Params, compared: Mapping[str, Mapping[str, Any]]) -> Table:
+    cells = [
+        [
+            f"{footing}: {method}",
+            str(rows[method]["solvable"]),
+            str(rows[method]["seeds"]),
+            *(_with_interval(rows[method], column) for column, _, _ in QUESTIONS),
+        ]
+        for footing, rows in compared.items()
+        for method in (POLICY, STILL)
+    ]
+    note = (
+        "One cubic a query, with the same time for both; interquartile means over the seeds and "
+        "their 95 % intervals; solved: of what anything solves; length: over the shortest "
+        "certified path known, of what was solved. From "
+        "reports/benchmark_policies/policies.json; all methods stand below."
+    )
+    return Table(
+        "A policy, and the same search without one",
+        note,
+        ("on", "queries", "seeds", *(words for _, words, _ in QUESTIONS)),
+        cells,
+        planners=[method for _ in compared for method in (POLICY, STILL)],
+        links=[Links(runs_link("benchmark_policies", params.policies.chart))] * len(cells),
+    )
+
+
+def _apart(one: Mapping[str, Any], other: Mapping[str, Any], column: str) -> int:
+    """1 where the interval of one lies above the other's, -1 below, 0 where they meet or one of
+    them is not known.
+    """
+    low, high, other_low, other_high = (
+        own[f"{column}_{end}"] for own in (one, other) for end in ("low", "high")
+    )
+    if None in (low, high, other_low, other_high):
+        return 0
+    return int(low > other_high) - int(high < other_low)
+
+
+def _number(row: Mapping[str, Any], column: str, end: str = "iqm") -> str:
+    value = row[f"{column}_{end}"]
+    return fixed(value, 3) if column.startswith("ratio") else share(value, 1)
+
+
+def _with_interval(row: Mapping[str, Any], column: str) -> str:
+    middle, known = _number(row, column), row[f"{column}_low"] is not None
+    low, high = _number(row, column, "low"), _number(row, column, "high")
+    return f"{middle} [{low}, {high}]" if known else middle

@@ -1,0 +1,191 @@
+"""Who is ahead in the benchmark at equal time, where the planner loses, and which planners stand
+for the rest: in sentences, from its tables.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pandas as pd
+
+from constraint_geodesics.benchmark.queries import KEEP_OUT, TABLE
+from constraint_geodesics.benchmark.statistics import (
+    AHEAD,
+    all_constraints,
+    quantile_with_failures,
+    ratio_of,
+)
+from constraint_geodesics.palette import planner_family
+from constraint_geodesics.report.benchmark_tables import FEW, ahead_text
+from constraint_geodesics.report.cells import fixed, milliseconds, share
+
+PLANNER = "planner"
+"""Its name in params.yaml, to which every baseline is compared."""
+WHERE = {TABLE: "in the workcell", KEEP_OUT: "with a sphere on the way"}
+"""What a sentence says of each scene."""
+ASKED = 30
+"""Queries in each scene below which a planner does not stand for others."""
+SERVES = 0.5
+"""Of the queries, a planner that solves less is no loss where it is sooner."""
+CHOICE = (
+    "Of each family but the planner's own the one that solves most in its worse scene, at a tie "
+    f"the one with the shorter 95th percentile of length, among those asked {ASKED} queries or "
+    "more in every scene."
+)
+"""Who stands for the rest, and in which order: `best_of_families`."""
+
+
+def best_of_families(overview: pd.DataFrame) -> list[str]:
+    """The planners that CHOICE names, the best first; where the planner itself was asked fewer
+    queries, so many are enough.
+
+    overview: the benchmark's summary with all constraints together.
+    """
+    least = min(ASKED, int(overview.loc[overview["planner"] == PLANNER, "queries"].min()))
+    figures = overview.groupby("planner", sort=False).agg(
+        scenes=("scene", "nunique"),
+        queries=("queries", "min"),
+        solved=("success_of_solvable", "min"),
+        length=("ratio_p95_all", "max"),
+    )
+    families = figures.index.map(lambda name: planner_family(str(name)) or "")
+    asked = (figures["queries"] >= least) & (figures["scenes"] == overview["scene"].nunique())
+    rest = figures.assign(family=families)[asked & (families != planner_family(PLANNER))]
+    ordered = rest.sort_values(["solved", "length"], ascending=[False, True], kind="stable")
+    return [str(name) for name in ordered.drop_duplicates("family").index]
+
+
+def winner(budgets: pd.DataFrame) -> str:
+    """Who is ahead at equal time: the planner, unless a baseline is ahead of it in more cases of
+    constraint, scene and time than behind; then the one with the largest surplus.
+
+    budgets: of `ours_against_baselines`.
+    """
+    surplus = (
+        budgets["verdict"]
+        .map({"ahead": 1, "behind": -1})
+        .fillna(0)
+        .groupby(budgets["baseline"], sort=False)
+        .sum()
+    )
+    return str(surplus.idxmax()) if len(surplus) and surplus.max() > 0 else PLANNER
+
+
+def equal_time(budgets: pd.DataFrame) -> str:
+    """How the planner and its baselines stand within the same time."""
+    first = winner(budgets)
+    if first == PLANNER:
+        return ahead_text(budgets)
+    own = budgets.loc[budgets["baseline"] == first, "verdict"].value_counts()
+    return (
+        f"It is ahead of the planner in {own.get('ahead', 0)} cases of constraint, scene and "
+        f"budget, and behind in {own.get('behind', 0)}. {ahead_text(budgets)}"
+    )
+
+
+def planner_result(overview: pd.DataFrame) -> str:
+    """What the planner reaches in each scene, all constraints together."""
+    own = overview[overview["planner"] == PLANNER].set_index("scene")
+    told = [
+        f"{where} it solves {share(own['success_of_solvable'][scene], 1)} of what any planner "
+        f"solved, in {milliseconds(own['time_median_s'][scene])} ms at the median and, in 95 % of "
+        f"the cases, within {fixed(own['ratio_p95_all'][scene], 3)} times the shortest path known"
+        for scene, where in WHERE.items()
+        if scene in own.index
+    ]
+    text = "; ".join(told)
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def losses(rows: pd.DataFrame, budgets: pd.DataFrame) -> dict[str, str]:
+    """Where a baseline is ahead of the planner: a title and what it is, for each way to be ahead.
+
+    rows: of the benchmark's table.  budgets: of `ours_against_baselines`.
+    """
+    pairs = compared(rows, list(dict.fromkeys(map(str, budgets["baseline"]))))
+    told = {
+        "Within the same time": _within(budgets),
+        "At the median": _sooner(pairs),
+        "At the 95th percentile of length, whatever time it takes": _shorter(pairs),
+    }
+    found = {title: f"{'; '.join(parts)}." for title, parts in told.items() if parts}
+    nothing = "no baseline is ahead within the same time, sooner at the median, or shorter."
+    return found or {"Nowhere": nothing}
+
+
+def compared(rows: pd.DataFrame, baselines: Sequence[str]) -> pd.DataFrame:
+    """The planner and each baseline over the solvable queries that both were asked, all
+    constraints together: one row a scene and baseline.
+
+    queries; success, time_s (median) and ratio_p95 (of length over the best known, failures
+    infinite), and the same of the baseline behind `baseline_`.
+    """
+    pooled = all_constraints(rows)
+    pooled = pooled.assign(ratio=ratio_of(pooled))[pooled["best_known_rad"].notna()]
+    names = [f"{whose}{name}" for whose in ("", "baseline_") for name in _figures(pooled)]
+    table: list[dict[str, Any]] = []
+    for scene in WHERE:
+        case = pooled[pooled["scene"] == scene]
+        mine = case[case["planner"] == PLANNER]
+        for baseline in baselines:
+            theirs = case[(case["planner"] == baseline) & case["query"].isin(mine["query"])]
+            same = mine[mine["query"].isin(theirs["query"])]
+            if len(theirs):
+                figures = (*_figures(same).values(), *_figures(theirs).values())
+                about = {"scene": scene, "baseline": baseline, "queries": same["query"].nunique()}
+                table.append(about | dict(zip(names, figures, strict=True)))
+    return pd.DataFrame(table, columns=["scene", "baseline", "queries", *names])
+
+
+def _figures(own: pd.DataFrame) -> dict[str, float]:
+    return {
+        "success": float(own["valid"].mean()),
+        "time_s": float(own["time_s"].median()),
+        "ratio_p95": quantile_with_failures(own["ratio"].to_numpy(), 0.95),
+    }
+
+
+def _within(budgets: pd.DataFrame) -> list[str]:
+    ahead = budgets[budgets["verdict"] == "ahead"]
+    sure = ahead[ahead["queries"] >= FEW]
+    told = []
+    for (budget, scene), case in sure.groupby(["budget_s", "scene"]):
+        names = " and ".join(
+            f"{baseline} under {', '.join(own['constraint'])}"
+            for baseline, own in case.groupby("baseline", sort=False)
+        )
+        told.append(f"in {_duration(budget)} {WHERE[str(scene)]}, {names}")
+    few = len(ahead) - len(sure)
+    if few:
+        told.append(f"{few} comparisons over fewer than {FEW} queries stand in a table below")
+    return told
+
+
+def _sooner(pairs: pd.DataFrame) -> list[str]:
+    sooner = pairs[pairs["baseline_time_s"] < pairs["time_s"]]
+    serving = sooner[sooner["baseline_success"] >= SERVES]
+    told = [
+        f"{row['baseline']} {WHERE[row['scene']]}, in {milliseconds(row['baseline_time_s'])} ms "
+        f"against {milliseconds(row['time_s'])} (it solves {share(row['baseline_success'], 1)}, "
+        f"the planner {share(row['success'], 1)})"
+        for row in _rows(serving)
+    ]
+    rest = len(sooner) - len(serving)
+    return told + ([f"{rest} more that solve less than half"] if rest else [])
+
+
+def _shorter(pairs: pd.DataFrame) -> list[str]:
+    shorter = pairs[pairs["baseline_ratio_p95"] * (1.0 + AHEAD) < pairs["ratio_p95"]]
+    return [
+        f"{row['baseline']} {WHERE[row['scene']]}, {fixed(row['baseline_ratio_p95'], 3)} times the "
+        f"best known against {fixed(row['ratio_p95'], 3)} on {row['queries']} queries, in "
+        f"{milliseconds(row['baseline_time_s'])} ms against {milliseconds(row['time_s'])}"
+        for row in _rows(shorter)
+    ]
+
+
+def _rows(pairs: pd.DataFrame) -> list[Mapping[Any, Any]]:
+    return list(pairs.to_dict("records"))
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:g} s" if seconds >= 1.0 else f"{1e3 * seconds:g} ms"
