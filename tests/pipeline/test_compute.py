@@ -291,10 +291,20 @@ def test_progress_on_a_terminal_is_a_bar() -> None:
     assert "2/2" in shown
 
 
-def test_waiting_is_seen_on_a_terminal_alone(capfd: pytest.CaptureFixture[str]) -> None:
+def test_waiting_in_a_log_or_a_notebook_is_one_line_where_it_is_long(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     with waiting("loading the planner"):
         pass
     assert capfd.readouterr() == ("", "")
+    monkeypatch.setattr("constraint_geodesics.pipeline.progress.LINE_AFTER_S", 0.05)
+    for description, line in (("loading [it]", "loading [it] …\n"), ("", "")):
+        with waiting(description):
+            time.sleep(0.3)
+        assert capfd.readouterr() == ("", line)
+
+
+def test_waiting_on_a_terminal_gives_way_to_a_bar() -> None:
     program = (
         "from constraint_geodesics.pipeline.progress import progress, waiting\n"
         "with waiting('loading [it]'):\n"

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -11,6 +12,8 @@ if TYPE_CHECKING:  # Rich is loaded where there is a terminal, not for `geodesic
     from rich.progress import Progress
 
 LINE_EVERY_S = 15.0
+LINE_AFTER_S = 2.0
+"""Work that is over sooner says nothing where there is no terminal."""
 
 
 def progress(description: str, total: int) -> AbstractContextManager[Callable[[], None]]:
@@ -29,10 +32,12 @@ def progress(description: str, total: int) -> AbstractContextManager[Callable[[]
 def waiting(description: str) -> Iterator[None]:
     """Show that work whose length nobody knows goes on: on a terminal a line with the time it took
     so far, which goes when the work is done and gives way to a bar of `progress` within it;
-    elsewhere nothing.  An empty description shows nothing.
+    elsewhere, a notebook too, one plain line after two seconds.  An empty description shows
+    nothing.
     """
     if not description or not sys.stderr.isatty():
-        yield
+        with _line_after(f"{description} …" if description else ""):
+            yield
         return
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -45,6 +50,19 @@ def waiting(description: str) -> Iterator[None]:
             yield
         finally:
             _waiting.remove(line)
+
+
+@contextmanager
+def _line_after(line: str) -> Iterator[None]:
+    """Write a line if the body is not over soon."""
+    late = threading.Timer(LINE_AFTER_S, print, (line,), {"file": sys.stderr, "flush": True})
+    late.daemon = True
+    if line:
+        late.start()
+    try:
+        yield
+    finally:
+        late.cancel()
 
 
 _waiting: list["Progress"] = []
