@@ -64,8 +64,10 @@ def _said(q: Any, robot: "SerialRobot") -> str:
     """Which value can't be meant in rad, where all are possible in degrees; else blank."""
     import numpy as np
 
-    rows, turning = np.atleast_2d(np.asarray(q, float)), ~robot.chain.prismatic
-    beyond = np.where(turning, np.maximum(robot.lower - rows, rows - robot.upper), 0.0)
+    rows = np.atleast_2d(np.asarray(q, float))
+    endless = np.isin(robot.joint_names, list(robot.continuous))  # whole turns are its controller's
+    counted = ~(robot.chain.prismatic | endless)
+    beyond = np.where(counted, np.maximum(robot.lower - rows, rows - robot.upper), 0.0)
     mended = _in_rad(rows, robot)
     inside = (mended >= robot.lower - ROOM_RAD) & (mended <= robot.upper + ROOM_RAD)
     if not (inside.all() and beyond.max() > FAR_RAD):
