@@ -12,6 +12,9 @@ if TYPE_CHECKING:  # Rich is loaded where there is a terminal, not for `geodesic
     from rich.progress import Progress
 
 LINE_EVERY_S = 15.0
+CELL_EVERY_S = 0.2
+CELL_WIDTH = 30
+"""Of a bar in a notebook [letters]."""
 LINE_AFTER_S = 2.0
 """Work that is over sooner says nothing where there is no terminal."""
 
@@ -19,13 +22,16 @@ LINE_AFTER_S = 2.0
 def progress(description: str, total: int) -> AbstractContextManager[Callable[[], None]]:
     """Show how many of `total` tasks are done; the function it gives is called after each of them.
 
-    On a terminal a bar with the time left.  Elsewhere plain lines: one at every quarter, one where
-    15 s passed since the last, and with CI=true the last line alone.  An empty description shows
-    nothing.
+    On a terminal and in a notebook a bar with the time left.  Elsewhere plain lines: one at every
+    quarter, one where 15 s passed since the last, and with CI=true the last line alone.  An empty
+    description shows nothing.
     """
     if not description:
         return nullcontext(lambda: None)
-    return _bar(description, total) if sys.stderr.isatty() else _lines(description, total)
+    if sys.stderr.isatty():
+        return _bar(description, total)
+    in_notebook = type(sys.stderr).__module__.startswith("ipykernel")
+    return _cell(description, total) if in_notebook else _lines(description, total)
 
 
 @contextmanager
@@ -104,6 +110,34 @@ def _bar(description: str, total: int) -> Iterator[Callable[[], None]]:
             bar.update(task, advance=1, left=_time_left(done, total, start))
 
         yield advance
+
+
+@contextmanager
+def _cell(description: str, total: int) -> Iterator[Callable[[], None]]:
+    """One line that is written again and again: Rich's bars need widgets in a notebook."""
+    start = shown = time.monotonic()
+    done = longest = 0
+
+    def write(end: str = "") -> None:
+        nonlocal longest
+        full = CELL_WIDTH * done // max(total, 1)
+        bar = "━" * full + "─" * (CELL_WIDTH - full)
+        left = f", {_time_left(done, total, start)}" if done else ""
+        line = f"{description} {bar} {done}/{total}{left}"
+        longest = max(longest, len(line))
+        print(f"\r{line:<{longest}}", end=end, file=sys.stderr, flush=True)
+
+    def advance() -> None:
+        nonlocal done, shown
+        done += 1
+        if done == total:
+            write("\n")
+        elif time.monotonic() - shown >= CELL_EVERY_S:
+            shown = time.monotonic()
+            write()
+
+    write()
+    yield advance
 
 
 @contextmanager
