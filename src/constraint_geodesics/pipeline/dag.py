@@ -17,8 +17,7 @@ import numpy as np
 from dvc.repo import Repo
 from scipy.optimize import isotonic_regression
 
-LEFT_OUT = ("digest_code", "stages/")
-"""Beginnings of the names of stages that are not drawn."""
+LEFT_OUT = "digest_code"
 GAP = 3
 """Columns between two names, at least."""
 SWEEPS = 6
@@ -38,10 +37,12 @@ class Bus(NamedTuple):
 
 
 def pipeline(root: Path = Path()) -> tuple[nx.DiGraph, dict[str, int]]:
-    """What needs what, an edge from each script to the next, and how many items each has."""
+    """What needs what of dvc.yaml, an edge from each script to the next, and how many items each
+    has.
+    """
     with Repo(str(root)) as repo:
         graph = repo.index.graph
-        stages = [own for own in graph if not own.addressing.startswith(LEFT_OUT)]
+        stages = [s for s in graph if s.path_in_repo == "dvc.yaml" and s.name != LEFT_OUT]
         script = {own: Path(shlex.split(own.cmd)[1]).stem for own in stages}
         needed = [(first, then) for then, first in graph.edges if {first, then} <= set(stages)]
     edges = {(script[first], script[then]) for first, then in needed}
