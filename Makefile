@@ -58,7 +58,7 @@ repro: env  ## run all stages that are out of date, then print the results
 pretrained: env  ## copy the planner that was built into the package, for those who install it
 	geodesics package
 
-dag: env  ## the pipeline as a graph, a node a stage
+dag: env  ## the pipeline as a drawing, a name a script
 	@python -m constraint_geodesics.pipeline.dag
 
 smoke: env  ## the same pipeline on small parameters, in a copy of this checkout

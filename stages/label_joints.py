@@ -2,6 +2,7 @@
 queries.
 """
 
+import json
 import sys
 
 from constraint_geodesics.constraints.constraint import constraint_manifold
@@ -20,13 +21,17 @@ from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.text_files import write_text
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
+from constraint_geodesics.tracking.store import stable
 
 STAGE = "label_joints"
 
 
 def main(params: Params, layout: Layout, constraint: str) -> None:
-    """Write data/joints/<constraint>/ and its data card."""
+    """Write data/joints/<constraint>/, its data card and, in a file of their own, since DVC and
+    MLflow show every number of a card, the histograms of its columns.
+    """
     scene = Scene.from_params(params, constraint)
     manifold = constraint_manifold(scene.robot, params.constraints[constraint])
     labels = params.labels
@@ -43,15 +48,18 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
         )
         shards = parallel_map(draw_shard, tasks, params.compute, description=f"label {constraint}")
         queries = draw_queries(scene, manifold, constraint, labels.queries, labels.query_seed)
-        card = {
+        drawn_with = {
             "constraint": constraint,
             "robot": scene.robot.name,
             "seed": str(labels.seed),
             "rows": str(rows),
         }
-        write_joints(shards, layout.joints(constraint), card)
+        write_joints(shards, layout.joints(constraint), drawn_with)
         write_queries(queries, layout.queries(constraint))
-        run.report(data_card(shards), layout.report(STAGE, constraint))
+        card = data_card(shards)
+        histograms = stable(card.pop("histograms"))
+        write_text(layout.report(STAGE, f"{constraint}-histograms"), json.dumps(histograms) + "\n")
+        run.report(card, layout.report(STAGE, constraint))
 
 
 if __name__ == "__main__":

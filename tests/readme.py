@@ -108,12 +108,23 @@ def _range(values: list[float]) -> str:
     return low if low == high else f"{low} to {high}"
 
 
+def with_pipeline(text: str) -> str:
+    """A page's text with the drawing of `make dag`."""
+    from constraint_geodesics.pipeline.dag import drawing, pipeline
+
+    return replaced(text, "dag", f"```text\n{drawing(*pipeline(ROOT))}\n```")
+
+
 def with_numbers(text: str) -> str:
     """A page's text with every quoted number as the reports have it now."""
     return QUOTED.sub(_requoted, text)
 
 
-PAGES = {README: with_planners, RESULTS: filled, EXPERIMENTS: with_stage_times}
+PAGES = {
+    README: with_planners,
+    RESULTS: filled,
+    EXPERIMENTS: lambda text: with_pipeline(with_stage_times(text)),
+}
 NUMBERED = ("scenes.md", "problems.md", "scaling.md", "reliability.md")
 PAGES |= {ROOT / "docs" / page: with_numbers for page in NUMBERED}
 """What brings each page up to date."""

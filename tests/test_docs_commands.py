@@ -2,6 +2,7 @@
 here.
 """
 
+import gzip
 import os
 import re
 import shutil
@@ -16,6 +17,7 @@ import pytest
 import yaml
 
 from constraint_geodesics import bundle
+from tests.benchmark.problem_fixtures import moveit_pair
 from tests.identification.hidden import demonstrations
 from tests.planner_fixtures import packaged_planner
 from tests.test_cli_plan import called
@@ -54,6 +56,7 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "geodesics replay FILE": ("tests/recording/test_recording.py", "open_recordings"),
     "geodesics demo": ("tests/test_cli_demo.py", '"demo"'),
     "geodesics bench": ("tests/test_cli_json.py", '"bench"'),
+    "geodesics bench --problems": HERE,
     "geodesics serve": (REGISTRY, "geodesics (serve"),
     "geodesics ui": ("tests/tracking/test_experiment.py", "ui_command"),
     "make": MAKE,
@@ -62,16 +65,19 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "dvc exp diff": (EXPERIMENT, '"dvc", "exp", "diff"'),
     "dvc exp run": (EXPERIMENT, '"dvc", "exp", "run"'),
     "dvc exp show": (EXPERIMENT, '"dvc", "exp", "show"'),
+    "dvc metrics show": (EXPERIMENT, '"dvc", "metrics", "show"'),
     "dvc metrics diff": (EXPERIMENT, '"dvc", "metrics", "diff"'),
     "dvc params diff": (EXPERIMENT, '"dvc", "params", "diff"'),
     "dvc plots diff": (EXPERIMENT, '"dvc", "plots", "diff"'),
     "dvc repro": ("tests/end_to_end/smoke.py", '"repro"'),
+    "dvc status": (EXPERIMENT, '"dvc", "status"'),
+    "git commit": (EXPERIMENT, '"git", "commit"'),
     "git restore": (EXPERIMENT, '"git", "restore"'),
     "git status": (EXPERIMENT, '"git", "status"'),
     "mlflow server": (SERVERS, '"mlflow", "server"'),
-    "dvc remote": (SERVERS, '"remote"'),
-    "dvc push": (SERVERS, '"push"'),
-    "dvc pull": (SERVERS, '"pull"'),
+    "dvc remote": (EXPERIMENT, '"dvc", "remote"'),
+    "dvc push": (EXPERIMENT, '"dvc", "push"'),
+    "dvc pull": (EXPERIMENT, '"dvc", "pull"'),
     "dask": ("tests/pipeline/cluster.py", '"-m", "dask"'),
     "curl": (REGISTRY, "curl"),
     "source": ("tests/test_doctor.py", "source .venv/bin/activate"),
@@ -88,7 +94,7 @@ def kind_of(words: list[str]) -> str:
     """The name of a command in COVERED."""
     if words[:2] == ["geodesics", "replay"] and words[2:]:
         return "geodesics replay FILE"
-    if words[:3] == ["geodesics", "results", "--experiments"]:
+    if words[2:3] in (["--experiments"], ["--problems"]):
         return " ".join(words[:3])
     length = {
         "geodesics": 2,
@@ -124,9 +130,14 @@ def test_every_command_is_run_somewhere() -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a newcomer's checkout has of the files that commands read, a first path among them."""
+    """What a newcomer's checkout has of the files that commands read, a first path among them; a
+    planner gets little time for a problem of others.
+    """
     folder = tmp_path_factory.mktemp("checkout")
-    shutil.copy(ROOT / "params.yaml", folder)
+    params = (ROOT / "params.yaml").read_text()
+    (folder / "params.yaml").write_text(
+        re.sub(r"^(  (held_)?limit_s:).*", r"\1 2.0", params, flags=re.M)
+    )
     (folder / "reports").mkdir()
     for name in ("table.md", "table.csv"):
         shutil.copy(ROOT / "reports" / name, folder / "reports")
@@ -144,6 +155,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "moveit_scene.yaml").write_text(yaml.safe_dump(state))
     request = {"goal_constraints": [{"joint_constraints": joints}]}
     (folder / "moveit_request.yaml").write_text(yaml.safe_dump(request))
+    (example,) = re.findall(r"^```json\n(.*?)^```", TEXTS["problems.md"].read_text(), re.S | re.M)
+    (folder / "panda.json.gz").write_bytes(gzip.compress(example.encode()))
+    moveit_pair(folder / "folder_of_moveit", "0001")
     return folder
 
 
@@ -180,6 +194,7 @@ def test_a_command_of_ours_does_what_its_page_says(words, folder, monkeypatch, c
         "identify": "keeps the direction (0, 0, 1)",
         "results": "planner",
         "replay": "path.rrd",
+        "bench": "rows: .geodesics/bench/problems.csv.gz",
     }
     assert expected[words[1]] in out
 

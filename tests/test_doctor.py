@@ -39,7 +39,7 @@ from constraint_geodesics.doctor import (
 )
 from constraint_geodesics.robot.kinematics import RobotError
 from constraint_geodesics.scene.urdf import data_path, find_urdf
-from tests.test_cli_plan import strict
+from tests.test_cli_plan import said_aloud, strict
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(bundle.__file__).parent
@@ -165,7 +165,12 @@ def test_packages_are_compared_with_the_lock(tmp_path) -> None:
     assert missing.message == "1 of 4 are missing: PyYAML"
     assert other.message == "1 of 4 are of another version: numpy 1.26.4, not 2.4.6"
     assert missing.status == other.status == "problem"
-    assert missing.mend == "python -m pip install -r requirements.lock"
+    words = missing.mend.split()
+    assert words[:4] == ["python", "-m", "pip", "install"]
+    assert (ROOT / words[-1]).is_file()
+    makefile = (ROOT / "Makefile").read_text()
+    (hashed,) = re.findall(r"^HASHED := (.*)$", makefile, re.M)
+    assert set(words[4:-2]) == set(hashed.split()) - {"$(INSTALL)", "--no-compile"}
     lock.write_text("torch==2.12.0\n")
     found = only(look("packages", tmp_path, here), "problem")
     assert "torch 2.13.0+cpu, not 2.12.0" in found.message
@@ -745,7 +750,7 @@ def command(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
 def test_the_command_tells_by_its_exit_code(tmp_path) -> None:
     robot_checkout(tmp_path, "xarm/xarm9_robot.urdf")
     done = command("doctor", folder=tmp_path)
-    assert (done.returncode, done.stderr) == (1, "")
+    assert (done.returncode, said_aloud(done.stderr)) == (1, [])
     assert "\033" not in done.stdout
     lines = done.stdout.splitlines()
     assert [line for line in lines if re.match(r"problem  robot: +xarm/xarm9_robot.urdf", line)]

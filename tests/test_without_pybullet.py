@@ -13,6 +13,7 @@ from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.robot.kinematics import load_robot
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.scene import Scene
+from tests.test_cli_plan import error_line
 
 ROBOT = Path(__file__).resolve().parent / "robots" / "six_axis.urdf"
 POST = Box("post", (0.45, 0.0, 0.4), (0.06, 0.06, 0.8))
@@ -145,5 +146,5 @@ def test_the_arm_that_comes_with_pybullet_is_asked_for_in_one_line(tmp_path) -> 
     ends = ("--start=0 0 -1 0 0 0", "--goal=0 0 -1 0 0 0", "--constraint=free")
     done = run(COMMAND.format(words=["geodesics", "plan", *ends]), tmp_path)
     assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
+    line = error_line(done.stderr)
     assert line.startswith("error: xarm/xarm6_robot.urdf: no such URDF here, and PyBullet")

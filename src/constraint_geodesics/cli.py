@@ -18,7 +18,7 @@ from constraint_geodesics.cli_problems import ProblemOptions, bench_problems
 from constraint_geodesics.errors import ParamsError
 from constraint_geodesics.extras import MissingExtraError, require
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.progress import progress
+from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
 from constraint_geodesics.pipeline.threads import ONE_THREAD
 from constraint_geodesics.text_files import write_text
@@ -39,6 +39,29 @@ app = typer.Typer(
     rich_markup_mode=None,  # plain help starts in half the time, and keeps the units' brackets
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def _say_version(wanted: bool) -> None:
+    if not wanted:
+        return
+    from importlib import metadata
+
+    try:
+        about = metadata.metadata("constraint-geodesics")
+    except metadata.PackageNotFoundError:
+        line = "the package is not installed, only found by PYTHONPATH: it has no version"
+        raise RuntimeError(line) from None
+    print(about["Name"], about["Version"])
+    raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: bool = typer.Option(
+        False, "--version", callback=_say_version, is_eager=True, help="Print name and version."
+    ),
+) -> None:
+    """What `geodesics` takes before the name of a command."""
 
 
 app.command("plan", context_settings={"allow_extra_args": False})(cli_planning.plan)
@@ -92,7 +115,8 @@ def check_params(
     from constraint_geodesics.params import load_params
 
     try:
-        check(load_params(file))
+        with waiting(f"checking {file}"):
+            check(load_params(file))
     except ParamsError as error:
         if not as_json:
             raise
@@ -109,7 +133,9 @@ def look_for_trouble(as_json: bool = JSON) -> None:
     """
     from constraint_geodesics import doctor
 
-    raise SystemExit(doctor.show(Path(), json_wanted=as_json))
+    with waiting("looking at this checkout"):
+        findings = doctor.examine(Path())
+    raise SystemExit(doctor.show(findings, json_wanted=as_json))
 
 
 @app.command("recover")
@@ -155,16 +181,7 @@ def warm_up(
     from constraint_geodesics import warmup
 
     began, done_before = time.perf_counter(), warmup.is_done()
-    if not done_before:
-        on_terminal = sys.stderr.isatty()
-        with progress("compiling" if on_terminal else "", warmup.pieces()) as advance:
-
-            def tell(name: str, seconds: float) -> None:
-                if not on_terminal:
-                    print(f"{name}: {seconds:.1f} s", file=sys.stderr, flush=True)
-                advance()
-
-            warmup.ensure(jobs, tell)
+    cli_planning.compile_kernels(jobs)
     seconds = time.perf_counter() - began
     if as_json:
         print(json.dumps({"compiled": not done_before, "seconds": round(seconds, 1)}))

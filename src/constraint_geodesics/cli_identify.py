@@ -19,6 +19,7 @@ from constraint_geodesics.cli_planning import (
     Urdf,
     loading,
 )
+from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
 
 
@@ -91,7 +92,9 @@ def identify_constraint(
             raise PlannerError("--where-shown is of the file that --out names: give it, too")
         if not 0.0 <= loosely < math.inf:
             raise PlannerError(f"--loosely {loosely}: must be 0 or more, and finite")
-        with loading(), Arm(planner, urdf, tool_link, tool_pose, hold, srdf).open() as loaded:
+        with loading():
+            loaded = Arm(planner, urdf, tool_link, tool_pose, hold, srdf).open()
+        with loaded, waiting(f"looking what {demonstrations} keeps to"):
             robot, workcell = loaded.robot, loaded.scene.workcell
             shown, motions = demonstrations_from(demonstrations, robot)
             found = identify(shown if motions else np.concatenate(shown), robot)

@@ -11,8 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from constraint_geodesics import completion
+from constraint_geodesics.cli_degrees import (
+    refuse_degrees,
+    refuse_degrees_of_pose,
+    refuse_degrees_of_table,
+)
 from constraint_geodesics.extras import require
-from constraint_geodesics.pipeline.progress import waiting
+from constraint_geodesics.pipeline.progress import progress, waiting
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
 
 if TYPE_CHECKING:
@@ -20,6 +25,8 @@ if TYPE_CHECKING:
     from constraint_geodesics.constraints.constraint import Constraint, Pose
     from constraint_geodesics.goals.goal import Wanted
     from constraint_geodesics.planner import Planner
+    from constraint_geodesics.scene.scene_file import SceneFile
+    from constraint_geodesics.trajectory import Trajectory
 
 NO_PATH = 3
 POSE = '"x y z roll pitch yaw", in m and rad'
@@ -87,12 +94,12 @@ class Arm(NamedTuple):
         """
         from constraint_geodesics.scene.scene_file import read_attached, read_scene
 
-        files = [read_scene(file) for file in self.scenes or ()]
-        files += [read_attached(file) for file in self.attached or ()]
+        files = [(file, read_scene(file)) for file in self.scenes or ()]
+        files += [(file, read_attached(file)) for file in self.attached or ()]
         found = self._planner(method)
         try:
-            for file in files:
-                file.into(found.scene)
+            for file, said in files:
+                _add(said, file, found)
         except BaseException:
             found.close()
             raise
@@ -113,6 +120,16 @@ class Arm(NamedTuple):
         tool = None if self.tool_pose is None else _pose(self.tool_pose, "--tool-pose")
         values = dict(map(held, self.hold or []))
         return Planner.from_urdf(self.urdf, self.tool_link, self.srdf, tool, hold=values)
+
+
+def _add(said: "SceneFile", file: Path, planner: "Planner") -> None:
+    """Raises SceneError with the file's name."""
+    from constraint_geodesics.scene.scene import SceneError
+
+    try:
+        said.into(planner.scene)
+    except SceneError as error:
+        raise error if str(file) in str(error) else SceneError(f"{file}: {error}") from None
 
 
 class Ends(NamedTuple):
@@ -240,7 +257,9 @@ def plan(
         asked = None if moveit_request is not None else ends.asked()
         if moveit_request is not None and any(ends):
             raise PlannerError("--moveit-request goes without --start, --constraint and --goal…")
-        with loading(), arm.open(method) as loaded:
+        with loading():
+            loaded = arm.open(method)
+        with loaded:
             shown, state = None, None
             if demonstrations is not None:
                 shown, _ = demonstrations_from(demonstrations, loaded.robot)
@@ -255,16 +274,18 @@ def plan(
             else:
                 assert asked is not None
                 first, wanted = asked[0], [asked[1]]
+                refuse_degrees({"--start": first, "--goal": asked[1]}, loaded.robot)
                 kept = _constraint(asked[2], loaded)
-            path = loaded.plan(
-                first,
-                wanted,
-                kept,
-                budget_s=budget,
-                snap=snap,
-                velocity_scale=velocity_scale,
-                acceleration_scale=acceleration_scale,
-            )
+            with waiting("planning" if budget is None else f"planning for {budget:g} s"):
+                path = loaded.plan(
+                    first,
+                    wanted,
+                    kept,
+                    budget_s=budget,
+                    snap=snap,
+                    velocity_scale=velocity_scale,
+                    acceleration_scale=acceleration_scale,
+                )
             source = loaded.source
     except (
         *(BundleError, ConstraintError, DemonstrationError, MoveitError, PlannerError),
@@ -274,17 +295,52 @@ def plan(
     print(f"planner: {source}", file=sys.stderr)
     about: dict[str, Any] = path.summary()
     if path.status == "solved":
-        if out is not None:
-            path.save(out)
-        if record is not None:
-            path.record(record, demonstrations=shown)
-        if picture is not None:
-            path.draw(picture)
+        with waiting("writing"):
+            if out is not None:
+                path.save(out)
+            if record is not None:
+                path.record(record, demonstrations=shown)
+            if picture is not None:
+                path.draw(picture)
         if trajectory:
             about["trajectory"] = path.to_joint_trajectory()
-    told = json.dumps(about) if as_json or trajectory else f"{path.status}: {path.explanation}"
-    print(told)
+    print(json.dumps(about) if as_json or trajectory else _told(path))
     raise SystemExit(0 if path.status == "solved" else NO_PATH)
+
+
+def _told(path: "Trajectory") -> str:
+    """An answer in one line: the figures of a path and what is proven of it, or why there is
+    none.
+    """
+    certificate = path.certificate
+    if path.status != "solved" or certificate is None:
+        return f"{path.status}: {path.explanation}"
+    moved = path.statistics.snapped_rad
+    figures = [
+        f"{path.length_rad:.2f} rad",
+        f"motion {path.times[-1]:.2f} s",
+        f"planned in {_spent(path.planning_time_s)}",
+        *([f"from a start moved by {moved:.2g} rad"] if moved else []),
+    ]
+    name, constraint = path.constraint_name, path.constraint
+    proven = _proven(certificate, "" if constraint.is_free else name, constraint.caveat)
+    return f"solved: {', '.join(figures)}; proven: {proven}"
+
+
+def _spent(seconds: float) -> str:
+    """A time as people say it."""
+    if seconds >= 1.0:
+        return f"{seconds:.2f} s"
+    return f"{1e3 * seconds:.0f} ms" if seconds >= 1e-3 else "less than 1 ms"
+
+
+def _proven(certificate: "Certificate", constraint: str, caveat: str) -> str:
+    """What holds on the whole path, in words.  constraint: its name, blank for none."""
+    if not constraint:
+        return _clearance(certificate)
+    bound = f"at most {certificate.violation_bound:.1e} (rad, m) off {constraint}"
+    bound += f", {caveat}," if caveat else ""
+    return f"{bound} anywhere, {_clearance(certificate)}"
 
 
 def inverse_kinematics(
@@ -310,7 +366,9 @@ def inverse_kinematics(
     arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf, scene, attach)
     try:
         wanted = _pose(pose, "--pose")
-        with loading(), arm.open() as loaded:
+        with loading():
+            loaded = arm.open()
+        with loaded, waiting("looking for configurations"):
             found, names = loaded.ik(wanted), loaded.robot.joint_names
     except (BundleError, PlannerError, RobotError, SceneError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
@@ -351,15 +409,21 @@ def check(
     from constraint_geodesics.constraints.constraint import ConstraintError
     from constraint_geodesics.planner import PlannerError, SceneError
     from constraint_geodesics.robot.kinematics import RobotError
+    from constraint_geodesics.trajectory import read_trajectory
 
     arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf, scene, attach)
     try:
-        with loading(), arm.open() as loaded:
+        with loading():
+            loaded = arm.open()
+        with loaded, waiting(f"checking {file}"):
             own = None if constraint is None else _constraint(constraint, loaded)
             certificate = loaded.check(file, own)
+            broken = certificate.violation
+            if broken is not None and broken.kind == "joint_limits" and file.is_file():
+                rows = read_trajectory(file, robot=loaded.robot).joints
+                refuse_degrees_of_table(file, rows, loaded.robot)
     except (BundleError, ConstraintError, PlannerError, RobotError, SceneError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
-    broken = certificate.violation
     untimed = (
         " (no times: velocity and acceleration not looked at)"
         if math.isnan(certificate.duration_s)
@@ -367,15 +431,11 @@ def check(
     )
     meant = constraint or f"the constraint that {file.name} names"
     caveat = "" if own is None or isinstance(own, str) else own.caveat
-    meant = f"{meant}, {caveat}," if caveat else meant
     if as_json:
         print(json.dumps(certificate.summary()))
     elif broken is None:
-        print(
-            f"valid: {certificate.length_rad:.3f} rad, at most "
-            f"{certificate.violation_bound:.1e} (rad, m) off {meant} "
-            f"anywhere, {_clearance(certificate)}{untimed}"
-        )
+        proven = _proven(certificate, meant, caveat)
+        print(f"valid: {certificate.length_rad:.3f} rad, {proven}{untimed}")
     else:
         print(f"{broken.kind}: {broken.message}")
     raise SystemExit(0 if broken is None else NO_PATH)
@@ -428,7 +488,8 @@ def show_robot(
             params = RobotParams(
                 urdf=str(file), tool_link=tool_link, hold=values, may_touch=touching
             )
-            understood = understand(params)
+            with waiting("looking which links touch"):
+                understood = understand(params)
             about, lines = understood.summary(), list(understood.lines())
     except RobotError as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
@@ -438,15 +499,19 @@ def show_robot(
 @contextmanager
 def loading() -> Iterator[None]:
     """Say what a planner's user waits for: the compiler where it was not asked before."""
+    compile_kernels()
+    with waiting("loading the planner"):
+        yield
+
+
+def compile_kernels(jobs: int | None = None) -> None:
+    """With a bar, where they are not compiled.  jobs: processes, by default one a core."""
     from constraint_geodesics import warmup
 
-    what = "loading the planner"
     if not warmup.is_done():
-        what = "compiling the kernels, once for this environment: a minute or two"
-        if not sys.stderr.isatty():
-            print(what, file=sys.stderr, flush=True)
-    with waiting(what):
-        yield
+        what = "compiling the kernels, once for this environment"
+        with progress(what, warmup.pieces()) as advance:
+            warmup.ensure(jobs, lambda *_: advance())
 
 
 def _goal(joints: str | None, pose: str | None, free: str | None, tolerance: str | None) -> Any:
@@ -483,6 +548,7 @@ def _pose(text: str, option: str) -> "Pose":
     values = _joints(text, option)
     if len(values) != 6 or not all(map(math.isfinite, values)):
         raise PlannerError(f"{option} {text!r}: must be six finite numbers, {POSE}")
+    refuse_degrees_of_pose(values, option)
     try:
         return Pose.from_rpy(values[:3], values[3:])
     except ConstraintError as error:

@@ -45,7 +45,10 @@ PACKAGE = "constraint_geodesics"
 NEEDED_PYTHON = (3, 11)
 """Planning works with later ones, without PyBullet."""
 NEW_ENVIRONMENT = "rm -rf .venv && make env"
-INSTALL_LOCK = "python -m pip install -r requirements.lock"
+INSTALL_LISTED = (
+    "python -m pip install --require-hashes --no-deps --no-build-isolation -r requirements.hashes"
+)
+"""As `make env` does."""
 ACTIVATE = "source .venv/bin/activate"
 LEAST_FREE = 2_000_000_000
 """Bytes: an environment and one run of the pipeline take about that."""
@@ -145,9 +148,8 @@ def as_text(findings: Sequence[Finding], colours: Mapping[str, str] | None = Non
     return "\n".join(lines)
 
 
-def show(root: Path, *, json_wanted: bool) -> int:
-    """Print all findings about a folder.  Returns the exit code."""
-    findings = examine(root)
+def show(findings: Sequence[Finding], *, json_wanted: bool) -> int:
+    """Print the findings.  Returns the exit code."""
     # no colours where standard output is no terminal, or they are not wanted
     colours = COLOURS if sys.stdout.isatty() and not os.environ.get("NO_COLOR") else None
     print(as_json(findings) if json_wanted else as_text(findings, colours))
@@ -219,7 +221,7 @@ def _completing(root: Path, here: Surroundings) -> str:
     """How the environment gets what it lacks."""
     if _in_another_environment(root, here):
         return ACTIVATE
-    return INSTALL_LOCK if (here.prefix / "pyvenv.cfg").is_file() else "make env"
+    return INSTALL_LISTED if (here.prefix / "pyvenv.cfg").is_file() else "make env"
 
 
 def _on_path(here: Surroundings, name: str) -> Path | None:
@@ -673,7 +675,7 @@ def _of_database(file: Path, root: Path, here: Surroundings) -> Iterator[Answer]
         yield _problem(message, aside)
     elif version not in known:
         later = numbers(_locked(root).get("mlflow", installed)) > numbers(installed)
-        newer = INSTALL_LOCK if later else "python -m pip install --upgrade mlflow"
+        newer = INSTALL_LISTED if later else "python -m pip install --upgrade mlflow"
         unknown = f"which the installed MLflow {installed} does not know: a newer one wrote it"
         yield _problem(f"{schema}, {unknown}", f"{newer}, or put it aside: mv {name} {name}.newer")
     elif version not in newest:
@@ -830,7 +832,7 @@ def main() -> int:
     about = "Look for what is wrong with this checkout and its environment, and say the mend."
     parser = argparse.ArgumentParser(prog=f"python -m {PACKAGE}.doctor", description=about)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    return show(Path(), json_wanted=parser.parse_args().json)
+    return show(examine(Path()), json_wanted=parser.parse_args().json)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ REPORT, CURVES = "reports/train_analytic/plane.json", "reports/train_analytic/pl
 IN_PLACE = {
     "train_analytic@sphere": STAGE,
     "reports/train_analytic/sphere.json": REPORT,
+    "reports/train_analytic/torus.json": REPORT,
     "reports/train_policies/joint_space-learning.csv": CURVES,
     "tilt-5": NAME,
     "tilt-5-temp": NAME,
@@ -89,6 +90,7 @@ def test_an_experiment_is_run_compared_brought_back_and_undone(committed: Path) 
     assert "mean_ratio_mean" in ran(
         committed, of_the_page("dvc", "metrics", "diff", holding="sphere")
     )
+    assert "mean_ratio_mean" in ran(committed, of_the_page("dvc", "metrics", "show"))
     assert NAME in ran(committed, of_the_page("dvc", "exp", "show"))
     assert "geodesics.reward.form" in ran(committed, of_the_page("dvc", "exp", "diff"))
     ran(committed, of_the_page("dvc", "plots", "diff"))
@@ -102,3 +104,21 @@ def test_an_experiment_is_run_compared_brought_back_and_undone(committed: Path) 
     assert not ran(committed, [*of_the_page("git", "status"), "--porcelain"])
     ran(committed, of_the_page("dvc", "exp", "apply"))
     assert json.loads((committed / REPORT).read_text()) == after
+
+
+def test_another_checkout_pulls_instead_of_repeating(committed: Path, tmp_path: Path) -> None:
+    for undo in (of_the_page("git", "restore"), of_the_page("dvc", "checkout")):
+        ran(committed, undo)
+    add = of_the_page("dvc", "remote", "add")
+    ran(committed, [str(tmp_path / "shared") if word.startswith("/srv/") else word for word in add])
+    ran(committed, of_the_page("git", "commit"))
+    ran(committed, of_the_page("dvc", "push"))
+    theirs = tmp_path / "theirs"
+    ran(committed, ["git", "clone", "--quiet", str(committed), str(theirs)])
+    assert not (theirs / "data" / "analytic" / "plane").exists()
+    stages = (STAGE, "digest_code")  # of the others nothing was run here
+    ran(theirs, [*of_the_page("dvc", "pull"), *stages])
+    assert "up to date" in ran(theirs, [*of_the_page("dvc", "status"), *stages])
+    assert "Running stage" not in ran(theirs, ["dvc", "repro", STAGE])
+    kept = Path("data") / "analytic" / "plane" / "curves.npz"
+    assert (theirs / kept).read_bytes() == (committed / kept).read_bytes()

@@ -1,8 +1,10 @@
 """One answer wherever the work runs, and one line where it can't."""
 
+import io
 import logging
 import os
 import pty
+import re
 import subprocess
 import sys
 import threading
@@ -20,7 +22,7 @@ from constraint_geodesics.learning.dataset import ShardTask, draw_shard, shard_t
 from constraint_geodesics.params import ComputeParams, Params
 from constraint_geodesics.pipeline import compute
 from constraint_geodesics.pipeline.compute import ComputeError, as_finished, parallel_map
-from constraint_geodesics.pipeline.progress import waiting
+from constraint_geodesics.pipeline.progress import progress, waiting
 from constraint_geodesics.pipeline.threads import ONE_THREAD
 from constraint_geodesics.scene.scene import Scene
 from tests.pipeline.cluster import DEAD, cluster
@@ -291,10 +293,43 @@ def test_progress_on_a_terminal_is_a_bar() -> None:
     assert "2/2" in shown
 
 
-def test_waiting_is_seen_on_a_terminal_alone(capfd: pytest.CaptureFixture[str]) -> None:
+class Cell(io.StringIO):
+    """Standard error of a notebook's cell, as Jupyter's kernel calls it."""
+
+
+Cell.__module__ = "ipykernel.iostream"
+
+
+def test_progress_in_a_notebook_is_a_bar_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", Cell())
+    monkeypatch.setattr("constraint_geodesics.pipeline.progress.CELL_EVERY_S", 0.0)
+    with progress("label [free]", 4) as advance:
+        for _ in range(4):
+            advance()
+    shown = sys.stderr.getvalue()
+    assert shown.count("\n") == 1
+    assert shown.endswith("\n")
+    lines = [line.strip() for line in shown.split("\r")[1:]]
+    assert [re.search(r" (\d)/4", line)[1] for line in lines] == list("01234")
+    assert [line.count("━") for line in lines] == [0, 7, 15, 22, 30]
+    assert all(line.startswith("label [free] ") for line in lines)
+    assert "took" in lines[-1]
+
+
+def test_waiting_in_a_log_or_a_notebook_is_one_line_where_it_is_long(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     with waiting("loading the planner"):
         pass
     assert capfd.readouterr() == ("", "")
+    monkeypatch.setattr("constraint_geodesics.pipeline.progress.LINE_AFTER_S", 0.05)
+    for description, line in (("loading [it]", "loading [it] …\n"), ("", "")):
+        with waiting(description):
+            time.sleep(0.3)
+        assert capfd.readouterr() == ("", line)
+
+
+def test_waiting_on_a_terminal_gives_way_to_a_bar() -> None:
     program = (
         "from constraint_geodesics.pipeline.progress import progress, waiting\n"
         "with waiting('loading [it]'):\n"

@@ -263,14 +263,12 @@ def test_planners_differ_in_colour_and_marker():
 
 
 def test_histograms_show_every_column_but_quaternions_and_say_what_is_held():
-    card = {
-        "histograms": {
-            "joint_1": {"first": -1.0, "last": 1.0, "counts": [1, 2, 3, 4]},
-            "roll": {"first": np.pi / 2, "last": np.pi / 2 + 1e-9, "counts": [10, 0, 0, 0]},
-            "quaternion_x": {"first": 0.0, "last": 1.0, "counts": [1, 1, 1, 7]},
-        }
+    histograms = {
+        "joint_1": {"first": -1.0, "last": 1.0, "counts": [1, 2, 3, 4]},
+        "roll": {"first": np.pi / 2, "last": np.pi / 2 + 1e-9, "counts": [10, 0, 0, 0]},
+        "quaternion_x": {"first": 0.0, "last": 1.0, "counts": [1, 1, 1, 7]},
     }
-    figure = figures.data_histograms(card, lambda _: "rad")
+    figure = figures.data_histograms(histograms, lambda _: "rad")
     assert [axes.get_title() for axes in figure.axes] == ["joint_1 [rad]", "roll [rad]"]
     counts, edges, _ = figure.axes[0].patches[0].get_data()
     assert (counts.tolist(), edges.tolist()) == ([1, 2, 3, 4], [-1.0, -0.5, 0.0, 0.5, 1.0])

@@ -263,7 +263,10 @@ def run(tmp_path_factory):
             for task in shard_tasks(ShardTask(scene, manifold, 120, seed_of(name, 1)), 120)
         ]
         write_joints(shards, layout.joints(name), {"seed": "1"})
-        write_json(layout.report("label_joints", name), data_card(shards))
+        card = data_card(shards)
+        histograms = layout.report("label_joints", f"{name}-histograms")
+        write_json(histograms, card.pop("histograms"))
+        write_json(layout.report("label_joints", name), card)
         write_csv(layout.report("benchmark_planners", name, "csv"), sampled_rows())
     with scene.world() as world:
         for name, settings in params.manifolds.items():
@@ -632,6 +635,7 @@ def test_drawn_curves_are_those_of_the_seeds_that_found_one(run, tmp_path):
         "reports/train_policies/joint_space-learning.csv",
         "reports/train_manifold/paper.json",
         "reports/label_joints/level_cup.json",
+        "reports/label_joints/level_cup-histograms.json",
         "data/submanifolds/planner-free/submanifold.json",
         "data/analytic/plane/curves.npz",
         "data/joints/free/joints.parquet",

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -11,28 +12,38 @@ if TYPE_CHECKING:  # Rich is loaded where there is a terminal, not for `geodesic
     from rich.progress import Progress
 
 LINE_EVERY_S = 15.0
+CELL_EVERY_S = 0.2
+CELL_WIDTH = 30
+"""Of a bar in a notebook [letters]."""
+LINE_AFTER_S = 2.0
+"""Work that is over sooner says nothing where there is no terminal."""
 
 
 def progress(description: str, total: int) -> AbstractContextManager[Callable[[], None]]:
     """Show how many of `total` tasks are done; the function it gives is called after each of them.
 
-    On a terminal a bar with the time left.  Elsewhere plain lines: one at every quarter, one where
-    15 s passed since the last, and with CI=true the last line alone.  An empty description shows
-    nothing.
+    On a terminal and in a notebook a bar with the time left.  Elsewhere plain lines: one at every
+    quarter, one where 15 s passed since the last, and with CI=true the last line alone.  An empty
+    description shows nothing.
     """
     if not description:
         return nullcontext(lambda: None)
-    return _bar(description, total) if sys.stderr.isatty() else _lines(description, total)
+    if sys.stderr.isatty():
+        return _bar(description, total)
+    in_notebook = type(sys.stderr).__module__.startswith("ipykernel")
+    return _cell(description, total) if in_notebook else _lines(description, total)
 
 
 @contextmanager
 def waiting(description: str) -> Iterator[None]:
     """Show that work whose length nobody knows goes on: on a terminal a line with the time it took
     so far, which goes when the work is done and gives way to a bar of `progress` within it;
-    elsewhere nothing.  An empty description shows nothing.
+    elsewhere, a notebook too, one plain line after two seconds.  An empty description shows
+    nothing.
     """
     if not description or not sys.stderr.isatty():
-        yield
+        with _line_after(f"{description} …" if description else ""):
+            yield
         return
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -45,6 +56,19 @@ def waiting(description: str) -> Iterator[None]:
             yield
         finally:
             _waiting.remove(line)
+
+
+@contextmanager
+def _line_after(line: str) -> Iterator[None]:
+    """Write a line if the body is not over soon."""
+    late = threading.Timer(LINE_AFTER_S, print, (line,), {"file": sys.stderr, "flush": True})
+    late.daemon = True
+    if line:
+        late.start()
+    try:
+        yield
+    finally:
+        late.cancel()
 
 
 _waiting: list["Progress"] = []
@@ -86,6 +110,34 @@ def _bar(description: str, total: int) -> Iterator[Callable[[], None]]:
             bar.update(task, advance=1, left=_time_left(done, total, start))
 
         yield advance
+
+
+@contextmanager
+def _cell(description: str, total: int) -> Iterator[Callable[[], None]]:
+    """One line that is written again and again: Rich's bars need widgets in a notebook."""
+    start = shown = time.monotonic()
+    done = longest = 0
+
+    def write(end: str = "") -> None:
+        nonlocal longest
+        full = CELL_WIDTH * done // max(total, 1)
+        bar = "━" * full + "─" * (CELL_WIDTH - full)
+        left = f", {_time_left(done, total, start)}" if done else ""
+        line = f"{description} {bar} {done}/{total}{left}"
+        longest = max(longest, len(line))
+        print(f"\r{line:<{longest}}", end=end, file=sys.stderr, flush=True)
+
+    def advance() -> None:
+        nonlocal done, shown
+        done += 1
+        if done == total:
+            write("\n")
+        elif time.monotonic() - shown >= CELL_EVERY_S:
+            shown = time.monotonic()
+            write()
+
+    write()
+    yield advance
 
 
 @contextmanager

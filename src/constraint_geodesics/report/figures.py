@@ -494,9 +494,9 @@ def planner_comparison(table: pd.DataFrame) -> Figure:
     return _tidied(figure)
 
 
-def data_histograms(card: Mapping[str, Any], units: Callable[[str], str]) -> Figure:
-    """Histograms of one constraint's set, from its data card.  units: the unit of a column."""
-    shown = {n: own for n, own in card["histograms"].items() if not n.startswith("quaternion")}
+def data_histograms(histograms: Mapping[str, Any], units: Callable[[str], str]) -> Figure:
+    """Histograms of one constraint's set, by its columns.  units: the unit of a column."""
+    shown = {n: own for n, own in histograms.items() if not n.startswith("quaternion")}
     figure, grid = _panels(len(shown), (1.75, 1.25), columns=5)
     for axes, (name, entry) in zip(grid, shown.items(), strict=True):
         edges = np.linspace(entry["first"], entry["last"], len(entry["counts"]) + 1)

@@ -340,7 +340,8 @@ def _draw_data_card(layout: Layout, constraint: str) -> Drawn:
         f"{card['self_collision']:.1%} of the rows touch the arm itself, "
         f"{card['workcell_collision']:.1%} the workcell; {card['free']:.1%} touch nothing."
     )
-    figure = figures.data_histograms(card, _unit)
+    histograms = read_metrics(layout.report("label_joints", f"{constraint}-histograms"))
+    figure = figures.data_histograms(histograms, _unit)
     alt = f"Histograms of joints and tool poses of the set {constraint}"
     return Drawn(f"data_{constraint}", constraint, caption, figure, alt)
 
