@@ -3,7 +3,8 @@
     python -m tests.browser.first_screens [FOLDER]
 
 README as a web page, both pages of the report and the documentation's first page, each on a
-desktop, at night and on a phone; the page that `geodesics ui` opens; and three recordings in Rerun's viewer.
+desktop, at night and on a phone; the page that `geodesics ui` opens; three recordings in Rerun's
+viewer.
 What this checkout has not made is named, with the command that makes it.
 """
 
@@ -18,6 +19,7 @@ from markdown_it import MarkdownIt
 
 from constraint_geodesics.palette import planner_colour
 from tests.browser.chromium import ROOT, chromium, visit
+from tests.browser.dashboard import SIDE_PANEL_CLOSED
 from tests.browser.screenshots import MissingRunError, copied_dashboard, rerun, settled
 
 if TYPE_CHECKING:
@@ -84,6 +86,7 @@ def page_shot(browser: "Browser", address: str, size: str) -> bytes:
 def ui_shot(browser: "Browser") -> bytes:
     """What `geodesics ui` opens."""
     with copied_dashboard() as address, visit(browser, **SIZES["desktop"]) as (page, _):
+        page.add_init_script(SIDE_PANEL_CLOSED)
         page.goto(address)
         page.wait_for_load_state("networkidle")
         return settled(page)

@@ -184,14 +184,14 @@ def keep_newest(dashboard: str) -> None:
 
 @contextlib.contextmanager
 def copied_dashboard() -> Iterator[str]:
-    """The dashboard of a copy of this checkout's runs, the newest of each setting."""
+    """What `geodesics ui` opens on a copy of this checkout's runs, the newest of each setting."""
     if not (ROOT / "mlflow.db").is_file():
         raise MissingRunError("mlflow.db: this checkout has no runs yet: make repro")
     with tempfile.TemporaryDirectory() as folder:
         shutil.copy2(ROOT / "mlflow.db", folder)
         with dashboard_of(Path(folder)) as page:
             keep_newest(base_of(page))
-            yield base_of(page)
+            yield page
 
 
 # Rerun
@@ -365,7 +365,9 @@ def main(wanted: Sequence[str]) -> int:
             began = time.monotonic()
             try:
                 if name.startswith("mlflow"):
-                    dashboard = dashboard or open_until_end.enter_context(copied_dashboard())
+                    dashboard = dashboard or base_of(
+                        open_until_end.enter_context(copied_dashboard())
+                    )
                 (IMAGES / f"{name}.png").write_bytes(compressed(shot.take(browser, dashboard)))
                 print(f"docs/images/{name}.png  {time.monotonic() - began:.0f} s", flush=True)
             except (

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from constraint_geodesics.pipeline.layout import RECORDINGS, Layout, in_checkout
 
-FOLDERS = (RECORDINGS, "first_path")
+FOLDERS = (RECORDINGS, "first_path", ".geodesics/bench/recordings")
 """Where recordings lie, relative to the checkout."""
 HEADINGS = (
     *("#", "constraint", "scene", "manifold", "planner", "query", "seed"),
