@@ -41,7 +41,7 @@ from constraint_geodesics.robot.kinematics import RobotError
 from constraint_geodesics.scene.urdf import data_path
 from constraint_geodesics.search.roadmap import Roadmap
 from constraint_geodesics.taken_along import FILES, MissingFileError, put_back, taken_along
-from constraint_geodesics.text_files import read_json, read_kept, written
+from constraint_geodesics.text_files import read_content, read_json, written
 
 _CONSTRAINTS: TypeAdapter[dict[Name, ConstraintParams]] = TypeAdapter(dict[Name, ConstraintParams])
 CARD, ROADMAPS = "planner.json", "roadmaps.safetensors"
@@ -203,7 +203,7 @@ def _lasting(folder: Path) -> Path:
     """
     if not ((folder / FILES).is_dir() and (folder / CARD).is_file()):
         return folder
-    digest = hashlib.sha256(read_kept(folder / CARD)).hexdigest()[:16]
+    digest = hashlib.sha256(read_content(folder / CARD, piped=False)).hexdigest()[:16]
     place = user_cache_path("constraint_geodesics") / "planners" / digest
     if not place.is_dir():
         place.parent.mkdir(parents=True, exist_ok=True)

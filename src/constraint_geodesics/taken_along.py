@@ -15,7 +15,7 @@ from typing import Any
 from constraint_geodesics.params import RobotParams
 from constraint_geodesics.robot.arm_file import digest_of
 from constraint_geodesics.robot.description import find_mesh
-from constraint_geodesics.text_files import read_content, read_kept
+from constraint_geodesics.text_files import read_content
 from constraint_geodesics.xml_files import read_xml
 
 FILES = "files"
@@ -109,7 +109,7 @@ def _require(folder: Path, name: str, wanted: Any) -> None:
     file = folder / name
     try:
         inside = file.resolve().is_relative_to((folder / FILES).resolve())
-        content = read_kept(file) if inside else b""
+        content = read_content(file, piped=False) if inside else b""
     except OSError as error:
         raise MissingFileError(f"{file}: {error.strerror}") from None
     except ValueError:  # NUL
