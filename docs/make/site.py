@@ -4,6 +4,7 @@ from the net is an error.
 
 import base64
 import json
+import os
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -14,6 +15,8 @@ from mkdocs.structure.files import File
 
 NOTEBOOK = "first_path.ipynb"
 PAGE = "first_path_notebook.md"
+OUTSIDE = "checkout:"
+"""Before a link's file that is not of the site, in place of a path that MkDocs would look for."""
 LOADING = {
     "script": "src",
     "img": "src",
@@ -33,7 +36,9 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, config: Any, **_: Any) -> str:
-    """Links to the notebook lead to its page; pictures of reports are data inside the page."""
+    """Links to the notebook lead to its page; pictures of reports are data inside the page, and
+    links to reports lead out of the site.
+    """
     reports = Path(config["docs_dir"]).parent
 
     def embedded(found: re.Match[str]) -> str:
@@ -41,7 +46,14 @@ def on_page_markdown(markdown: str, config: Any, **_: Any) -> str:
         return f"](data:image/png;base64,{picture})"
 
     linked = re.sub(r"\]\(\.\./(reports/[^)]+\.png)\)", embedded, markdown)
-    return linked.replace(f"({NOTEBOOK})", f"({PAGE})")
+    outside = re.sub(r"\]\(\.\./(reports/[^)]+)\)", rf"]({OUTSIDE}\1)", linked)
+    return outside.replace(f"({NOTEBOOK})", f"({PAGE})")
+
+
+def on_page_content(html: str, config: Any, **_: Any) -> str:
+    """Links to reports lead to those of the checkout that the site lies in."""
+    site, checkout = Path(config["site_dir"]), Path(config["docs_dir"]).parent
+    return html.replace(f'href="{OUTSIDE}', f'href="{os.path.relpath(checkout, site)}/')
 
 
 def on_post_build(config: Any) -> None:

@@ -178,7 +178,7 @@ def recording_file(folder: Path, path: Trajectory) -> dict[str, Any]:
 
 
 def identification_files(folder: Path, robot: SerialRobot) -> dict[str, Any]:
-    """Demonstrations, the constraint that they keep to, and the same where they were."""
+    """Demonstrations, and the constraint that they keep to."""
     shown = [rows[::3] for rows in demonstrations("cup", robot, 10)]
     lines = [",".join(("demonstration", *robot.joint_names))]
     for number, rows in enumerate(shown):
@@ -186,9 +186,7 @@ def identification_files(folder: Path, robot: SerialRobot) -> dict[str, Any]:
     (folder / "demonstrations.csv").write_text("# format: 1\n" + "\n".join(lines) + "\n")
     found = identify(folder / "demonstrations.csv", robot)
     assert found.constraint is not None, found.explanation
-    assert found.supported is not None
     found.save(folder / "constraint.yaml")
-    found.save(folder / "constraint_where_shown.yaml", where_shown=True)
     q = np.concatenate([shown[0][:2], robot.sample(2, np.random.default_rng(0))])
     return {
         "demonstrations.csv": {
@@ -197,7 +195,6 @@ def identification_files(folder: Path, robot: SerialRobot) -> dict[str, Any]:
             "last_rad": np.round(shown[-1][-1], 5).tolist(),
         },
         "constraint.yaml": constraint_facts(found.constraint, robot, q),
-        "constraint_where_shown.yaml": constraint_facts(found.supported, robot, q),
     }
 
 
