@@ -91,10 +91,10 @@ def test_what_is_sooner_or_shorter_is_named_with_both_figures():
     )
     told = losses(rows, verdicts(BiRRT=["behind"], PRM=["behind"], SLSQP=["behind"]))
     assert told == {
-        "At the median": "BiRRT in the workcell, in 5 ms against 10 (it solves 100.0%, the planner "
-        "100.0%); 1 more that solve less than half.",
-        "At the 95th percentile of length, whatever time it takes": "SLSQP in the workcell, 1.000 "
-        "times the best known against 1.050 on 4 queries, in 2,000 ms against 10.",
+        "At the median": "“BiRRT” in the workcell, in 5 ms against 10 (it solves 100.0%, the "
+        "planner 100.0%); 1 more that solve less than half.",
+        "At the 95th percentile of length, whatever time it takes": "“SLSQP” in the workcell, "
+        "1.000 times the best known against 1.050 on 4 queries, in 2,000 ms against 10.",
     }
 
 
@@ -102,8 +102,8 @@ def test_within_the_same_time_few_queries_are_only_counted():
     rows = pd.DataFrame(answers("planner", 0.001, 2.0) + answers("BiRRT", 0.1, 2.1))
     budgets = verdicts(BiRRT=["ahead", "behind", "ahead"], PRM=["ahead"])
     assert losses(rows, budgets)["Within the same time"] == (
-        "in 10 ms in the workcell, BiRRT under level_cup and PRM under level_cup; in 1 s in the "
-        "workcell, BiRRT under level_cup."
+        "in 10 ms in the workcell, “BiRRT” under level_cup and “PRM” under level_cup; in 1 s in "
+        "the workcell, “BiRRT” under level_cup."
     )
     assert losses(rows, budgets.assign(queries=FEW - 1))["Within the same time"] == (
         f"3 comparisons over fewer than {FEW} queries stand in a table below."

@@ -150,7 +150,7 @@ def _within(budgets: pd.DataFrame) -> list[str]:
     told = []
     for (budget, scene), case in sure.groupby(["budget_s", "scene"]):
         names = " and ".join(
-            f"{baseline} under {', '.join(own['constraint'])}"
+            f"“{baseline}” under {', '.join(own['constraint'])}"
             for baseline, own in case.groupby("baseline", sort=False)
         )
         told.append(f"in {_duration(budget)} {WHERE[str(scene)]}, {names}")
@@ -164,7 +164,7 @@ def _sooner(pairs: pd.DataFrame) -> list[str]:
     sooner = pairs[pairs["baseline_time_s"] < pairs["time_s"]]
     serving = sooner[sooner["baseline_success"] >= SERVES]
     told = [
-        f"{row['baseline']} {WHERE[row['scene']]}, in {milliseconds(row['baseline_time_s'])} ms "
+        f"“{row['baseline']}” {WHERE[row['scene']]}, in {milliseconds(row['baseline_time_s'])} ms "
         f"against {milliseconds(row['time_s'])} (it solves {share(row['baseline_success'], 1)}, "
         f"the planner {share(row['success'], 1)})"
         for row in _rows(serving)
@@ -176,8 +176,8 @@ def _sooner(pairs: pd.DataFrame) -> list[str]:
 def _shorter(pairs: pd.DataFrame) -> list[str]:
     shorter = pairs[pairs["baseline_ratio_p95"] * (1.0 + AHEAD) < pairs["ratio_p95"]]
     return [
-        f"{row['baseline']} {WHERE[row['scene']]}, {fixed(row['baseline_ratio_p95'], 3)} times the "
-        f"best known against {fixed(row['ratio_p95'], 3)} on {row['queries']} queries, in "
+        f"“{row['baseline']}” {WHERE[row['scene']]}, {fixed(row['baseline_ratio_p95'], 3)} times "
+        f"the best known against {fixed(row['ratio_p95'], 3)} on {row['queries']} queries, in "
         f"{milliseconds(row['baseline_time_s'])} ms against {milliseconds(row['time_s'])}"
         for row in _rows(shorter)
     ]
