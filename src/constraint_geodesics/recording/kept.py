@@ -25,7 +25,7 @@ _MARGIN_M, _THIN_M = 0.08, 0.001
 held exactly.
 """
 _THIN = rr.Radius.ui_points(1.5)
-_ROUND = np.linspace(0.0, 2.0 * np.pi, 65)[:, None]
+_ROUND = np.linspace(0.0, 2.0 * np.pi, 33)[:, None]
 
 Drawing = tuple[Any, ...]
 
