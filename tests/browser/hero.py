@@ -42,7 +42,7 @@ FROM, TO, REACH_M, HEIGHT_M = math.radians(-40.0), math.radians(40.0), 0.45, 0.3
 """Where the tool is at start and goal: the directions from the base, how far and how high."""
 PILLAR = Cylinder("pillar", Placement((0.53, 0.0, 0.23)), length_m=0.46, radius_m=0.05)
 """Between them."""
-EYE_M, TARGET_M, FIELD_DEG = (1.12, -1.02, 0.92), (0.24, 0.02, 0.24), 38.0
+EYE_M, TARGET_M, FIELD_DEG = (-0.06, -1.15, 1.05), (0.25, 0.0, 0.22), 36.0
 GROUND_M = 0.72
 LINE_M, DASH_M = 0.004, 0.035
 """Radius of the tool's line, and how far apart the places on the way without the pillar are."""

@@ -13,7 +13,6 @@ import contextlib
 import io
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -24,10 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from PIL import Image
 
-from constraint_geodesics.constraints.constraint import Pose
-from constraint_geodesics.goals.region import GoalRegion
 from constraint_geodesics.palette import BLUE, VERMILION, planner_colour
-from constraint_geodesics.planner import Planner
 from constraint_geodesics.tracking.views import VIEWS, View
 from tests.browser import hero
 from tests.browser.chromium import ROOT, chromium, served, until, visit
@@ -243,19 +239,6 @@ def cup_path(file: Path) -> None:
     hero.planned(hero.carried_cup())[0].record(file)
 
 
-def region_path(file: Path) -> None:
-    """README's other arm, to a region."""
-    above = GoalRegion(Pose.from_rpy([0.4, 0.2, 0.4], [3.14159265, 0.0, 0.5]), free=["yaw"])
-    with Planner.from_urdf("franka_panda/panda.urdf", tool_link="panda_grasptarget") as panda:
-        panda.plan([0.0, -0.3, 0.0, -2.0, 0.0, 1.8, 0.5], above, "free").record(file)
-
-
-def episode(file: Path) -> None:
-    """What `geodesics demo --out` writes."""
-    command = [sys.executable, "-m", "constraint_geodesics.cli", "demo", "--out", str(file)]
-    subprocess.run(command, cwd=ROOT, env=smoke.environment(ROOT), check=True)
-
-
 def drawn(page: "Page", colour: str) -> bool:
     return int(having(scene_of(picture(page)), colour).sum()) >= CURVE_PIXELS
 
@@ -291,16 +274,6 @@ SHOTS = {
         "Rerun with a planned path of the level cup past a pillar: the arm with its cup, the level "
         "plane and the tool's way, what the constraint allows, and the joints",
         written_here(cup_path, planner_colour("planner")),
-    ),
-    "rerun_region": Shot(
-        "Rerun with a path of a Panda to a region of poses: the region, the configurations that "
-        "were looked at in grey, and the joints",
-        written_here(region_path, planner_colour("planner")),
-    ),
-    "rerun_episode": Shot(
-        "Rerun with an arm that carries a cup among obstacles that it sees when they are near: the "
-        "path that it follows in blue, those before in grey",
-        written_here(episode, BLUE),
     ),
     "rerun_execution": Shot(
         "Rerun with an executed path: the arm, the cup with its spheres from near by, the "

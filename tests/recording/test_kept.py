@@ -117,7 +117,7 @@ def test_the_direction_that_is_kept_stands_on_its_plane_within_its_limit(free, t
     angle = np.arccos(np.clip(tips[:, free] / UPRIGHT_M, -1.0, 1.0))
     size = np.linalg.norm(held.residual(shown)[:, 3:], axis=1)
     np.testing.assert_allclose(angle, size, atol=1e-3)  # single precision, near upright
-    (circle,) = column(file, "/tool/place/limit", LINE)[0]
+    (circle,) = column(file, "/tool/place/level", LINE)[0]
     np.testing.assert_allclose(np.linalg.norm(circle, axis=1), UPRIGHT_M, atol=1e-6)
     np.testing.assert_allclose(np.array(circle)[:, free], UPRIGHT_M * np.cos(TOLERANCE), atol=1e-6)
     turn = column(file, "/tool/place/level", "Cylinders3D:quaternions")[0][0]

@@ -25,9 +25,9 @@ _MARGIN_M, _THIN_M = 0.08, 0.001
 held exactly.
 """
 _THIN = rr.Radius.ui_points(1.5)
-_ROUND = np.linspace(0.0, 2.0 * np.pi, 65)[:, None]
+_ROUND = np.linspace(0.0, 2.0 * np.pi, 33)[:, None]
 
-Drawing = tuple[str, Any]
+Drawing = tuple[Any, ...]
 
 
 def kept_drawings(
@@ -70,9 +70,10 @@ def _upright(turn: np.ndarray, angles: np.ndarray, loosely: float) -> Iterator[D
     lying = Rotation.from_matrix(np.roll(np.eye(3), -free - 1, axis=1)).as_quat()
     size = {"lengths": [_THIN_M], "radii": [LEVEL_M], "quaternions": [rr.Quaternion(xyzw=lying)]}
     plane = rr.Cylinders3D(**size, colors=[(*CARRIED, 90)], fill_mode="solid")
-    yield f"{PLACE}/level", plane
+    limit: tuple[Any, ...] = ()
     if 0.0 < loosely < 0.5 * np.pi:
         first, second = np.eye(3)[angles]
         about = loosely * (np.cos(_ROUND) * first + np.sin(_ROUND) * second)
         circle = Rotation.from_rotvec(about).apply(UPRIGHT_M * axis)
-        yield f"{PLACE}/limit", rr.LineStrips3D([circle], colors=[LIMIT], radii=[_THIN])
+        limit = (rr.LineStrips3D([circle], colors=[LIMIT], radii=[_THIN]),)
+    yield f"{PLACE}/level", plane, *limit

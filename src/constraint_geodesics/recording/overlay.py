@@ -269,7 +269,7 @@ def _in_space(part: _Part, opacity: float) -> Iterator[Chunk]:
         elif path == "/tool/trace":
             yield from _coloured(moved, rr.LineStrips3D, part.colour)
             yield static(f"{part.entity}/tool/name", _name(part, chunk))
-        elif path == "/tool/position" and chunk.is_static:
+        elif path in ("/tool/frame/axes", "/tool/position") and chunk.is_static:
             yield from _coloured(moved, rr.Points3D, part.colour)
         else:
             yield moved
@@ -431,9 +431,9 @@ def _panels(series: Sequence[dict[str, _Lines]]) -> list[tuple[Any, float]]:
         own = [one for entity, lines in found.items() if entity.startswith(begin) for one in lines]
         return max((float(lines.values[:, columns].max()) for lines in own), default=None)
 
-    tops = {unit: top(f"constraint/{unit}/") for unit in ("deg", "mm")}
-    residuals = {unit: most for unit, most in tops.items() if most is not None}
-    rows = [(one, 1.0) for one in panels.constraint_panel(top("share/", slice(1)), residuals)]
+    residuals = any(entity.startswith("constraint/") for entity in found)
+    shares = top("share/", slice(1))
+    rows = [(one, 1.0) for one in panels.constraint_panel(shares, residuals=residuals)]
     if (spheres := top("cup_spheres")) is not None:
         rows += [(one, 1.0) for one in panels.cup_panels(spheres, top("cup_tilt") or 0.0)]
     joints = sorted({joint for lines in found["joints"] for joint in lines.names})

@@ -81,17 +81,14 @@ def space_view(
     return rrb.Spatial3DView(origin="/", name=name, **shown)
 
 
-def constraint_panel(shares: float | None, residuals: dict[str, float]) -> list[Any]:
-    """What the constraint bounds: as a share of what the judge grants, and behind that in its own
-    units; nothing where it bounds nothing.
-
-    shares: the largest one [%], None where there are none; residuals: the largest value by its
-    unit, limits among them.
+def constraint_panel(largest: float | None, *, residuals: bool) -> list[Any]:
+    """What the constraint bounds: as shares of what the judge grants, up to the largest [%] if
+    there are any, and behind that in its own units; nothing where it bounds nothing.
     """
-    tabs = [] if shares is None else [share_panel(shares)]
-    for unit, most in residuals.items():
-        top = 1.2 * most if most > 0.0 else 1.0
-        tabs.append(series_view(f"constraint/{unit}", f"Constraint [{unit}]", (0.0, top)))
+    tabs = [] if largest is None else [share_panel(largest)]
+    if residuals:
+        name = "Constraint [mm or deg]"
+        tabs.append(rrb.TimeSeriesView(origin="constraint", name=name))
     return [rrb.Tabs(*tabs, active_tab=0)] if tabs else []
 
 
@@ -123,8 +120,9 @@ def cup_panels(spheres: float, tilt_deg: float) -> list[Any]:
 
 def series_view(origin: str, name: str, limits: tuple[float, float], *, legend: bool = True) -> Any:
     """The series below an entity between two values."""
-    axis, words = rrb.ScalarAxis(range=limits), rrb.PlotLegend(visible=legend)
-    return rrb.TimeSeriesView(origin=origin, name=name, axis_y=axis, plot_legend=words)
+    how = {} if legend else {"plot_legend": rrb.PlotLegend(visible=False)}
+    axis = rrb.ScalarAxis(range=limits)
+    return rrb.TimeSeriesView(origin=origin, name=name, axis_y=axis, **how)
 
 
 def latent_view_of(axis_names: Sequence[str], low: np.ndarray, high: np.ndarray) -> Any:

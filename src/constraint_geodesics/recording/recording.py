@@ -523,16 +523,15 @@ def tool_chunks(
 
 def tool_axes(sampled: Frames, kept: Constraint | None) -> Iterator[Chunk]:
     """The tool's place and axes, and what a constraint keeps: what moves with `tool_moves`."""
-    yield static("tool/position", rr.Points3D.from_fields(colors=[INK], radii=[_POINT]))
+    now = rr.Points3D(np.zeros((1, 3)), colors=[INK], radii=[_POINT])
     axes = rr.Arrows3D(vectors=AXIS_M * np.eye(3), colors=AXES, radii=[0.003])
-    yield static(f"{FRAME}/axes", axes)
+    yield static(f"{FRAME}/axes", axes, now)
     for drawing in kept_drawings(kept, sampled.tool):
         yield static(*drawing)
 
 
 def tool_moves(sampled: Frames) -> Iterator[Chunk]:
-    """Where the tool is, its frame, and the place where what does not turn with it is drawn."""
-    yield moving("tool/position", rr.Points3D.columns(positions=sampled.tool), sampled.time)
+    """The tool's frame, and its place, where what does not turn with it is drawn."""
     turn = Rotation.from_matrix(sampled.turn).as_quat()
     frame = rr.Transform3D.columns(translation=sampled.tool, quaternion=turn)
     yield moving(FRAME, frame, sampled.time)
@@ -567,7 +566,8 @@ def series_chunks(series: Sequence[Series], sampled: Frames) -> Iterator[Chunk]:
     """Series with their limits."""
     for one in series:
         entity = _entity("constraint", one.unit, one.name)
-        yield _limited(entity, one.name, f"limit of {one.name}")  # the panel says the unit
+        name = f"{one.name} [{one.unit}]"
+        yield _limited(entity, name, f"limit of {name}")
         yield _with_limit(entity, one.values, one.limit, sampled)
 
 
@@ -597,8 +597,8 @@ def _with_limit(entity: str, values: np.ndarray, limit: float, sampled: Frames) 
 def joint_chunks(robot: SerialRobot, sampled: Frames) -> Iterator[Chunk]:
     """Joint positions [rad or m] with their limits, and as shares of each joint's range."""
     own, names = colours(np.arange(robot.dof)), list(robot.joint_names)
-    yield static("joints", rr.SeriesLines(names=names, colors=own))
-    yield static("joints", rr.AnyValues(lower=robot.lower.tolist(), upper=robot.upper.tolist()))
+    limits = rr.AnyValues(lower=robot.lower.tolist(), upper=robot.upper.tolist())
+    yield static("joints", rr.SeriesLines(names=names, colors=own), limits)
     yield scalars("joints", sampled.joints, sampled.time)
     share = range_share(sampled.joints, robot.lower, robot.upper)
     ends = np.broadcast_to([1.0, -1.0], (len(share), 2))
@@ -675,12 +675,8 @@ def _blueprint(
 
 def constraint_panel(series: Sequence[Series], shares: Sequence[Series]) -> list[Any]:
     """What the constraint bounds; nothing where it bounds nothing."""
-    residuals: dict[str, float] = {}
-    for one in series:
-        most = max(one.limit, float(one.values.max()))
-        residuals[one.unit] = max(residuals.get(one.unit, 0.0), most)
     largest = max((float(one.values.max()) for one in shares), default=None)
-    return panels.constraint_panel(largest, residuals)
+    return panels.constraint_panel(largest, residuals=bool(series))
 
 
 def path_time(sampled: Frames) -> Any:
@@ -697,9 +693,9 @@ def _entity(*parts: str) -> str:
     return str(rr.new_entity_path(list(parts)))
 
 
-def static(entity: str, archetype: Any) -> Chunk:
+def static(entity: str, *archetypes: Any) -> Chunk:
     """What an entity has all the time."""
-    batches = archetype.as_component_batches()
+    batches = [batch for own in archetypes for batch in own.as_component_batches()]
     columns = [batch.partition([len(batch.as_arrow_array())]) for batch in batches]
     return Chunk.from_columns(entity, [], columns)
 
