@@ -78,8 +78,9 @@ def test_the_search_finds_a_word_without_a_server(
     with visit(browser, viewport=DESK) as (page, traffic):
         page.context.set_offline(True)
         page.goto((site / "index.html").as_uri())
+        page.wait_for_load_state("networkidle")
         page.locator("input[name=query]").click()
-        page.locator("input[name=query]").fill(words)
+        page.locator("input[name=query]").press_sequentially(words)  # the theme listens to keys
         found = page.locator("a.md-search-result__link")
         until(lambda: found.count() > 0, f"{words} is found")
         leads = [link.get_attribute("href") or "" for link in found.all()]
