@@ -357,9 +357,8 @@ class Trajectory:
         motions: tuple[np.ndarray, ...] = ()
         if demonstrations is not None:
             motions = tuple(demonstrations_from(demonstrations, self.scene.robot)[0])
-        record = PathRecord(
-            "planner", name, 0, 0, self.joints, text, goal=goal, demonstrations=motions
-        )
+        about = {"times": self.times, "goal": goal, "demonstrations": motions}
+        record = PathRecord("planner", name, 0, 0, self.joints, text, **about)
         record = replace(record, ways=tuple(way.points for way in self.statistics.ways))
         manifold = ConstraintManifold(self.scene.robot, self.constraint)
         around, carried = self.scene.workcell, self.scene.attached
