@@ -181,7 +181,7 @@ def warm_up(
     from constraint_geodesics import warmup
 
     began, done_before = time.perf_counter(), warmup.is_done()
-    cli_planning.compile_kernels(jobs)
+    warmup.ensure(jobs)
     seconds = time.perf_counter() - began
     if as_json:
         print(json.dumps({"compiled": not done_before, "seconds": round(seconds, 1)}))

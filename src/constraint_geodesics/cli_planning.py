@@ -17,7 +17,7 @@ from constraint_geodesics.cli_degrees import (
     refuse_degrees_of_table,
 )
 from constraint_geodesics.extras import require
-from constraint_geodesics.pipeline.progress import progress, waiting
+from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
 
 if TYPE_CHECKING:
@@ -499,19 +499,8 @@ def show_robot(
 @contextmanager
 def loading() -> Iterator[None]:
     """Say what a planner's user waits for: the compiler where it was not asked before."""
-    compile_kernels()
     with waiting("loading the planner"):
         yield
-
-
-def compile_kernels(jobs: int | None = None) -> None:
-    """With a bar, where they are not compiled.  jobs: processes, by default one a core."""
-    from constraint_geodesics import warmup
-
-    if not warmup.is_done():
-        what = "compiling the kernels, once for this environment"
-        with progress(what, warmup.pieces()) as advance:
-            warmup.ensure(jobs, lambda *_: advance())
 
 
 def _goal(joints: str | None, pose: str | None, free: str | None, tolerance: str | None) -> Any:

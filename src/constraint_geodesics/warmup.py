@@ -16,6 +16,7 @@ from pathlib import Path
 import numba
 from numba.core.registry import cpu_target
 
+from constraint_geodesics.pipeline.progress import progress
 from constraint_geodesics.robot.kernels import forward_batch
 
 Tell = Callable[[str, float], None]
@@ -45,9 +46,9 @@ def pieces() -> int:
     return len(JOBS)
 
 
-def ensure(processes: int | None = None, tell: Tell = lambda *_: None) -> None:
-    """Compile what is not compiled yet; nothing where all is.  processes: by default as many as
-    cores.
+def ensure(processes: int | None = None) -> None:
+    """Compile what is not compiled yet, with a bar; nothing where all is.  processes: by default as
+    many as cores.
 
     Several callers wait for the first of them.  Raises WarmupError if something can't be compiled.
     """
@@ -56,7 +57,9 @@ def ensure(processes: int | None = None, tell: Tell = lambda *_: None) -> None:
     with _alone():
         if is_done():
             return
-        _compile_all(processes or _cores(), tell)
+        what = "compiling the kernels, once for this environment"
+        with progress(what, pieces()) as advance:
+            _compile_all(processes or _cores(), lambda *_: advance())
         _mark().touch()
 
 

@@ -148,7 +148,8 @@ def _within(budgets: pd.DataFrame) -> list[str]:
     ahead = budgets[budgets["verdict"] == "ahead"]
     sure = ahead[ahead["queries"] >= FEW]
     told = []
-    for (budget, scene), case in sure.groupby(["budget_s", "scene"]):
+    for (_, scene), case in sure.groupby(["budget_s", "scene"]):
+        budget = float(case["budget_s"].iloc[0])
         names = " and ".join(
             f"“{baseline}” under {', '.join(own['constraint'])}"
             for baseline, own in case.groupby("baseline", sort=False)
