@@ -38,3 +38,25 @@ def test_self_collision_needs_no_workcell(scene: Scene) -> None:
 def test_an_exempt_link_must_exist(scene: Scene) -> None:
     with pytest.raises(ValueError, match="wrist"):
         World(scene.robot, [Box("table", (0, 0, -0.1), (1, 1, 0.1), ("wrist",))])
+
+
+def test_what_is_said_of_a_configuration_hangs_on_none_before(scene: Scene) -> None:
+    """On this line through a thin plate PyBullet lists a contact from before, 57 mm deep, where the
+    tool is 0.2 mm beyond the plate.
+    """
+    middle, turned = (0.385313, -0.116618, 0.121411), (0.611937, -2.072554, -1.358975)
+    plate = Box("plate", middle, (0.44629, 0.405245, 0.004), rpy_rad=turned)
+    ends = (
+        (0.066910804, 0.019165697, -0.612012413, -2.034068807, 1.574598240, 1.049143949),
+        (0.147732309, -0.048778510, -0.482671400, -2.071216421, 1.491368400, 1.109770540),
+    )
+    line = np.linspace(*ends, 41)
+    with World(scene.robot, [plate]) as world:
+        along = world.free(line)
+    alone = []
+    for row in line:
+        with World(scene.robot, [plate]) as fresh:
+            alone.append(fresh.is_free(row))
+    assert along.tolist() == alone
+    assert not along.all()
+    assert along[-1]

@@ -377,10 +377,18 @@ class World:
                 if contact[8] >= 0.0:  # a contact is listed from a small positive distance on
                     continue
                 if contact[2] in moving:
-                    own = True
+                    own = own or self._overlap(contact)
                 elif body != self._body or contact[3] != _BASE:  # what carries the arm may touch
-                    workcell = True
+                    workcell = workcell or self._overlap(contact)
         return own, workcell
+
+    def _overlap(self, contact: Sequence[Any]) -> bool:
+        """Whether the two links of a contact overlap now: PyBullet keeps contacts from one
+        configuration to the next, and lists some, centimetres deep, of links that are apart again.
+        """
+        _, first, second, link, other = contact[:5]
+        points = self._bullet.getClosestPoints(first, second, 0.0, link, other)
+        return any(point[8] < 0.0 for point in points)
 
 
 _BASE = -1
