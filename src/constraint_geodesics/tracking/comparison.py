@@ -50,16 +50,21 @@ def of_seeds(
             median(ratios) if ratios else math.nan,
             1e3 * median(row["time_s"] for row in own),
         )
-        found.append(dict(zip(COMPARED, figures, strict=True)))
+        found.append(_compared(*figures))
     return found
 
 
-def of_summary(row: Mapping[str, Any], columns: Columns) -> dict[str, Any]:
-    """COMPARED of a row of figures; None where it has none."""
-    spent = row.get(columns.time)
-    spent_ms = None if spent is None else columns.per_ms * spent
-    figures = row.get(columns.success), row.get(columns.ratio), spent_ms
+def _compared(success: float, ratio: float, spent_ms: float) -> dict[str, float]:
+    """With as many digits as a column shows."""
+    figures = (float(f"{figure:.6g}") for figure in (success, ratio, spent_ms))
     return dict(zip(COMPARED, figures, strict=True))
+
+
+def of_summary(row: Mapping[str, Any], columns: Columns) -> dict[str, float]:
+    """COMPARED of a row of figures; nan where it has none."""
+    told = (row.get(name) for name in (columns.success, columns.ratio, columns.time))
+    success, ratio, spent = (math.nan if figure is None else float(figure) for figure in told)
+    return _compared(success, ratio, columns.per_ms * spent)
 
 
 def cells_of(

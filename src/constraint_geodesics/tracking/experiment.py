@@ -232,7 +232,7 @@ class StageRun:
             MetricLogger(self.send, CHILD + name)(0, row)
         spread = _spread(figures)
         means = {name: spread.get(f"seeds/{name}_mean", math.nan) for name in figures[0]}
-        self.metric_logger()(0, means)
+        self.metric_logger()(0, {name: float(f"{mean:.6g}") for name, mean in means.items()})
 
     def recordings(self, rows: Sequence[Mapping[str, Any]], shown: str = "") -> None:
         """Tell where paths are recorded: all of them in a file of this run and in its description;

@@ -20,8 +20,9 @@ NOTE, MADE = "mlflow.note.content", "geodesics.views"
 differs, and what somebody changed in the dashboard stays until then."""
 FIRST_MS = 1_700_000_000_000
 """When the last view in the menu was made, as the menu understands it: the youngest is on top."""
-NAME_PX, CREATED_PX, TEXT_PX, FIGURE_PX = 310, 110, 130, 112
-"""Widths of columns.  The first holds the longest name of a run."""
+NAME_PX, CREATED_PX, TEXT_PX, FIGURE_PX = 285, 100, 120, 96
+"""Widths of columns.  The first holds the longest name of a run; all of COMPARED is seen in a
+window of 1400."""
 
 
 @dataclass(frozen=True)
@@ -160,8 +161,8 @@ def _note() -> str:
     lines = [f"- **{view.name}**: {view.tells}" for view in VIEWS]
     return "\n".join(
         [
-            "Runs of the pipeline's stages, those of seeds and planners below them."
-            " Click **Views** above the table of runs:",
+            "Click **Views** at the top right (it has the name of the view that is open) for a view"
+            " of each question:",
             "",
             *lines,
             "",
