@@ -43,10 +43,10 @@ env: .venv/installed  ## make .venv with every pinned package, those of the pipe
 
 plan: .venv/planning  ## plan one path that keeps a cup level, at once: CSV, picture and recording in first_path/
 	geodesics warmup
-	geodesics plan --constraint level_cup \
+	geodesics plan --constraint level_cup --attach docs/examples/cup.yaml \
 	  --start "$(FIRST_START)" --goal "$(FIRST_GOAL)" \
 	  --out first_path/path.csv --picture first_path/path.png --record first_path/path.rrd
-	geodesics check first_path/path.csv
+	geodesics check first_path/path.csv --attach docs/examples/cup.yaml
 	@echo "Look at first_path/path.png, or replay it: make replay FILE=first_path/path.rrd"
 
 repro: env  ## run all stages that are out of date, then print the results
