@@ -357,9 +357,9 @@ class Trajectory:
         motions: tuple[np.ndarray, ...] = ()
         if demonstrations is not None:
             motions = tuple(demonstrations_from(demonstrations, self.scene.robot)[0])
-        about = {"times": self.times, "goal": goal, "demonstrations": motions}
-        record = PathRecord("planner", name, 0, 0, self.joints, text, **about)
-        record = replace(record, ways=tuple(way.points for way in self.statistics.ways))
+        record = PathRecord("planner", name, 0, 0, self.joints, text, goal=goal)
+        ways = tuple(way.points for way in self.statistics.ways)
+        record = replace(record, times=self.times, demonstrations=motions, ways=ways)
         manifold = ConstraintManifold(self.scene.robot, self.constraint)
         around, carried = self.scene.workcell, self.scene.attached
         record_path(Path(file), record, manifold, around, frames=frames, attached=carried)
