@@ -272,7 +272,7 @@ def test_a_path_that_breaks_a_promise_is_code_three(command, saved, tmp_path) ->
     assert answer["valid"] is False
     assert answer["violation"]["kind"] == "constraint"
     lines = saved.read_text().splitlines()
-    (tmp_path / "jump.csv").write_text("\n".join([*lines[:10], *lines[20:]]))
+    (tmp_path / "jump.csv").write_text("\n".join([*lines[:11], *lines[21:]]))
     code, out, _ = command("check", str(tmp_path / "jump.csv"))
     assert code == 3
     assert out.startswith("step: rows 7 and 8")

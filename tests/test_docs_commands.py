@@ -192,7 +192,7 @@ def test_a_command_of_ours_does_what_its_page_says(words, folder, monkeypatch, c
         "params": "ok",
         "robot": "carried by 7 joints",
         "ik": ".",
-        "identify": "on a sphere" if any("wipe" in w for w in given) else "direction (0, 0, 1)",
+        "identify": "on a sphere" if "docs/examples/wipe.csv" in given else "direction (0, 0, 1)",
         "results": "planner",
         "replay": "path.rrd",
         "bench": "rows: .geodesics/bench/problems.csv.gz",

@@ -149,7 +149,9 @@ def test_a_newer_recording_is_refused_and_one_without_a_format_read(monkeypatch,
 
     stored, chunks, _ = recording.read_chunks(written(RECORDING))
     assert recording.about_of(stored.recording_id, chunks) == about
-    with pytest.raises(recording.RecordingError, match=f"{LATER} reads it; this one") as error:
+    with pytest.raises(
+        recording.RecordingError, match="a later constraint_geodesics reads it; this one"
+    ) as error:
         recording.read_chunks(written(Format(RECORDING.number + 1, LATER)))
     assert str(error.value).startswith(str(file))
     chunks = recording.text_chunks("from before recordings said so")

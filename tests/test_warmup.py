@@ -4,6 +4,7 @@ planning.
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys

@@ -19,7 +19,7 @@ def metrics() -> list[Path]:
         for stage in yaml.safe_load((ROOT / file).read_text())["stages"].values():
             names = (name for entry in stage.get("metrics", ()) for name in entry)
             found |= {one for name in names for one in ROOT.glob(re.sub(r"\$\{.*?\}", "*", name))}
-    return sorted(found)
+    return sorted(one for one in found if not one.stem.endswith("-histograms"))
 
 
 def figures(value: object) -> int:

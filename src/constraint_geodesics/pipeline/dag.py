@@ -46,10 +46,11 @@ def pipeline(root: Path = Path()) -> tuple[nx.DiGraph, dict[str, int]]:
         script = {own: Path(shlex.split(own.cmd)[1]).stem for own in stages}
         needed = [(first, then) for then, first in graph.edges if {first, then} <= set(stages)]
     edges = {(script[first], script[then]) for first, then in needed}
-    found = nx.DiGraph()
+    needed_once = nx.transitive_reduction(nx.DiGraph((a, b) for a, b in edges if a != b))
+    found = nx.DiGraph()  # in the order of the names, so that it is drawn in one way
     found.add_nodes_from(sorted(set(script.values())))
-    found.add_edges_from(sorted((first, then) for first, then in edges if first != then))
-    return nx.transitive_reduction(found), dict(Counter(script.values()))
+    found.add_edges_from(sorted(needed_once.edges))
+    return found, dict(Counter(script.values()))
 
 
 def drawing(graph: nx.DiGraph, items: Mapping[str, int]) -> str:

@@ -56,7 +56,7 @@ def _region(held: np.ndarray, tolerance: np.ndarray, place: np.ndarray, tool: np
     centre = np.where(held, place, 0.5 * (low + high))
     half = np.where(held, np.maximum(tolerance, 0.5 * _THIN_M), 0.5 * (high - low) + _MARGIN_M)
     style = {"colors": [(*rgb(palette.BLUE), 40)], "fill_mode": "transparentfillmajorwireframe"}
-    return rr.Boxes3D(centers=[centre], half_sizes=[half], radii=[_THIN], **style)
+    return rr.Boxes3D(centers=[centre], half_sizes=[half], **style)
 
 
 def _upright(turn: np.ndarray, angles: np.ndarray, loosely: float) -> Iterator[Drawing]:

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from constraint_geodesics import palette
 from constraint_geodesics.certification.certifier import Limits
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Series
-from constraint_geodesics.formats import NUMBER, RECORDING, SINCE, FormatError
+from constraint_geodesics.formats import NUMBER, RECORDING, FormatError
 from constraint_geodesics.geometry.braking import Pace
 from constraint_geodesics.params import PlannerParams
 from constraint_geodesics.recording import panels
@@ -253,7 +253,7 @@ def digest(sampled: Frames) -> str:
 def about_chunk(about: About) -> Chunk:
     """Where the recording comes from, and its format."""
     known = {name: value for name, value in vars(about).items() if value is not None}
-    return static(ABOUT, rr.AnyValues(**known, **RECORDING.entries))
+    return static(ABOUT, rr.AnyValues(**known, **{NUMBER: RECORDING.number}))
 
 
 def write_recording(
@@ -310,9 +310,9 @@ def read_chunks(file: Path) -> tuple[Any, list[Chunk], bool]:
     except RuntimeError as error:
         raise RecordingError(f"{file}: not a recording: {error}") from None
     about = _about_row(chunks)
-    number, since = ((about.get(name) or [None])[0] for name in (NUMBER, SINCE))
+    number = (about.get(NUMBER) or [None])[0]
     try:
-        RECORDING.require(1 if number is None else number, since)
+        RECORDING.require(1 if number is None else number)
     except FormatError as error:
         raise RecordingError(f"{file}: {error}") from None
     return stores[0], chunks, blueprint
