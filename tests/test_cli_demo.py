@@ -97,9 +97,10 @@ def test_it_is_shown_live_until_it_is_stopped(tmp_path) -> None:
             lines.append(line.strip())
             if re.match(r"\d+\.\d\d s: (goal reached|touched|no path)", line):
                 break
-        assert any(line.startswith("http://127.0.0.1:") for line in lines), lines
+        pages = [line for line in lines if line.startswith("http://127.0.0.1:")]
+        assert pages, lines
         assert any(ANSWERED.match(line) for line in lines), lines
-        page = lines[0].split("?")[0]
+        page = pages[0].split("?")[0]
         assert b"rerun" in wait_for(page).lower()
         assert shown.poll() is None  # the viewer stays
         shown.terminate()

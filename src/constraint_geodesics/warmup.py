@@ -16,7 +16,6 @@ from pathlib import Path
 import numba
 from numba.core.registry import cpu_target
 
-from constraint_geodesics.pipeline.progress import progress
 from constraint_geodesics.robot.kernels import forward_batch
 
 Tell = Callable[[str, float], None]
@@ -57,6 +56,8 @@ def ensure(processes: int | None = None) -> None:
     with _alone():
         if is_done():
             return
+        from constraint_geodesics.pipeline.progress import progress  # only where something is shown
+
         what = "compiling the kernels, once for this environment"
         with progress(what, pieces()) as advance:
             _compile_all(processes or _cores(), lambda *_: advance())
