@@ -97,11 +97,11 @@ def _urdf(file: Path, contents: dict[str, bytes]) -> str:
 
 def _plain(file: Path, contents: dict[str, bytes]) -> str:
     """A file as it is, and the colours beside an OBJ."""
-    content = read_content(file)
+    content, colours = read_content(file), file.with_suffix(".mtl")
     folder = f"{FILES}/{digest_of(content)}"
-    for own in (file, file.with_suffix(".mtl")):
-        if own.is_file():
-            contents[f"{folder}/{own.name}"] = read_content(own)
+    contents[f"{folder}/{file.name}"] = content
+    if colours.is_file():
+        contents[f"{folder}/{colours.name}"] = read_content(colours)
     return f"{folder}/{file.name}"
 
 

@@ -306,7 +306,11 @@ class World:
         self._place(q)
         # a little more, so that what is as far away as `most_m` is still found
         (a, i), (b, k) = self._indices(first), self._indices(second)
-        found = self._bullet.getClosestPoints(a, b, most_m + 1e-4, i, k)
+        return self._between(a, b, i, k, most_m + 1e-4)
+
+    def _between(self, first: int, second: int, link: int, other: int, most_m: float) -> float:
+        """Distance of two bodies' links as they stand [m]; inf where it is more than `most_m`."""
+        found = self._bullet.getClosestPoints(first, second, most_m, link, other)
         return min((point[8] for point in found), default=np.inf)
 
     def _indices(self, key: BodyKey) -> tuple[int, int]:
@@ -387,8 +391,7 @@ class World:
         configuration to the next, and lists some, centimetres deep, of links that are apart again.
         """
         _, first, second, link, other = contact[:5]
-        points = self._bullet.getClosestPoints(first, second, 0.0, link, other)
-        return any(point[8] < 0.0 for point in points)
+        return self._between(first, second, link, other, 0.0) < 0.0
 
 
 _BASE = -1
