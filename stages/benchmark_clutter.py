@@ -8,12 +8,10 @@ from constraint_geodesics.benchmark.arm_source import PipelineArm
 from constraint_geodesics.benchmark.entries import code_digest, data_digest
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
-from constraint_geodesics.report.problems_page import write_problem_report
+from constraint_geodesics.report.problems_page import report_answers
 from constraint_geodesics.studies.clutter import cluttered
-from constraint_geodesics.studies.problem_runs import MEASURED_BY, Asked, answered
-from constraint_geodesics.tracking.comparison import problem_cells
+from constraint_geodesics.studies.problem_runs import MEASURED_BY, Asked
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "benchmark_clutter"
@@ -38,15 +36,10 @@ def main(params: Params, layout: Layout) -> None:
         f"the arm of params.yaml in its workcell among random shapes, {own.scenes} scenes of each "
         f"kind, {own.queries} queries of each kind and constraint; {own.limit_s:g} s for a query"
     ]
-    title, reports = "Queries among clutter", layout.root / "reports"
+    title = "Queries among clutter"
     work = Work(STAGE, STAGE, own, [layout.planner])
     with tracked_stage(work, params.tracking.experiment, layout.root) as run:
-        table = answered(drawn, of, "clutter")
-        found = write_problem_report(
-            reports, "clutter", title, about, table, run_header(layout.root)
-        )
-        run.cells(problem_cells(found))
-        run.mirror({"rows": len(table)}, reports / "clutter.json")
+        report_answers(run, layout, "clutter", title, about, drawn, of)
 
 
 if __name__ == "__main__":

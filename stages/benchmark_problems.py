@@ -10,12 +10,10 @@ from constraint_geodesics.benchmark.problem_files import Problem, every, read_pr
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.code import digest
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
-from constraint_geodesics.report.problems_page import write_problem_report
-from constraint_geodesics.studies.problem_runs import MEASURED_BY, Asked, answered
+from constraint_geodesics.report.problems_page import report_answers
+from constraint_geodesics.studies.problem_runs import MEASURED_BY, Asked
 from constraint_geodesics.studies.problems import TILTED, tilted
-from constraint_geodesics.tracking.comparison import problem_cells
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "benchmark_problems"
@@ -43,16 +41,11 @@ def main(params: Params, layout: Layout) -> None:
         f"{own.limit_s:g} s for a query, {own.held_limit_s:g} s with a held tilt",
         *held_beyond(problems),
     ]
-    title, reports = "Problems of MotionBenchMaker", layout.root / "reports"
+    title = "Problems of MotionBenchMaker"
     settings = own.model_dump(mode="json", exclude={"planners"})
     work = Work(STAGE, STAGE, settings, [file])
     with tracked_stage(work, params.tracking.experiment, layout.root) as run:
-        table = answered(asked, of, "problems")
-        found = write_problem_report(
-            reports, "problems", title, about, table, run_header(layout.root)
-        )
-        run.cells(problem_cells(found))
-        run.mirror({"rows": len(table)}, reports / "problems.json")
+        report_answers(run, layout, "problems", title, about, asked, of)
 
 
 def held_beyond(problems: list[Problem]) -> list[str]:

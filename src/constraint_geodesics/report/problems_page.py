@@ -5,14 +5,21 @@ reports/clutter.md.
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from constraint_geodesics.benchmark.problem_files import Problem
 from constraint_geodesics.benchmark.row import write_table
+from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.report.cells import fixed, markdown_table
-from constraint_geodesics.studies.problem_runs import figures
+from constraint_geodesics.studies.problem_runs import Asked, answered, figures
 from constraint_geodesics.text_files import write_text
+from constraint_geodesics.tracking.comparison import problem_cells
+
+if TYPE_CHECKING:  # `geodesics bench` writes the same tables, and tracks nothing
+    from constraint_geodesics.tracking.experiment import StageRun
 
 Figures = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]
 """By constraint, scene or "all", and planner."""
@@ -28,6 +35,24 @@ NOTE = (
     'where there is none in "failures too". Best known: the shortest such path that any planner '
     "here found. Wrongly certified: paths that the certificate takes and PyBullet does not"
 )
+
+
+def report_answers(
+    run: "StageRun",
+    layout: Layout,
+    name: str,
+    title: str,
+    about: Sequence[str],
+    problems: Sequence[Problem],
+    asked: Asked,
+) -> None:
+    """Ask the planners what they have not answered yet, and write the report of a stage, in
+    reports/ and in its run.
+    """
+    table, folder = answered(problems, asked, name), layout.root / "reports"
+    found = write_problem_report(folder, name, title, about, table, run_header(layout.root))
+    run.cells(problem_cells(found))
+    run.mirror({"rows": len(table)}, folder / f"{name}.json")
 
 
 def write_problem_report(
