@@ -46,6 +46,7 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.paths import read_paths
 from constraint_geodesics.pipeline.stage import complain
 from constraint_geodesics.recording.recording import read_recording
+from constraint_geodesics.report.chooser import Chooser
 from constraint_geodesics.report.page import Section, Table, write_page
 from constraint_geodesics.robot.description import read_description
 from constraint_geodesics.robot.kinematics import load_robot
@@ -650,12 +651,20 @@ def test_a_page_shows_names_and_runs_none(tmp_path: Path) -> None:
     hostile = HOSTILE_NAME + "\"'><img src=x onerror=alert(2)>"
     table = Table(hostile, hostile, [hostile], [[hostile]], planners=[hostile])
     section = Section("one", hostile, hostile, tables=[table])
+    content = {"planners": [{"name": hostile}], "cases": [{"constraint": hostile}]}
     page = write_page(
         Layout(tmp_path),
         "benchmark",
         about={hostile: hostile},
         planners=1,
         rows=1,
+        winner=hostile,
+        standing=hostile,
+        result=hostile,
+        losses={hostile: hostile},
+        chooser=Chooser(
+            {"other": [hostile]}, [hostile], hostile, [hostile], {hostile: hostile}, content
+        ),
         sections=[section],
     ).read_text()
     assert "<script>alert" not in page
