@@ -488,8 +488,7 @@ def show_robot(
             params = RobotParams(
                 urdf=str(file), tool_link=tool_link, hold=values, may_touch=touching
             )
-            with waiting("looking which links touch"):
-                understood = understand(params)
+            understood = understand(params)
             about, lines = understood.summary(), list(understood.lines())
     except RobotError as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None

@@ -343,6 +343,22 @@ def test_waiting_on_a_terminal_gives_way_to_a_bar() -> None:
     assert "loading [it]" not in bar.split("2/2")[0], "it gives way to the bar"
 
 
+def test_waiting_on_a_terminal_gives_way_to_another() -> None:
+    program = (
+        "import time\n"
+        "from constraint_geodesics.pipeline.progress import waiting\n"
+        "with waiting('the planner'):\n"
+        "    with waiting('its arm'):\n"
+        "        time.sleep(0.2)\n"
+        "    time.sleep(0.2)\n"
+    )
+    before, within = on_a_terminal(program).split("its arm", 1)
+    assert "the planner" in before
+    inner, after = within.rsplit("its arm", 1)
+    assert "the planner" not in inner
+    assert "the planner" in after
+
+
 STAGE = """
 import numpy as np, torch
 from threadpoolctl import threadpool_info

@@ -36,8 +36,8 @@ from constraint_geodesics.moveit import (
 )
 from constraint_geodesics.params import one_line
 from constraint_geodesics.robot.arm_file import digest_of
-from constraint_geodesics.robot.description import find_mesh
-from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, urdf_root
+from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
+from constraint_geodesics.scene.arm import mesh_digests
 from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.names import require_names
 from constraint_geodesics.scene.point_cloud import PointCloud
@@ -321,11 +321,8 @@ def told_of_arm(robot: SerialRobot) -> Mapping[str, Any]:
     """What answers depend on in the arm's files: its URDF, the meshes that are collided, and the
     links that may touch, whoever says so.
     """
-    meshes = urdf_root(robot.urdf).iterfind("link/collision/geometry/mesh")
-    files = (find_mesh(mesh.get("filename", ""), robot.urdf) for mesh in meshes)
-    contents = [digest_of(file.read_bytes()) for file in files if file is not None]
     return {
         "urdf": digest_of(robot.urdf.read_bytes()),
-        "meshes": contents,
+        "meshes": mesh_digests(robot),
         "allowed": sorted(map(list, robot.allowed)),
     }

@@ -37,7 +37,7 @@ def progress(description: str, total: int) -> AbstractContextManager[Callable[[]
 @contextmanager
 def waiting(description: str) -> Iterator[None]:
     """Show that work whose length nobody knows goes on: on a terminal a line with the time it took
-    so far, which goes when the work is done and gives way to a bar of `progress` within it;
+    so far, which goes when the work is done and gives way to a bar or another such line within it;
     elsewhere, a notebook too, one plain line after two seconds.  An empty description shows
     nothing.
     """
@@ -49,7 +49,8 @@ def waiting(description: str) -> Iterator[None]:
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as line:
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    with _given_way(), bar as line:
         line.add_task(description, total=None)
         _waiting.append(line)
         try:
@@ -72,7 +73,7 @@ def _line_after(line: str) -> Iterator[None]:
 
 
 _waiting: list["Progress"] = []
-"""The lines that are shown now: a terminal has one bottom, which the bar within them needs."""
+"""The lines that are shown now: a terminal has one bottom, which what is within them needs."""
 
 
 @contextmanager

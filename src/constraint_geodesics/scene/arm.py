@@ -16,8 +16,9 @@ import numpy as np
 from platformdirs import user_cache_path
 
 from constraint_geodesics.params import RobotParams
+from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.robot.arm_file import digest_of, write_arm
-from constraint_geodesics.robot.description import Arm, arm_to, read_description
+from constraint_geodesics.robot.description import Arm, arm_to, find_mesh, read_description
 from constraint_geodesics.robot.kinematics import (
     RobotError,
     SerialRobot,
@@ -109,7 +110,8 @@ def _allowed(
             f"{robot.urdf}: the links that may touch are found with PyBullet, which is not "
             "installed: name an SRDF (--srdf), or use Python 3.11"
         )
-    found, sampled = allowed_by_sampling(robot)
+    with waiting(f"looking which links of {arm.description.name} touch, once for this arm"):
+        found, sampled = allowed_by_sampling(robot)
     write_text(kept, json.dumps([found, *sampled]))
     return found, sampled
 
@@ -117,11 +119,17 @@ def _allowed(
 def _sampled_digest(robot: SerialRobot) -> str:
     """Of all that sampling depends on, beside the URDF."""
     own = allowed_collisions
-    meshes = urdf_root(robot.urdf).iterfind("link/collision/geometry/mesh")
-    files = dict.fromkeys(mesh.get("filename", "") for mesh in meshes)
     settings = (own.SAMPLES, own.ALWAYS, own.NEAR_M, own.OFTEN)
     parts = [np.stack([robot.lower, robot.upper]).tobytes().hex(), repr(settings)]
-    return digest_of(" ".join([*parts, *(digest_of(Path(f).read_bytes()) for f in files)]).encode())
+    return digest_of(" ".join([*parts, *mesh_digests(robot)]).encode())
+
+
+def mesh_digests(robot: SerialRobot) -> list[str]:
+    """Of the meshes that are collided, each once, in the URDF's order."""
+    meshes = urdf_root(robot.urdf).iterfind("link/collision/geometry/mesh")
+    names = dict.fromkeys(mesh.get("filename", "") for mesh in meshes)
+    files = (find_mesh(name, robot.urdf) for name in names)
+    return [digest_of(file.read_bytes()) for file in files if file is not None]
 
 
 def _readable(mesh: Path) -> Path:
