@@ -14,13 +14,11 @@ from jaxtyping import Bool, Float
 
 from constraint_geodesics.constraints.polynomial import Relation
 from constraint_geodesics.constraints.tool_features import FEATURES
-from constraint_geodesics.identification.forms import across, axis_words, of_axis, vector
+from constraint_geodesics.identification.forms import across, axis_near, axis_words, of_axis, vector
 from constraint_geodesics.identification.vanishing import Sample
 
 WIDEST_RAD, WIDEST_M = 0.35, 0.03
 """Half-widths beyond which nothing is taken for a tolerance."""
-NAMED_RAD = 0.06
-"""How far from the axes of tool and base those of a bound may seem to be."""
 SHARE, INLIERS = 0.99, 0.9
 """Of the rows that are within a bound; of those that tell how far right rows can be off."""
 WRONG = 2.5
@@ -91,18 +89,10 @@ def _bound(
     return Bound(own.row(width), float(np.sqrt(np.mean(beyond))), right)
 
 
-def _named(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"] | None:
-    """The axis that a direction is near, if it is near one."""
-    k = int(np.argmax(np.abs(direction)))
-    axis = np.zeros(3)
-    axis[k] = np.sign(direction[k])
-    return axis if np.linalg.norm(direction - axis) < NAMED_RAD else None
-
-
 def _cone(sample: Sample) -> _Middle | None:
     """About the direction that an axis keeps best, in the mean."""
     left, _, turned = np.linalg.svd(sample.rotation.mean(axis=0))
-    own, direction = _named(turned[0]), _named(left[:, 0])
+    own, direction = axis_near(turned[0]), axis_near(left[:, 0])
     if own is None or direction is None:
         return None
     if direction.sum() < 0.0:
@@ -143,7 +133,7 @@ def _slab(sample: Sample) -> _Middle | None:
     low, high = _shortest(heights[right], SHARE)
     middle, normal = 0.5 * (low + high), np.eye(3)[k]
     _, directions = np.linalg.eigh(np.cov(sample.position[right].T))
-    if _named(directions[:, 0]) is None:
+    if axis_near(directions[:, 0]) is None:
         return None
 
     def other(some: Sample) -> float:

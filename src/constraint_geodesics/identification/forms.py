@@ -38,7 +38,7 @@ class Round(NamedTuple):
 ROUND = (Round(0.05, 15.0), Round(0.01, 5.0), Round(0.005, 1.0), Round(0.001, 0.5))
 """From the roundest on."""
 NEAR_AXIS = 0.06
-"""How far from an axis a direction may be that is rounded to it."""
+"""How far from an axis of tool or base a direction may seem to be that is meant to be along it."""
 
 
 class Form(NamedTuple):
@@ -63,7 +63,8 @@ class Form(NamedTuple):
         x, at = x.copy(), 0
         for part in self.parts:
             if part == "d":
-                x[at : at + 3] = _axis_near(unit(x[at : at + 3]))
+                near = axis_near(unit(x[at : at + 3]))
+                x[at : at + 3] = unit(x[at : at + 3]) if near is None else near
             elif part == "l":
                 x[at] = digits.metres * np.round(x[at] / digits.metres)
             elif part == "c":
@@ -361,10 +362,10 @@ def unit(v: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     return v / np.linalg.norm(v)
 
 
-def _axis_near(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """The axis that a direction is near, or the direction itself."""
+def axis_near(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"] | None:
+    """The axis that a direction is near, if it is near one."""
     axis = np.sign(direction) * (np.abs(direction) == np.abs(direction).max())
-    return axis if np.linalg.norm(direction - axis) < NEAR_AXIS else direction
+    return axis if np.linalg.norm(direction - axis) < NEAR_AXIS else None
 
 
 def _upright(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
