@@ -45,7 +45,11 @@ def test_a_goal_in_degrees_beside_a_tool_pose_is_refused_too(geodesics) -> None:
     start, goal = pairs_of("level_cup", 1, seed=1)[0]
     words = (f"--start={words_of(start)}", f"--goal={words_of(np.degrees(goal))}")
     _, _, err = geodesics("plan", *words, "--constraint", "free")
-    assert "--goal looks like degrees" in error_line(err)
+    line = error_line(err)
+    assert "--goal looks like degrees" in line
+    pasted = shlex.split(line.split("in rad: ")[1])
+    ends = [[float(x) for x in words.split()] for words in pasted[1::2]]
+    assert np.array(ends) == pytest.approx(np.array([start, goal]), abs=1e-6), "the start was not"
     pose = ("--goal-pose", "0.4 0.2 0.4 180 0 30")
     code, out, err = geodesics("plan", words[0], *pose, "--constraint", "free")
     assert (code, out) == (2, "")

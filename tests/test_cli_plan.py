@@ -107,7 +107,7 @@ def test_a_path_is_planned_and_its_files_are_written(command, query, tmp_path) -
     proven = rf"at most {bound} \(rad, m\) off level_cup anywhere, at least {clear} mm from .*"
     assert re.fullmatch(f"solved: {figures}; proven: {proven}\n", out), out
     assert err.strip() == f"planner: {bundle.PACKAGED}"
-    joints, times, constraint, _ = read_trajectory(csv)
+    joints, times, constraint, *_ = read_trajectory(csv)
     assert joints.tobytes() == own.joints.tobytes()
     assert times.tobytes() == own.times.tobytes()
     assert constraint.axes == own.constraint.axes
@@ -198,8 +198,14 @@ def test_configurations_are_numbers_with_spaces_or_commas_negative_ones_first(
         (asked(ZEROS, "0 0 0 0 0 inf", "free"), r"goal\[5\] is not finite"),
         (asked(ZEROS, ZEROS, "cup"), "'cup'.*level_cup"),
         ((*asked(ZEROS, ZEROS, "free"), "--budget", "0"), "budget_s = 0"),
+        (("plan", "--start", "0.5", "-0.5", "0"), "--start takes its numbers in quotes"),
+        ((*asked(ZEROS, ZEROS), "--out", "a", "--record", "./a"), "one file can't hold them all"),
+        ((*asked(ZEROS, ZEROS), "--picture", "a.jpg"), r"written as PNG: a\.png"),
     ],
-    ids=("three", "seven", "word", "nothing", "nan", "inf", "name", "budget"),
+    ids=(
+        *("three", "seven", "word", "nothing", "nan", "inf", "name", "budget"),
+        *("unquoted", "one file", "jpg"),
+    ),
 )
 def test_wrong_usage_of_plan_is_code_two(command, words, said) -> None:
     code, out, err = command(*words)
@@ -432,6 +438,12 @@ def test_a_scene_and_what_is_carried_come_from_files(command, query, tmp_path) -
     code, out, _ = command("check", str(csv), *files, "--json")
     assert code == 0
     assert "cup on link6" in strict(out)["rests_on"]
+    code, out, err = command("check", str(csv), *files[:2], "--json")
+    assert strict(out)["valid"]
+    line = (
+        f"note: {csv} was planned among cup, which are not in this scene: give --scene and --attach"
+    )
+    assert line in err.splitlines()
     (tmp_path / "scene.yaml").write_text(SCENE.replace("ball", "table"))
     code, out, err = command(*asked(*query), *files)
     assert (code, out) == (2, "")

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -23,6 +24,7 @@ from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.methods import SearchMethod
 from constraint_geodesics.planner import PlannerError
 from constraint_geodesics.recording.recording import read_recording
+from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.candidates import Answer, Parts, Task, candidates, refined, rows_of
 from constraint_geodesics.trajectory import read_trajectory
@@ -612,7 +614,7 @@ def test_a_saved_path_is_read_to_the_last_bit(tmp_path) -> None:
     for name in NAMES:
         path = solved(name)[0]
         path.save(tmp_path / "new" / f"{name}.csv")
-        joints, times, constraint, _ = read_trajectory(tmp_path / "new" / f"{name}.csv")
+        joints, times, constraint, *_ = read_trajectory(tmp_path / "new" / f"{name}.csv")
         assert joints.tobytes() == path.joints.tobytes()
         assert times.tobytes() == path.times.tobytes()
         assert (constraint.axes, constraint.tolerance) == (
@@ -649,6 +651,23 @@ def test_a_saved_path_is_certified_by_itself(planner, tmp_path) -> None:
         packaged_planner().check(tmp_path / "path.csv", "cup")
 
 
+def test_a_path_names_the_shapes_it_was_planned_among(tmp_path) -> None:
+    ball = Sphere("ball", (0.0, 0.0, 3.0), 0.1)
+    cup = Cylinder("cup", Pose([0, 0, 0.1], np.eye(3)), length_m=0.1, radius_m=0.03)
+    file = tmp_path / "path.csv"
+    start, goal = pairs_of("free", 1, seed=14)[0]
+    with Planner.load(bundle.PACKAGED) as planner:
+        planner.scene.attach(cup, link=planner.robot.tool_link)
+        planner.plan(start, goal, "free", scene=[ball]).save(file)
+        assert {"ball", "cup"} < set(read_trajectory(file).shapes)
+        with pytest.warns(UserWarning, match=r"path\.csv was planned among ball, which"):
+            assert planner.check(file).valid
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            planner.scene.add(ball)
+            assert planner.check(file).valid
+
+
 def lines_of(tmp_path: Path) -> list[str]:
     solved("level_cup")[0].save(tmp_path / "path.csv")
     return (tmp_path / "path.csv").read_text().splitlines()
@@ -659,7 +678,7 @@ def test_a_path_of_somebody_else_may_lack_times_and_constraint(tmp_path) -> None
     bare = tmp_path / "bare.csv"
     table = [line.split(",", 1)[1] for line in lines if not line.startswith("#")]
     bare.write_text("\r\n".join(table) + "\r\n\r\n")
-    joints, times, constraint, _ = read_trajectory(bare)
+    joints, times, constraint, *_ = read_trajectory(bare)
     assert joints.tobytes() == path.joints.tobytes()
     assert times is None
     assert constraint is None
@@ -681,6 +700,8 @@ def test_a_path_of_somebody_else_may_lack_times_and_constraint(tmp_path) -> None
             '# constraint: {"axes": [2], "tolerance": [0], "reference": null}',
             "line 1: not a constraint",
         ),
+        (2, "# shapes: [1]", r"line 2: not a list of names: \[1\]"),
+        (2, "# shapes: [", "line 2: not a list of names"),
         (5, "0,0,0,zero,0,0,0", "line 5: not a row of numbers"),
         (5, "0,0,0,,0,0,0", "line 5: not a row of numbers"),
         (7, "0,0,0,0,0,0", "line 7: 6 numbers under 7 names"),
@@ -709,7 +730,7 @@ def test_files_that_hold_no_path_are_refused(tmp_path) -> None:
 def test_columns_are_the_joints_that_their_names_say(planner, tmp_path, change) -> None:
     path = solved("free")[0]
     path.save(tmp_path / "path.csv")
-    about, _, header, *rows = (tmp_path / "path.csv").read_text().splitlines()
+    about, _, _, header, *rows = (tmp_path / "path.csv").read_text().splitlines()
     names = header.split(",")
     headers = {
         "reversed": [",".join([names[0], *names[:0:-1]])],

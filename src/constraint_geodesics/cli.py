@@ -79,10 +79,27 @@ def main() -> None:
     atexit.register(
         gc.freeze
     )  # or Python looks for garbage in all that numba has loaded, for 0.4 s
+    _require_quotes(sys.argv[1:])
     try:
         app()
     except (ValueError, OSError, RuntimeError, MissingExtraError) as error:
         raise SystemExit(complain(error)) from None
+
+
+def _require_quotes(words: Sequence[str]) -> None:
+    """Say which option stands before several numbers, of which it would get the first alone."""
+    for option, *numbers in zip(words, words[1:], words[2:], strict=False):
+        if option.startswith("--") and all(map(_is_number, numbers)):
+            line = f'{option} takes its numbers in quotes: {option} "{numbers[0]} …"'
+            raise SystemExit(complain(ValueError(line), WRONG_USAGE))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 @app.command("package")

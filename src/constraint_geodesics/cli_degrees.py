@@ -31,7 +31,10 @@ def refuse_degrees(given: Mapping[str, Any], robot: "SerialRobot") -> None:
     ends = {n: q for n, q in given.items() if isinstance(q, list) and len(q) == robot.dof}
     for name, q in ends.items():
         if said := _said(q, robot):
-            own = [f'{n} "{_words(_in_rad(end, robot))}"' for n, end in ends.items()]
+            mended = {
+                n: _in_rad(q, robot) if _beyond(q, robot).any() else q for n, q in ends.items()
+            }
+            own = [f'{n} "{_words(q)}"' for n, q in mended.items()]
             raise PlannerError(f"{name} looks like degrees: {said}; in rad: {' '.join(own)}")
 
 
@@ -64,10 +67,7 @@ def _said(q: Any, robot: "SerialRobot") -> str:
     """Which value can't be meant in rad, where all are possible in degrees; else blank."""
     import numpy as np
 
-    rows = np.atleast_2d(np.asarray(q, float))
-    endless = np.isin(robot.joint_names, list(robot.continuous))  # whole turns are its controller's
-    counted = ~(robot.chain.prismatic | endless)
-    beyond = np.where(counted, np.maximum(robot.lower - rows, rows - robot.upper), 0.0)
+    rows, beyond = np.atleast_2d(np.asarray(q, float)), np.atleast_2d(_beyond(q, robot))
     mended = _in_rad(rows, robot)
     inside = (mended >= robot.lower - ROOM_RAD) & (mended <= robot.upper + ROOM_RAD)
     if not (inside.all() and beyond.max() > FAR_RAD):
@@ -75,6 +75,15 @@ def _said(q: Any, robot: "SerialRobot") -> str:
     row, joint = np.unravel_index(int(beyond.argmax()), beyond.shape)
     limits = f"{robot.lower[joint]:.4g} to {robot.upper[joint]:.4g} rad"
     return f"{robot.joint_names[joint]} = {rows[row, joint]:g} is far beyond its limits, {limits}"
+
+
+def _beyond(q: Any, robot: "SerialRobot") -> "Float[np.ndarray, '*batch D']":
+    """By how much joints lie beyond their limits [rad], where degrees would."""
+    import numpy as np
+
+    endless = np.isin(robot.joint_names, list(robot.continuous))  # whole turns are its controller's
+    counted, q = ~(robot.chain.prismatic | endless), np.asarray(q, float)
+    return np.where(counted, np.maximum(robot.lower - q, q - robot.upper), 0.0).clip(0.0)
 
 
 def _in_rad(q: Any, robot: "SerialRobot") -> "Float[np.ndarray, '*batch D']":

@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -251,6 +252,7 @@ def plan(
         require("record")
     arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf, scene, attach)
     try:
+        _require_apart(out, record, picture)
         if demonstrations is not None and record is None:
             raise PlannerError("--demonstrations is drawn in what --record names: give it, too")
         ends = Ends(start, constraint, goal, goal_pose, goal_free, goal_tolerance)
@@ -306,6 +308,23 @@ def plan(
             about["trajectory"] = path.to_joint_trajectory()
     print(json.dumps(about) if as_json or trajectory else _told(path))
     raise SystemExit(0 if path.status == "solved" else NO_PATH)
+
+
+def _require_apart(out: Path | None, record: Path | None, picture: Path | None) -> None:
+    """Raises PlannerError where one file would be written over another, or in a kind that its name
+    denies.
+    """
+    from constraint_geodesics.planner import PlannerError
+
+    files = {
+        f"{option} {file}": file.resolve()
+        for option, file in (("--out", out), ("--record", record), ("--picture", picture))
+        if file is not None
+    }
+    if len(set(files.values())) < len(files):
+        raise PlannerError(f"{', '.join(files)}: one file can't hold them all")
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise PlannerError(f"--picture {picture}: a picture is written as PNG: {picture.stem}.png")
 
 
 def _told(path: "Trajectory") -> str:
@@ -417,7 +436,8 @@ def check(
             loaded = arm.open()
         with loaded, waiting(f"checking {file}"):
             own = None if constraint is None else _constraint(constraint, loaded)
-            certificate = loaded.check(file, own)
+            with warnings.catch_warnings(record=True) as told:
+                certificate = loaded.check(file, own)
             broken = certificate.violation
             if broken is not None and broken.kind == "joint_limits" and file.is_file():
                 rows = read_trajectory(file, robot=loaded.robot).joints
@@ -431,6 +451,8 @@ def check(
     )
     meant = constraint or f"the constraint that {file.name} names"
     caveat = "" if own is None or isinstance(own, str) else own.caveat
+    for one in told:
+        print(f"note: {one.message}: give --scene and --attach", file=sys.stderr)
     if as_json:
         print(json.dumps(certificate.summary()))
     elif broken is None:

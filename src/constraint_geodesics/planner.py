@@ -6,6 +6,7 @@ trajectory = planner.plan(start, goal, "level_cup")
 """
 
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -377,14 +378,19 @@ class Planner:
     ) -> Certificate:
         """Certify a path from CSV (`read_trajectory`) under a constraint, by default the one its
         file names; without a reference it is held where the path begins.  start, goal: the ends
-        [rad] that it must have, if any.
+        [rad] that it must have, if any.  Warns of shapes that the path was planned among and the
+        scene has not.
 
         Raises PlannerError if the file can't be read, or neither names a constraint that exists.
         """
         self._require_open()
         names = self.robot.joint_names
         path = Path(checked_path(file, "file", PlannerError))
-        joints, times, own, moving = read_trajectory(path, names, self.robot)
+        joints, times, own, moving, among = read_trajectory(path, names, self.robot)
+        there = self.scene.now.names
+        if missing := [name for name in among if name not in there]:
+            line = f"{file} was planned among {', '.join(missing)}, which are not in this scene"
+            warnings.warn(line, stacklevel=2)
         if constraint is not None:
             own, _ = self._named(constraint)
         if own is None:

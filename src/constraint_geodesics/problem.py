@@ -118,8 +118,8 @@ def end_refused(
     manifold: ConstraintManifold, q: Float[np.ndarray, "D"], end: Literal["start", "goal"]
 ) -> Status | None:
     """Why a configuration can't be this end of a path, collisions apart; None where it can."""
+    if manifold.robot.limit_distance(q) < -LIMIT_SLACK:  # first: what is in degrees is beyond them
+        return "out_of_limits"
     if not manifold.violation(q) <= SATISFIED:  # nor is it where it is no number
         return "start_violates" if end == "start" else "goal_violates"
-    if manifold.robot.limit_distance(q) < -LIMIT_SLACK:
-        return "out_of_limits"
     return None

@@ -40,7 +40,7 @@ from constraint_geodesics.search.space import space_of
 from constraint_geodesics.text_files import read_text, write_text
 from constraint_geodesics.values import checked_path, finite_number, numbers, shown
 
-CONSTRAINT, VELOCITY = "constraint", "start_velocity"
+CONSTRAINT, VELOCITY, SHAPES = "constraint", "start_velocity", "shapes"
 """Names of the comment lines of a trajectory's CSV, `# name: JSON`."""
 REDRAWN = 0.9 * SATISFIED
 """Violation [rad or m] that lines may use which are drawn anew on a path's way."""
@@ -209,14 +209,15 @@ class Trajectory:
 
     def save(self, file: str | Path) -> None:
         """Write it as CSV: comment lines with the constraint, the velocity at the start where it
-        does not rest there, and the format, then time_s and the joints [rad], a line a waypoint.
+        does not rest there, the names of the shapes that it was planned among, carried ones too,
+        and the format, then time_s and the joints [rad], a line a waypoint.
 
         Raises PlannerError without a path.
         """
         self._require_path("save")
         names = self.scene.robot.joint_names
         checked_path(file, "file", PlannerError)
-        write_trajectory(Path(file), self.motion, self.constraint, names)
+        write_trajectory(Path(file), self.motion, self.constraint, names, self.scene.names)
 
     def to_joint_trajectory(self) -> dict[str, Any]:
         """As ROS's trajectory_msgs/JointTrajectory: `joint_names`, and `points` with `positions`
@@ -459,14 +460,21 @@ def _shares(s: Any) -> Float[np.ndarray, "n"]:
 
 
 def write_trajectory(
-    file: Path, motion: Motion, constraint: Constraint, names: Sequence[str]
+    file: Path,
+    motion: Motion,
+    constraint: Constraint,
+    names: Sequence[str],
+    shapes: Sequence[str] = (),
 ) -> None:
     """Write waypoints and times as CSV, before the header comment lines of the constraint, of the
-    velocity at the first waypoint unless it rests, and of the format; numbers to the last bit.
+    velocity at the first waypoint unless it rests, of the shapes' names, and of the format; numbers
+    to the last bit.
     """
     lines = [f"# {CONSTRAINT}: {json.dumps(constraint.to_json())}"]
     if motion.start_velocity.any():
         lines.append(f"# {VELOCITY}: {json.dumps(motion.start_velocity.tolist())}")
+    if shapes:
+        lines.append(f"# {SHAPES}: {json.dumps(list(shapes))}")
     lines += [f"# {NUMBER}: {TABLE.line}", ",".join(("time_s", *names))]
     for t, row in zip(motion.times, motion.joints, strict=True):
         lines.append(",".join(repr(float(x)) for x in (t, *row)))
@@ -474,14 +482,15 @@ def write_trajectory(
 
 
 class Read(NamedTuple):
-    """What a CSV says of a path: waypoints [rad], and what it has of times [s], a constraint and
-    the velocity at the first waypoint [rad/s].
+    """What a CSV says of a path: waypoints [rad], and what it has of times [s], a constraint, the
+    velocity at the first waypoint [rad/s], and names of the shapes that it was planned among.
     """
 
     joints: Float[np.ndarray, "T D"]
     times: Float[np.ndarray, "T"] | None
     constraint: Constraint | None
     start_velocity: Float[np.ndarray, "D"] | None
+    shapes: tuple[str, ...] = ()
 
 
 def read_trajectory(
@@ -509,7 +518,7 @@ def read_trajectory(
         name, _, text = (part.strip() for part in line.removeprefix("#").partition(":"))
         if name in said:
             raise PlannerError(f"{file}, line {number}: a second {name}")
-        if name in (CONSTRAINT, VELOCITY, NUMBER):
+        if name in (CONSTRAINT, VELOCITY, SHAPES, NUMBER):
             said[name] = number, text
     _require_format(file, *said.pop(NUMBER, (0, TABLE.line)))
     if len(table) < 2:
@@ -522,7 +531,18 @@ def read_trajectory(
     start = _velocity_of(file, *said[VELOCITY], joints.shape[1]) if VELOCITY in said else None
     if start is not None and not timed:
         raise PlannerError(f"{file}: a {VELOCITY} goes with times: there is no column time_s")
-    return Read(joints, times, constraint, start)
+    shapes = _shapes_of(file, *said[SHAPES]) if SHAPES in said else ()
+    return Read(joints, times, constraint, start, shapes)
+
+
+def _shapes_of(file: Path, number: int, text: str) -> tuple[str, ...]:
+    try:
+        given = json.loads(text)
+    except (ValueError, RecursionError):
+        given = None
+    if not (isinstance(given, list) and all(isinstance(name, str) for name in given)):
+        raise PlannerError(f"{file}, line {number}: not a list of names: {text[:80]}")
+    return tuple(given)
 
 
 def _require_format(file: Path, number: int, text: str) -> None:

@@ -48,7 +48,7 @@ def test_it_is_planned_and_certified(path, manifold) -> None:
 def test_its_path_is_read_again(path, manifold, tmp_path) -> None:
     file = tmp_path / "path.csv"
     path.save(file)
-    joints, _, constraint, _ = read_trajectory(file, manifold.robot.joint_names, manifold.robot)
+    joints, _, constraint, *_ = read_trajectory(file, manifold.robot.joint_names, manifold.robot)
     np.testing.assert_array_equal(joints, path.joints)
     assert constraint.key == manifold.constraint.key
     assert packaged_planner().check(file).valid
