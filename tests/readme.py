@@ -9,7 +9,8 @@ from collections import defaultdict
 from pathlib import Path
 from urllib.parse import unquote
 
-from constraint_geodesics.report.benchmark_tables import FEW
+from constraint_geodesics.params import load_params
+from constraint_geodesics.report.benchmark_tables import FEW, asks_in_python
 
 ROOT = Path(__file__).resolve().parents[1]
 README, RESULTS, EXPERIMENTS = (
@@ -27,7 +28,10 @@ BLOCKS = {
 """What stands between <!-- name --> and <!-- /name --> in docs/results.md: a file of reports/."""
 SHORTENED = ("budgets",)
 """Blocks that are their file's first paragraph."""
-SHOWN = ("planner", "trees + band", "SLSQP", "BiRRT + band", "BiRRT", "RRT* 10 s")
+SHOWN = (
+    *("planner", "trees + band", "SLSQP", "BiRRT + band", "BiRRT", "RRT* 10 s"),
+    *("learned + band", "learned"),
+)
 """Rows of README's table."""
 QUOTED = re.compile(r"([\d.]+)([^\d<]{0,12})<!-- from (\S+) (\S+) ([\d.e-]+) (\d) -->")
 """A number with its source behind it: file, key (a blank is written %20), scale, digits."""
@@ -38,11 +42,15 @@ def with_planners(text: str) -> str:
     with (ROOT / "reports" / "benchmark" / "overview.csv").open() as file:
         found = {(row["planner"], row["scene"]): row for row in csv.DictReader(file)}
     columns = ("solved", "length, p95", "median [ms]")
-    head = ("planner", *columns, *(f"sphere: {column}" for column in columns))
-    lines = [f"| {' | '.join(head)} |", f"|---|{'---:|' * 6}"]
+    head = ("planner", "queries × seeds", *columns, *(f"sphere: {column}" for column in columns))
+    lines = [f"| {' | '.join(head)} |", f"|---|{'---:|' * 7}"]
+    slow = asks_in_python(load_params(ROOT / "params.yaml").benchmark.planners)
     for planner in SHOWN:
-        cells = [cell for scene in ("table", "keep_out") for cell in _cells(found[planner, scene])]
-        lines.append(f"| {' | '.join((planner, *cells))} |")
+        rows = [found[planner, scene] for scene in ("table", "keep_out")]
+        name = f"{planner} †" if planner in slow else planner
+        asked = f"{rows[0]['queries']} × {rows[0]['seeds']}"
+        cells = [cell for row in rows for cell in _cells(row)]
+        lines.append(f"| {' | '.join((name, asked, *cells))} |")
     return QUOTED.sub(_requoted, replaced(text, "planners", "\n".join(lines)))
 
 

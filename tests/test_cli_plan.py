@@ -281,7 +281,7 @@ def test_a_path_that_breaks_a_promise_is_code_three(command, saved, tmp_path) ->
     (tmp_path / "jump.csv").write_text("\n".join([*lines[:11], *lines[21:]]))
     code, out, _ = command("check", str(tmp_path / "jump.csv"))
     assert code == 3
-    assert out.startswith("step: rows 7 and 8")
+    assert out.startswith("step: rows 6 and 7")
 
 
 def test_a_certificate_is_one_json_object(command, saved) -> None:

@@ -253,10 +253,11 @@ class RefinedLearnedMethod(LearnedMethod):
         return met.best_of_each
 
     def sound(self, task: Task, curves: Sequence[LatentCurve]) -> Iterator[Candidate]:
-        """The shortest first."""
+        """The shortest first, then the curves as they are: a band may meet what they pass."""
         t = np.linspace(0.0, 1.0, task.settings.segments + 1)
         found = (refined(task, "policy", curve.decoded(t)) for curve in curves)
         yield from sorted((c for c in found if c is not None), key=lambda c: c.length)
+        yield from super().sound(task, curves)
 
 
 def _free_configurations(task: Task) -> Float[np.ndarray, "n D"]:

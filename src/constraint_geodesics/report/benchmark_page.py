@@ -210,14 +210,7 @@ def _overview_blocks(summary: pd.DataFrame, in_python: Sequence[str], which: str
 def _of_planners(title: str, note: str, cells: Cells, links: Sequence[Links] = ()) -> Table:
     """A block whose rows begin with their planner's name."""
     header, rows = _parted(cells)
-    return Table(
-        title,
-        note,
-        header,
-        rows,
-        planners=[row[0].removeprefix("learned geodesic; here ") for row in rows],
-        links=links,
-    )
+    return Table(title, note, header, rows, planners=[row[0] for row in rows], links=links)
 
 
 def _parted(cells: Cells) -> tuple[Sequence[str], Cells]:

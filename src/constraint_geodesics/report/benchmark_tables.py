@@ -58,11 +58,13 @@ PYTHON_NOTE = (
     "constraint (OMPL's atlas and tangent bundle have no tangent space for a tolerance) it has no "
     "rows of it here."
 )
+_LEARNED = "learned"
+"""The planner of the benchmark that the paper's learned geodesics stand next to."""
 TABLE_I_NOTE = (
     "The paper's lengths have no unit and are of one query, on its own machine with a GPU; ours "
     "are latent lengths (eq. 2, on the `planner` manifold) of valid paths over all queries and "
-    "seeds of a method. So compare the ratios ×: the average over that of the geodesic, here over "
-    "that of the planner's paths of the same queries."
+    "seeds of a method. So compare the ratios ×: the average over that of the learned geodesics, "
+    "here of the same queries. `planner` is not learned and has no row in the paper."
 )
 
 
@@ -138,26 +140,36 @@ def _overview_row(row: Mapping[Any, Any], in_python: Collection[str]) -> tuple[s
 
 
 def table_i_cells(rows: pd.DataFrame) -> Cells:
-    """The paper's Table I next to the same planners' rows of one constraint and scene."""
+    """The paper's Table I next to the same planners' rows of one constraint and scene, and the
+    planner's, which the paper has not.
+    """
     valid, column = rows[rows["valid"]], f"{LATENT}planner"
-    lengths = {name: valid[valid["planner"] == name][column] for name in PUBLISHED}
-    planner = valid[valid["planner"] == "planner"]
+    learned = valid[valid["planner"] == _LEARNED].set_index("query")[column]
     cells: Cells = [TABLE_I]
-    for name, (shortest, average, spread, seconds, _) in PUBLISHED.items():
-        own, found = rows[rows["planner"] == name], lengths[name]
+    for name in (*PUBLISHED, "planner"):
+        own, found = rows[rows["planner"] == name], valid[valid["planner"] == name]
         if own.empty:
             continue
-        base = planner[planner["query"].isin(own["query"])][column].mean()
+        base = found["query"].map(learned)
+        ratio = found[column][base.notna()].mean() / base.mean()
         row = (
-            f"learned geodesic; here `{name}`" if name == "planner" else name,
-            *(f"{shortest:.2f}", f"{average:.2f} ± {spread:.2f}"),
-            *(f"{average / PUBLISHED['planner'][1]:.2f}", f"{seconds:.2f}", fixed(found.min(), 2)),
-            f"{fixed(found.mean(), 2)} ± {fixed(found.std(), 2)}",
-            *(fixed(found.mean() / base, 2), f"{own['time_s'].mean():.3g}"),
+            *(f"`{name}`" if name in (_LEARNED, "planner") else name, *_published(name)),
+            fixed(found[column].min(), 2),
+            f"{fixed(found[column].mean(), 2)} ± {fixed(found[column].std(), 2)}",
+            *(fixed(ratio, 2), f"{own['time_s'].mean():.3g}"),
             *(share(own["valid"].mean()), str(len(own))),
         )
         cells.append(row)
     return cells
+
+
+def _published(name: str) -> tuple[str, str, str, str]:
+    """The paper's figures of a planner: shortest, average, ratio and time."""
+    if name not in PUBLISHED:
+        return ("–",) * 4
+    shortest, average, spread, seconds, _ = PUBLISHED[name]
+    ratio = average / PUBLISHED[_LEARNED][1]
+    return f"{shortest:.2f}", f"{average:.2f} ± {spread:.2f}", f"{ratio:.2f}", f"{seconds:.2f}"
 
 
 def ahead_markdown(table: pd.DataFrame) -> str:

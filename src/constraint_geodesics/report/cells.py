@@ -10,10 +10,10 @@ PUBLISHED = {
     "PRM": (499.42, 530.89, 24.43, 9.75, 1.53),
     "RRT* 10 s": (134.80, 155.28, 17.84, 5.21, 1.38),
     "BiRRT": (53.00, 84.65, 25.52, 2.903, 0.16),
-    "planner": (70.56, 79.81, 7.64, 3.8, 1.81),
+    "learned": (70.56, 79.81, 7.64, 3.8, 1.81),
 }
 """Table I of the paper: shortest path, average, its ±, planning time [s], its ±; its learned
-geodesic stands next to our planner.
+geodesic stands next to the benchmark's `learned`.
 """
 Cells = list[Sequence[str]]
 """A table's header and its rows."""

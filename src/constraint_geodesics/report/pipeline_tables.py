@@ -24,7 +24,7 @@ from constraint_geodesics.report.results import (
     table_cells,
 )
 
-PUBLISHED_AS = {"prm": "PRM", "rrt_star": "RRT* 10 s", "birrt": "BiRRT", LEARNED: "planner"}
+PUBLISHED_AS = {"prm": "PRM", "rrt_star": "RRT* 10 s", "birrt": "BiRRT", LEARNED: "learned"}
 """Where the paper's Table I has the planners of this run."""
 
 
@@ -60,7 +60,7 @@ def _published_cells(planner: str) -> list[str]:
     if planner not in PUBLISHED_AS:
         return ["–"] * 4
     shortest, average, spread, time, time_spread = PUBLISHED[PUBLISHED_AS[planner]]
-    ratio, times = average / PUBLISHED["planner"][1], plus_minus(time, time_spread, fixed)
+    ratio, times = average / PUBLISHED["learned"][1], plus_minus(time, time_spread, fixed)
     return [fixed(shortest), plus_minus(average, spread, fixed), fixed(ratio), times]
 
 

@@ -104,11 +104,14 @@ class Asked:
         return self._certified(sampled(self.task, LatentCurve(self.problem, self.ends, phi)))
 
     def refined_length(self, phi: Float[np.ndarray, "p"]) -> float | None:
-        """The same of what the planner's elastic band makes of the curve."""
+        """The same of what the planner's elastic band makes of the curve; of the curve itself where
+        that is not certified.
+        """
         task = self.task
         t = np.linspace(0.0, 1.0, task.settings.segments + 1)
         curve = LatentCurve(self.problem, self.ends, phi)
-        return self._certified(refined(task, "policy", curve.decoded(t)))
+        banded = self._certified(refined(task, "policy", curve.decoded(t)))
+        return self.certified_length(phi) if banded is None else banded
 
     def _certified(self, candidate: Candidate | None) -> float | None:
         if candidate is None:
