@@ -67,6 +67,7 @@ def test_random_requests(effort: Effort) -> None:
     finally:
         planner.scene.become(first)
     about = {name: value for name, value in asdict(figures).items() if isinstance(value, int)}
+    about["solved"] = figures.statuses["solved"]
     count("random_requests", effort, **about)
     _keep(effort, figures)
     assert not figures.wrong, "\n".join(figures.wrong[:20])

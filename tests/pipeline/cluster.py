@@ -17,7 +17,7 @@ DEAD = 9
 """The exit code of a worker that dies in a task that is made to."""
 ORDERLY = {0, DEAD, -signal.SIGKILL}
 _DASK = [sys.executable, "-m", "dask"]
-_STARTS_S = 30
+_STARTS_S = 120
 
 
 @dataclass(frozen=True)
@@ -55,11 +55,7 @@ def cluster(folder: Path, workers: int = 2, allowed_failures: int = 0) -> Iterat
             subprocess.Popen([*_DASK, "worker", *one, *loopback], **options) for _ in range(workers)
         ]
         try:
-            deadline = time.monotonic() + _STARTS_S
-            while not file.exists() and time.monotonic() < deadline:
-                time.sleep(0.05)
-            address = json.loads(file.read_text())["address"]
-            compute = ComputeParams(backend="dask", workers=0, dask_address=address)
+            compute = ComputeParams(backend="dask", workers=0, dask_address=_address(file))
             yield Cluster(scheduler, tuple(started), compute, log)
         finally:
             # workers first: one that is told to stop by its scheduler and by a signal at once may
@@ -67,6 +63,18 @@ def cluster(folder: Path, workers: int = 2, allowed_failures: int = 0) -> Iterat
             codes = [_stop(process) for process in (*started, scheduler)]
     # workers that lost their scheduler end by themselves, and not always in order
     assert codes[-1] == -signal.SIGKILL or set(codes) <= ORDERLY, log.read_text()
+
+
+def _address(file: Path) -> str:
+    """Of the scheduler, once its file is written as a whole."""
+    deadline = time.monotonic() + _STARTS_S
+    while True:
+        try:
+            return str(json.loads(file.read_text())["address"])
+        except (OSError, ValueError):
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.05)
 
 
 def _stop(process: subprocess.Popen[bytes]) -> int:

@@ -14,7 +14,7 @@ import pytest
 from constraint_geodesics.tracking.dashboard import serve_and_open
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
-STARTS_S = 90
+STARTS_S = 300
 
 
 def free_port() -> int:

@@ -46,6 +46,8 @@ def slopes_markdown(fits: pd.DataFrame) -> str:
     rows: Cells = [("grows with", "what", "exponent", "± standard error", "points")]
     for row in fits.to_dict("records"):
         slope, error = (fixed(row[name]) for name in ("slope", "standard_error"))
+        if row["points"] < 3:  # two points lie on a line, whatever they are
+            continue
         rows.append((row["axis"], row["what"], slope, error, str(row["points"])))
     return f"{markdown_table(rows)}\n"
 

@@ -8,7 +8,7 @@ import urllib.request
 import webbrowser
 from collections.abc import Sequence
 
-STARTS_S = 60.0
+STARTS_S = 300.0
 """Time that the server is given to answer."""
 
 
