@@ -10,6 +10,7 @@ from pathlib import Path
 from urllib.parse import unquote
 
 from constraint_geodesics.params import load_params
+from constraint_geodesics.peers.registry import all_settings
 from constraint_geodesics.report.benchmark_tables import FEW, asks_in_python
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -44,7 +45,7 @@ def with_planners(text: str) -> str:
     columns = ("solved", "length, p95", "median [ms]")
     head = ("planner", "queries × seeds", *columns, *(f"sphere: {column}" for column in columns))
     lines = [f"| {' | '.join(head)} |", f"|---|{'---:|' * 7}"]
-    slow = asks_in_python(load_params(ROOT / "params.yaml").benchmark.planners)
+    slow = asks_in_python(all_settings(load_params(ROOT / "params.yaml")))
     for planner in SHOWN:
         rows = [found[planner, scene] for scene in ("table", "keep_out")]
         name = f"{planner} †" if planner in slow else planner
