@@ -316,7 +316,7 @@ def test_a_collision_is_named_in_json_as_well(command, tmp_path) -> None:
     ("line", "text", "said"),
     [
         (1, "# constraint: {}", "line 1: not a constraint"),
-        (4, "0,0,0,0,zero,0,0", "line 4: not a row of numbers"),
+        (5, "0,0,0,0,zero,0,0", "line 5: not a row of numbers"),
         (9, "0,0,0", "line 9: 3 numbers under 7 names"),
     ],
 )

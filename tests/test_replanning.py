@@ -138,7 +138,7 @@ def test_velocities_that_no_path_begins_with_are_refused():
         ._preparation.task(normal.constraint)
         .manifold.jacobian(state.configuration)
     )
-    off = asked(state.velocity + 0.1 * jacobian[3])
+    off = asked(0.5 * state.velocity + 0.1 * jacobian[3])
     assert off.status == "start_violates"
     assert "leads off level_cup at" in off.explanation
     free = planner.constraints["free"]
