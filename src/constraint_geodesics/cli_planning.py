@@ -437,6 +437,8 @@ def check(
         with loaded, waiting(f"checking {file}"):
             own = None if constraint is None else _constraint(constraint, loaded)
             with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("ignore")
+                warnings.simplefilter("always", UserWarning)  # of shapes that are missing
                 certificate = loaded.check(file, own)
             broken = certificate.violation
             if broken is not None and broken.kind == "joint_limits" and file.is_file():

@@ -81,7 +81,9 @@ def test_more_wanted_paths_are_no_longer(world: World) -> None:
 
 def test_limits_bend_the_path(world: World) -> None:
     bent = 0
-    for asked in problems(world, "level_cup", 60):
+    for number, asked in enumerate(problems(world, "level_cup", 60)):
+        if bent and number >= 12:
+            break
         wide = TrajectoryOptimisation(TrajectoryOptimisationSettings(starts=1)).plan(asked, 0)
         if wide.status != "solved":
             continue
@@ -105,7 +107,6 @@ def test_limits_bend_the_path(world: World) -> None:
         assert robot.limit_distance(path.joints).min() >= -1e-9
         assert length(path.joints) > length(wide.joints)
         bent += 1
-        break
     assert bent
 
 

@@ -44,10 +44,8 @@ LEGEND_ROOM = 0.27
 def slopes_markdown(fits: pd.DataFrame) -> str:
     """The exponents as a table, axis by axis.  fits: `growth.slopes`."""
     rows: Cells = [("grows with", "what", "exponent", "± standard error", "points")]
-    for row in fits.to_dict("records"):
+    for row in fits[fits["points"] > 2].to_dict("records"):  # any two points lie on a line
         slope, error = (fixed(row[name]) for name in ("slope", "standard_error"))
-        if row["points"] < 3:  # two points lie on a line, whatever they are
-            continue
         rows.append((row["axis"], row["what"], slope, error, str(row["points"])))
     return f"{markdown_table(rows)}\n"
 
