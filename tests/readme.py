@@ -11,7 +11,7 @@ from urllib.parse import unquote
 
 from constraint_geodesics.params import load_params
 from constraint_geodesics.peers.registry import all_settings
-from constraint_geodesics.report.benchmark_tables import FEW, asks_in_python
+from constraint_geodesics.report.benchmark_tables import FEW, asked, asks_in_python
 
 ROOT = Path(__file__).resolve().parents[1]
 README, RESULTS, EXPERIMENTS = (
@@ -48,10 +48,8 @@ def with_planners(text: str) -> str:
     slow = asks_in_python(all_settings(load_params(ROOT / "params.yaml")))
     for planner in SHOWN:
         rows = [found[planner, scene] for scene in ("table", "keep_out")]
-        name = f"{planner} †" if planner in slow else planner
-        asked = f"{rows[0]['queries']} × {rows[0]['seeds']}"
         cells = [cell for row in rows for cell in _cells(row)]
-        lines.append(f"| {' | '.join((name, asked, *cells))} |")
+        lines.append(f"| {' | '.join((*asked(rows[0], slow), *cells))} |")
     return QUOTED.sub(_requoted, replaced(text, "planners", "\n".join(lines)))
 
 

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from constraint_geodesics import bundle, cli, cli_planning
-from constraint_geodesics.pipeline import progress
+from constraint_geodesics import bundle, cli, cli_planning, progress
 from constraint_geodesics.recording.recording import read_recording
 from constraint_geodesics.trajectory import read_trajectory
 from tests.planner_fixtures import NAMES, nodes_of, packaged_bundle, packaged_planner, pairs_of

@@ -18,10 +18,10 @@ from constraint_geodesics.cli_problems import ProblemOptions, bench_problems
 from constraint_geodesics.errors import ParamsError
 from constraint_geodesics.extras import MissingExtraError, require
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
 from constraint_geodesics.pipeline.threads import ONE_THREAD
-from constraint_geodesics.text_files import write_text
+from constraint_geodesics.progress import waiting
+from constraint_geodesics.text_files import is_number, write_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -89,17 +89,9 @@ def main() -> None:
 def _require_quotes(words: Sequence[str]) -> None:
     """Say which option stands before several numbers, of which it would get the first alone."""
     for option, *numbers in zip(words, words[1:], words[2:], strict=False):
-        if option.startswith("--") and all(map(_is_number, numbers)):
+        if option.startswith("--") and all(map(is_number, numbers)):
             line = f'{option} takes its numbers in quotes: {option} "{numbers[0]} …"'
             raise SystemExit(complain(ValueError(line), WRONG_USAGE))
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 @app.command("package")

@@ -32,9 +32,10 @@ def refuse_degrees(given: Mapping[str, Any], robot: "SerialRobot") -> None:
     for name, q in ends.items():
         if said := _said(q, robot):
             mended = {
-                n: _in_rad(q, robot) if _beyond(q, robot).any() else q for n, q in ends.items()
+                n: _in_rad(end, robot) if _beyond(end, robot).any() else end
+                for n, end in ends.items()
             }
-            own = [f'{n} "{_words(q)}"' for n, q in mended.items()]
+            own = [f'{n} "{_words(end)}"' for n, end in mended.items()]
             raise PlannerError(f"{name} looks like degrees: {said}; in rad: {' '.join(own)}")
 
 

@@ -19,8 +19,8 @@ from constraint_geodesics.cli_planning import (
     Urdf,
     loading,
 )
-from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
+from constraint_geodesics.progress import waiting
 
 
 def identify_constraint(

@@ -18,8 +18,8 @@ from constraint_geodesics.cli_degrees import (
     refuse_degrees_of_table,
 )
 from constraint_geodesics.extras import require
-from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
+from constraint_geodesics.progress import waiting
 
 if TYPE_CHECKING:
     from constraint_geodesics.certification.certifier import Certificate

@@ -94,6 +94,15 @@ def reading(file: Path) -> Iterator[None]:
         raise DamagedFileError(f"{file}: damaged: {reason}") from error
 
 
+def is_number(word: str) -> bool:
+    """Whether Python reads it as a number."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
 def kept_json(file: Path) -> Any:
     """What was kept in a file of JSON; None where it is missing or damaged, and is made again."""
     try:

@@ -37,7 +37,7 @@ from constraint_geodesics.search.band import project, step_lengths
 from constraint_geodesics.search.candidates import Candidate
 from constraint_geodesics.search.run_out import left_over, rows_from, run_out, run_outs
 from constraint_geodesics.search.space import space_of
-from constraint_geodesics.text_files import read_text, write_text
+from constraint_geodesics.text_files import is_number, read_text, write_text
 from constraint_geodesics.values import checked_path, finite_number, numbers, shown
 
 CONSTRAINT, VELOCITY, SHAPES = "constraint", "start_velocity", "shapes"
@@ -566,7 +566,7 @@ def _velocity_of(file: Path, number: int, text: str, dof: int) -> Float[np.ndarr
 
 def _header(file: Path, cells: Sequence[str], names: Sequence[str] | None) -> list[str]:
     header = [name.strip() for name in cells]
-    if any(_is_number(name) for name in header):
+    if any(is_number(name) for name in header):
         wanted = "a header line with the joints' names is needed before the rows"
         raise PlannerError(f"{file}: {wanted}")
     if names is not None and header[int(header[0] == "time_s") :] != list(names):
@@ -589,19 +589,11 @@ def _table(file: Path, lines: Sequence[tuple[int, str]], count: int) -> Float[np
 
 
 def _numbers(file: Path, number: int, cells: Sequence[str], count: int) -> list[float]:
-    if not all(_is_number(cell) for cell in cells):
+    if not all(is_number(cell) for cell in cells):
         raise PlannerError(f"{file}, line {number}: not a row of numbers")
     if len(cells) != count:
         raise PlannerError(f"{file}, line {number}: {len(cells)} numbers under {count} names")
     return [float(cell) for cell in cells]
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _constraint_of(file: Path, number: int, text: str, robot: SerialRobot | None) -> Constraint:

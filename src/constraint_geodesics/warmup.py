@@ -56,7 +56,7 @@ def ensure(processes: int | None = None) -> None:
     with _alone():
         if is_done():
             return
-        from constraint_geodesics.pipeline.progress import progress  # only where something is shown
+        from constraint_geodesics.progress import progress  # only where something is shown
 
         what = "compiling the kernels, once for this environment"
         with progress(what, pieces()) as advance:

@@ -22,8 +22,8 @@ from constraint_geodesics.learning.dataset import ShardTask, draw_shard, shard_t
 from constraint_geodesics.params import ComputeParams, Params
 from constraint_geodesics.pipeline import compute
 from constraint_geodesics.pipeline.compute import ComputeError, as_finished, parallel_map
-from constraint_geodesics.pipeline.progress import progress, waiting
 from constraint_geodesics.pipeline.threads import ONE_THREAD
+from constraint_geodesics.progress import progress, waiting
 from constraint_geodesics.scene.scene import Scene
 from tests.pipeline.cluster import DEAD, cluster
 
@@ -302,7 +302,7 @@ Cell.__module__ = "ipykernel.iostream"
 
 def test_progress_in_a_notebook_is_a_bar_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", Cell())
-    monkeypatch.setattr("constraint_geodesics.pipeline.progress.CELL_EVERY_S", 0.0)
+    monkeypatch.setattr("constraint_geodesics.progress.CELL_EVERY_S", 0.0)
     with progress("label [free]", 4) as advance:
         for _ in range(4):
             advance()
@@ -322,7 +322,7 @@ def test_waiting_in_a_log_or_a_notebook_is_one_line_where_it_is_long(
     with waiting("loading the planner"):
         pass
     assert capfd.readouterr() == ("", "")
-    monkeypatch.setattr("constraint_geodesics.pipeline.progress.LINE_AFTER_S", 0.05)
+    monkeypatch.setattr("constraint_geodesics.progress.LINE_AFTER_S", 0.05)
     for description, line in (("loading [it]", "loading [it] …\n"), ("", "")):
         with waiting(description):
             time.sleep(0.3)
@@ -331,7 +331,7 @@ def test_waiting_in_a_log_or_a_notebook_is_one_line_where_it_is_long(
 
 def test_waiting_on_a_terminal_gives_way_to_a_bar() -> None:
     program = (
-        "from constraint_geodesics.pipeline.progress import progress, waiting\n"
+        "from constraint_geodesics.progress import progress, waiting\n"
         "with waiting('loading [it]'):\n"
         "    with progress('a bar within', 2) as advance:\n"
         "        advance(); advance()\n"
@@ -346,7 +346,7 @@ def test_waiting_on_a_terminal_gives_way_to_a_bar() -> None:
 def test_waiting_on_a_terminal_gives_way_to_another() -> None:
     program = (
         "import time\n"
-        "from constraint_geodesics.pipeline.progress import waiting\n"
+        "from constraint_geodesics.progress import waiting\n"
         "with waiting('the planner'):\n"
         "    with waiting('its arm'):\n"
         "        time.sleep(0.2)\n"

@@ -302,7 +302,7 @@ def test_without_meshes_a_recording_is_small_and_names_the_urdfs(xarm, tmp_path)
         )
     small, large = read_recording(slim), read_recording(whole)
     assert (small.meshes, large.meshes) == (0, 8)
-    assert slim.stat().st_size < 0.3e6 < whole.stat().st_size
+    assert slim.stat().st_size < whole.stat().st_size / 5
     assert small.recording_id == large.recording_id
     assert set(small.entity_paths) < set(large.entity_paths)
     assert column(slim, "/robot", "urdf") == [["xarm/xarm6_robot.urdf"]]

@@ -63,8 +63,9 @@ class Form(NamedTuple):
         x, at = x.copy(), 0
         for part in self.parts:
             if part == "d":
-                near = axis_near(unit(x[at : at + 3]))
-                x[at : at + 3] = unit(x[at : at + 3]) if near is None else near
+                direction = unit(x[at : at + 3])
+                near = axis_near(direction)
+                x[at : at + 3] = direction if near is None else near
             elif part == "l":
                 x[at] = digits.metres * np.round(x[at] / digits.metres)
             elif part == "c":

@@ -22,8 +22,8 @@ import joblib
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
 from constraint_geodesics.params import ComputeParams
-from constraint_geodesics.pipeline.progress import progress
 from constraint_geodesics.pipeline.threads import one_thread, stay_on_one_thread
+from constraint_geodesics.progress import progress
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from constraint_geodesics.errors import ParamsError
 from constraint_geodesics.extras import MissingExtraError
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.progress import waiting
 from constraint_geodesics.pipeline.threads import one_thread
+from constraint_geodesics.progress import waiting
 from constraint_geodesics.text_files import reading, write_text
 
 if TYPE_CHECKING:

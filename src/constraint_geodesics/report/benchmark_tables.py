@@ -130,13 +130,18 @@ def overview_cells(case: pd.DataFrame, in_python: Collection[str] = ()) -> Cells
 def _overview_row(row: Mapping[Any, Any], in_python: Collection[str]) -> tuple[str, ...]:
     low, high = share(row["success_low"]), share(row["success_high"])
     return (
-        f"{row['planner']}{' †' if row['planner'] in in_python else ''}",
-        f"{row['queries']} × {row['seeds']}",
+        *asked(row, in_python),
         f"{share(row['success_of_solvable'])} [{low}, {high}]",
         *(str(row["claimed_but_invalid"]), _p95(row, "ratio_p95_all"), _iqm(row, 3)),
         *(fixed(row["reference_iqm"], 3), milliseconds(row["time_median_s"])),
         *(milliseconds(row["time_p95_s"]), share(row["beaten"])),
     )
+
+
+def asked(row: Mapping[Any, Any], in_python: Collection[str]) -> tuple[str, str]:
+    """The planner, marked where its search asks through Python, and what it was asked."""
+    mark = " †" if row["planner"] in in_python else ""
+    return f"{row['planner']}{mark}", f"{row['queries']} × {row['seeds']}"
 
 
 def table_i_cells(rows: pd.DataFrame) -> Cells:

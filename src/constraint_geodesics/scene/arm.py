@@ -16,7 +16,7 @@ import numpy as np
 from platformdirs import user_cache_path
 
 from constraint_geodesics.params import RobotParams
-from constraint_geodesics.pipeline.progress import waiting
+from constraint_geodesics.progress import waiting
 from constraint_geodesics.robot.arm_file import digest_of, write_arm
 from constraint_geodesics.robot.description import Arm, arm_to, find_mesh, read_description
 from constraint_geodesics.robot.kinematics import (

@@ -21,7 +21,7 @@ from constraint_geodesics.geometry.braking import Pace
 from constraint_geodesics.learning.dataset import Queries, draw_queries
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.params import ExecutionParams
-from constraint_geodesics.pipeline.progress import progress
+from constraint_geodesics.progress import progress
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.cup import CupSettings, Execution, execute
 from constraint_geodesics.text_files import reading, written

@@ -43,7 +43,7 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import corrected, retracted
 from constraint_geodesics.params import GeodesicParams, GeometryParams
 from constraint_geodesics.pipeline.machine import machine
-from constraint_geodesics.pipeline.progress import progress
+from constraint_geodesics.progress import progress
 from constraint_geodesics.studies.geodesic_search import (
     MANIFOLDS,
     PAIRS,

@@ -35,8 +35,8 @@ from constraint_geodesics.learning.training import TrainingRun, train_manifold
 from constraint_geodesics.learning.vae import JointVae
 from constraint_geodesics.params import ManifoldParams, Params
 from constraint_geodesics.peers.elastic_band import answer, first_free, settled, task_of
-from constraint_geodesics.pipeline.progress import progress
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
+from constraint_geodesics.progress import progress
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
