@@ -157,6 +157,51 @@ def test_what_is_attached_in_the_base_frame_is_where_the_arm_has_it(
     np.testing.assert_allclose(held.shape.at.matrix, Placement((0.0, 0.0, 0.07)).matrix, atol=1e-9)
 
 
+def between(parent: str, child: str, above_m: float) -> dict[str, Any]:
+    """A geometry_msgs/TransformStamped."""
+    transform = {"translation": {"x": 0.0, "y": 0.0, "z": above_m}, "rotation": UPRIGHT}
+    return {"header": {"frame_id": parent}, "child_frame_id": child, "transform": transform}
+
+
+def test_transforms_that_say_what_is_taken_for_granted_are_fine(
+    planner: Planner, tmp_path: Path
+) -> None:
+    raw = a_scene(planner.robot.joint_names)
+    raw["fixed_frame_transforms"] = [
+        between("world", "world", 0.0),
+        between("link_base", "world", 0.0),
+        between("world", "camera", 1.0),  # nothing refers to it
+    ]
+    add_moveit_scene(written(tmp_path, raw), planner.scene)
+    assert len(planner.scene.workcell) == 5
+
+
+def of_two_parts(name: str, **more: Any) -> dict[str, Any]:
+    """A cup with its handle."""
+    cup = an_object(name, 3, [0.1, 0.03], pose(0, 0, 0.07), **more)
+    cup["primitives"].append({"type": 1, "dimensions": [0.02, 0.02, 0.05]})
+    cup["primitive_poses"].append(pose(0.04, 0, 0.07))
+    return cup
+
+
+def test_an_attached_object_takes_no_other_ones_place(planner: Planner, tmp_path: Path) -> None:
+    """Its parts have made-up names; what stood around the arm under its own goes, whole."""
+    raw = a_scene(planner.robot.joint_names)
+    (held,) = raw["robot_state"]["attached_collision_objects"]
+    held["object"] = of_two_parts("cup", frame="link6")
+    objects, standing = raw["world"]["collision_objects"], pose(0.5, 0, 0.3)
+    objects.append(an_object("cup_2", 3, [0.1, 0.03], standing))
+    before = planner.scene.now
+    with pytest.raises(MoveitError, match="its part 'cup_2' is called as another object"):
+        add_moveit_scene(written(tmp_path, raw), planner.scene)
+    assert planner.scene.now is before
+    objects[-1] = of_two_parts("cup", pose=standing)
+    held["object"] = an_object("cup", 3, [0.1, 0.03], pose(0, 0, 0.07), frame="link6")
+    add_moveit_scene(written(tmp_path, raw), planner.scene)
+    assert [one.name for one in planner.scene.attached] == ["cup"]
+    assert not {"cup", "cup_2"} & {shape.name for shape in planner.scene.workcell}
+
+
 def set_in(raw: Any, path: str, value: Any) -> Any:
     at = raw
     *outer, last = [int(p) if p.isdigit() else p for p in path.split(".")]
@@ -192,6 +237,10 @@ def set_in(raw: Any, path: str, value: Any) -> Any:
         ("link_padding", [{"link_name": "link3", "padding": 0.01}], "link_padding"),
         ("link_scale", [{"link_name": "link3", "scale": 1.1}], "link_scale"),
         ("robot_state.multi_dof_joint_state", {"joint_names": ["base"]}, "multi_dof_joint_state"),
+        ("robot_state.joint_state.velocity", [0, 0, 0.1, 0, 0, 0], "motions begin at rest"),
+        ("fixed_frame_transforms", [between("link_base", "world", -0.8)], "'world' in 'link_base'"),
+        ("fixed_frame_transforms", [between("map", "world", 0.1)], "'world' in 'map'"),
+        ("fixed_frame_transforms", [between("world", "link_base", 0.8)], "'link_base' in 'world'"),
         ("allowed_collision_matrix.default_entry_values", [], "1 default names, 0 values"),
     ],
 )
@@ -337,6 +386,8 @@ def test_a_held_orientation_is_a_constraint(planner: Planner, tmp_path: Path) ->
         ("max_cartesian_speed", 0.2, "max_cartesian_speed"),
         ("trajectory_constraints", {"constraints": [{}]}, "trajectory_constraints"),
         ("start_state.attached_collision_objects", [{}], "attached_collision_objects"),
+        ("start_state.multi_dof_joint_state", {"joint_names": ["base"]}, "multi_dof_joint_state"),
+        ("start_state.joint_state.velocity", [0.1], "motions begin at rest"),
     ],
 )
 def test_what_is_no_request_is_named(

@@ -6,7 +6,7 @@ something in them, other path constraints than an orientation's, links other tha
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -85,6 +85,7 @@ def add_moveit_scene(file: Path, scene: PlanningScene) -> dict[str, float]:
                 if float(own[neutral[0]]) != neutral[1]:
                     raise MoveitError(f"{entry}: links are taken as they are: {own}")
         _require_none(state, "robot_state.multi_dof_joint_state", "joint_names")
+        _require_at_base(raw, scene)
         joints = _joint_state(_entry(state, "joint_state", {}), "robot_state")
         named = dict[str, list[str]]()
         now, q = scene.now, _configuration(joints, scene.robot)
@@ -95,8 +96,12 @@ def add_moveit_scene(file: Path, scene: PlanningScene) -> dict[str, float]:
             now = now.adding(*shapes)
         for number, own in enumerate(_list(state, "attached_collision_objects")):
             where = f"robot_state.attached_collision_objects[{number}]"
-            for held in _held(own, where, scene, q):
-                named.setdefault(str(own["object"]["id"]), []).append(held.name)
+            name, parts = str(own["object"]["id"]), _held(own, where, scene, q)
+            around = named.pop(name, [])
+            _require_free([held.name for held in parts], {name, *around}, now.names, where)
+            now = now.removing(*(part for part in around if part != name))
+            named[name] = [held.name for held in parts]
+            for held in parts:
                 now = now.attaching(held)
         known = {*scene.links, *scene.now.names, *named}
         for first, second in _allowed(_entry(raw, "allowed_collision_matrix", {}), known):
@@ -120,16 +125,13 @@ def read_moveit_request(
     """
     raw, robot = _read(file), planner.robot
     try:
-        given = _joint_state(
-            _entry(_entry(raw, "start_state", {}), "joint_state", {}), "start_state"
-        )
+        state_given = _entry(raw, "start_state", {})
+        given = _joint_state(_entry(state_given, "joint_state", {}), "start_state")
+        _require_none(state_given, "start_state.multi_dof_joint_state", "joint_names")
         _require_none(raw, "start_state", "attached_collision_objects")
         _require_none(raw, "trajectory_constraints", "constraints")
         if float(raw.get("max_cartesian_speed") or 0.0) > 0.0:
             raise MoveitError("max_cartesian_speed: speeds are limited joint by joint alone")
-        moving = _entry(_entry(raw, "start_state", {}), "joint_state", {}).get("velocity") or []
-        if any(float(value) != 0.0 for value in moving):
-            raise MoveitError("start_state.joint_state.velocity: motions begin at rest")
         start = _named_joints({**(state or {}), **given}, robot, "start_state")
         goals = [
             _goal(own, planner.scene, f"goal_constraints[{number}]")
@@ -248,6 +250,8 @@ def _joint_state(raw: Any, where: str) -> dict[str, float]:
     names, values = _list(raw, "name"), _list(raw, "position")
     if len(names) != len(values):
         raise MoveitError(f"{where}.joint_state: {len(names)} names, {len(values)} positions")
+    if any(float(value) != 0.0 for value in _list(raw, "velocity")):
+        raise MoveitError(f"{where}.joint_state.velocity: motions begin at rest")
     found = {str(name): float(value) for name, value in zip(names, values, strict=True)}
     return _all_finite(found, f"{where}.joint_state")
 
@@ -283,6 +287,25 @@ def _fixed(scene: PlanningScene, frame: str) -> Float[np.ndarray, "4 4"]:
     if np.abs(poses[0] - poses[1]).max() > _SAME:
         raise MoveitError(f"frame {frame!r}: moves with the arm: write poses in its base")
     return poses[0]
+
+
+def _require_at_base(raw: Any, scene: PlanningScene) -> None:
+    """That a scene's transforms say of the world what is taken for granted: it is the base."""
+    for own in _list(raw, "fixed_frame_transforms"):
+        parent = str(_entry(_entry(own, "header", {}), "frame_id", ""))
+        child = str(_entry(own, "child_frame_id", ""))
+        if not (child in _WORLD or (parent in _WORLD and child in scene.links)):
+            continue
+        given, expected = _entry(own, "transform", {}), np.eye(4)
+        if given:
+            given = {"position": given["translation"], "orientation": given["rotation"]}
+        if parent in _WORLD or parent in scene.links:
+            expected = np.linalg.inv(_fixed(scene, parent)) @ _fixed(scene, child)
+        if np.abs(_pose(given) - expected).max() > _ALONG:
+            raise MoveitError(
+                f"fixed_frame_transforms: {child!r} in {parent!r} is elsewhere: the world is taken "
+                "to be the robot's base: write poses in a link's frame"
+            )
 
 
 def _shapes(
@@ -361,7 +384,14 @@ def _mesh_file(raw: Any) -> Path:
     return file
 
 
-def _held(raw: Any, where: str, scene: PlanningScene, q: np.ndarray | None) -> Iterable[Attached]:
+def _require_free(parts: Iterable[str], own: set[str], taken: Collection[str], where: str) -> None:
+    """That an attached object takes no other object's place."""
+    for part in parts:
+        if part in taken and part not in own:
+            raise MoveitError(f"{where}: its part {part!r} is called as another object: rename it")
+
+
+def _held(raw: Any, where: str, scene: PlanningScene, q: np.ndarray | None) -> list[Attached]:
     """An attached object's shapes, in their link's frame."""
     link = str(raw["link_name"])
 

@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from constraint_geodesics.params import RobotParams
 from constraint_geodesics.robot.arm_file import write_arm
 from constraint_geodesics.robot.description import arm_to, find_mesh, read_description
 from constraint_geodesics.robot.kinematics import RobotError, load_robot, rotation_from_rpy
+from constraint_geodesics.scene.scene import robot_from
 from constraint_geodesics.scene.urdf import data_path
 from constraint_geodesics.scene.world import World
 
@@ -245,6 +247,13 @@ def test_limits_of_joints_that_stand_still_are_not_asked_for(limit: str, tmp_pat
     assert load_robot(*write_arm(arm, tmp_path)).joint_names == ("lift", "roll")
     with pytest.raises(RobotError, match="'turn'"):
         arm_to(description, "hand")
+
+
+def test_a_joint_that_follows_the_arm_is_refused_however_the_robot_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "arm.urdf"
+    file.write_text(ARM.replace('<mimic joint="grip"', '<mimic joint="turn"'))
+    with pytest.raises(RobotError, match="'follow' follows 'turn'"):
+        robot_from(RobotParams(urdf=str(file), tool_link="hand"))
 
 
 def test_what_follows_a_joint_of_the_arm_may_be_held_on_purpose(tmp_path: Path) -> None:

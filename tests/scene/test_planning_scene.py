@@ -209,6 +209,9 @@ def test_a_change_that_fails_changes_nothing(planner: Planner, tmp_path: Path) -
         assert planner.scene.now is before
     with pytest.raises(SceneError, match="already"):
         planner.plan(q[0], q[1], "free", scene=[CRATE])
+    twins = [Sphere("wall", (1.0, 1.0, 1.0), 0.1), Sphere("wall", (-1.0, 1.0, 1.0), 0.1)]
+    with pytest.raises(SceneError, match="two shapes are called 'wall'"):
+        Planner.from_urdf("franka_panda/panda.urdf", "panda_hand", workcell=twins)
     assert planner.scene.now is before
     np.testing.assert_array_equal(planner._certifier.collisions.free(q), free)
     np.testing.assert_array_equal(planner._certifier._world.free(q), free)
@@ -342,6 +345,21 @@ def test_a_file_that_was_written_anew_is_read_anew_where_its_shape_moves(
     planner.scene.move("part", Placement((0.0, 2.0, 1.2)))
     body = planner._certifier.collisions.collider.bodies[BodyKey("part", True)]
     assert np.ptp(body.pieces[0].corners, axis=0) == pytest.approx([0.6] * 3)
+
+
+def test_a_file_that_was_written_anew_is_read_anew_where_an_equal_shape_takes_its_place(
+    planner: Planner, tmp_path: Path
+) -> None:
+    """In one change, of a planner's scene and of a world."""
+    file, at = cube(tmp_path / "own.obj", 0.02), Placement((0.0, 2.0, 1.0))
+    planner.scene.add(Mesh("part", file, at))
+    cube(file, 0.3)
+    planner.scene.become(planner.scene.now.removing("part").adding(Mesh("part", file, at)))
+    body = planner._certifier.collisions.collider.bodies[BodyKey("part", True)]
+    assert np.ptp(body.pieces[0].corners, axis=0) == pytest.approx([0.6] * 3)
+    world = planner._certifier._world
+    low, high = world._bullet.getAABB(world._shapes["part"].body)
+    assert np.subtract(high, low) == pytest.approx([0.6] * 3, abs=0.05)
 
 
 def test_what_is_away_is_allowed_to_touch_once_it_comes_back(planner: Planner) -> None:

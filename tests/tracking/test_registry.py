@@ -18,7 +18,7 @@ import pytest
 import torch
 from tests.tracking.test_experiment import server
 
-from constraint_geodesics import Planner
+from constraint_geodesics import Constraint, Planner, Pose
 from constraint_geodesics.bundle import PACKAGED
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 from constraint_geodesics.tracking.registry import register_planner
@@ -159,6 +159,8 @@ def test_a_model_has_a_signature_an_example_and_nothing_pickled(root: Path) -> N
 
 def test_the_champion_is_served_as_its_page_says(root: Path) -> None:
     page = (ROOT / "docs" / "mlflow.md").read_text()
+    reference = Pose.from_rpy([0.0, 0.0, 0.0], [0.4, 0.0, 0.0])
+    tilted = Constraint((0, 0, 0, 1, 1, 0), reference=reference)
     (serve,) = re.findall(r"^geodesics (serve .*)$", page, re.M)
     (body,) = re.findall(r"^curl \S+ .*? -d '(.*?)'$", page, re.M | re.S)
     command = [sys.executable, "-m", "constraint_geodesics.cli", *serve.split()]
@@ -171,8 +173,10 @@ def test_the_champion_is_served_as_its_page_says(root: Path) -> None:
         others = [
             QUERY | {"constraint": "nothing"},
             QUERY | {"constraint": '{"axes": [0, 0, 0, 1, 1, 0]}'},
+            QUERY | {"constraint": json.dumps(tilted.to_json())},
+            QUERY | {"constraint": '{"axes": [0, 0, 0, 1, 1, 0], "tolerances": [1, 1]}'},
         ]
-        unknown, own = ask(address, json.dumps({"dataframe_records": others}))
+        unknown, own, off, misspelt = ask(address, json.dumps({"dataframe_records": others}))
     assert all(answer["joints"] == path["joints"] for answer in at_once), (
         "requests do not disturb each other"
     )
@@ -183,6 +187,9 @@ def test_the_champion_is_served_as_its_page_says(root: Path) -> None:
     assert len(path["times"]) == len(path["joints"]) == path["rows"]
     assert unknown["status"] == "bad_query"
     assert "level_cup" in unknown["explanation"]
+    assert off["status"] == "start_violates"
+    assert misspelt["status"] == "bad_query"
+    assert "tolerances is not taken over" in misspelt["explanation"]
 
 
 def test_what_cannot_be_served_is_one_line(root: Path, tmp_path: Path) -> None:

@@ -177,7 +177,12 @@ def _look(
             bullet.performCollisionDetection()
             contacts = bullet.getContactPoints(bodyA=body, bodyB=body)
             ends = {tuple(sorted(c[3:5], key=rank.__getitem__)) for c in contacts if c[8] < 0.0}
-            touched = {(names[first], names[second]) for first, second in ends}
+            touched = {
+                (names[first], names[second])
+                for first, second in ends
+                # PyBullet also lists contacts of links that are apart again
+                if any(c[8] < 0.0 for c in bullet.getClosestPoints(body, body, 0.0, first, second))
+            }
             seen.touched.append(touched)
             for first, second in list(misses):
                 if (first, second) in touched or bullet.getClosestPoints(

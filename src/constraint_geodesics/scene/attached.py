@@ -20,3 +20,11 @@ class Attached:
     def name(self) -> str:
         """The shape's."""
         return self.shape.name
+
+
+def is_unchanged(one: Shape | Attached, before: Shape | Attached) -> bool:
+    """Whether a shape, attached or not, is what it was.  One that reads files is if it is the very
+    same object: an equal one may have been made since its file was written anew.
+    """
+    own, known = (x.shape if isinstance(x, Attached) else x for x in (one, before))
+    return one is before or (one == before and (own is known or not own.reads_files))

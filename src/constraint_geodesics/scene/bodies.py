@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
 from constraint_geodesics.scene import convex_kernels as kernels
-from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.attached import Attached, is_unchanged
 from constraint_geodesics.scene.names import require_names
 from constraint_geodesics.scene.pieces import Piece, read_pieces
 from constraint_geodesics.scene.scene import Scene
@@ -254,7 +254,7 @@ class BodyTable:
         news = set[BodyKey]()
         for name, one in wanted.items():
             made, own = before.shapes.get(name, (None, None))
-            if made is one or made == one:
+            if made is not None and is_unchanged(one, made):
                 continue
             own = _own_of(one.shape if isinstance(one, Attached) else one, self._dof, own)
             key, shapes[name] = BodyKey(name, True), (one, own)

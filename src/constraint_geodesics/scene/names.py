@@ -13,13 +13,16 @@ class SceneError(ValueError):
 
 
 def shapes_of(given: Any, name: str) -> tuple[Shape, ...]:
-    """Shapes of a list.  Raises SceneError, with the name of the list, for what is none."""
+    """Shapes of a list.  Raises SceneError, with the name of the list, for what is none, and for
+    two of one name.
+    """
     if not isinstance(given, Iterable) or isinstance(given, str | Mapping):
         raise SceneError(f"{name} = {shown(given)}: must be a list of shapes")
     found = tuple(given)
     for shape in found:
         if not isinstance(shape, Shape):
             raise SceneError(f"{shown(shape)} is no shape: a scene takes Box, Sphere, …")
+    _require_distinct([shape.name for shape in found])
     return found
 
 
@@ -44,9 +47,7 @@ def require_names(
     names = set(given)
     for name in names.intersection(links):
         raise SceneError(f"{name!r} is a link of the robot: give the shape another name")
-    if len(names) < len(given):
-        twice = next(name for name in given if given.count(name) > 1)
-        raise SceneError(f"two shapes are called {twice!r}: give one another name")
+    _require_distinct(given)
     for link in (*(own for s in shapes for own in s.exempt_links), *(one.link for one in attached)):
         if link not in links:
             raise SceneError(f"no link is called {link!r}: {', '.join(links)}")
@@ -54,3 +55,9 @@ def require_names(
     for name in (*touching, *(end for pair in allowed for end in pair)):
         if name not in links and name not in names:
             raise SceneError(f"{name!r} is no link of the robot, nor a shape of the scene")
+
+
+def _require_distinct(names: Sequence[str]) -> None:
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise SceneError(f"two shapes are called {twice!r}: give one another name")

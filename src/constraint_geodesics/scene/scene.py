@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from constraint_geodesics.params import Params, RobotParams, WorkcellParams
+from constraint_geodesics.robot.description import arm_to, read_description
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, load_robot
 from constraint_geodesics.scene.arm import ADJACENT, load_arm
 from constraint_geodesics.scene.attached import Attached
@@ -56,11 +57,9 @@ class Scene:
 
     def adding(self, *shapes: Shape) -> "Scene":
         """With more shapes, whose names are new."""
-        taken = set(self.names)
         for shape in shapes_of(shapes, "shapes"):
-            if shape.name in taken:
+            if shape.name in self.names:
                 raise SceneError(f"there is a shape called {shape.name!r} already: remove it first")
-            taken.add(shape.name)
         return replace(self, workcell=(*self.workcell, *shapes))
 
     def removing(self, *names: str) -> "Scene":
@@ -138,10 +137,15 @@ def _of(named: tuple[Shape, ...] | tuple[Attached, ...]) -> str:
 
 def robot_from(params: RobotParams) -> SerialRobot:
     """The robot that parameters name: read from its own URDF where they name nothing beyond it."""
-    if params.hold or params.tool or params.may_touch != ADJACENT:
-        robot = load_arm(params).robot
+    file = find_urdf(params.urdf)
+    plain = not (params.hold or params.tool or params.may_touch != ADJACENT)
+    if plain:
+        arm = arm_to(read_description(file), params.tool_link)
+        plain = all(joint.kind != "continuous" for joint in arm.moved)
+    if plain:
+        robot = load_robot(file, params.tool_link, params.limits_rad)
     else:
-        robot = load_robot(find_urdf(params.urdf), params.tool_link, params.limits_rad)
+        robot = load_arm(params).robot
     for name, velocity in zip(robot.joint_names, robot.velocity, strict=True):
         if not np.isfinite(velocity):
             raise RobotError(f"{params.urdf}: {name} has no <limit velocity=…>: give its limit")

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, urdf_root
-from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.attached import Attached, is_unchanged
 from constraint_geodesics.scene.names import require_names
 from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.urdf import quiet
@@ -180,7 +180,7 @@ class World:
         gone = {
             name
             for name, own in self._shapes.items()
-            if wanted.get(name) is not own.made and wanted.get(name) != own.made
+            if name not in wanted or not is_unchanged(wanted[name], own.made)
         }
         news = {n: one for n, one in wanted.items() if n not in self._shapes or n in gone}
         made = self._made(news)  # all that can fail, before anything goes

@@ -5,7 +5,6 @@ object; the networks beside it are safetensors, whose checksums are verified.  N
 importing it hands a model to MLflow.
 """
 
-import json
 import threading
 import time
 from collections.abc import Hashable, Mapping
@@ -17,15 +16,16 @@ import pandas as pd
 from mlflow.exceptions import MlflowException
 from mlflow.protos.databricks_pb2 import DEADLINE_EXCEEDED
 
-from constraint_geodesics.constraints.constraint import Constraint
+from constraint_geodesics.constraints.constraint import Constraint, constraint_from_json
 from constraint_geodesics.pipeline.threads import stay_on_one_thread
 from constraint_geodesics.planner import Planner
+from constraint_geodesics.text_files import parse_json
 from constraint_geodesics.tracking.serving import WANTED_UNTIL
 
 
 class ServedPlanner(mlflow.pyfunc.PythonModel):
-    """A row is a query: start and goal [rad], and a constraint's name or its axes and tolerance as
-    JSON.
+    """A row is a query: start and goal [rad], and a constraint's name or its axes, tolerance and
+    reference as JSON.
     """
 
     def load_context(self, context: Any) -> None:
@@ -63,18 +63,25 @@ class ServedPlanner(mlflow.pyfunc.PythonModel):
             return {"status": "bad_query", "explanation": str(error), "joints": [], "times": []}
 
 
+_WHOLE = {"axes": None, "tolerance": [0.0] * 6, "reference": None}
+"""What is said of a constraint, and what it is where that is not said."""
+
+
 def constraint_of(text: str) -> str | Constraint:
-    """A constraint's name as it is, or {"axes": [...], "tolerance": [...]}, held where the start
-    has them.
+    """A constraint's name as it is, or {"axes": [...], "tolerance": [...], "reference": …}, held
+    where the start has them unless there is a reference.
     """
     if not text.lstrip().startswith("{"):
         return text
     try:
-        about = json.loads(text)
-        return Constraint(tuple(about["axes"]), tuple(about.get("tolerance", (0.0,) * 6)))
-    except (KeyError, TypeError) as error:
+        about = parse_json(text)
+        if more := about.keys() - _WHOLE.keys():
+            raise ValueError(f"{', '.join(sorted(more))} is not taken over")
+        return constraint_from_json(_WHOLE | about)
+    except ValueError as error:
         raise ValueError(
-            f"{text}: must have axes, and may have a tolerance, six numbers each: {error}"
+            f"{text}: must have axes, and may have a tolerance, six numbers each, and a reference: "
+            f"{error}"
         ) from None
 
 
