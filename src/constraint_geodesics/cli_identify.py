@@ -18,6 +18,7 @@ from constraint_geodesics.cli_planning import (
     ToolLink,
     Urdf,
     loading,
+    require_apart,
 )
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
 from constraint_geodesics.progress import waiting
@@ -88,6 +89,7 @@ def identify_constraint(
     if record is not None:
         require("record")
     try:
+        require_apart({"the demonstrations": demonstrations, "--out": out, "--record": record})
         if where_shown and out is None:
             raise PlannerError("--where-shown is of the file that --out names: give it, too")
         if not 0.0 <= loosely < math.inf:

@@ -1,12 +1,15 @@
 """Demonstrations of hidden tasks: what is identified keeps to the hidden formula."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from tests.identification.hidden import HIDDEN, UPRIGHT, demonstrations, drawn, manifold_of
 
 from constraint_geodesics.constraints.constraint import ConstraintError, ConstraintManifold
+from constraint_geodesics.constraints.polynomial import PolynomialConstraint
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.identification import (
     DemonstrationError,
@@ -168,6 +171,58 @@ def test_what_nothing_can_be_learned_from_is_one_line(name, xarm) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_one_motion_is_one_however_it_is_written(xarm, tmp_path) -> None:
+    """Twice, as demonstrations of a row each, or with its frames' numbers in front."""
+    motion = demonstrations("cup", xarm, 10)[0]
+    numbered = np.column_stack([np.arange(len(motion)), motion])
+    np.savetxt(tmp_path / "frames.csv", numbered, delimiter=",")
+    for given in ([motion, motion.copy()], [row[None] for row in motion], tmp_path / "frames.csv"):
+        found = identify(given, xarm)
+        assert found.constraint is None
+        assert found.demonstrations == 1
+        assert "there are no others" in found.missing
+
+
+def test_rows_that_are_shown_twice_count_once(xarm) -> None:
+    rows = drawn("cup", xarm, 300, seed=3)
+    once, twice = identify(rows, xarm), identify(np.concatenate([rows, rows]), xarm)
+    assert twice.rows == once.rows == 300
+    assert twice.relations == once.relations
+
+
+def test_glitches_make_no_variation(xarm) -> None:
+    """Free motions that hardly differ, with a row anywhere in each; and one joint that is written
+    within half a turn, so that it jumps where it passes that.
+    """
+    rng, t = np.random.default_rng(6), np.linspace(0.0, 1.0, 60)[:, None]
+    first, last = 0.4 * xarm.sample(2, rng)
+    noise = rng.normal(size=(2, 10, 1, xarm.dof))
+    shown = first + t * (last - first) + 0.01 * (noise[0] + np.sin(3 * t) * noise[1])
+    jumping = shown.copy()
+    jumping[..., 0] -= 2 * np.pi * (shown[..., 0] > np.median(shown[..., 0]))
+    wide = replace(xarm, lower=xarm.lower - 2 * np.pi, upper=xarm.upper + 2 * np.pi)
+    glitched = shown.copy()
+    glitched[np.arange(10), rng.integers(60, size=10)] = xarm.sample(10, rng)
+    for own in (shown, jumping, glitched):
+        assert identify(own, wide).constraint is None
+
+
+def test_what_is_no_table_of_joints_is_refused_by_its_names(xarm, tmp_path) -> None:
+    names = ["time_s", *xarm.joint_names[:5]]
+    table = np.column_stack([np.linspace(0, 1, 60), demonstrations("cup", xarm, 1)[0][:60, :5]])
+    (tmp_path / "own.csv").write_text(
+        "\n".join([",".join(names), *(",".join(map(str, row)) for row in table)])
+    )
+    for given in (tmp_path / "own.csv", pd.DataFrame(table, columns=names)):
+        with pytest.raises(DemonstrationError, match="named otherwise than the joints"):
+            identify(given, xarm)
+    motion = demonstrations("cup", xarm, 1)[0]
+    with pytest.raises(DemonstrationError, match="all but 1 of"):
+        identify([motion, motion[:1]], xarm)
+    mixed = pd.DataFrame(motion[:, ::-1], columns=xarm.joint_names[::-1])
+    assert identify(mixed, xarm).rows == len(motion)
+
+
 def test_files_are_read_as_arrays_are(xarm, tmp_path) -> None:
     import pandas as pd
 
@@ -213,14 +268,26 @@ def test_a_saved_constraint_is_planned_with_and_certified(xarm, kuka, tmp_path) 
         if path.status == "solved":
             hidden = manifold_of("cup", xarm)
             assert np.abs(hidden.residual(path.joints)).max() < 2e-4
+            assert "left out" in path.explanation
+            bare = PolynomialConstraint(found.constraint.relations)
+            assert "left out" not in planner.plan(start, goal, bare).explanation
+            assert "left out" in planner.plan(start, goal, loaded).explanation
     loose = with_tolerance(found.constraint, 3.0)
     tolerances = [own.tolerance for own in loose.relations]
     assert tolerances[:2] == pytest.approx([3 * x for x in found.left_out[:2]])
+    again = found.held_loosely(3.0).held_loosely(3.0)
+    assert again.constraint.key == found.held_loosely(3.0).constraint.key
     (tmp_path / "other.yaml").write_text("format: 1\nconstraint: {kind: polynomial}\n")
     with pytest.raises(ConstraintError, match="other.yaml: not a constraint: KeyError"):
         load_constraint(tmp_path / "other.yaml")
     with pytest.raises(ConstraintError, match="found for xarm6 with the tool link6, not"):
         load_constraint(tmp_path / "cup.yaml", kuka)
+    longer = xarm.chain.tool.copy()
+    longer[2, 3] += 0.1
+    other = replace(xarm, chain=xarm.chain._replace(tool=longer))
+    with pytest.raises(ConstraintError, match=r"found for a tool link6 at \(.*, not at \(.*0\.1"):
+        load_constraint(tmp_path / "cup.yaml", other)
+    assert load_constraint(tmp_path / "cup.yaml", xarm).key == loaded.key
     nothing = identify(xarm.sample(500, np.random.default_rng(0)), xarm)
     with pytest.raises(ConstraintError, match="no constraint to save"):
         save_constraint(nothing, tmp_path / "free.yaml")

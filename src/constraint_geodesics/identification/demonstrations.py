@@ -27,6 +27,8 @@ STATE, EPISODE = "observation.state", "episode_index"
 """Columns of a LeRobot data set."""
 NUMBERS = ("demonstration", "demo", "episode", EPISODE)
 """Names of a column that tells demonstrations apart."""
+TIMES = frozenset({"time", "time_s", "t", "timestamp"})
+"""Names of a column that is no joint's."""
 Demonstrations = Sequence[Float[np.ndarray, "T D"]]
 
 
@@ -49,17 +51,51 @@ def demonstrations_from(
         )
     if isinstance(given, (str, Path)):
         given = _read(Path(given), robot)
+    if hasattr(given, "to_numpy") and hasattr(given, "columns"):  # a table of pandas
+        names = [name for name in given.columns if isinstance(name, str)]
+        given = _told_apart("the table", names, given.to_numpy(), robot)
     shown, motions = _arrays(given)
     found = [_checked(rows, k, robot, motions) for k, rows in enumerate(shown)]
-    rows = sum(len(own) for own in found)
-    if rows < FEWEST_ROWS:
-        raise DemonstrationError(
-            f"{rows} rows in all: at least {FEWEST_ROWS} are needed; show more of the motion"
-        )
+    if motions and 2 * sum(len(own) == 1 for own in found) > len(found):
+        found, motions = [np.concatenate(found)], False  # the numbers tell rows apart
+    _require_rows(sum(map(len, found)))
     every = np.concatenate(found)
     if (np.ptp(every, axis=0) < SPREAD_RAD).all():
         raise DemonstrationError("all rows are the same configuration: show the arm moving")
+    found = _different(found, motions)
+    every = np.concatenate(found)
+    _require_rows(len(every))
+    others = len(every) - max(map(len, found))
+    if motions and 0 < others < FEWEST_ROWS // 2:
+        raise DemonstrationError(
+            f"all but {others} of {len(every)} rows are of one demonstration: show more of the "
+            f"others"
+        )
     return found, motions or _is_a_motion(every)
+
+
+def _require_rows(count: int) -> None:
+    if count < FEWEST_ROWS:
+        raise DemonstrationError(
+            f"{count} rows in all: at least {FEWEST_ROWS} are needed; show more of the motion"
+        )
+
+
+def nearest_turns(q: Float[np.ndarray, "n D"], robot: SerialRobot) -> Float[np.ndarray, "n D"]:
+    """The same configurations with the values of revolute joints within half a turn of their mean
+    direction.
+    """
+    middle = np.angle(np.exp(1j * q).mean(axis=0))
+    turned = middle + (q - middle + np.pi) % (2.0 * np.pi) - np.pi
+    found: Float[np.ndarray, "n D"] = np.where(robot.chain.prismatic, q, turned)
+    return found
+
+
+def _different(shown: list[np.ndarray], motions: bool) -> list[np.ndarray]:
+    """Without repeated motions, or repeated rows: of each other they show nothing."""
+    if motions:
+        return list({own.tobytes(): own for own in shown}.values())
+    return [own[np.sort(np.unique(own, axis=0, return_index=True)[1])] for own in shown]
 
 
 def _arrays(given: Any) -> tuple[list[np.ndarray], bool]:
@@ -145,7 +181,7 @@ def _require_format(file: Path, comments: Sequence[str]) -> None:
             raise DemonstrationError(f"{file}: {error}") from None
 
 
-def _told_apart(file: Path, names: list[str], table: np.ndarray, robot: SerialRobot) -> Any:
+def _told_apart(file: Path | str, names: list[str], table: np.ndarray, robot: SerialRobot) -> Any:
     """Rows, or demonstrations where a column tells them apart: one of NUMBERS, or without names
     the first of one more than there are joints, if its numbers are whole.
     """
@@ -160,6 +196,11 @@ def _told_apart(file: Path, names: list[str], table: np.ndarray, robot: SerialRo
                 f"{file}: the first of {table.shape[1]} columns must be the demonstration's "
                 f"number, or name the columns: time_s, {', '.join(robot.joint_names)}"
             )
+    elif unlike := TIMES.intersection(names) | set(NUMBERS).intersection(names):
+        raise DemonstrationError(
+            f"{file}: beside {', '.join(sorted(unlike))} its columns are named otherwise than the "
+            f"joints: {', '.join(robot.joint_names)}"
+        )
     else:
         return table
     if numbers is None:

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from constraint_geodesics.constraints.constraint import (
     Constraint,
     ConstraintError,
@@ -12,9 +14,12 @@ from constraint_geodesics.formats import CONSTRAINT, FormatError
 from constraint_geodesics.identification.identify import Identified
 from constraint_geodesics.params import ParamsError, read_yaml
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.shape import Placement
 from constraint_geodesics.text_files import written
 
 SUFFIXES = (".yaml", ".yml")
+SAME_TOOL = 1e-6
+"""By which entries of a tool's pose may differ."""
 
 
 def save_constraint(identified: Identified, file: str | Path, where_shown: bool = False) -> None:
@@ -33,10 +38,11 @@ def save_constraint(identified: Identified, file: str | Path, where_shown: bool 
         raise ConstraintError("what was identified is not of the tool: it has no region")
     if file.suffix not in SUFFIXES:
         raise ConstraintError(f"{file}: the name must end in {' or '.join(SUFFIXES)}")
+    own = identified.robot
     about = {
         **CONSTRAINT.entries,
         "explanation": identified.explanation,
-        "robot": {"name": identified.robot[0], "tool_link": identified.robot[1]},
+        "robot": {"name": own.name, "tool_link": own.tool_link, "tool": _listed(own.tool)},
         "found_in": {
             "rows": identified.rows,
             "demonstrations": identified.demonstrations,
@@ -64,14 +70,37 @@ def load_constraint(file: str | Path, robot: SerialRobot | None = None) -> Const
         raise ConstraintError(f"{file}: not a constraint's file: must be entries by name")
     try:
         about = CONSTRAINT.updated(about)
-        own = about["robot"]["name"], about["robot"]["tool_link"]
-        if robot is not None and own != (robot.name, robot.tool_link):
-            raise ConstraintError(
-                f"found for {own[0]} with the tool {own[1]}, not {robot.name} with "
-                f"{robot.tool_link}"
-            )
+        own = about["robot"]
+        names = own["name"], own["tool_link"]
+        if robot is not None:
+            _require_whose(names, own.get("tool"), robot)
         return constraint_from_json(about["constraint"])
     except (ConstraintError, FormatError) as error:
         raise ConstraintError(f"{file}: {error}") from None
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ConstraintError(f"{file}: not a constraint: {type(error).__name__} {error}") from None
+
+
+def _require_whose(names: tuple[str, str], pose: Any, robot: SerialRobot) -> None:
+    """pose: of the tool, which files lack that were written before it was."""
+    if names != (robot.name, robot.tool_link):
+        raise ConstraintError(
+            f"found for {names[0]} with the tool {names[1]}, not {robot.name} with "
+            f"{robot.tool_link}"
+        )
+    if pose is None:
+        return
+    tool = Placement(**{name: tuple(values) for name, values in pose.items()})
+    if np.abs(tool.matrix - robot.chain.tool).max() > SAME_TOOL:
+        raise ConstraintError(
+            f"found for a tool {names[1]} at {_told(tool)} in the last joint's frame, not "
+            f"at {_told(Placement.of_matrix(robot.chain.tool))}"
+        )
+
+
+def _listed(tool: Placement) -> dict[str, list[float]]:
+    return {"position_m": list(tool.position_m), "rpy_rad": list(tool.rpy_rad)}
+
+
+def _told(tool: Placement) -> str:
+    return f"({' '.join(f'{x:.4g}' for x in (*tool.position_m, *tool.rpy_rad))})"

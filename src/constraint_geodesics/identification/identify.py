@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,7 +24,7 @@ from constraint_geodesics.constraints.spline import Spline, SplineConstraint, Sp
 from constraint_geodesics.constraints.tool_features import FEATURES
 from constraint_geodesics.identification import freeform
 from constraint_geodesics.identification.bounds import Bound, bounds_of
-from constraint_geodesics.identification.demonstrations import demonstrations_from
+from constraint_geodesics.identification.demonstrations import demonstrations_from, nearest_turns
 from constraint_geodesics.identification.forms import (
     POSE,
     POSITION,
@@ -54,6 +54,7 @@ from constraint_geodesics.identification.vanishing import (
     without,
 )
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.shape import Placement
 
 SURELY_RAD = 6e-3
 """Freeform relations hold where left-out demonstrations are no further off: there are gaps between
@@ -87,6 +88,14 @@ Found = Callable[[Sample], tuple[AnyRelation, ...]]
 """Relations as they are found on rows."""
 
 
+class Whose(NamedTuple):
+    """A robot's name, its tool link, and where that is in the frame of the last joint."""
+
+    name: str
+    tool_link: str
+    tool: Placement
+
+
 @dataclass(frozen=True)
 class Identified:
     """What demonstrations keep to.
@@ -96,8 +105,8 @@ class Identified:
     codim: dimensions that relations take.  noise_rad: rms distance of the rows from the constraint
     manifold, along each direction that is held; nan without one.  left_out: rms
     of each row of the residual on left-out demonstrations, in its unit.  missing: what was seen but
-    not supported, or why there is nothing.  dropped: rows that were taken to be wrong.  robot: its
-    name and tool link, of whose tool all this is said.  support: the region where demonstrations
+    not supported, or why there is nothing.  dropped: rows that were taken to be wrong.  robot: of
+    whose tool all this is said.  support: the region where demonstrations
     were; `supported` keeps a path in it.  bounds: how many of the relations are tolerances.
     rounded: the same with axes and round numbers that left-out demonstrations are no further from,
     None if there are none; is_rounded: whether these are taken.  loosely: by how many times what
@@ -113,7 +122,7 @@ class Identified:
     rows: int
     demonstrations: int
     dropped: int
-    robot: tuple[str, str]
+    robot: Whose
     support: Support | None = None
     bounds: int = 0
     rounded: "Identified | None" = None
@@ -158,10 +167,11 @@ class Identified:
         }
 
     def held_loosely(self, times: float) -> "Identified":
-        """The same with a constraint that is looser (`with_tolerance`)."""
+        """The same with a constraint that is looser (`with_tolerance`) than what was identified."""
         if self.constraint is None:
             return self
-        return replace(self, constraint=with_tolerance(self.constraint, times), loosely=times)
+        wider = with_tolerance(self.constraint, times - self.loosely)
+        return replace(self, constraint=wider, loosely=times)
 
     def save(self, file: str | Path, where_shown: bool = False) -> None:
         """Write the constraint as YAML (`files.save_constraint`)."""
@@ -187,7 +197,8 @@ def identify(demonstrations: Any, robot: SerialRobot) -> Identified:
     """The constraint that demonstrations keep to.
 
     demonstrations: rows (n, D), or (demonstrations, T, D), or a list of (T, D) [rad], or a file:
-    CSV (a first column more is the demonstration's number) or parquet as LeRobot writes it.
+    CSV (a first column more is the demonstration's number) or parquet as LeRobot writes it.  What
+    is shown twice counts once.
     Raises DemonstrationError, one line, for what nothing can be learned from.
     """
     shown, motions = demonstrations_from(demonstrations, robot)
@@ -213,7 +224,8 @@ def identify(demonstrations: Any, robot: SerialRobot) -> Identified:
     q = np.concatenate(shown)
     if not search.relations and search.folds:
         search = _of_joints(search, sample, robot, q)
-    search = _varied(search, q)
+    of_all = len(search.sample) == len(q)
+    search = _varied(search, nearest_turns(q if of_all else q[kept], robot))
     if search.joint is None:
         search = _bounded(search, sample)
     dropped = len(sample) - len(search.sample)
@@ -658,7 +670,7 @@ def _rounded(search: _Search) -> _Search | None:
 
 def _told(search: _Search, robot: SerialRobot, demonstrations: int, dropped: int) -> Identified:
     missing, counts = "; ".join(search.missing), (len(search.sample), demonstrations, dropped)
-    whose = robot.name, robot.tool_link
+    whose = Whose(robot.name, robot.tool_link, Placement.of_matrix(robot.chain.tool))
     if not search.relations and not search.bounds:
         missing = missing or "the demonstrations keep to no relation, the motion is free"
         return Identified(None, (), 0, np.nan, (), missing, *counts, whose)
