@@ -64,7 +64,7 @@ dag: env  ## the pipeline as a drawing, a name a script
 smoke: env  ## the same pipeline on small parameters, in a copy of this checkout
 	python tests/end_to_end/smoke.py .geodesics/smoke
 
-bench: env  ## all planners on all queries, and the studies (three hours; go on after an interruption by calling it again)
+bench: env  ## all planners on all queries, and the studies (hours; go on after an interruption by calling it again)
 	geodesics params
 	python stages/draw_benchmark_queries.py
 	@# a study that can't be made, as that of problems from a file that is not here, stops no other
@@ -179,5 +179,6 @@ replay: .venv/planning  ## replay a path in Rerun: make replay FILE=data/recordi
 	geodesics replay $(FILE)
 
 clean:  ## remove unfinished work, not results
-	@test ! -e .geodesics/runs || geodesics recover  # what MLflow has not got yet lies there
-	rm -rf .geodesics
+	@test ! -e .geodesics/runs || geodesics recover  # what MLflow has not got yet lies there, and stays
+	find .geodesics -mindepth 1 -maxdepth 1 ! -name runs -exec rm -rf {} + 2>/dev/null || true
+	@rmdir .geodesics/runs .geodesics 2>/dev/null || true

@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-from constraint_geodesics.benchmark.entries import code_digest, data_digest
 from constraint_geodesics.benchmark.queries import TABLE, read_queries
 from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.benchmark.runner import fingerprint
 from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.code import code_digest, data_digest
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine, run_header
@@ -68,13 +68,7 @@ def fingerprinted(params: Params, layout: Layout) -> list[Part]:
         name: [q for q in read_queries(layout.benchmark_queries(name)) if q.scene == TABLE]
         for name in params.constraints
     }
-    shared = [
-        (layout.root / "requirements.lock").read_bytes(),
-        code_digest(MEASURED_BY),
-        data_digest(layout.planner),
-        machine(),
-        SEED,
-    ]
+    shared = [code_digest(MEASURED_BY), data_digest(layout.planner), machine(), SEED]
     found = []
     for part in parts_of(queries, layout.planner, layout.arm_rows):
         asked = part.queries

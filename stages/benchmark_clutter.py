@@ -5,8 +5,8 @@ four constraints; goes on where an earlier run of it stopped.
 import sys
 
 from constraint_geodesics.benchmark.arm_source import PipelineArm
-from constraint_geodesics.benchmark.entries import code_digest, data_digest
 from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.code import code_digest, data_digest
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.problems_page import report_answers

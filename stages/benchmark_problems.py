@@ -5,10 +5,9 @@ their scenes; goes on where an earlier run of it stopped.
 import sys
 
 from constraint_geodesics.benchmark.arm_source import UrdfArm
-from constraint_geodesics.benchmark.entries import code_digest
 from constraint_geodesics.benchmark.problem_files import Problem, every, read_problems
 from constraint_geodesics.params import Params
-from constraint_geodesics.pipeline.code import digest
+from constraint_geodesics.pipeline.code import code_digest, digest
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.problems_page import report_answers

@@ -42,7 +42,7 @@ Settings = Mapping[str, BaselineSettings]
 def main(params: Params, layout: Layout) -> None:
     """Write reports/benchmark/ and data/benchmark.db."""
     drawn = {"drawn": params.benchmark.drawn}
-    work = Work(STAGE, STAGE, drawn, [layout.benchmark_table])
+    work = Work(STAGE, STAGE, drawn, [layout.benchmark_table, layout.training_times])
     with tracked_stage(work, params.tracking.experiment, layout.root) as run:
         write(params, layout, run)
 
@@ -98,7 +98,7 @@ def write_tables(
     case = rows[(rows["constraint"] == illustrated) & (rows["scene"] == TABLE)]
     ours, own = own_names(settings)
     ahead = ours_against_baselines(rows, ours, own, BUDGETS)
-    costs = break_even_table(rows, training_times(params, layout, settings), reference)
+    costs = break_even_table(rows, json.loads(layout.training_times.read_text()), reference)
     written_tables = (
         ("summary", summary, tables.benchmark_markdown(summary)),
         ("overview", overview, tables.overview_markdown(overview, in_python)),
@@ -132,25 +132,6 @@ def own_names(settings: Settings) -> tuple[dict[str, float], list[str]]:
     ours = {name: one.given_s for name, one in own.items() if not one.switched_off}
     bare = [name for name, one in own.items() if {"graph", "policy"} <= one.switched_off]
     return ours, [name for name in own if name not in ours and name not in bare]
-
-
-def training_times(params: Params, layout: Layout, settings: Settings) -> dict[str, float]:
-    """Seconds that stages took to make what each planner needs, from data to files; 0 for those
-    that learn nothing.
-    """
-    frame = pd.read_csv(layout.stage_times)
-    seconds = dict(zip(frame["stage"], frame["seconds"], strict=True))
-    searched = params.geodesics.searched[0]
-    return {
-        name: sum(
-            spent
-            for stage, spent in seconds.items()
-            if stage.startswith(tuple(first.format(searched=searched) for first in own.trained))
-        )
-        if own.trained
-        else 0.0
-        for name, own in settings.items()
-    }
 
 
 if __name__ == "__main__":

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from constraint_geodesics.benchmark.entries import code_digest, data_digest
 from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.params import Params
+from constraint_geodesics.pipeline.code import code_digest, data_digest
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine, run_header
@@ -32,7 +32,7 @@ def main(params: Params, layout: Layout) -> None:
     """Write data/episode_rows/ as episodes end, then reports/episodes.csv.gz, .json and .md, and
     recordings of the first ones.
     """
-    code = f"{code_digest('studies.episode_runs')} {data_digest(layout.planner)} {machine()}"
+    code = f"{code_digest('studies.episode_runs')} {data_digest(layout.planner)} {machine()} {SEED}"
     folder = layout.root / "data" / "episode_rows"
     tasks = [
         runs.Task(layout.planner, constraint, number, SEED, code, folder)

@@ -36,11 +36,11 @@ def bench_problems(options: ProblemOptions) -> None:
     """Answer what is not answered yet, write the rows and the tables, and print these.  Exit code
     2: wrong usage, or a file that can't be used.
     """
-    from constraint_geodesics.benchmark.entries import code_digest
     from constraint_geodesics.benchmark.problem_files import ProblemFileError, every, read_problems
     from constraint_geodesics.benchmark.row import write_table
     from constraint_geodesics.params import load_params
     from constraint_geodesics.peers.baseline import BaselineError
+    from constraint_geodesics.pipeline.code import code_digest
     from constraint_geodesics.pipeline.layout import Layout
     from constraint_geodesics.pipeline.machine import run_header
     from constraint_geodesics.report.problems_page import totals_markdown

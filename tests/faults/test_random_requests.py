@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from constraint_geodesics.benchmark.entries import code_digest
+from constraint_geodesics.pipeline.code import code_digest
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import Status
 from constraint_geodesics.trajectory import Trajectory

@@ -46,9 +46,9 @@ def test_what_an_import_reaches_counts_wherever_it_stands(package: Path) -> None
 
 
 def test_drawing_counts_where_a_stage_draws(package: Path) -> None:
-    assert set(read(package, "from package import planner\n")) == {"planner.py"}
+    assert set(read(package, "from package import planner\n")) == {"planner.py", "defaults"}
     drawn = set(read(package, "from package import planner\nimport package.recording.rerun\n"))
-    assert drawn == {"planner.py", "recording/rerun.py", "palette.py"}
+    assert drawn == {"planner.py", "defaults", "recording/rerun.py", "palette.py"}
 
 
 def test_text_changes_no_digest_and_code_does(package: Path) -> None:

@@ -2,12 +2,10 @@
 of their rows.
 """
 
-import hashlib
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +28,12 @@ from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import BaselineParams, Params
 from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings
 from constraint_geodesics.peers.registry import BaselineBuilder, after, all_settings
-from constraint_geodesics.pipeline.code import code_of, digest
+from constraint_geodesics.pipeline.code import code_digest, data_digest
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
-from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.arm import mesh_digests
+from constraint_geodesics.scene.scene import Scene, robot_from
 from constraint_geodesics.scene.urdf import find_urdf
 
 JUDGED_BY = "benchmark.runner"
@@ -60,6 +59,11 @@ class Run:
     rows: Path
     learned: Sequence[str]
     record: Recorder | None = None
+
+    @cached_property
+    def measured_on(self) -> list[str]:
+        """Those that there are: a few planners are asked without them, too."""
+        return [name for name in self.learned if self.layout.manifold(name).is_dir()]
 
     @cached_property
     def settings(self) -> dict[str, BaselineSettings]:
@@ -109,7 +113,7 @@ def batches_of(run: Run) -> list[QueryBatch]:
     tells how long the rest will take.
     """
     params, settings = run.params, run.params.benchmark
-    learned = {name: LearnedManifold.load(run.layout.manifold(name)) for name in run.learned}
+    learned = {name: LearnedManifold.load(run.layout.manifold(name)) for name in run.measured_on}
     build = BaselineBuilder(params, run.layout.root)
     shared, found = _shared_parts(run), list[tuple[int, QueryBatch]]()
     for (constraint, name), own in _by_case(run.queries).items():
@@ -192,10 +196,10 @@ def _shared_parts(run: Run) -> list[Any]:
         params.robot.model_dump(),
         params.workcell.model_dump(),
         find_urdf(params.robot.urdf).read_bytes(),
-        (layout.root / "requirements.lock").read_bytes(),
+        mesh_digests(robot_from(params.robot)),
         code_digest(JUDGED_BY),
         machine(),
-        data_digest(*(layout.manifold(name) for name in run.learned)),
+        data_digest(*(layout.manifold(name) for name in run.measured_on)),
     ]
 
 
@@ -215,6 +219,25 @@ def _data_of(run: Run, settings: BaselineSettings) -> str:
         folders += [layout.manifold(name) for name in run.params.manifolds]
         folders += [layout.submanifolds, layout.learned]
     return data_digest(*folders)
+
+
+def training_times(params: Params, layout: Layout) -> dict[str, float]:
+    """Seconds that stages took to make what each planner needs, from data to files; 0 for those
+    that learn nothing.
+    """
+    settings, frame = all_settings(params), pd.read_csv(layout.stage_times)
+    seconds = dict(zip(frame["stage"], frame["seconds"], strict=True))
+    searched = params.geodesics.searched[0]
+    return {
+        name: sum(
+            spent
+            for stage, spent in seconds.items()
+            if stage.startswith(tuple(first.format(searched=searched) for first in own.trained))
+        )
+        if own.trained
+        else 0.0
+        for name, own in settings.items()
+    }
 
 
 def spread(numbered: Sequence[tuple[int, QueryBatch]]) -> list[QueryBatch]:
@@ -284,23 +307,3 @@ def fewer(
         some = described if constraints is None else constraints
         changed[block] = {name: one for name, one in described.items() if name in some}
     return params.model_copy(update=changed), slow
-
-
-def data_digest(*folders: Path) -> str:
-    """Of all files in some folders."""
-    digest = hashlib.sha256()
-    for folder in folders:
-        for file in sorted(path for path in folder.rglob("*") if path.is_file()):
-            digest.update(file.relative_to(folder).as_posix().encode() + file.read_bytes())
-    return digest.hexdigest()
-
-
-@cache
-def code_digest(*modules: str) -> str:
-    """Of these modules of the package and of all that their results hang on."""
-    package = Path(__file__).parents[1]
-    files: dict[str, str] = {}
-    for module in modules:
-        file = package.joinpath(*module.split(".")).with_suffix(".py")
-        files |= {module: digest(file)} | code_of(file, package)
-    return hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()

@@ -7,6 +7,7 @@ the formatter change none.
 
 import ast
 import hashlib
+import json
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -24,6 +25,8 @@ FOUND_BY_NAME = {
 """What a module reaches without an import statement: kinds that params.yaml names."""
 NO_RESULT = ("__init__", "cli", "params", "pipeline", "tracking")
 """Rooms that change no result: parameters are dependencies by their values."""
+DEFAULTS = ("planner.py", ("PlannerParams", "JudgeParams"))
+"""The module whose results also hang on what params.py has for these where nobody says another."""
 
 
 def code_of(script: Path, package: Path) -> dict[str, str]:
@@ -45,7 +48,41 @@ def code_of(script: Path, package: Path) -> dict[str, str]:
             for pattern in FOUND_BY_NAME.get(file.relative_to(package).as_posix(), ()):
                 left += package.glob(pattern)
     found |= {page for file in found for page in file.parent.glob("templates/*")}
-    return {file.relative_to(package).as_posix(): digest(file) for file in sorted(found)}
+    files = {file.relative_to(package).as_posix(): digest(file) for file in sorted(found)}
+    if DEFAULTS[0] in files:
+        files["defaults"] = _of_defaults()
+    return files
+
+
+def _of_defaults() -> str:
+    from constraint_geodesics import params
+
+    told = [getattr(params, name)().model_dump(mode="json") for name in DEFAULTS[1]]
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
+
+
+@cache
+def code_digest(*modules: str) -> str:
+    """Of these modules of the package and of all that their results hang on, with the libraries
+    that the checkout has locked.
+    """
+    package = Path(__file__).parents[1]
+    lock, files = package.parents[1] / "requirements.lock", dict[str, str]()
+    if lock.is_file():
+        files[lock.name] = digest(lock)
+    for module in modules:
+        file = package.joinpath(*module.split(".")).with_suffix(".py")
+        files |= {module: digest(file)} | code_of(file, package)
+    return hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()
+
+
+def data_digest(*folders: Path) -> str:
+    """Of all files in some folders."""
+    found = hashlib.sha256()
+    for folder in folders:
+        for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+            found.update(file.relative_to(folder).as_posix().encode() + file.read_bytes())
+    return found.hexdigest()
 
 
 @cache

@@ -106,6 +106,11 @@ class Layout:
         return self.root / "reports" / "benchmark.csv"
 
     @property
+    def training_times(self) -> Path:
+        """Seconds that were trained for each planner of the benchmark, when it was run (JSON)."""
+        return self.root / "reports" / "benchmark_training.json"
+
+    @property
     def benchmark_recordings(self) -> Path:
         """Folder of the recordings of some of the benchmark's paths."""
         return self.root / "data" / "recordings" / "run_benchmark"

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,9 @@ from jaxtyping import Float
 from constraint_geodesics.constraints.spline import Spline, SplineConstraint
 from constraint_geodesics.identification import Identified, identify
 from constraint_geodesics.params import DemonstrationsParams, Params
+from constraint_geodesics.pipeline.code import code_digest, data_digest
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.planner import Planner, PlannerError
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
 from constraint_geodesics.scene.scene import Scene
@@ -28,10 +31,13 @@ from constraint_geodesics.text_files import kept_json, write_text
 
 FORMULA, IDENTIFIED, WITHIN = "formula", "identified", "identified, where shown"
 ROUNDED, COMPARED = "identified, rounded", "identified, as asked of peers"
+AS_NETWORKS = "identified, as asked of networks"
 TANGENTS, NEAREST = "local models of poses", "nearest rows"
 PEERS = (TANGENTS, NEAREST)
 LEVEL_SET, RESIDUAL = "level-set network", "residual network"
 DESCENT, FLAT, POLICY = "VAE, geodesic", "VAE, no variance", "VAE, policy"
+NETWORK_SEEDS = 3
+"""Seeds that networks are trained on: that takes longest."""
 LEARNED = (LEVEL_SET, RESIDUAL, DESCENT, FLAT, POLICY)
 """Those that studies/learned_demonstrations.py trains."""
 APART_RAD = (0.4, 2.5)
@@ -84,6 +90,18 @@ def cases_of(task: str) -> tuple[Case, ...]:
     return {"wavy surface": OF_SURFACES, "torus": OF_SURFACES, "hole": OF_HOLES}.get(task, CASES)
 
 
+MEASURED_WITH = {"robot", "workcell", "demonstrations", "judge", "geodesics", "manifolds"}
+"""Parameters that the rows of a cell hang on."""
+
+
+@cache
+def _inputs(layout: Layout, stage: str) -> str:
+    """Digests of what a cell's rows hang on beside parameters."""
+    code = layout.root / "data" / "code" / f"{stage}.txt"
+    parts = [code.read_text() if code.is_file() else "", machine(), data_digest(layout.planner)]
+    return " ".join(map(str, [*parts, code_digest()]))
+
+
 @dataclass(frozen=True)
 class Cell:
     """One task, shown in one way, with one seed; picklable."""
@@ -116,13 +134,12 @@ class Cell:
 
     @property
     def folder(self) -> Path:
-        """Where its rows are until all cells are measured, those of these settings and this code
-        alone.
+        """Where its rows are until all cells are measured, those of these settings, this code,
+        planner and machine alone.
         """
         name = f"{self.task}-{self.case.name}-{self.seed}".replace(" ", "-").replace(",", "")
-        code = self.layout.root / "data" / "code" / f"{self.stage}.txt"
-        told = code.read_text() if code.is_file() else ""
-        key = sha256((self.settings.model_dump_json() + told).encode()).hexdigest()[:12]
+        told = self.params.model_dump_json(include=MEASURED_WITH) + _inputs(self.layout, self.stage)
+        key = sha256(told.encode()).hexdigest()[:12]
         return self.layout.scratch(self.stage, name) / key
 
 
@@ -350,11 +367,14 @@ def summary(table: pd.DataFrame, peer_pairs: int) -> dict[str, Any]:
     """Figures by task, case and method; medians and 95th percentiles over all paths of all seeds,
     and the largest over seeds of the seeds' medians.
 
-    COMPARED: what is identified, on the queries that peers are asked.
+    COMPARED: what is identified, on the queries that peers are asked; AS_NETWORKS: of the draws
+    that networks are trained on.
     """
     figures: dict[str, Any] = {}
     asked = table[(table["method"] == IDENTIFIED) & (table["query"] < peer_pairs)]
-    table = pd.concat([table, asked.assign(method=COMPARED)])
+    first = sorted(asked["seed"].unique())[:NETWORK_SEEDS]
+    few = asked[asked["seed"].isin(first)].assign(method=AS_NETWORKS)
+    table = pd.concat([table, asked.assign(method=COMPARED), few])
     for named, own in table.groupby(["task", "case", "method"], sort=False):
         task, case, method = map(str, named)
         solved = own[own["status"] == "solved"]

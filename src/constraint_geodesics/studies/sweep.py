@@ -13,12 +13,12 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import constraint_geodesics
 from constraint_geodesics.benchmark.runner import fingerprint
 from constraint_geodesics.params import Params, load_params
-from constraint_geodesics.pipeline.code import code_of, digest
+from constraint_geodesics.pipeline.code import code_digest
 from constraint_geodesics.pipeline.compute import as_finished
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.studies.search_space import Changes, SearchSpace, label_of
 from constraint_geodesics.studies.sweep_ranking import FIGURES, seed_figures
 from constraint_geodesics.text_files import reading, write_text
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from constraint_geodesics.studies.sweep_seed import SweepTask
 
 STAGE = "sweep_policies"
-SEED_MODULE = "sweep_seed.py"
+SEARCHED_BY = "studies.sweep_seed"
 """Beside this one: what it imports decides what is done again after a change of the code."""
 
 Record = dict[str, Any]
@@ -275,9 +275,7 @@ def _shared(params: Params, layout: Layout) -> list[Any]:
 @cache
 def _contents(inputs: tuple[Path, ...]) -> str:
     """A digest of the data and of the code, read once."""
-    package = Path(constraint_geodesics.__file__).parent
-    script = Path(__file__).with_name(SEED_MODULE)
-    return fingerprint([dvc_md5(file) for file in inputs], code_of(script, package), digest(script))
+    return fingerprint([dvc_md5(file) for file in inputs], code_digest(SEARCHED_BY), machine())
 
 
 def _inputs(params: Params, layout: Layout) -> list[Path]:

@@ -423,9 +423,8 @@ def source_tags(root: Path) -> dict[str, str]:
     commit = _git(root, "rev-parse", "HEAD")
     if commit:
         # what a pipeline itself writes while it runs makes no commit dirty
-        changed = _git(
-            root, "status", "--porcelain", "--", ".", ":!dvc.lock", ":!reports", ":!.geodesics"
-        )
+        written = (":!dvc.lock", ":!*/dvc.lock", ":!reports", ":!.geodesics")
+        changed = _git(root, "status", "--porcelain", "--", ".", *written)
         tags |= {
             "git_commit": commit,
             "mlflow.source.git.commit": commit,
