@@ -46,7 +46,8 @@ def benchmark_summary(rows: pd.DataFrame, reference: str) -> pd.DataFrame:
     mean over queries (of each query's mean over its seeds) with its 95 % bootstrap interval;
     ratio_p95_all: the 95th percentile with every row that is not valid counted as infinite, of the
     solvable queries.
-    time_*: of all rows [s].  within_1, _5, _10: median time [s] to a valid path within so many per
+    time_*: of the rows of solvable queries [s], or a planner's own limit would be its time where
+    there is no path.  within_1, _5, _10: median time [s] to a valid path within so many per
     cent of the best known, infinite where fewer than half of the rows get there.
     reference_iqm: the interquartile mean of `reference` over the queries that the planner has a
     valid path of.
@@ -71,7 +72,7 @@ def benchmark_summary(rows: pd.DataFrame, reference: str) -> pd.DataFrame:
 
 def _figures(own: pd.DataFrame) -> dict[str, Any]:
     solvable = own[own["best_known_rad"].notna()]
-    ratio, time = own["ratio"].dropna(), own["time_s"]
+    ratio, time = own["ratio"].dropna(), solvable["time_s"]
     low, middle, high = interquartile_mean(own.groupby("query")["ratio"].mean().dropna().to_numpy())
     solved = solvable.groupby("query")["valid"].mean().to_numpy()
     success_low, _, success_high = _interval(solved, np.mean)
@@ -238,9 +239,10 @@ def break_even_table(
     """From how many queries on the reference's training pays: its cost over what it saves a query.
 
     training_s: of each planner, 0 where it is not named.  One row a planner, the reference first:
-    training_s, query_s (mean over all of its rows of the queries that both were asked),
+    training_s, query_s (mean over its rows of the solvable queries that both were asked),
     reference_s, success (valid rows), and break_even, infinite where the other is no slower.
     """
+    rows = _solvable(rows)
     mine, spent = rows[rows["planner"] == reference], training_s.get(reference, 0.0)
     keys, table = [*CASE, "query"], list[dict[str, Any]]()
     means = mine[[*keys, "time_s"]].groupby(keys, as_index=False).mean()

@@ -158,12 +158,14 @@ class PolicySolver:
         asked = rounds(problem, self.policy, self.params, ends, rng)
         return _first_accepted(problem, ends, asked, accept, began)
 
-    def search_at_random(self, problem: GeodesicProblem, ends: Ends, accept: Accept) -> Geodesic:
-        """A control of `search`: no fewer curves than its first round measures, none by a policy,
-        chosen by the same rule.
+    def search_at_random(
+        self, problem: GeodesicProblem, ends: Ends, accept: Accept, curves: int = 0
+    ) -> Geodesic:
+        """A control of `search`: no curve is by a policy, chosen by the same rule; as many as a
+        first round has without a look for feasible ones, or `curves` if these are more.
         """
         began, params = time.perf_counter(), self.params
-        number = params.rollouts + params.kept * params.episode_steps
+        number = max(params.rollouts + params.kept * params.episode_steps, curves)
         drawn = random_round(problem, ends, number, np.random.default_rng(self.seed))
         return _first_accepted(problem, ends, [drawn], accept, began)
 

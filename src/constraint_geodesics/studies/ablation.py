@@ -119,7 +119,7 @@ class LearnedAblation:
         """
         whole = self._problem(0, domain)
         mean = ChartProblem(MeanManifold(self.chart), whole.curve, domain)
-        ends, drawn = self._colliding(whole, rng)
+        ends, collide = self._colliding(whole, rng)
         straight = [
             Geodesic.nothing("not_found", whole.curve, *pair) for pair in zip(*ends, strict=True)
         ]
@@ -129,7 +129,7 @@ class LearnedAblation:
             "straight_latent_line": straight,
         }
         count = float(len(straight))
-        counts = {"pairs": count, "straight_lines_that_collide": count / drawn}
+        counts = {"pairs": count, "straight_lines_that_collide": collide}
         return {
             name: path_figures(self.chart, self._points(curves), self.free) | counts
             for name, curves in found.items()
@@ -137,20 +137,25 @@ class LearnedAblation:
 
     def _colliding(
         self, problem: ChartProblem, rng: np.random.Generator
-    ) -> tuple[tuple[Float[np.ndarray, "P N"], Float[np.ndarray, "P N"]], int]:
-        """Pairs whose straight latent line touches something, and how many were drawn."""
-        starts, goals, drawn, found = [], [], 0, 0
+    ) -> tuple[tuple[Float[np.ndarray, "P N"], Float[np.ndarray, "P N"]], float]:
+        """Pairs of free ends whose straight latent line touches something, and the share of these
+        of all pairs of free ends that were drawn.
+        """
+        starts, goals, drawn, asked, found = [], [], 0, 0, 0
         t = np.linspace(0.0, 1.0, COARSE)[:, None]
         while found < self.pairs and drawn < MOST_DRAWN:
             ends = problem.sample_ends(DRAWN_AT_ONCE, rng)
             line = (1 - t) * ends.z_start[:, None] + t * ends.z_goal[:, None]
             joints = self.chart.decode(line)
-            untouched = self.free(joints.reshape(-1, joints.shape[-1]))
-            rows = ~untouched.reshape(joints.shape[:2]).all(axis=1)
+            untouched = self.free(joints.reshape(-1, joints.shape[-1])).reshape(joints.shape[:2])
+            between = untouched[:, 0] & untouched[:, -1]
+            rows = between & ~untouched.all(axis=1)
             starts.append(ends.z_start[rows])
             goals.append(ends.z_goal[rows])
-            drawn, found = drawn + len(ends), found + int(rows.sum())
-        return (np.concatenate(starts)[: self.pairs], np.concatenate(goals)[: self.pairs]), drawn
+            drawn, asked = drawn + len(ends), asked + int(between.sum())
+            found += int(rows.sum())
+        pairs = np.concatenate(starts)[: self.pairs], np.concatenate(goals)[: self.pairs]
+        return pairs, found / max(asked, 1)
 
     def _problem(self, segments: int, domain: Samples) -> ChartProblem:
         return ChartProblem(self.chart, curve_family(self.chart.dim, self.params, segments), domain)

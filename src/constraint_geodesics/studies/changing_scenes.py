@@ -4,6 +4,7 @@ that is carried, a sphere that comes up while the arm moves.
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from itertools import count as counted
 from typing import Any
 
 import numpy as np
@@ -32,16 +33,19 @@ BUDGETS_S = (None, 0.03, 0.1, 0.5)
 SUDDEN = 0.25
 """Share of the motion at which a sphere comes up."""
 TRIES = 20
+DRAWN = 100
+"""Pairs of ends at a time."""
 
 Rows = Iterator[dict[str, Any]]
 
 
 def pairs(planner: Planner, name: str, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Ends from the constraint's roadmap, without end."""
-    nodes, rng = planner.nodes(name), np.random.default_rng(seed)
-    while True:
-        start, goal = nodes[rng.integers(len(nodes), size=2)]
-        yield start, goal
+    """Free ends drawn like the data, none of which is of the planner's roadmap, without end."""
+    scene = planner.scene.now
+    manifold = ConstraintManifold(scene.robot, planner.constraints[name])
+    for attempt in counted():
+        ends = draw_queries(scene, manifold, name, DRAWN, seed + 1000 * attempt)
+        yield from zip(ends.starts, ends.goals, strict=True)
 
 
 def _long_paths(planner: Planner, name: str, seed: int) -> Iterator[Trajectory]:

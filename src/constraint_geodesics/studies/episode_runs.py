@@ -23,7 +23,7 @@ from constraint_geodesics.peers.birrt import BirrtSettings
 from constraint_geodesics.peers.wrappers import BandAfter, UntilSound
 from constraint_geodesics.planner import Planner, limits_of
 from constraint_geodesics.problem import PlanningProblem
-from constraint_geodesics.scene.clearance import clearance_model
+from constraint_geodesics.scene.clearance import Clearances
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.studies import episodes as study
@@ -61,16 +61,16 @@ class FromScratch(AbstractContextManager["FromScratch"]):
     """The classical answer: where the rest of the path touches what was seen the arm stops on it,
     and BiRRT with a band after it plans from rest, until its path is certified.
 
-    What is left of a path is looked at by the planner's own proof, and the scene's changes are as
-    incremental as the planner's; limits: what paths are certified for.
+    It asks compiled distances, what is left of a path is looked at by the planner's own proof, and
+    the scene's changes are as incremental as the planner's; limits: what paths are certified for.
     """
 
     def __init__(self, scene: Scene, limits: Limits, row_spacing_rad: float, seed: int) -> None:
         from constraint_geodesics.peers.ompl import SamplingPlanner
 
         self.scene, self.seed, self._opened = scene, seed, ExitStack()
-        self._world = self._opened.enter_context(scene.world())
         self._certifier = self._opened.enter_context(Certifier(scene, limits))
+        self._clearances = Clearances(scene, self._certifier.collisions.apart)
         settings = BirrtSettings()
         search = SamplingPlanner(settings.search, settings, row_spacing_rad)
         self._planner = UntilSound(BandAfter(search), self._is_sound, SOUND_S)
@@ -81,8 +81,8 @@ class FromScratch(AbstractContextManager["FromScratch"]):
     def see(self, obstacles: Sequence[Shape]) -> None:
         """Into the scene of search and proof."""
         self.scene = self.scene.adding(*obstacles)
-        self._world.change(self.scene.workcell, self.scene.attached, self.scene.allowed)
         self._certifier.change(self.scene)
+        self._clearances.change(self.scene)
 
     def moving(self, path: Trajectory, at_s: float) -> Trajectory | None:
         """On along the path where it is clear, else the stop on it."""
@@ -98,8 +98,8 @@ class FromScratch(AbstractContextManager["FromScratch"]):
             path.joints[-1],
             path.wanted,
             manifold,
-            self._world.is_free,
-            clearance_model(self.scene),
+            self._certifier.collisions.is_free,
+            self._clearances.model(self._certifier.collisions.apart),
             self._certifier.collisions.is_clear,
         )
         self.seed += 1

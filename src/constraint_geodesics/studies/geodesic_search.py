@@ -158,22 +158,22 @@ def run_seed(task: SeedTask) -> SeedResult:
             mean = policy.mean
     rows, paths, coefficients = [], [], []
     problem, solver = task.problem, PolicySolver(mean, task.params, task.seed)
-    searches = ((PLANNER, solver.search), (RANDOM, solver.search_at_random))
     with Certifier(task.scene, judge_limits(task.judge)) as certifier:
         for query in np.flatnonzero(task.connected)[:1]:
             # once before the clock: a worker's first search also loads compiled code
             ends = query_ends(problem, task.queries, int(query))
-            for _, search in searches:
+            for search in (solver.search, solver.search_at_random):
                 search(problem, ends, partial(_accepted, task, ends, certifier))
         for query in range(len(task.queries)):
             ends = query_ends(problem, task.queries, query)
             accept = partial(_accepted, task, ends, certifier)
-            for planner, search in searches:
-                if task.connected[query]:
-                    found = search(problem, ends, accept)
-                else:
-                    pair = ends.z_start[0], ends.z_goal[0]
-                    found = Geodesic.nothing("not_connected", problem.curve, *pair)
+            if task.connected[query]:
+                learned = solver.search(problem, ends, accept)
+                at_random = solver.search_at_random(problem, ends, accept, learned.evaluations)
+            else:
+                pair = ends.z_start[0], ends.z_goal[0]
+                learned = at_random = Geodesic.nothing("not_connected", problem.curve, *pair)
+            for planner, found in ((PLANNER, learned), (RANDOM, at_random)):
                 row, path = _measured(task, found, ends, certifier)
                 row["time_s"] += task.connection_s[query]
                 rows.append({"planner": planner, "query": query, "seed": task.seed, **row})

@@ -15,6 +15,7 @@ from constraint_geodesics.studies.demonstrations import (
     DESCENT,
     FLAT,
     LEVEL_SET,
+    NETWORK_SEEDS,
     POLICY,
     RESIDUAL,
     Answering,
@@ -27,9 +28,6 @@ from constraint_geodesics.studies.demonstrations import (
 )
 from constraint_geodesics.studies.row_latents import RowLatents
 from constraint_geodesics.studies.row_networks import RowNetwork, level_set, residual
-
-NETWORK_SEEDS = 3
-"""Seeds that networks are trained on: that takes longest."""
 
 
 def measure(cell: Cell) -> list[Columns]:
@@ -87,15 +85,17 @@ def _latents(cell: Cell, scene: Scene) -> Trained:
 
 def _vae(cell: Cell, rows: int, dim: int) -> ManifoldParams:
     own = cell.settings.learned
+    base = cell.params.manifolds[own.vae]
     changed = {
         "latent_dim": dim,
         "seed": cell.seed,
         "beta": own.beta,
         "epochs": own.epochs,
+        "variance_epochs": round(base.variance_epochs * own.epochs / base.epochs),
         "patience": own.epochs,
         "batch_size": max(rows // own.batches, 1),
     }
-    return cell.params.manifolds[own.vae].model_copy(update=changed)
+    return base.model_copy(update=changed)
 
 
 def _policy(cell: Cell) -> GeodesicParams:

@@ -32,9 +32,11 @@ from constraint_geodesics.learning.dataset import ShardTask, draw_free, seed_of
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import GeodesicParams, Params
 from constraint_geodesics.peers.registry import BaselineBuilder
+from constraint_geodesics.peers.wrappers import band_after
 from constraint_geodesics.problem import PathPlanner, PlanningProblem
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.search.band import BandSettings
 from constraint_geodesics.search.candidates import ROW_SAFETY, Candidate, Task, refined, rows_of
 from constraint_geodesics.studies.geodesic_search import policy_problem
 from constraint_geodesics.studies.optimum import OptimumSettings, family_optimum
@@ -383,13 +385,13 @@ def _query_rows(
         answered(asked, straight(asked, 0.0))  # what is loaded late is no method's
         answers = query_answers(asked, compared)
         known = PlanningProblem(query.start, query.goal, manifold, world.is_free, clearance)
-        planned = [
-            (name, seed, _planned(asked, known, planner, seed))
-            for name, planner in peers.items()
-            for seed in (range(PEER_SEEDS) if name != PLANNER else (0,))
-        ]
         band = [_or_nan(asked.refined_length, answer) for _, _, answer in answers]
-    every = [*answers, *planned]
+        every = list(answers)
+        for name, planner in peers.items():
+            for seed in range(PEER_SEEDS) if name != PLANNER else (0,):
+                answer, refined_rad = _planned(asked, known, planner, seed, name != PLANNER)
+                every.append((name, seed, answer))
+                band.append(refined_rad)
     best = float(np.fmin.reduce([*(answer.length for _, _, answer in every), *band]))
     about = {"constraint": query.constraint, "scene": query.scene, "query": query.number}
     rows = [
@@ -398,9 +400,7 @@ def _query_rows(
         | {"best_rad": best, "curves": answer.curves, "checked": answer.checked}
         | {"search_ms": 1e3 * answer.search_s, "time_ms": 1e3 * (answer.search_s + answer.check_s)}
         | {"refined_rad": refined_rad}
-        for (name, seed, answer), refined_rad in zip(
-            every, [*band, *(answer.length for _, _, answer in planned)], strict=True
-        )
+        for (name, seed, answer), refined_rad in zip(every, band, strict=True)
     ]
     return rows, [answer for _, _, answer in answers]
 
@@ -411,14 +411,22 @@ def _or_nan(length: Callable[[np.ndarray], float | None], answer: Answer) -> flo
     return np.nan if found is None else found
 
 
-def _planned(asked: Asked, problem: PlanningProblem, planner: PathPlanner, seed: int) -> Answer:
-    """Another planner's answer, certified as all are; its path is no curve of the family."""
+def _planned(
+    asked: Asked, problem: PlanningProblem, planner: PathPlanner, seed: int, is_raw: bool
+) -> tuple[Answer, float]:
+    """Another planner's answer, certified as all are, and its length after a band [rad], that of
+    the answer where it has had one; its path is no curve of the family.
+    """
     began = time.perf_counter()
-    joints = planner.plan(problem, seed).joints
+    planned = planner.plan(problem, seed)
     found = time.perf_counter()
-    length = asked.length_of(joints) if len(joints) > 1 else None
+    length = asked.length_of(planned.joints) if len(planned.joints) > 1 else None
     checked_s, nothing = time.perf_counter() - found, np.zeros(asked.problem.curve.coefficients)
-    return Answer(nothing, np.nan if length is None else length, found - began, checked_s, 0, 1)
+    banded = None
+    if is_raw and len(planned.joints) > 1:
+        banded = asked.length_of(band_after(problem, planned, BandSettings()).joints)
+    raw, refined_rad = (np.nan if x is None else x for x in (length, banded or length))
+    return Answer(nothing, raw, found - began, checked_s, 0, 1), refined_rad
 
 
 SHARES = (
@@ -429,6 +437,10 @@ SHARES = (
 the seed's own answers and (`_all`) with failures infinite, and over the family's shortest curve;
 the same of refined answers; median time [ms].
 """
+
+
+CASES = ["constraint", "query"]
+"""Columns that tell queries of one scene apart."""
 
 
 def seed_figures(rows: pd.DataFrame) -> pd.DataFrame:
@@ -464,17 +476,17 @@ def policy_figures(rows: pd.DataFrame) -> dict[str, Any]:
 
     Each of SHARES has its mean, interquartile mean and the 95 % bootstrap interval of the latter;
     beaten_in_*: probability that a seed of the policy solves more, or has a smaller p95, than one
-    of the method (Agarwal et al. 2021).
+    of the method, on the queries that the method was asked (Agarwal et al. 2021).
     """
     seeds, figures = seed_figures(rows), dict[str, Any]()
     scores = {str(name): own for name, own in seeds.groupby("method", sort=False)}
     able = rows[rows["best_rad"].notna()]
     counts = {
-        "queries": int(rows.groupby(["constraint", "query"]).ngroups),
-        "solvable": int(able.groupby(["constraint", "query"]).ngroups),
+        "queries": int(rows.groupby(CASES).ngroups),
+        "solvable": int(able.groupby(CASES).ngroups),
     }
     for name, own in scores.items():
-        asked = able[able["method"] == name].groupby(["constraint", "query"]).ngroups
+        asked = able[able["method"] == name].groupby(CASES).ngroups
         found: dict[str, Any] = counts | {"seeds": len(own), "asked": asked}
         found["curves"] = float(own["curves"].mean())
         for column in SHARES:
@@ -485,8 +497,10 @@ def policy_figures(rows: pd.DataFrame) -> dict[str, Any]:
             found |= {f"{column}_mean": float(values.mean()), f"{column}_low": low}
             found |= {f"{column}_iqm": interquartile_mean(values), f"{column}_high": high}
         if name != POLICY:
+            same = rows[rows["method"] == name][CASES].drop_duplicates()
+            policy = seed_figures(rows[rows["method"] == POLICY].merge(same))
             for column, sign in (("solved", 1.0), ("ratio_p95", -1.0)):
-                mine, theirs = (sign * scores[k][column].to_numpy(float) for k in (POLICY, name))
+                mine, theirs = (sign * s[column].to_numpy(float) for s in (policy, own))
                 found[f"beaten_in_{column}"] = probability_of_improvement(mine, theirs)
         figures[name] = {key: _json(value) for key, value in found.items()}
     return figures
