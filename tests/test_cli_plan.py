@@ -212,6 +212,12 @@ def test_wrong_usage_of_plan_is_code_two(command, words, said) -> None:
     assert re.search(said, error_line(err)), err
 
 
+def test_numbers_of_a_list_need_no_quotes() -> None:
+    cli._require_quotes(["replay", "--web", "1", "6"])
+    with pytest.raises(SystemExit):
+        cli._require_quotes(["ik", "--pose", "0.4", "0.2"])
+
+
 @pytest.mark.parametrize("missing", ["--start", "--goal", "--constraint"])
 def test_every_needed_option_is_asked_for(command, missing) -> None:
     given = {"--start": ZEROS, "--goal": ZEROS, "--constraint": "free"}
@@ -416,7 +422,7 @@ def test_a_method_is_chosen_by_its_name_and_named_in_the_answer(command, query, 
 def test_what_bench_does_not_know_is_one_line(monkeypatch, capfd, tmp_path, words, said) -> None:
     words = ("bench", "--out", str(tmp_path / "bench"), *words)
     code, _, err = called(monkeypatch, capfd, words)
-    assert code == 1
+    assert code == 2
     assert said in error_line(err)
     assert not (tmp_path / "bench").exists()
 

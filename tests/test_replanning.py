@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BPoly
 
-from constraint_geodesics import Planner, Sphere, Trajectory
+from constraint_geodesics import Constraint, Planner, Sphere, Trajectory
 from constraint_geodesics.geometry.braking import State
 from constraint_geodesics.planner import PlannerError
 from constraint_geodesics.trajectory import read_trajectory
@@ -420,3 +420,25 @@ def test_scales_stay_and_other_robots_are_refused():
         pytest.raises(PlannerError, match="of another robot"),
     ):
         other.replan(slow, 0.0)
+
+
+def test_a_moment_before_the_end_is_answered_too() -> None:
+    """However a clock rounds it."""
+    planner = packaged_planner()
+    for path in planned(6):
+        end = float(path.times[-1])
+        for before in (1e-9, 1e-6, 1e-4, 1e-3):
+            stop = path.stop(end - before)
+            np.testing.assert_allclose(stop.joints[-1], path.joints[-1], atol=1e-4)
+            answer = planner.replan(path, end - before)
+            assert answer.status in ("solved", "stopped")
+            np.testing.assert_allclose(answer.joints[-1], path.joints[-1], atol=1e-4)
+
+
+def test_a_velocity_in_the_middle_of_a_narrow_tolerance_leads_off() -> None:
+    """Where the constraint is held as the start has it, nothing is off yet."""
+    start, goal = pairs_of("free", 1, seed=3)[0]
+    level = Constraint((0, 0, 1, 0, 0, 0), tolerance=(0, 0, 1e-4, 0, 0, 0))
+    answer = packaged_planner().plan(start, goal, level, start_velocity=[0, 0.3, 0, 0, 0, 0])
+    assert answer.status == "start_violates"
+    assert "leads off" in answer.explanation

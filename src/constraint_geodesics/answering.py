@@ -148,7 +148,8 @@ class Answering:
         if onward.status != "solved":
             return None
         whole = np.concatenate([tail, onward.joints[1:]])
-        end = End(onward.joints[-1])
+        regions = onward.asked.regions
+        end = End(onward.joints[-1], regions[0] if len(regions) == 1 else None)
         found = self.judged(query, whole, onward.source, end)
         return found if isinstance(found, Trajectory) else None
 

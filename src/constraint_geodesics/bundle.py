@@ -24,6 +24,7 @@ from pydantic import TypeAdapter, ValidationError
 from safetensors.numpy import save
 
 from constraint_geodesics.array_files import ArrayFileError, read_weights
+from constraint_geodesics.errors import WrongUsageError
 from constraint_geodesics.fields import Name
 from constraint_geodesics.formats import PLANNER, Format, FormatError
 from constraint_geodesics.geometry.errors import GeometryError
@@ -51,7 +52,7 @@ PACKAGED = Path(__file__).parent / "pretrained"
 """The bundle of the committed run, which comes with the package."""
 
 
-class BundleError(ValueError):
+class BundleError(WrongUsageError):
     """A planner's files can't be used; the message names the file and says why."""
 
 

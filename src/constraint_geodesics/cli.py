@@ -86,10 +86,14 @@ def main() -> None:
         raise SystemExit(complain(error)) from None
 
 
+VECTORS = {"--start", "--goal", "--goal-pose", "--goal-tolerance", "--pose", "--tool-pose"}
+"""Options that take several numbers."""
+
+
 def _require_quotes(words: Sequence[str]) -> None:
     """Say which option stands before several numbers, of which it would get the first alone."""
     for option, *numbers in zip(words, words[1:], words[2:], strict=False):
-        if option.startswith("--") and all(map(is_number, numbers)):
+        if option in VECTORS and all(map(is_number, numbers)):
             line = f'{option} takes its numbers in quotes: {option} "{numbers[0]} …"'
             raise SystemExit(complain(ValueError(line), WRONG_USAGE))
 
@@ -381,13 +385,13 @@ def _listed(wanted: "Filter") -> "list[Listed]":
 
 def _named(words: Sequence[str]) -> list[Path]:
     """The files that some words name, by themselves or by their numbers in the list."""
-    from constraint_geodesics.recording.catalogue import Filter, by_words
+    from constraint_geodesics.recording.catalogue import CatalogueError, Filter, by_words
 
     files = {word: Path(word) for word in words if Path(word).is_file()}
     numbers = [word for word in words if word not in files]
     if missing := next((word for word in numbers if not word.isdigit()), None):
         none = f"{missing}: no such recording"
-        raise FileNotFoundError(f"{none}; `geodesics replay` lists those there are")
+        raise CatalogueError(f"{none}; `geodesics replay` lists those there are")
     if numbers:
         found = by_words(_listed(Filter()), numbers)
         files |= {word: Path(entry.file) for word, entry in zip(numbers, found, strict=True)}
@@ -434,6 +438,7 @@ def ui(
     require_free(port)
     page = runs_page(root, port)
     print(json.dumps({"address": page}) if as_json else f"{page}  (stop with Ctrl-C)", flush=True)
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # the server's log is no answer
     if browser is None:
         from constraint_geodesics.recording.viewer import display
 

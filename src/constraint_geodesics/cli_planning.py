@@ -4,7 +4,7 @@ import json
 import math
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -252,7 +252,10 @@ def plan(
         require("record")
     arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf, scene, attach)
     try:
-        _require_apart(out, record, picture)
+        require_apart({"--out": out, "--record": record, "--picture": picture})
+        if picture is not None and picture.suffix.lower() != ".png":
+            line = f"--picture {picture}: a picture is written as PNG: {picture.stem}.png"
+            raise PlannerError(line)
         if demonstrations is not None and record is None:
             raise PlannerError("--demonstrations is drawn in what --record names: give it, too")
         ends = Ends(start, constraint, goal, goal_pose, goal_free, goal_tolerance)
@@ -310,21 +313,15 @@ def plan(
     raise SystemExit(0 if path.status == "solved" else NO_PATH)
 
 
-def _require_apart(out: Path | None, record: Path | None, picture: Path | None) -> None:
-    """Raises PlannerError where one file would be written over another, or in a kind that its name
-    denies.
-    """
+def require_apart(named: Mapping[str, Path | None]) -> None:
+    """Raises PlannerError where one file would be written over another.  named: by option."""
     from constraint_geodesics.planner import PlannerError
 
     files = {
-        f"{option} {file}": file.resolve()
-        for option, file in (("--out", out), ("--record", record), ("--picture", picture))
-        if file is not None
+        f"{option} {file}": file.resolve() for option, file in named.items() if file is not None
     }
     if len(set(files.values())) < len(files):
         raise PlannerError(f"{', '.join(files)}: one file can't hold them all")
-    if picture is not None and picture.suffix.lower() != ".png":
-        raise PlannerError(f"--picture {picture}: a picture is written as PNG: {picture.stem}.png")
 
 
 def _told(path: "Trajectory") -> str:
@@ -440,6 +437,9 @@ def check(
                 warnings.simplefilter("ignore")
                 warnings.simplefilter("always", UserWarning)  # of shapes that are missing
                 certificate = loaded.check(file, own)
+            held = loaded.constraints[own] if isinstance(own, str) else own
+            if held is None:
+                held = read_trajectory(file, robot=loaded.robot).constraint
             broken = certificate.violation
             if broken is not None and broken.kind == "joint_limits" and file.is_file():
                 rows = read_trajectory(file, robot=loaded.robot).joints
@@ -452,13 +452,12 @@ def check(
         else ""
     )
     meant = constraint or f"the constraint that {file.name} names"
-    caveat = "" if own is None or isinstance(own, str) else own.caveat
     for one in told:
         print(f"note: {one.message}: give --scene and --attach", file=sys.stderr)
     if as_json:
         print(json.dumps(certificate.summary()))
     elif broken is None:
-        proven = _proven(certificate, meant, caveat)
+        proven = _proven(certificate, meant, "" if held is None else held.caveat)
         print(f"valid: {certificate.length_rad:.3f} rad, {proven}{untimed}")
     else:
         print(f"{broken.kind}: {broken.message}")

@@ -399,7 +399,8 @@ class Planner:
             None if q is None else checked_configuration(q, self.robot.dof, name)
             for q, name in ((start, "start"), (goal, "goal"))
         )
-        held = self._held_at(own, joints[0])
+        # one that is not placed is held as the first row has it, if that is anywhere
+        held = self._held_at(own, np.nan_to_num(joints[0]))
         return self._certifier.certify(joints, held, first, last, times, start_velocity=moving)
 
     def _named(self, constraint: str | Constraint) -> tuple[Constraint, str]:

@@ -131,7 +131,8 @@ class Replanning:
         if not (moving and stops):  # an arm that can stop plans again when it stands
             parts = replace(query.parts, tree=query.parts.tree and not moving)
             own = replace(query, parts=parts)
-            yield self.answering.answer(own, (ConfigurationGoal(query.goal),), None)
+            goal = ConfigurationGoal(query.goal, exactly=True)
+            yield self.answering.answer(own, (goal,), None)
 
     def _after(self, query: Query, stop: Motion) -> Iterator[Trajectory | None]:
         """The stop, and other paths from there, as one trajectory."""

@@ -358,7 +358,7 @@ class Trajectory:
         motions: tuple[np.ndarray, ...] = ()
         if demonstrations is not None:
             motions = tuple(demonstrations_from(demonstrations, self.scene.robot)[0])
-        record = PathRecord("planner", name, 0, 0, self.joints, text, goal=goal)
+        record = PathRecord(self.method, name, None, None, self.joints, text, goal=goal)
         ways = tuple(way.points for way in self.statistics.ways)
         record = replace(record, times=self.times, demonstrations=motions, ways=ways)
         manifold = ConstraintManifold(self.scene.robot, self.constraint)
@@ -438,7 +438,8 @@ def stopping(
     straight = run_out(space, state.configuration, velocity, pace)
     drawn = chain(curves, [] if straight is None else [straight])
     redrawn = (rows_from(own, rows[0], velocity, pace, REDRAWN) for own in drawn)
-    for others in chain(redrawn, [np.delete(rows, 1, axis=0)]):
+    left_out = [np.delete(rows, 1, axis=0)] if len(rows) > 1 else []
+    for others in chain(redrawn, left_out):
         found = shortest_stop(others, velocity, pace)
         if found is not None:
             return found, False
@@ -566,10 +567,12 @@ def _velocity_of(file: Path, number: int, text: str, dof: int) -> Float[np.ndarr
 
 def _header(file: Path, cells: Sequence[str], names: Sequence[str] | None) -> list[str]:
     header = [name.strip() for name in cells]
+    if names is not None and header[int(header[0] == "time_s") :] == list(names):
+        return header  # joints may be called by numbers
     if any(is_number(name) for name in header):
         wanted = "a header line with the joints' names is needed before the rows"
         raise PlannerError(f"{file}: {wanted}")
-    if names is not None and header[int(header[0] == "time_s") :] != list(names):
+    if names is not None:
         raise PlannerError(
             f"{file}: its columns are {', '.join(header)}: must be {', '.join(names)}, after "
             f"time_s if any"

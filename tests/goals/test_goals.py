@@ -237,3 +237,14 @@ def test_what_is_no_goal_is_refused(wanted) -> None:
     start = pairs_of("free", 1, seed=1)[0][0]
     with pytest.raises(PlannerError, match="goal"):
         packaged_planner().plan(start, wanted, "free")
+
+
+def test_a_region_whose_angles_the_constraint_holds_elsewhere_is_refused_at_once() -> None:
+    """Both hold roll and pitch, at two references."""
+    planner = packaged_planner()
+    start = pairs_of("fixed_orientation", 1, seed=4)[0][0]
+    position, rotation = planner.robot.forward(start)
+    tilted = rotation_from_rpy(np.array([0.3, 0.0, 0.0])) @ rotation
+    region = GoalRegion(Pose(position, tilted), free=["yaw"])
+    answer = planner.plan(start, region, "fixed_orientation")
+    assert answer.status == "goal_violates", answer.explanation

@@ -242,9 +242,9 @@ def test_the_command_prints_the_list_and_its_json(checkout, geodesics) -> None:
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (["nothing.rrd"], 1, "nothing.rrd: no such recording; `geodesics replay` lists"),
-        (["99"], 1, "99: no number of the list"),
-        (["--planner", "magic"], 1, "no recording of planner magic"),
+        (["nothing.rrd"], 2, "nothing.rrd: no such recording; `geodesics replay` lists"),
+        (["99"], 2, "99: no number of the list"),
+        (["--planner", "magic"], 2, "no recording of planner magic"),
         (["1", "--planner", "birrt"], 2, "choose from the list: give no file"),
         (["1", "--json"], 2, "--json prints the list"),
         (["1", "--save", "out.rrd"], 1, "query0-learned_geodesic-seed0.rrd: not a recording"),
@@ -274,7 +274,7 @@ def test_at_a_terminal_the_command_asks(checkout: Path) -> None:
     """Enter opens nothing; a number that is none is a mistake."""
     for answer, code, said in (
         (b"\n", 0, b"Which to open?"),
-        (b"77\n", 1, b"77: no number of the list"),
+        (b"77\n", 2, b"77: no number of the list"),
     ):
         terminal, own = pty.openpty()
         running = subprocess.Popen(

@@ -106,7 +106,7 @@ def state_at(motion: Motion, at_s: float) -> State:
         place, row = joints[row], row + 1
     elif np.linalg.norm(joints[row - 1] - place) <= AT_A_ROW:
         place = joints[row - 1]
-    if np.linalg.norm(velocity) <= AT_REST:
+    if np.linalg.norm(velocity) <= AT_REST or row == len(joints):  # at its end it rests
         velocity = np.zeros_like(start)
     return State(place, velocity, row)
 

@@ -56,7 +56,7 @@ Wanted = Goal | Pose | ArrayLike
 @dataclass(frozen=True, eq=False)
 class ConfigurationGoal:
     """One configuration (D,) [rad or m]; of continuous joints the angles, which whole turns do not
-    change.
+    change, or exactly these values.
 
     Raises PlannerError where it is asked for, if it has not as many joints as the robot, or is not
     finite.
@@ -64,6 +64,7 @@ class ConfigurationGoal:
 
     joints: Float[np.ndarray, "D"]
     region: Constraint | None = None
+    exactly: bool = False
 
     @property
     def description(self) -> str:
@@ -76,7 +77,7 @@ class ConfigurationGoal:
         """It alone, or with the whole turns of continuous joints."""
         robot = manifold.robot
         q = checked_configuration(self.joints, robot.dof, "goal")
-        if not robot.continuous:
+        if self.exactly or not robot.continuous:
             return [q]
         turning = np.array([name in robot.continuous for name in robot.joint_names])
         turned = whole_turns(robot, q[None], turning, start)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from constraint_geodesics.constraints.both import both
 from constraint_geodesics.constraints.constraint import AXES, Constraint, ConstraintManifold, Pose
-from constraint_geodesics.problem import PlannerError
+from constraint_geodesics.problem import SATISFIED, PlannerError
 from constraint_geodesics.robot.inverse_kinematics import seeds_of, solutions, turned_towards
 from constraint_geodesics.search.nearest import members_of, nearest_on
 from constraint_geodesics.values import numbers, shown
@@ -77,10 +77,14 @@ class GoalRegion:
         there = solutions(robot, self.pose.position, self.pose.rotation, near=start)
         there = there[np.argsort(np.linalg.norm(there - start, axis=1))][:NEAREST]
         seeds = np.concatenate([start[None], there, near])
-        found = nearest_on(together, start, seeds)
-        if not len(found):
-            yield from nearest_on(ConstraintManifold(robot, self.region), start, seeds)
+        region = ConstraintManifold(robot, self.region)
+        found = [q for q in nearest_on(together, start, seeds) if region.violation(q) <= SATISFIED]
+        if not found:
+            yield from nearest_on(region, start, seeds)
             return
         yield from found
         yield None
-        yield from members_of(together, many)
+        # both may hold an angle at two references, and keep one of them
+        yield from (
+            q for q in members_of(together, many) if q is None or region.violation(q) <= SATISFIED
+        )

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from constraint_geodesics.bundle import Bundle, read_bundle
 from constraint_geodesics.constraints.constraint import ConstraintManifold
+from constraint_geodesics.errors import WrongUsageError
 from constraint_geodesics.fields import Positive
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
@@ -25,7 +26,7 @@ GRAPH = ("label_joints", "train_manifold {searched}", "extract_submanifold {sear
 """Stages that make it with the constraints' graphs on it."""
 
 
-class BaselineError(ValueError):
+class BaselineError(WrongUsageError):
     """A planner of the benchmark can't be made; the message is one line with its name."""
 
 

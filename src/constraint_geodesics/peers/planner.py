@@ -50,7 +50,7 @@ class PlannerSettings(BaselineSettings):
         """The paper's system for the learned methods, nothing else."""
         if self.method == "planner":
             return ()
-        return (*GRAPH, "train_policies {searched}", "build_learned")
+        return (*GRAPH, "train_policies", "build_learned")
 
     @property
     def ends_by_counting(self) -> bool:

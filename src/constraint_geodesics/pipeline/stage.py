@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from constraint_geodesics.errors import ParamsError
+from constraint_geodesics.errors import ParamsError, WrongUsageError
 from constraint_geodesics.extras import MissingExtraError
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.threads import one_thread
@@ -63,7 +63,7 @@ def complain(error: Exception, code: int | None = None) -> int:
     print(f"error: {_plain(str(error))}", file=sys.stderr)
     if code is not None:
         return code
-    return WRONG_USAGE if isinstance(error, ParamsError | MissingExtraError) else 1
+    return WRONG_USAGE if isinstance(error, WrongUsageError | MissingExtraError) else 1
 
 
 def _plain(text: str) -> str:

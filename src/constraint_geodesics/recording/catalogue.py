@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from constraint_geodesics.errors import WrongUsageError
 from constraint_geodesics.pipeline.layout import RECORDINGS, Layout, in_checkout
 
 FOLDERS = (RECORDINGS, "first_path", ".geodesics/bench/recordings")
@@ -24,7 +25,7 @@ SEARCHING = ("train_geodesics", "benchmark_planners", "execute_paths")
 """Stages whose tables name recordings, besides the benchmark."""
 
 
-class CatalogueError(ValueError):
+class CatalogueError(WrongUsageError):
     """No recording is as asked for; the message says what there is instead."""
 
 

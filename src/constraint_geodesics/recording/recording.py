@@ -102,8 +102,9 @@ class PathRecord:
 
     planner: str
     constraint: str
-    query: int
-    seed: int
+    query: int | None
+    """None where it is of no set of queries; nor has it a seed then."""
+    seed: int | None
     joints: Float[np.ndarray, "T D"]
     """Configurations along the path [rad or m], the latent curve's points in the same order."""
     text: str
@@ -130,7 +131,16 @@ class PathRecord:
     @property
     def name(self) -> str:
         """For people; two paths may share it."""
+        if self.query is None:
+            return f"{self.constraint}-{self.planner}"
         return f"{self.constraint}-query{self.query}-{self.planner}-seed{self.seed}"
+
+    @property
+    def title(self) -> str:
+        """What a viewer shows of it."""
+        if self.query is None:
+            return f"{self.constraint}: {self.planner}"
+        return f"{self.constraint}, query {self.query}: {self.planner}, seed {self.seed}"
 
 
 @dataclass(frozen=True)
@@ -234,9 +244,8 @@ def record_path(
         about_chunk(About(path.planner, path.constraint, path.scene, path.query, path.seed)),
         *text_chunks(path.text),
     ]
-    name = f"{path.constraint}, query {path.query}: {path.planner}, seed {path.seed}"
     blueprint = _blueprint(path, sampled, series, shares)
-    write_recording(file, f"{path.name}-{digest(sampled)}", name, chunks, blueprint)
+    write_recording(file, f"{path.name}-{digest(sampled)}", path.title, chunks, blueprint)
 
 
 def text_chunks(text: str) -> list[Chunk]:

@@ -22,6 +22,7 @@ from constraint_geodesics.recording.recording import (
     rerun_command,
     write_recording,
 )
+from constraint_geodesics.text_files import written
 
 LOOPBACK = "127.0.0.1"
 VIEWER_PORT, WEB_PORT = 9876, 9090
@@ -123,8 +124,8 @@ def save_recordings(files: Sequence[Path], out: Path, *, apart: bool = False) ->
         if len(shown) > 1:
             several = "paths of several constraints can't be saved as one recording"
             raise RecordingError(f"{several}: add --side-by-side")
-        out.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(shown[0], out)
+        with written(out) as part:
+            shutil.copyfile(shown[0], part)
 
 
 def prepared(files: Sequence[Path], folder: Path, *, apart: bool) -> list[Path]:
@@ -151,7 +152,10 @@ def _with_meshes(source: Opened, file: Path) -> Path:
     with file.open("wb") as whole:
         # one file: the viewer arranges what it sees first, and would not take the second one's
         # blueprint
-        subprocess.run(merge, stdout=whole, stderr=subprocess.DEVNULL, check=True)
+        done = subprocess.run(merge, stdout=whole, stderr=subprocess.PIPE, check=False)
+    if done.returncode:
+        why = " ".join(done.stderr.decode(errors="replace").split())[-200:]
+        raise RecordingError(f"{source.file}: Rerun can't add its meshes: {why}")
     return file
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from constraint_geodesics.certification.collisions import CollisionCheck
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.constraints.projection import retract
-from constraint_geodesics.problem import Status, end_refused
+from constraint_geodesics.problem import LIMIT_SLACK, Status, end_refused
 from constraint_geodesics.search.candidates import Answer
 from constraint_geodesics.search.nearest import projection
 from constraint_geodesics.search.preparation import Query
@@ -40,7 +40,8 @@ def refused_end(
 
 def _limit(manifold: ConstraintManifold, end: str, q: Float[np.ndarray, "D"]) -> str:
     robot = manifold.robot
-    for k in np.flatnonzero((q < robot.lower) | (q > robot.upper)):
+    beyond = np.maximum(robot.lower - q, q - robot.upper)
+    for k in np.flatnonzero(beyond > LIMIT_SLACK):
         unit = "m" if robot.chain.prismatic[k] else "rad"
         limits = f"its limits are {robot.lower[k]:.4g} and {robot.upper[k]:.4g} {unit}"
         if robot.joint_names[k] in robot.continuous:
@@ -62,9 +63,12 @@ def not_connected(query: Query, answer: Answer, collisions: CollisionCheck) -> s
     for q in _same_pose(query, seeds):
         if collisions.is_free(q) and _component(query, roadmap, q) & reached:
             return f"{line}; the goal's tool pose can be reached from the start as {_listed(q)} rad"
-    away = float(np.linalg.norm(nodes[0] - query.goal))
-    nearest = f"the nearest configuration that the start can reach, {away:.2f} rad away"
-    return f"{line}; {nearest}, is {_listed(nodes[0])}"
+    nearest = next((q for q in nodes if collisions.is_free(q)), None)  # of the scene as it is now
+    if nearest is None:
+        return line
+    away = float(np.linalg.norm(nearest - query.goal))
+    told = f"the nearest configuration that the start can reach, {away:.2f} rad away"
+    return f"{line}; {told}, is {_listed(nearest)}"
 
 
 def _same_pose(query: Query, seeds: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "m D"]:

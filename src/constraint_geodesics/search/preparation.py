@@ -154,9 +154,14 @@ class Preparation:
             manifold = ConstraintManifold(self.scene.robot, constraint)
             roadmap = partial(self._roadmap, key, manifold)
             self._tasks[key] = Task(manifold, self._clearance, roadmap, self.band)
-        elif self._tasks[key].clearance is not self._clearance:
-            self._tasks[key] = replace(self._tasks[key], clearance=self._clearance)
-        return self._tasks[key]
+        known = self._tasks[key]
+        if known.clearance is not self._clearance:
+            known = replace(known, clearance=self._clearance)
+        kept = known.manifold.constraint
+        if kept is not constraint and kept.caveat != constraint.caveat:  # no key holds words
+            known = replace(known, manifold=ConstraintManifold(self.scene.robot, constraint))
+        self._tasks[key] = known
+        return known
 
     def _roadmap(self, key: tuple, manifold: ConstraintManifold) -> Roadmap | None:
         if key not in self._roadmaps:

@@ -220,5 +220,7 @@ def _leading_off(query: Query, velocity: np.ndarray) -> float:
     for group in rows.loose_groups:
         size = float(np.linalg.norm(residual[group]))
         if size >= rows.tolerance[group].max() - SATISFIED:
-            worst = max(worst, float(residual[group] @ rates[group]) / size)
+            # from the middle of a narrow tolerance any way leads off
+            off = residual[group] @ rates[group] / size if size else np.linalg.norm(rates[group])
+            worst = max(worst, float(off))
     return worst
