@@ -150,7 +150,7 @@ REFUSED: list[tuple[Change, tuple[str, ...]]] = [
     (lambda p: p["robot"].update(urdf="no/arm.urdf"), ("robot", "no/arm.urdf", "no such URDF")),
     (
         lambda p: p["robot"].update(urdf="params.yaml"),
-        ("robot: ", "params.yaml: no URDF", "no XML"),
+        ("robot: ", "params.yaml: the file is no XML", "no XML"),
     ),
     (lambda p: p["robot"].update(tool_link="hand"), ("robot", "there is no link 'hand'")),
     (lambda p: p["robot"].update(limits_rad={"elbow": [-1, 1]}), ("robot", "elbow", "joint6")),

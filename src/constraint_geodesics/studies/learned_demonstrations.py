@@ -91,7 +91,7 @@ def _vae(cell: Cell, rows: int, dim: int) -> ManifoldParams:
         "seed": cell.seed,
         "beta": own.beta,
         "epochs": own.epochs,
-        "variance_epochs": round(base.variance_epochs * own.epochs / base.epochs),
+        "variance_epochs": max(base.variance_epochs * own.epochs // base.epochs, 1),
         "patience": own.epochs,
         "batch_size": max(rows // own.batches, 1),
     }
