@@ -57,8 +57,9 @@ class Scene:
 
     def adding(self, *shapes: Shape) -> "Scene":
         """With more shapes, whose names are new."""
+        taken = set(self.names)
         for shape in shapes_of(shapes, "shapes"):
-            if shape.name in self.names:
+            if shape.name in taken:
                 raise SceneError(f"there is a shape called {shape.name!r} already: remove it first")
         return replace(self, workcell=(*self.workcell, *shapes))
 
