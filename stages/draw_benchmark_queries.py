@@ -8,7 +8,7 @@ import sys
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.benchmark.judge import judge_limits
+from constraint_geodesics.benchmark.judge import judge_limits, problem_of
 from constraint_geodesics.benchmark.queries import (
     QueryError,
     draw_benchmark,
@@ -21,7 +21,6 @@ from constraint_geodesics.params import Params
 from constraint_geodesics.peers.registry import BaselineBuilder
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
-from constraint_geodesics.problem import PlanningProblem
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
 
@@ -50,14 +49,13 @@ def draw(params: Params, layout: Layout, constraint: str) -> None:
     with (
         build(settings.placed_by, scene, constraint, manifold) as (planners, _),
         Certifier(scene, judge_limits(params.judge)) as certifier,
-        scene.world() as world,
     ):
         clearance = clearance_model(scene, certifier.collisions.apart)
 
         def plan(
             start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]
         ) -> Float[np.ndarray, "T D"]:
-            problem = PlanningProblem(start, goal, manifold, world.is_free, clearance)
+            problem = problem_of(start, goal, manifold, certifier, clearance)
             return shortest_of(planners, problem, certifier)
 
         queries = draw_benchmark(scene, manifold, constraint, settings, plan)

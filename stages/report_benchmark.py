@@ -31,8 +31,10 @@ from constraint_geodesics.tracking.comparison import BENCHMARK, cells_of
 from constraint_geodesics.tracking.experiment import StageRun, Work, tracked_stage
 
 STAGE = "report_benchmark"
-BUDGETS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 20.0)
-"""Time budgets at which the planner is held against its baselines [s]."""
+BUDGETS = (0.01, 0.03, 0.1, 0.3, 1.0, 20.0)
+"""Time budgets at which the planner is held against its baselines [s]: it is given no more than a
+second, they have ended at the last.
+"""
 SERVES = 0.5
 """Valid rows of all that a planner must have to be drawn among those that serve queries."""
 

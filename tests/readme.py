@@ -57,7 +57,7 @@ def _cells(row: dict[str, str]) -> tuple[str, str, str]:
     """Share solved of the solvable, p95 of the length over the best known with failures as
     infinite, and the median time of one figure of the benchmark's overview.
     """
-    ratio, few = float(row["ratio_p95_all"]), int(row["rows"]) < FEW
+    ratio, few = float(row["ratio_p95_all"]), int(row["queries"]) < FEW
     length = "–" if few else "∞" if ratio == float("inf") else f"{ratio:.3f}"
     milliseconds = 1e3 * float(row["time_median_s"])
     time = f"{milliseconds:,.0f}" if milliseconds >= 100.0 else f"{milliseconds:.3g}"

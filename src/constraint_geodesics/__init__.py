@@ -1,4 +1,4 @@
-"""Shortest robot paths that keep a task constraint, by policy search on one learned manifold."""
+"""Shortest robot paths that keep a task constraint, certified on the whole path."""
 
 import os
 import sys

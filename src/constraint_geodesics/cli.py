@@ -454,12 +454,14 @@ def serve(
         "models:/constraint_geodesics@champion", help="The planner in MLflow's registry."
     ),
     port: int = typer.Option(5002, help="Port that it listens on.", min=1, max=65535),
-    host: str = typer.Option("127.0.0.1", help="Who else may ask: 0.0.0.0 is everybody."),
+    host: str = typer.Option(
+        "127.0.0.1", help="Address to listen on; 0.0.0.0 lets everybody ask, without a password."
+    ),
     workers: int = typer.Option(1, help="Processes, each with its own planner.", min=1, max=1024),
     waiting: int = typer.Option(16, help="Requests that a process lets in at once.", min=1),
     as_json: bool = JSON,
 ) -> None:
-    """Answer planning requests over HTTP, on this machine only; it runs until it is stopped.
+    """Answer planning requests over HTTP, by default on this machine alone, until it is stopped.
 
     Requests are those of MLflow's model server. Where too many wait, the answer is 503.
     """

@@ -228,7 +228,7 @@ def plan(
         str,
         typer.Option(
             help="planner: straight line, roadmap and trees, refined; nothing in it is learned.  "
-            "learned: trained policies on the learned manifold alone, as in the paper.  "
+            "learned: curves that a trained policy proposes, certified and not refined.  "
             "learned+band: the same, refined by the planner's elastic band.",
             shell_complete=completion.methods,
         ),

@@ -56,7 +56,7 @@ FAMILIES = {
         ORANGE,
         "this planner, its parts and policies",
         (
-            *("planner", "planned", "learned", "without", "only", "nothing learned"),
+            *("planner", "planned", "learned", "without", "only"),
             *("trees + band", "band and trees", "graph", "policy", "policies", "the same search"),
         ),
     ),

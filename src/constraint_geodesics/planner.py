@@ -106,8 +106,8 @@ class Planner:
         `planner.source` says which it was.
 
         method: how curves are looked for.  "planner": straight line, roadmap and trees, refined;
-        nothing in it is learned.  "learned": by policies on the learned manifold alone, as the
-        paper does; "learned+band": the same, refined by the planner's elastic band.
+        nothing in it is learned.  "learned": by a trained policy in its chart, as the paper
+        does; "learned+band": the same, refined by the planner's elastic band.
         Raises BundleError if files are missing or altered, PlannerError for another method.
         """
         if source is not None:

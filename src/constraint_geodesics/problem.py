@@ -59,6 +59,10 @@ class PlanningProblem:
     """Whether the straight lines between rows (T, D) touch nothing; None if `is_free` is all that
     is known.
     """
+    is_sound: Callable[[np.ndarray], bool] | None = None
+    """Whether a whole path (T, D) is certified, for planners that are asked again where it is not;
+    None where nobody looks.
+    """
 
     def keeps_clear(self, rows: Float[np.ndarray, "T D"]) -> bool:
         """Whether a path touches nothing on its whole way, where that is known, else at

@@ -112,7 +112,7 @@ def test_the_overview_says_what_its_csv_says(layout, page, params):
     drawn = page.rows("Scene table, planners that are drawn")
     assert {name.removesuffix(" †") for name in drawn} - {"planner"} <= set(params.benchmark.drawn)
     parts = page.rows("Scene table, the planner and its parts")
-    assert {"without graph", "without policies", "nothing learned"} <= set(parts)
+    assert {"without graph", "without graph, 1 s", "without trees"} <= set(parts)
     assert "BiRRT" not in parts
 
 

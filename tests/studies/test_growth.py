@@ -81,7 +81,8 @@ ASKED = {
 
 
 def law(values, seconds, axis="queries", what="one"):
-    return pd.DataFrame({"axis": axis, "value": values, "what": what, "seconds": seconds})
+    told = {"axis": axis, "value": values, "what": what, "seconds": seconds}
+    return pd.DataFrame(told | {"solved": np.nan})
 
 
 @given(
@@ -123,6 +124,13 @@ def test_there_is_one_row_for_each_axis_and_what():
 def test_what_has_no_logarithm_is_left_out():
     fit = slopes(law([0, 1, 2, 3, 4, 8], [100.0, 1.0, 4.0, np.nan, 16.0, 0.0])).iloc[0]
     assert fit["slope"] == pytest.approx(2.0)
+    assert fit["points"] == 3
+
+
+def test_sizes_of_which_less_than_half_is_solved_are_left_out():
+    known = law([1, 2, 4, 8], [1.0, 2.0, 4.0, 2.0])
+    fit = slopes(known.assign(solved=[1.0, 0.5, 0.5, 0.4])).iloc[0]
+    assert fit["slope"] == pytest.approx(1.0)
     assert fit["points"] == 3
 
 

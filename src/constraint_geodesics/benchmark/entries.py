@@ -222,21 +222,22 @@ def _data_of(run: Run, settings: BaselineSettings) -> str:
 
 
 def training_times(params: Params, layout: Layout) -> dict[str, float]:
-    """Seconds that stages took to make what each planner needs, from data to files; 0 for those
-    that learn nothing.
+    """Seconds that stages took to make what each planner needs, from data to files: training, and
+    the roadmaps of those that have any; 0 for those that need nothing.
     """
     settings, frame = all_settings(params), pd.read_csv(layout.stage_times)
     seconds = dict(zip(frame["stage"], frame["seconds"], strict=True))
     searched = params.geodesics.searched[0]
+    needed = {
+        name: (*own.trained, *["build_planner"] * own.uses_bundle) for name, own in settings.items()
+    }
     return {
         name: sum(
             spent
             for stage, spent in seconds.items()
-            if stage.startswith(tuple(first.format(searched=searched) for first in own.trained))
+            if stage.startswith(tuple(first.format(searched=searched) for first in own))
         )
-        if own.trained
-        else 0.0
-        for name, own in settings.items()
+        for name, own in needed.items()
     }
 
 

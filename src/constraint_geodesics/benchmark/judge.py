@@ -11,6 +11,8 @@ from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.params import JudgeParams
+from constraint_geodesics.problem import PlanningProblem
+from constraint_geodesics.scene.clearance import ClearanceModel
 
 if TYPE_CHECKING:
     from constraint_geodesics.learning.learned_manifold import LearnedManifold
@@ -51,6 +53,25 @@ def judge_limits(judge: JudgeParams) -> Limits:
         max_step_rad=judge.max_step_rad,
         violation_tolerance=judge.violation_tolerance,
     )
+
+
+def problem_of(
+    start: Float[np.ndarray, "D"],
+    goal: Float[np.ndarray, "D"],
+    manifold: ConstraintManifold,
+    certifier: Certifier,
+    clearance: ClearanceModel | None,
+) -> PlanningProblem:
+    """A problem in the certifier's scene: its compiled checks are asked of configurations and
+    lines, its certificate of whole paths.
+    """
+    checks = certifier.collisions
+
+    def is_sound(joints: Float[np.ndarray, "T D"]) -> bool:
+        return certifier.certify(joints, manifold.constraint, start, goal).valid
+
+    known = checks.is_free, clearance, checks.is_clear, is_sound
+    return PlanningProblem(start, goal, manifold, *known)
 
 
 def measure_path(

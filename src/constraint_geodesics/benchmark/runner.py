@@ -16,12 +16,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.benchmark.judge import PathMeasures, judge_limits, measure_path
+from constraint_geodesics.benchmark.judge import (
+    PathMeasures,
+    judge_limits,
+    measure_path,
+    problem_of,
+)
 from constraint_geodesics.benchmark.queries import Query
 from constraint_geodesics.benchmark.row import KEY, key_of, read_rows, row_line
 from constraint_geodesics.certification.certifier import Certifier
@@ -94,9 +99,8 @@ class QueryBatch:
     """Some queries of one constraint and scene, with the planners that answer them; picklable.
 
     file: where the rows are kept, one JSON record a line.  record: called with every path that
-    there is.  learned: manifolds on which the paths' lengths are measured as well.  asked: whose
-    word planners have on single configurations: PyBullet's, or the certifier's check, compiled,
-    which asks PyBullet where bodies all but touch.  watch: what more is said of answers.
+    there is.  learned: manifolds on which the paths' lengths are measured as well.  watch: what
+    more is said of answers.
     """
 
     scene: Scene
@@ -108,7 +112,6 @@ class QueryBatch:
     file: Path
     learned: Mapping[str, "LearnedManifold"] = field(default_factory=dict)
     record: Recorder | None = None
-    asked: Literal["pybullet", "certifier"] = "pybullet"
     watch: Watch | None = None
 
     @property
@@ -186,21 +189,20 @@ def _append(file: Path, line: str) -> None:
 
 
 def _answered(batch: QueryBatch, query: Query, jobs: Sequence[_Job]) -> Iterator[dict[str, Any]]:
-    """Rows of one query."""
+    """Rows of one query.  All planners ask the certifier's compiled check, of configurations, lines
+    and whole paths.
+    """
     scene, manifold = query.in_scene(batch.scene), batch.manifold
     names = list(dict.fromkeys(job.baseline.name for job in jobs))
     with (
         Certifier(scene, judge_limits(batch.judge)) as certifier,
-        scene.world() as world,
         batch.build(names, scene, query.constraint, manifold) as (planners, made_s),
         _watched(batch, query, scene) as look,
     ):
         began = time.perf_counter()
         clearance = clearance_model(scene, certifier.collisions.apart)
         clearance_s = time.perf_counter() - began
-        is_free = {"pybullet": world.is_free, "certifier": certifier.collisions.is_free}
-        known = is_free[batch.asked], clearance, certifier.collisions.is_clear
-        problem = PlanningProblem(query.start, query.goal, manifold, *known)
+        problem = problem_of(query.start, query.goal, manifold, certifier, clearance)
         grown_by: dict[tuple[str, int], float] = {}
         for job in jobs:
             baseline = job.baseline

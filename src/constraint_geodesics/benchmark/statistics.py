@@ -39,8 +39,8 @@ def benchmark_summary(rows: pd.DataFrame, reference: str) -> pd.DataFrame:
     """One row a constraint, scene and planner, from the rows of benchmark.csv.
 
     queries, rows; solvable: queries that any planner solved.  success: valid rows of all;
-    success_of_solvable: of those whose query any planner solved, with its 95 % bootstrap interval
-    over queries.  claimed_but_invalid: rows called solved that the certifier refuses.
+    success_of_solvable: of those whose query any planner solved, with its 95 % interval of Clopper
+    and Pearson over queries.  claimed_but_invalid: rows called solved that the certifier refuses.
     not_applicable: rows of problems that the planner cannot work on.
     ratio_*: length over best known of valid rows: median, 95th percentile, and the interquartile
     mean over queries (of each query's mean over its seeds) with its 95 % bootstrap interval;
@@ -74,8 +74,7 @@ def _figures(own: pd.DataFrame) -> dict[str, Any]:
     solvable = own[own["best_known_rad"].notna()]
     ratio, time = own["ratio"].dropna(), solvable["time_s"]
     low, middle, high = interquartile_mean(own.groupby("query")["ratio"].mean().dropna().to_numpy())
-    solved = solvable.groupby("query")["valid"].mean().to_numpy()
-    success_low, _, success_high = _interval(solved, np.mean)
+    success_low, success_high = _of_a_share(solvable.groupby("query")["valid"].mean())
     reached = {
         f"within_{100 * share:.0f}_s": _median_time(solvable, 1.0 + share) for share in WITHIN
     }
@@ -101,6 +100,18 @@ def _figures(own: pd.DataFrame) -> dict[str, Any]:
         **reached,
         "peak_memory_median_mb": own["peak_memory_mb"].quantile(0.5),
     }
+
+
+def _of_a_share(solved: "pd.Series[float]") -> tuple[float, float]:
+    """The 95 % interval of Clopper and Pearson of a share of queries, each counted by the share of
+    its runs: none is ever of no width; nan without queries.
+    """
+    count, known = len(solved), float(solved.sum())
+    if not count:
+        return float("nan"), float("nan")
+    low = stats.beta.ppf(0.025, known, count - known + 1.0) if known > 0.0 else 0.0
+    high = stats.beta.ppf(0.975, known + 1.0, count - known) if known < count else 1.0
+    return float(low), float(high)
 
 
 def interquartile_mean(values: Float[np.ndarray, "n"]) -> tuple[float, float, float]:
@@ -265,8 +276,9 @@ def repeated(first: pd.DataFrame, again: pd.DataFrame) -> pd.DataFrame:
     """Two runs of the same rows compared: one row a planner.
 
     rows: that both have.  same_validity; length_difference: the largest relative one of rows valid
-    in both.  time_*: median of the first and of the second run [s] with 95 % bootstrap intervals,
-    and whether these overlap.
+    in both.  time_s, time_again_s: medians of the first and of the second run.  ratio_*: the median
+    over queries of the second time over the first of the same row, with its 95 % bootstrap
+    interval.
     """
     keys, table = [*CASE, "planner", "query", "seed"], []
     both = first.merge(again, on=keys, suffixes=("", "_again"))
@@ -279,13 +291,10 @@ def repeated(first: pd.DataFrame, again: pd.DataFrame) -> pd.DataFrame:
             "same_validity": bool((own["valid"] == own["valid_again"]).all()),
             "length_difference": float(relative.max()) if len(relative) else 0.0,
         }
-        for run in ("time", "time_again"):
-            column = "time_s" if run == "time" else "time_s_again"
-            low, middle, high = _interval(own[column].to_numpy(), np.median)
-            row |= {f"{run}_s": middle, f"{run}_low_s": low, f"{run}_high_s": high}
-        overlap = row["time_low_s"] <= row["time_again_high_s"]
-        row["overlap"] = bool(overlap and row["time_again_low_s"] <= row["time_high_s"])
-        table.append(row)
+        times = {"time_s": own["time_s"].median(), "time_again_s": own["time_s_again"].median()}
+        ratio = (own["time_s_again"] / own["time_s"]).groupby([own[k] for k in (*CASE, "query")])
+        low, middle, high = _interval(ratio.median().to_numpy(), np.median)
+        table.append(row | times | {"ratio": middle, "ratio_low": low, "ratio_high": high})
     return pd.DataFrame(table)
 
 
@@ -334,18 +343,20 @@ def summarise(paths: pd.DataFrame, latent: str, counted: Counted = "valid") -> p
     violation, success.
 
     paths: rows of `PathMeasures.row` with planner, query, seed, status and time_s.  latent: the
-    manifold whose latent length is compared.  Success, status, violation and time are over all
-    rows.  Table I is over one query: here each query's shortest path, average and standard
-    deviation over the seeds are taken first, then their mean over the queries (of the variance, for
-    the deviation).  Lengths are over the queries that every planner with any counted path has
-    solved, because an average over easier queries is a shorter one (those of APART over the ones
-    among them that it solves: `compared` counts them); `over_best_*`, the joint length over the
-    shortest counted path of the same query, is over all counted rows.
+    manifold whose latent length is compared. Success, status and violation are over all rows, times
+    over those of queries that any planner solves: a planner's own limit is no time of it. Table I
+    is over one query: here each query's shortest path, average and standard deviation over the
+    seeds are taken first, then their mean over the queries (of the variance, for the deviation).
+    Lengths are over the queries that every planner with any counted path has solved, because an
+    average over easier queries is a shorter one (those of APART over the ones among them that it
+    solves: `compared` counts them); `over_best_*`, the joint length over the shortest counted path
+    of the same query, is over all counted rows.
     """
     counts = paths["valid"] if counted == "valid" else paths["length_rad"].notna()
     kept = paths[counts]
     common = common_queries(kept[~kept["planner"].isin(APART)])
     over_best = kept["length_rad"] / kept.groupby("query")["length_rad"].transform("min")
+    solvable = set(kept["query"])
     rows = []
     for planner, group in paths.groupby("planner", sort=False):
         mine = kept[kept["planner"] == planner]
@@ -360,7 +371,7 @@ def summarise(paths: pd.DataFrame, latent: str, counted: Counted = "valid") -> p
                 "over_best_median": over_best[mine.index].median(),
                 "over_best_p95": over_best[mine.index].quantile(0.95),
                 **_violations(group),
-                **_times(group),
+                **_times(group[group["query"].isin(solvable)]),
             }
         )
     return pd.DataFrame(rows)

@@ -1,6 +1,5 @@
 """What is known of a baseline, and what it is made from."""
 
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -34,7 +33,7 @@ class BaselineError(WrongUsageError):
 class Context:
     """What a baseline is made from: the scene, the constraint, and the run it takes parts from.
 
-    opened: closed when the baselines are no longer needed.  shared: between those made together.
+    shared: between those made together.
     """
 
     scene: Scene
@@ -42,7 +41,6 @@ class Context:
     manifold: ConstraintManifold
     params: Params
     layout: Layout
-    opened: ExitStack
     shared: dict[str, Any]
 
     @property
@@ -76,7 +74,7 @@ class BaselineSettings(BaseModel):
     uses_clearance: ClassVar[bool] = True
     """Whether it is given the model of distances, whose making is then part of its preparation."""
     asks_in_python: ClassVar[bool] = False
-    """Whether its search asks PyBullet through Python for every state."""
+    """Whether its search asks through Python for every state."""
     uses_bundle: ClassVar[bool] = False
     """Whether it is made from the planner's files, though it may use nothing trained of them."""
     made_by: ClassVar[tuple[str, ...]] = ()

@@ -1,13 +1,17 @@
 """The project's own planner, whole or in parts, asked as its baselines are."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
 from typing import ClassVar, Literal, get_args
 
+from constraint_geodesics.bundle import read_bundle
 from constraint_geodesics.fields import Positive
 from constraint_geodesics.methods import open_method
 from constraint_geodesics.peers.baseline import GRAPH, BaselineSettings, Context
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search.candidates import ALL_PARTS, Parts
 
 Part = Literal["straight", "policy", "graph", "refinement", "tree"]
@@ -33,11 +37,12 @@ class PlannerSettings(BaselineSettings):
     budget_s: Positive | None = None
 
     def make(self, context: Context) -> PathPlanner:
-        """Baselines made together share one planner of each method, opened once."""
+        """All share one planner of each method, whose scene changes from query to query."""
         if self.method not in context.shared:
             context.shared[self.method] = _opened(context, self.method)
         parts = replace(ALL_PARTS, **dict.fromkeys(self.switched_off - {"policy"}, False))
-        return OwnPlanner(context.shared[self.method], parts, self.budget_s)
+        planner = context.shared[self.method]
+        return OwnPlanner(planner, planner.scene.now, parts, self.budget_s)
 
     @property
     def switched_off(self) -> set[str]:
@@ -68,12 +73,15 @@ class OwnPlanner:
     """The planner that users call, or some of its parts, behind the interface of its baselines."""
 
     planner: Planner
+    scene: Scene
     parts: Parts = ALL_PARTS
     budget_s: float | None = None
     name: str = "planner"
 
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:  # nothing in it is random
-        """One query under the problem's constraint."""
+        """One query under the problem's constraint, in the scene that it was made for."""
+        if self.scene != self.planner.scene.now:
+            self.planner.scene.become(self.scene)
         path = self.planner.plan(
             problem.start,
             problem.goal,
@@ -85,20 +93,37 @@ class OwnPlanner:
         return Solution(path.status, path.joints, path.planning_time_s, 1, explanation)
 
 
+@dataclass(frozen=True)
+class _Open:
+    """A planner as it was loaded.  known: the scene of its files; prepared: keys of constraints."""
+
+    planner: Planner
+    known: Scene
+    prepared: set[object]
+
+
+@lru_cache(maxsize=8)
+def _open(folder: Path, method: str) -> _Open:
+    """One a process, as those who plan have it."""
+    bundle = read_bundle(folder)
+    planner = Planner(bundle, "the pipeline's outputs", open_method(method, folder, bundle))
+    return _Open(planner, planner.scene.now, set())
+
+
 def _opened(context: Context, method: str) -> Planner:
-    """The planner in the context's scene, its graph and networks loaded."""
-    within = context.bundle.workcell.including(*context.scene.workcell)
-    bundle = replace(context.bundle, workcell=within)
-    found = open_method(method, context.layout.planner, bundle)
-    planner = context.opened.enter_context(Planner(bundle, "the pipeline's outputs", found))
-    if context.scene.attached:
-        planner.scene.become(context.scene)
-    constraint = context.manifold.constraint
-    planner.prepare(constraint)
-    nodes, trees = planner.nodes(constraint), Parts(straight=False, graph=False)
-    if len(nodes):  # loads the trees' compiled code
-        planner.plan(nodes[0], nodes[-1], constraint, parts=trees)
-    return planner
+    """The planner in the context's scene.  Roadmaps, which know no more than the scene of its
+    files, are made before, and what the first query loads is loaded.
+    """
+    own, constraint = _open(context.layout.planner, method), context.manifold.constraint
+    if constraint.key not in own.prepared:
+        own.planner.scene.become(own.known)
+        own.planner.prepare(constraint)
+        nodes, trees = own.planner.nodes(constraint), Parts(straight=False, graph=False)
+        if len(nodes):  # loads the trees' compiled code
+            own.planner.plan(nodes[0], nodes[-1], constraint, parts=trees)
+        own.prepared.add(constraint.key)
+    own.planner.scene.become(replace(context.scene, robot=own.planner.robot))
+    return own.planner
 
 
 BASELINE = PlannerSettings

@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
@@ -15,13 +15,17 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.palette import FAMILIES
 from constraint_geodesics.params import BaselineParams, Params, one_line
 from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings, Context
-from constraint_geodesics.peers.wrappers import BandAfter, Remembered, Restarted
+from constraint_geodesics.peers.wrappers import BandAfter, Remembered, Restarted, UntilSound
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.problem import PathPlanner
 from constraint_geodesics.scene.scene import Scene
 
 MARK = "\nBASELINE = "
 """How a file here says that it holds a kind of baseline."""
+AGAIN_S = 2.0
+"""Time [s] in which a planner that draws at random, and has no limit of its own, is asked again
+while its path is not sound.
+"""
 
 
 @lru_cache(maxsize=1)
@@ -97,18 +101,17 @@ class BaselineBuilder:
                     f"benchmark.planners has no {name!r}: must be one of {', '.join(known)}"
                 )
         settings = {name: settings_of(name, known[name]) for name in names}
-        with ExitStack() as opened:
-            context = Context(
-                scene, constraint, manifold, self.params, Layout(self.root), opened, {}
-            )
-            yield made_together(settings, context)
+        context = Context(scene, constraint, manifold, self.params, Layout(self.root), {})
+        yield made_together(settings, context)
 
 
 def made_together(
-    settings: Mapping[str, BaselineSettings], context: Context
+    settings: Mapping[str, BaselineSettings], context: Context, again_s: float = AGAIN_S
 ) -> tuple[dict[str, PathPlanner], dict[str, float]]:
     """Planners by name, and the seconds that making each one took: one with a band after it
-    shortens the very paths of the one without.  Raises BaselineError if one can't be made.
+    shortens the very paths of the one without.  Those that draw at random are asked again while
+    their path is not sound, for their own limit or `again_s`.  Raises BaselineError if one can't be
+    made.
     """
     first = {own.bare for own in settings.values() if own.band and own.restarts_s is None}
     remembered: dict[BaselineSettings, PathPlanner] = {}
@@ -119,9 +122,12 @@ def made_together(
         if own.bare in first and own.bare not in remembered:
             remembered[own.bare] = Remembered(_made(name, own, context))
         inner = remembered.get(own.bare) or _made(name, own, context)
-        banded = BandAfter(inner) if own.band else inner
-        limit = own.restarts_s
-        made[name] = banded if limit is None else Restarted(banded, limit)
+        found = BandAfter(inner) if own.band else inner
+        if own.restarts_s is not None:
+            found = Restarted(found, own.restarts_s)
+        elif own.random:
+            found = UntilSound(found, own.given_s or again_s)
+        made[name] = found
         took[name] = time.perf_counter() - began
     return made, took
 

@@ -4,7 +4,7 @@ is sound, and a memory.
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -34,7 +34,7 @@ class Restarted:
 
     An attempt that has begun is not interrupted; one that would not end in time by the mean of
     those before is not begun.  An answer that no other seed can change (a refusal, a misfit) ends
-    the search at once.
+    the search at once.  A path that is not sound counts for nothing where the problem can tell.
     """
 
     inner: PathPlanner
@@ -55,6 +55,8 @@ class Restarted:
             answer = self.inner.plan(problem, SEEDS * seed + attempts)
             attempts += 1
             iterations += answer.iterations
+            if _is_unsound(problem, answer):
+                answer = _unsound(problem, attempts)
             if best is None or _length(answer) < _length(best):
                 best = answer
             spent = time.perf_counter() - began
@@ -70,11 +72,10 @@ class UntilSound:
     """A planner that is asked again with another seed while its path is not sound, for `budget_s`
     [s] in all: one that looks at single configurations may touch something between them.
 
-    An attempt that has begun is not interrupted.
+    An attempt that has begun is not interrupted.  Where the problem can't tell, the first answers.
     """
 
     inner: PathPlanner
-    is_sound: Callable[[PlanningProblem, Float[np.ndarray, "T D"]], bool]
     budget_s: float
 
     @property
@@ -92,14 +93,22 @@ class UntilSound:
             attempts += 1
             iterations += answer.iterations
             began = time.perf_counter()
-            sound = answer.status != "solved" or self.is_sound(problem, answer.joints)
+            unsound = _is_unsound(problem, answer)
             # a remembered answer holds its own time
             spent_s += answer.time_s + time.perf_counter() - began
-            if sound:
+            if not unsound:
                 return replace(answer, time_s=spent_s, iterations=iterations)
-        nothing = np.empty((0, len(problem.start)))
-        line = f"none of {attempts} paths is sound"
-        return Solution("not_found", nothing, spent_s, iterations, line)
+        return replace(_unsound(problem, attempts), time_s=spent_s, iterations=iterations)
+
+
+def _is_unsound(problem: PlanningProblem, answer: Solution) -> bool:
+    known = problem.is_sound is not None and answer.status == "solved"
+    return known and not problem.is_sound(answer.joints)  # type: ignore[misc]
+
+
+def _unsound(problem: PlanningProblem, attempts: int) -> Solution:
+    nothing = np.empty((0, len(problem.start)))
+    return Solution("not_found", nothing, 0.0, 0, f"none of {attempts} paths is sound")
 
 
 def _length(answer: Solution) -> float:

@@ -64,7 +64,7 @@ def overview(rows: pd.DataFrame, styles: Styles) -> Figure:
 
 
 def break_even(costs: pd.DataFrame, styles: Styles) -> Figure:
-    """Time spent in all, training included, against the number of queries served.
+    """Time spent in all, training and roadmaps included, against the number of queries served.
 
     costs: planner, training_s, query_s (mean time of a query).
     """
@@ -75,7 +75,7 @@ def break_even(costs: pd.DataFrame, styles: Styles) -> Figure:
         spent = row["training_s"] + served * row["query_s"]
         axes.plot(served, spent, label=row["planner"], **styles[row["planner"]])
     axes.set(xscale="log", yscale="log")
-    axes.set(xlabel="queries served", ylabel="training and planning [s]")
+    axes.set(xlabel="queries served", ylabel="made beforehand, and planning [s]")
     axes.grid(color=LIGHT, linewidth=0.6)
     figure.legend(loc="outside right upper", fontsize=7, frameon=False)
     return figure

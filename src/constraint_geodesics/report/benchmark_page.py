@@ -99,7 +99,7 @@ def _overview_sections(params: Params, overview: pd.DataFrame) -> list[Section]:
         Section(
             "parts",
             "The planner without its parts",
-            "The same queries with a part left out, with a longer budget, or with nothing learned.",
+            "The same queries with a part left out, or with a longer budget.",
             tables=_overview_blocks(own, (), "the planner and its parts"),
         ),
     ]
@@ -130,7 +130,10 @@ def _published_section(params: Params, rows: pd.DataFrame) -> Section:
 def _break_even_section(layout: Layout, costs: pd.DataFrame) -> Section:
     note = "never: the other is no slower; from reports/benchmark/break_even.csv"
     block = _of_planners("From how many queries on", note, break_even_cells(costs))
-    told = "What training takes once, from data to files, against what it saves in each query."
+    told = (
+        "What training and roadmaps take once, from data to files, against what they save in each "
+        "query."
+    )
     return Section(
         "break_even", "When training pays", told, [_picture(layout, "break_even")], [block]
     )
@@ -193,7 +196,7 @@ def growth_cells(slopes: pd.DataFrame) -> Cells:
             *(fixed(row[name]) for name in ("slope", "standard_error")),
             str(row["points"]),
         )
-        for row in slopes.to_dict("records")
+        for row in slopes[slopes["points"] > 2].to_dict("records")  # any two lie on a line
     ]
 
 
@@ -222,7 +225,7 @@ def _parted(cells: Cells) -> tuple[Sequence[str], Cells]:
 CAPTIONS: Mapping[str, tuple[str, str, str]] = {
     "break_even": (
         "benchmark",
-        "Training and planning, in all",
+        "Training, roadmaps and planning, in all",
         "Seconds spent from the first query on, of planners with a valid path in half of "
         "their rows or more.",
     ),

@@ -183,7 +183,8 @@ def _trained_for(params: Params, layout: Layout) -> str:
         seconds = pd.read_csv(times).set_index("stage")["seconds"]
         if DIFFUSION in seconds:
             told.append(
-                f"path diffusion, the paths it learns from planned, {seconds[DIFFUSION]:.0f} s"
+                f"path diffusion, the paths it learns from planned, {seconds[DIFFUSION]:.0f} s; "
+                "the policies have seen spheres in training, path diffusion has not"
             )
     return f"{', '.join(told)}." if told else ""
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from constraint_geodesics.benchmark.judge import problem_of
 from constraint_geodesics.benchmark.queries import Query
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
@@ -102,9 +103,9 @@ class BiRRT:
         A path that is not certified (it jumped from one part of the constraint to another) is
         followed by another attempt, until BIRRT_S have passed.
         """
-        checks, spacing = self.certifier.collisions, self.planner.bundle.judge.row_spacing_rad
-        known = self.manifold, checks.is_free, self.clearance, checks.is_clear
-        problem, status, spent_s = PlanningProblem(start, goal, *known), "not_certified", 0.0
+        spacing = self.planner.bundle.judge.row_spacing_rad
+        problem = problem_of(start, goal, self.manifold, self.certifier, self.clearance)
+        status, spent_s = "not_certified", 0.0
         for seed in itertools.count():
             settings = BirrtSettings(budget_s=BIRRT_S - spent_s)
             found = SamplingPlanner("birrt", settings, spacing).plan(problem, seed)

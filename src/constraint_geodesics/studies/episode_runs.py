@@ -15,14 +15,15 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from constraint_geodesics.benchmark.judge import problem_of
 from constraint_geodesics.bundle import read_bundle
 from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.geometry.braking import ahead
+from constraint_geodesics.learning.dataset import draw_queries
 from constraint_geodesics.peers.birrt import BirrtSettings
 from constraint_geodesics.peers.wrappers import BandAfter, UntilSound
 from constraint_geodesics.planner import Planner, limits_of
-from constraint_geodesics.problem import PlanningProblem
 from constraint_geodesics.scene.clearance import Clearances
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.shape import Shape
@@ -36,6 +37,8 @@ REPLAN, SCRATCH = "replan", "BiRRT + band from scratch"
 """The controllers."""
 SOUND_S = 5.0
 """BiRRT is asked again for so long until its path is certified."""
+ENDS = 200
+"""Pairs of ends that a constraint's episodes are drawn from."""
 RECORDED = 2
 """Episodes of each constraint whose motions are kept for recordings."""
 
@@ -73,7 +76,7 @@ class FromScratch(AbstractContextManager["FromScratch"]):
         self._clearances = Clearances(scene, self._certifier.collisions.apart)
         settings = BirrtSettings()
         search = SamplingPlanner(settings.search, settings, row_spacing_rad)
-        self._planner = UntilSound(BandAfter(search), self._is_sound, SOUND_S)
+        self._planner = UntilSound(BandAfter(search), SOUND_S)
 
     def __exit__(self, *_: object) -> None:
         self._opened.close()
@@ -94,14 +97,9 @@ class FromScratch(AbstractContextManager["FromScratch"]):
     def resting(self, path: Trajectory) -> Trajectory:
         """A path of BiRRT's, timed within the limits of the first one."""
         began, manifold = time.perf_counter(), ConstraintManifold(self.scene.robot, path.constraint)
-        problem = PlanningProblem(
-            path.joints[-1],
-            path.wanted,
-            manifold,
-            self._certifier.collisions.is_free,
-            self._clearances.model(self._certifier.collisions.apart),
-            self._certifier.collisions.is_clear,
-        )
+        clearance = self._clearances.model(self._certifier.collisions.apart)
+        ends = path.joints[-1], path.wanted
+        problem = problem_of(*ends, manifold, self._certifier, clearance)
         self.seed += 1
         found = self._planner.plan(problem, self.seed)
         times = path.asked.pace.times(found.joints, None) if found.status == "solved" else None
@@ -111,10 +109,6 @@ class FromScratch(AbstractContextManager["FromScratch"]):
             nothing = np.empty((0, self.scene.robot.dof)), np.empty(0)
             return Trajectory(found.status, *nothing, found.explanation, asked, about)
         return Trajectory("solved", found.joints, times, "by BiRRT", asked, about)
-
-    def _is_sound(self, problem: PlanningProblem, joints: Float[np.ndarray, "T D"]) -> bool:
-        constraint = problem.manifold.constraint
-        return self._certifier.certify(joints, constraint, problem.start, problem.goal).valid
 
 
 # One episode
@@ -148,7 +142,7 @@ def ran(planner: Planner, constraint: str, number: int, seed: int) -> dict[str, 
     found = dict[str, Any](runs=[], answers=[], motions={})
     with study.carrying(planner, constraint):
         _prepare(planner, constraint)
-        episode = study.drawn(planner, constraint, number, seed)
+        episode = study.drawn(planner, constraint, number, seed, _ends(planner, constraint, seed))
         start = episode.first.joints[0]
         known = planner.scene.now
         whole = planner.plan(start, episode.goal, constraint, scene=episode.obstacles)
@@ -166,21 +160,38 @@ def ran(planner: Planner, constraint: str, number: int, seed: int) -> dict[str, 
 
 
 @cache
+def _ends(planner: Planner, constraint: str, seed: int) -> Float[np.ndarray, "n D"]:
+    """Free configurations that are none of the roadmap's."""
+    scene = planner.scene.now
+    manifold = ConstraintManifold(planner.robot, planner.constraints[constraint])
+    queries = draw_queries(scene, manifold, constraint, ENDS, seed)
+    return np.concatenate([queries.starts, queries.goals])
+
+
+@cache
 def _prepare(planner: Planner, constraint: str) -> None:
-    """Roadmap and compiled code, that of a replan too, so that no clock pays for them."""
+    """Roadmap and compiled code, that of a replan and of BiRRT too, so that no clock pays for
+    them.
+    """
     nodes = planner.nodes(constraint)
     path = planner.plan(nodes[0], nodes[-1], constraint)
     if path.status == "solved":
         planner.replan(path, 0.5 * float(path.times[-1]))
+        with _from_scratch(planner, path.scene, 0) as controller:
+            controller.resting(path)
+
+
+def _from_scratch(planner: Planner, scene: Scene, seed: int) -> FromScratch:
+    """For the planner's own promises."""
+    bundle = planner.bundle
+    limits = limits_of(bundle.planner, bundle.judge, planner.robot)
+    return FromScratch(scene, limits, bundle.judge.row_spacing_rad, seed)
 
 
 def _reports(planner: Planner, episode: Episode, seed: int) -> Iterator[tuple[str, Report]]:
     controller: Controller = Replanner(planner)
     yield REPLAN, study.report(episode, list(study.run(episode, controller)))
-    bundle, robot = planner.bundle, planner.robot
-    limits = limits_of(bundle.planner, bundle.judge, robot)
-    spacing = bundle.judge.row_spacing_rad
-    with FromScratch(episode.first.scene, limits, spacing, seed + episode.number) as controller:
+    with _from_scratch(planner, episode.first.scene, seed + episode.number) as controller:
         yield SCRATCH, study.report(episode, list(study.run(episode, controller)))
 
 

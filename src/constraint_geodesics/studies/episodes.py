@@ -442,14 +442,22 @@ def attach_cup(planner: Planner, constraint: str) -> None:
         planner.scene.attach(carried_cup(axis), link=planner.robot.tool_link)
 
 
-def drawn(planner: Planner, constraint: str, number: int, seed: int) -> Episode:
-    """A query between configurations of the constraint's roadmap, and one to MOST spheres and
-    boxes: one at least is on the path, none is seen at its start, start and goal touch none.
+def drawn(
+    planner: Planner,
+    constraint: str,
+    number: int,
+    seed: int,
+    ends: Float[np.ndarray, "n D"] | None = None,
+) -> Episode:
+    """A query between two of these ends [rad], by default configurations of the constraint's
+    roadmap, and one to MOST spheres and boxes: one at least is on the path, none is seen at its
+    start, start and goal touch none.
     """
-    rng, nodes = np.random.default_rng([seed, number]), planner.nodes(constraint)
+    rng = np.random.default_rng([seed, number])
+    known = planner.nodes(constraint) if ends is None else ends
     sensing_m = SENSING_M[number % len(SENSING_M)]
-    for _ in range(DRAWS if len(nodes) else 0):
-        start, goal = nodes[rng.integers(len(nodes), size=2)]
+    for _ in range(DRAWS if len(known) else 0):
+        start, goal = known[rng.integers(len(known), size=2)]
         path = planner.plan(start, goal, constraint)
         if path.status != "solved" or path.length_rad < SHORTEST_RAD:
             continue

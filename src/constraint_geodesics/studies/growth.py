@@ -20,6 +20,7 @@ import pandas as pd
 import torch
 from jaxtyping import Float, Int
 
+from constraint_geodesics.benchmark.judge import problem_of
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import (
     Constraint,
@@ -238,13 +239,15 @@ def slopes(table: pd.DataFrame) -> pd.DataFrame:
     """Exponents: for each (axis, what) the least-squares line of log seconds over log value.
 
     Columns: axis, what, slope, standard_error (nan with two points), seconds_at_1 and points.
-    Values of 0 and times that are not positive and finite are left out; all nan where fewer than
-    two distinct values remain.
+    Values of 0, times that are not positive and finite, and those of which less than half was
+    solved, where the median is the planner's own limit, are left out; all nan where fewer than two
+    distinct values remain.
     """
     rows = []
     for (axis, what), own in table.groupby(["axis", "what"], sort=False):
         value, seconds = own["value"].to_numpy(float), own["seconds"].to_numpy(float)
         used = (value > 0) & (seconds > 0) & np.isfinite(seconds)
+        used &= ~(own["solved"].to_numpy(float) < 0.5)
         line = _line(np.log(value[used]), np.log(seconds[used]))
         rows.append((axis, what, *line, int(used.sum())))
     columns = ["axis", "what", "slope", "standard_error", "seconds_at_1", "points"]
@@ -308,13 +311,11 @@ class _Asked:
     manifold: ConstraintManifold
     queries: Queries
 
-    def problems(self, world: World, certifier: Certifier) -> list[PlanningProblem]:
-        """As the planners are asked; world and certifier: of the same scene."""
-        apart = certifier.collisions.apart
-        clearance = clearance_model(self.scene, apart)
+    def problems(self, certifier: Certifier) -> list[PlanningProblem]:
+        """As the planners are asked; certifier: of the same scene."""
+        clearance = clearance_model(self.scene, certifier.collisions.apart)
         ends = zip(self.queries.starts, self.queries.goals, strict=True)
-        known = world.is_free, clearance, certifier.collisions.is_clear
-        return [PlanningProblem(start, goal, self.manifold, *known) for start, goal in ends]
+        return [problem_of(*own, self.manifold, certifier, clearance) for own in ends]
 
 
 def _joints(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
@@ -357,8 +358,8 @@ def _obstacles(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
 def _queries(subject: Subject, sizes: GrowthSizes) -> Iterator[list[Sample]]:
     scene, manifold, peer = subject.scene, subject.manifold, subject.planners[subject.peer]
     pool = draw_queries(scene, manifold, CONSTRAINT, max(sizes.all_batches), sizes.seed)
-    with scene.world() as world, Certifier(scene) as certifier:
-        problems = _Asked(scene, manifold, pool).problems(world, certifier)
+    with Certifier(scene) as certifier:
+        problems = _Asked(scene, manifold, pool).problems(certifier)
 
         def one_by_one(rows: Int[np.ndarray, "B"]) -> Sequence[bool]:
             answers = [peer.plan(replace(problems[row]), seed=int(row)) for row in rows]
@@ -471,8 +472,8 @@ def _held(scene: Scene, axes: tuple[int, ...], pose: Pose, k: int, sizes: Growth
 
 def _warmed(subject: Subject, asked: _Asked) -> None:
     """One query that does not count: it loads compiled code."""
-    with asked.scene.world() as world, Certifier(asked.scene) as certifier:
-        problem = asked.problems(world, certifier)[0]
+    with Certifier(asked.scene) as certifier:
+        problem = asked.problems(certifier)[0]
         for planner in subject.planners.values():
             planner.plan(problem, seed=0)
 
@@ -480,8 +481,8 @@ def _warmed(subject: Subject, asked: _Asked) -> None:
 def _planned(subject: Subject, axis: str, value: int, asked: _Asked) -> list[Sample]:
     """Every planner on every query, the planners in turn."""
     found = []
-    with asked.scene.world() as world, Certifier(asked.scene) as certifier:
-        for seed, problem in enumerate(asked.problems(world, certifier)):
+    with Certifier(asked.scene) as certifier:
+        for seed, problem in enumerate(asked.problems(certifier)):
             for name, planner in subject.planners.items():
                 own = replace(problem)  # a planner may remember the very problem that it answered
                 began = time.perf_counter()

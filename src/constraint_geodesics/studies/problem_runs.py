@@ -10,18 +10,15 @@ before it answers; all of that is in their time.  A path counts that is there wi
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
 
 from constraint_geodesics.benchmark.arm_source import ArmSource, opened
-from constraint_geodesics.benchmark.judge import judge_limits
 from constraint_geodesics.benchmark.problem_files import (
     Problem,
     require_different,
@@ -40,18 +37,16 @@ from constraint_geodesics.benchmark.runner import (
     rows_to_do,
     run_batch,
 )
-from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.params import BaselineParams, Params
 from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings, Context
 from constraint_geodesics.peers.ompl_settings import OmplSettings
 from constraint_geodesics.peers.registry import after, kind_of, made_together, settings_of
-from constraint_geodesics.peers.wrappers import UntilSound
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
-from constraint_geodesics.problem import PathPlanner, PlanningProblem
+from constraint_geodesics.problem import PathPlanner
 from constraint_geodesics.scene.scene import Scene
 
 MEASURED_BY = ("studies.problem_runs", "studies.problems", "studies.clutter")
@@ -116,25 +111,11 @@ class ProblemBuilder:
         if prepared not in _PREPARED:
             planner.prepare(manifold.constraint)
             _PREPARED.add(prepared)
-        with ExitStack() as stack, Certifier(scene, judge_limits(self.params.judge)) as certifier:
-            shared: dict[str, Any] = {"planner": planner}
-            context = Context(scene, constraint, manifold, self.params, Layout(), stack, shared)
-            made, took = made_together(settings, context)
-            sound = partial(_is_certified, certifier)
-            yield (
-                {
-                    name: UntilSound(own, sound, self.limit_s) if settings[name].random else own
-                    for name, own in made.items()
-                },
-                {name: s + changed_s * settings[name].uses_bundle for name, s in took.items()},
-            )
-
-
-def _is_certified(
-    certifier: Certifier, problem: PlanningProblem, joints: Float[np.ndarray, "T D"]
-) -> bool:
-    constraint = problem.manifold.constraint
-    return certifier.certify(joints, constraint, problem.start, problem.goal).valid
+        shared: dict[str, Any] = {"planner": planner}
+        context = Context(scene, constraint, manifold, self.params, Layout(), shared)
+        made, took = made_together(settings, context, self.limit_s)
+        changed = {name: s + changed_s * settings[name].uses_bundle for name, s in took.items()}
+        yield made, changed
 
 
 @contextmanager
@@ -220,7 +201,6 @@ def _batch(problems: Sequence[Problem], asked: Asked, arm: Mapping[str, Any]) ->
         build=ProblemBuilder(params, planners, first.arm, limit_s),
         judge=params.judge,
         file=asked.rows / f"{_plain(name)}-{_plain(first.group)}-{first.number}.jsonl",
-        asked="certifier",
         watch=watched,
     )
 

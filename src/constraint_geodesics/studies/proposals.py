@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from constraint_geodesics.benchmark.judge import judge_limits
+from constraint_geodesics.benchmark.judge import judge_limits, problem_of
 from constraint_geodesics.benchmark.queries import TABLE, Query, draw_benchmark, shortest_of
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import ConstraintManifold, constraint_manifold
@@ -356,13 +356,13 @@ def _queries(
     """The study's own, spheres on the planner's way."""
     studies = params.studies
     changed = {"queries": studies.queries, "seed": studies.seed}
-    with Certifier(scene, judge_limits(params.judge)) as certifier, scene.world() as world:
+    with Certifier(scene, judge_limits(params.judge)) as certifier:
         clearance = clearance_model(scene, certifier.collisions.apart)
 
         def plan(
             start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]
         ) -> Float[np.ndarray, "T D"]:
-            problem = PlanningProblem(start, goal, manifold, world.is_free, clearance)
+            problem = problem_of(start, goal, manifold, certifier, clearance)
             return shortest_of({PLANNER: planner}, problem, certifier)
 
         settings = params.benchmark.model_copy(update=changed)
@@ -379,12 +379,12 @@ def _query_rows(
     """One query's rows, and the answers that are curves of the family."""
     scene = query.in_scene(Scene.from_params(params, query.constraint))
     manifold, ends = problem.manifold, problem.ends(query.start[None], query.goal[None])
-    with Certifier(scene, judge_limits(params.judge)) as certifier, scene.world() as world:
+    with Certifier(scene, judge_limits(params.judge)) as certifier:
         clearance = clearance_model(scene, certifier.collisions.apart)
         asked = Asked(replace(problem, clearance=clearance), ends, query.number, certifier)
         answered(asked, straight(asked, 0.0))  # what is loaded late is no method's
         answers = query_answers(asked, compared)
-        known = PlanningProblem(query.start, query.goal, manifold, world.is_free, clearance)
+        known = problem_of(query.start, query.goal, manifold, certifier, clearance)
         band = [_or_nan(asked.refined_length, answer) for _, _, answer in answers]
         every = list(answers)
         for name, planner in peers.items():

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from constraint_geodesics.benchmark.judge import problem_of
 from constraint_geodesics.bundle import Bundle
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.certification.collisions import CollisionCheck
@@ -15,7 +16,6 @@ from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.peers.birrt import BirrtSettings
 from constraint_geodesics.peers.ompl import SamplingPlanner
 from constraint_geodesics.planner import Planner, limits_of
-from constraint_geodesics.problem import PlanningProblem
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.scene import robot_from
 
@@ -87,8 +87,7 @@ def try_thicket(task: Thicket) -> Solved:
         for name in task.constraints:
             manifold = ConstraintManifold(planner.scene.robot, planner.constraints[name])
             for start, goal in _pairs(manifold, checks, task.queries, rng):
-                known = manifold, checks.is_free, None, checks.is_clear
-                found = sampling.plan(PlanningProblem(start, goal, *known), seed=0)
+                found = sampling.plan(problem_of(start, goal, manifold, certifier, None), seed=0)
                 solved.append(
                     (
                         found.status == "solved"
