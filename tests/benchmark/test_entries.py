@@ -1,5 +1,6 @@
 """What the benchmark runs: planners by name, fewer of them, and what makes a row out of date."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +21,7 @@ from constraint_geodesics.benchmark.entries import (
     with_planners,
 )
 from constraint_geodesics.benchmark.queries import read_queries
+from constraint_geodesics.bundle import PACKAGED
 from constraint_geodesics.palette import FAMILIES
 from constraint_geodesics.params import BaselineParams, Params
 from constraint_geodesics.peers.baseline import BaselineError
@@ -29,6 +31,7 @@ from constraint_geodesics.peers.wrappers import Remembered
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import note_stage_time
 from constraint_geodesics.problem import PlanningProblem
+from constraint_geodesics.scene.sphere import Sphere
 
 
 def with_planner(params: Params, **entry: object) -> Params:
@@ -200,3 +203,16 @@ def test_blocks_with_all_planners_stand_evenly_apart() -> None:
     firsts = [k for k, name in enumerate(order) if str(name).endswith("0")]
     assert np.ptp(np.diff(firsts)) <= 4
     assert firsts[-1] - firsts[0] >= 6
+
+
+def test_the_planner_answers_in_the_scene_of_its_query_and_in_no_other(params, tmp_path) -> None:
+    shutil.copytree(PACKAGED, Layout(tmp_path).planner, ignore=shutil.ignore_patterns("learned"))
+    planner, manifold = packaged_planner(), manifold_of(packaged_planner(), "free")
+    start, goal = pairs_of("free", 1, seed=4)[0]
+    place = planner.scene.robot.forward(goal)[0]
+    before, build = planner.scene.now, BaselineBuilder(params, tmp_path)
+    blocked = before.adding(Sphere("at the goal", tuple(place.tolist()), 0.1))
+    problem = PlanningProblem(start, goal, manifold, lambda q: True)
+    for scene, status in ((before, "solved"), (blocked, "in_collision"), (before, "solved")):
+        with build(["planner"], scene, "free", manifold) as (made, _):
+            assert made["planner"].plan(problem, 0).status == status

@@ -2,7 +2,7 @@
 path that is not sound is no answer.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -65,13 +65,29 @@ def test_one_attempt_is_made_however_short_the_time(problem) -> None:
     assert len(inner.seeds) == 1
 
 
-def shorter_than(length: float):
-    return lambda problem, joints: bool(joints[-1, 0] < length)
+def shorter_than(length: float, problem: PlanningProblem) -> PlanningProblem:
+    """The problem with such paths as its sound ones."""
+    return replace(problem, is_sound=lambda joints: bool(joints[-1, 0] < length))
+
+
+def test_a_path_that_is_not_sound_is_no_shortest_one(problem) -> None:
+    inner = Listed((1.0, 3.0, 2.0, 4.0))
+    longer = replace(problem, is_sound=lambda joints: bool(joints[-1, 0] > 1.5))
+    assert Restarted(inner, 0.05).plan(longer, 0).joints[-1, 0] == 2.0
+    none = Restarted(Listed((1.0,)), 0.01).plan(longer, 0)
+    assert (none.status, none.joints.shape) == ("not_found", (0, 6))
+    assert "is sound" in none.explanation
+
+
+def test_where_nobody_can_tell_the_first_path_is_the_answer(problem) -> None:
+    inner = Listed((5.0, 1.0))
+    assert UntilSound(inner, 10.0).plan(problem, 0).joints[-1, 0] == 5.0
+    assert len(inner.seeds) == 1
 
 
 def test_the_first_sound_path_is_the_answer_with_the_time_of_all_attempts(problem) -> None:
     inner = Listed((5.0, 3.0, 1.0, 0.5), each_s=0.25)
-    found = UntilSound(inner, shorter_than(2.0), 10.0).plan(problem, 2)
+    found = UntilSound(inner, 10.0).plan(shorter_than(2.0, problem), 2)
     assert (found.status, found.joints[-1, 0]) == ("solved", 1.0)
     assert inner.seeds == [200_000, 200_001, 200_002]
     assert found.iterations == 3
@@ -80,7 +96,7 @@ def test_the_first_sound_path_is_the_answer_with_the_time_of_all_attempts(proble
 
 def test_there_is_no_answer_once_the_time_for_sound_paths_is_over(problem) -> None:
     inner = Listed((5.0,), each_s=0.25)
-    found = UntilSound(inner, shorter_than(2.0), 0.6).plan(problem, 0)
+    found = UntilSound(inner, 0.6).plan(shorter_than(2.0, problem), 0)
     assert (found.status, len(found.joints), len(inner.seeds)) == ("not_found", 0, 3)
     assert "none of 3 paths is sound" in found.explanation
 
@@ -88,5 +104,5 @@ def test_there_is_no_answer_once_the_time_for_sound_paths_is_over(problem) -> No
 @pytest.mark.parametrize("status", ["not_found", "in_collision"])
 def test_what_is_no_path_is_not_asked_again(problem, status) -> None:
     inner = Listed((np.nan,)) if status == "not_found" else Listed((1.0,), status)
-    assert UntilSound(inner, shorter_than(0.5), 5.0).plan(problem, 0).status == status
+    assert UntilSound(inner, 5.0).plan(shorter_than(0.5, problem), 0).status == status
     assert len(inner.seeds) == 1
