@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.interpolate import BPoly
+from scipy.interpolate import BPoly, CubicHermiteSpline
 
 from constraint_geodesics import Constraint, Planner, Sphere, Trajectory
 from constraint_geodesics.geometry.braking import State
@@ -109,6 +109,42 @@ def test_a_path_goes_on_from_where_another_one_is(name):
                 assert certificate.valid, certificate.violation
     assert len(longer) >= 5
     assert np.median(longer) < 1.02
+
+
+def beside_its_lines(path: Trajectory) -> float:
+    """How far a controller that follows the message by cubics gets from the waypoints' lines."""
+    points = path.to_joint_trajectory()["points"]
+    places, velocities = (np.array([p[k] for p in points]) for k in ("positions", "velocities"))
+    spline, worst = CubicHermiteSpline(path.times, places, velocities), 0.0
+    for first, last in zip(path.times[:-1], path.times[1:], strict=True):
+        at = spline(np.linspace(first, last, 20))
+        away = np.full(len(at), np.inf)
+        near = np.flatnonzero(np.abs(path.times[:-1] - first) < 0.1)
+        for place, line in zip(places[near], np.diff(places, axis=0)[near], strict=True):
+            share = np.clip((at - place) @ line / (line @ line), 0.0, 1.0)
+            away = np.minimum(away, np.linalg.norm(at - place - share[:, None] * line, axis=1))
+        worst = max(worst, float(away.max()))
+    return worst
+
+
+@pytest.mark.parametrize("name", ["level_cup", "free"])
+def test_an_arm_that_turns_back_comes_to_rest_first(name):
+    """No spline through the message leads beyond the corner."""
+    planner, seen = packaged_planner(), 0
+    for start, goal in pairs_of(name, 4, 5):
+        path = planner.plan(start, goal, name)
+        state = path.state(0.3 * path.times[-1])
+        back = planner.plan(state.configuration, start, name, start_velocity=state.velocity)
+        if back.status != "solved":
+            continue
+        seen += 1
+        lines = np.diff(back.joints, axis=0)
+        lines /= np.linalg.norm(lines, axis=1)[:, None]
+        corner = 1 + int(np.argmin((lines[1:] * lines[:-1]).sum(axis=1)))
+        assert lines[corner] @ lines[corner - 1] < -0.5
+        assert np.linalg.norm(back.state(back.times[corner]).velocity) < 0.02
+        assert beside_its_lines(back) < 1e-3
+    assert seen >= 3
 
 
 def test_a_start_at_rest_is_planned_as_without_a_velocity():

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from constraint_geodesics.certification.certifier import Certificate, Certifier
 from constraint_geodesics.constraints.both import both
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
-from constraint_geodesics.geometry.braking import Pace, shortest_stop
+from constraint_geodesics.geometry.braking import Pace, going_on, shortest_stop
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.goals.goal import Goal
 from constraint_geodesics.methods import Method
@@ -147,7 +147,7 @@ class Answering:
         onward = self.found(resting, goals, budget_s)
         if onward.status != "solved":
             return None
-        whole = np.concatenate([tail, onward.joints[1:]])
+        whole = going_on(tail, onward.joints)
         regions = onward.asked.regions
         end = End(onward.joints[-1], regions[0] if len(regions) == 1 else None)
         found = self.judged(query, whole, onward.source, end)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.answering import NO_MORE, TIMES, TOUCHES, Answering, End, Refused
-from constraint_geodesics.geometry.braking import Motion, State, ahead
+from constraint_geodesics.geometry.braking import Motion, State, ahead, going_on
 from constraint_geodesics.goals.goal import ConfigurationGoal
 from constraint_geodesics.problem import PlannerError, Status
 from constraint_geodesics.search.candidates import rows_of
@@ -141,7 +141,7 @@ class Replanning:
                 rows = rows_of(
                     candidate, share * self.answering.certifier.limits.violation_tolerance
                 )
-                joined = np.concatenate([stop.joints, rows[1:]])
+                joined = going_on(stop.joints, rows)
                 found = self.answering.judged(query, joined, candidate.source, End(query.goal))
                 yield found if isinstance(found, Trajectory) else None
 

@@ -27,6 +27,8 @@ SPARED = 0.98
 """Share of the accelerations that a motion is planned with: a stop has all of them, so that it can
 nearly always stay on the path.
 """
+_CORNER = 1e-5
+"""How near to a corner the rows beside it are [rad]."""
 _FRACTIONS = 7
 """Bisections of the line on which a motion stops."""
 
@@ -153,6 +155,22 @@ def shortest_stop(
     ended = _ending(rows, last, high)
     times = pace.hardest(ended, velocity)
     return None if times is None else Motion(ended, times, velocity)
+
+
+def going_on(
+    stop: Float[np.ndarray, "n D"], onward: Float[np.ndarray, "m D"]
+) -> Float[np.ndarray, "T D"]:
+    """The rows of a stop, then those of a path from its end, with one more on the last line and on
+    the first, close to the corner between them.
+
+    The way may turn back there.  The limits hold in differences, which let an arm pass a corner
+    the faster the longer its lines are; these two are so short that it all but rests in between.
+    """
+    corner, beside = stop[-1], list[np.ndarray]()
+    for line in (stop[-2] - corner, onward[1] - corner):
+        share = _CORNER / float(np.linalg.norm(line))
+        beside.append(corner + share * line if share < 0.5 else np.empty((0, len(corner))))
+    return np.vstack([stop[:-1], beside[0], corner, beside[1], onward[1:]])
 
 
 def _ending(rows: np.ndarray, last: int, share: float) -> np.ndarray:
