@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
-from constraint_geodesics import Constraint, Planner, Sphere, Trajectory
+from constraint_geodesics import Constraint, GoalRegion, Planner, Pose, Sphere, Trajectory
 from constraint_geodesics.geometry.braking import State
 from constraint_geodesics.planner import PlannerError
 from constraint_geodesics.trajectory import read_trajectory
@@ -145,6 +145,21 @@ def test_an_arm_that_turns_back_comes_to_rest_first(name):
         assert np.linalg.norm(back.state(back.times[corner]).velocity) < 0.02
         assert beside_its_lines(back) < 1e-3
     assert seen >= 3
+
+
+def test_of_several_goals_an_arm_that_must_stop_first_reaches_the_nearest():
+    """The end of its path is in no region where it is a configuration that was asked for."""
+    planner, (start, goal) = packaged_planner(), pairs_of("free", 1, 5)[0]
+    path = planner.plan(start, goal, "free")
+    at = 0.3 * path.times[-1]
+    state, behind = path.state(at), path.state(at - 0.15).configuration
+    region = GoalRegion(Pose(*planner.robot.forward(start)), tolerance=(0.01,) * 3 + (0.0,) * 3)
+    wanted = [behind, region]
+    back = planner.plan(state.configuration, wanted, "free", start_velocity=state.velocity)
+    assert back.status == "solved", back.explanation
+    np.testing.assert_array_equal(back.joints[-1], behind)
+    assert back.asked.regions == (region.region,)
+    assert len(back.statistics.looked_at) > 1
 
 
 def test_a_start_at_rest_is_planned_as_without_a_velocity():
