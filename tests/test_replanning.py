@@ -228,6 +228,18 @@ def test_a_state_is_that_of_the_trajectory_as_it_is_sent():
             path.state(wrong)
 
 
+def test_who_alters_a_state_leaves_the_path_as_it_was_certified():
+    path = planned(10)[0]
+    joints = path.joints.copy()
+    for handed in (
+        *(path.state(at).configuration for at in (0.0, path.times[3], path.times[-1])),
+        path.goal,
+        path.wanted,
+    ):
+        handed += 0.1
+    np.testing.assert_array_equal(path.joints, joints)
+
+
 def test_a_stop_is_on_the_path_and_as_short_as_the_limits_allow():
     planner, rng, proven = packaged_planner(), np.random.default_rng(0), 0
     for path in planned(10):

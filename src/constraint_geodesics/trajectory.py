@@ -121,7 +121,7 @@ class Trajectory:
     @property
     def goal(self) -> Float[np.ndarray, "D"] | None:
         """The configuration that is reached [rad]; None without a path."""
-        return self.joints[-1] if len(self.joints) else None
+        return self.joints[-1].copy() if len(self.joints) else None
 
     @property
     def constraint(self) -> Constraint:
@@ -295,7 +295,8 @@ class Trajectory:
     @property
     def wanted(self) -> Float[np.ndarray, "D"]:
         """The configuration that a motion is to reach [rad]: its last unless it stops before."""
-        return self.joints[-1] if self.asked.wanted is None else self.asked.wanted
+        wanted = self.joints[-1] if self.asked.wanted is None else self.asked.wanted
+        return wanted.copy()
 
     @property
     def motion(self) -> Motion:

@@ -105,9 +105,9 @@ def state_at(motion: Motion, at_s: float) -> State:
     share = _passed(at_s, np.array(marks), speeds)
     place = (1.0 - share) * joints[row - 1] + share * joints[row]
     if np.linalg.norm(joints[row] - place) <= AT_A_ROW:
-        place, row = joints[row], row + 1
+        place, row = joints[row].copy(), row + 1  # no view: who alters it leaves the path alone
     elif np.linalg.norm(joints[row - 1] - place) <= AT_A_ROW:
-        place = joints[row - 1]
+        place = joints[row - 1].copy()
     if np.linalg.norm(velocity) <= AT_REST or row == len(joints):  # at its end it rests
         velocity = np.zeros_like(start)
     return State(place, velocity, row)
