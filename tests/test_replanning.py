@@ -144,6 +144,10 @@ def test_an_arm_that_turns_back_comes_to_rest_first(name):
         assert lines[corner] @ lines[corner - 1] < -0.5
         assert np.linalg.norm(back.state(back.times[corner]).velocity) < 0.02
         assert beside_its_lines(back) < 1e-3
+        for soon in np.linspace(-0.02, 0.08, 30):
+            stop = back.stop(back.times[corner] + soon)
+            assert stop.status == "stopped"
+            assert stop.certificate is None or stop.certificate.valid
     assert seen >= 3
 
 
@@ -422,6 +426,11 @@ def test_a_stop_that_touches_something_says_so_and_is_there():
         assert answer.certificate.violation.message in answer.explanation
         np.testing.assert_array_equal(answer.start_velocity, path.state(at).velocity)
         assert len(answer.to_joint_trajectory()["points"]) == len(answer.joints) > 2
+        again = answer.stop(0.5 * answer.times[-1])  # on what touches nothing was proven
+        if again.certificate is not None:
+            assert again.certificate.violation == answer.certificate.violation
+            assert again.status == "in_collision"
+            assert answer.certificate.violation.message in again.explanation
         if seen == 3:
             break
     assert seen == 3

@@ -25,7 +25,7 @@ from constraint_geodesics.search.explanations import not_connected, refused_end
 from constraint_geodesics.search.preparation import Query
 from constraint_geodesics.search.pursuit import Pursued, shortest, slid
 from constraint_geodesics.search.run_out import refused_velocity, rows_from, run_out, run_outs
-from constraint_geodesics.trajectory import STANDING_S, Asked, Statistics, Trajectory, Way
+from constraint_geodesics.trajectory import STANDING_S, TOUCHES, Asked, Statistics, Trajectory, Way
 
 COINCIDENT_RAD = 1e-7
 """Ends that differ by less in every joint are one configuration."""
@@ -38,8 +38,6 @@ _TIGHTENED = (1.0, 0.7, 0.4)
 """Shares of the allowed violation that a path's waypoints are drawn for, should the certificate ask
 for closer ones.
 """
-TOUCHES = ("self_collision", "workcell_collision", "clearance")
-"""What a certificate finds where a motion meets something."""
 TIMES = "times"
 """What is refused where a motion can't go on along its waypoints."""
 _CLOSER = ("constraint_between_rows", "step")
