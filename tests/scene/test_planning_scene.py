@@ -1,7 +1,9 @@
 """A scene that changes: what follows it is what would be made anew."""
 
 import pickle
+import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -509,6 +511,36 @@ class _Refused(Sphere):
 
     def add_to(self, bullet: object) -> int:
         raise SystemError("returned a result with an exception set")
+
+
+def test_threads_that_share_a_planner_have_their_own_shapes(planner: Planner) -> None:
+    """And leave none to the other."""
+    before, (start, goal) = planner.scene.now, pairs_of("free", 1, seed=3)[0]
+    seen = dict[str, list[tuple[str, ...]]]()
+
+    def ask(ball: Sphere) -> None:
+        answers = [planner.plan(start, goal, FREE, scene=[ball]) for _ in range(30)]
+        seen[ball.name] = [tuple(own.name for own in one.scene.workcell) for one in answers]
+
+    def change() -> None:
+        for _ in range(30):
+            planner.scene.add(CRATE)
+            planner.scene.remove("crate")
+
+    balls = [Sphere(name, (0.3, 0.5, 1.0), 0.05) for name in ("one", "two")]
+    waits = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(3) as pool:
+            done = [*(pool.submit(ask, ball) for ball in balls), pool.submit(change)]
+            for one in done:
+                one.result(120.0)
+    finally:
+        sys.setswitchinterval(waits)
+    for own, other in (("one", "two"), ("two", "one")):
+        assert all(own in names and other not in names for names in seen[own])
+    assert planner.scene.now.names == before.names
+    in_step(planner)
 
 
 def test_what_pybullet_breaks_down_at_is_refused_by_its_name(planner: Planner) -> None:
