@@ -513,6 +513,49 @@ class _Refused(Sphere):
         raise SystemError("returned a result with an exception set")
 
 
+@pytest.mark.parametrize("where", ["clearances", "checks", "world", "scene"])
+def test_an_interrupted_change_has_changed_nothing(
+    planner: Planner, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    """Wherever it comes: planner and scene agree, and shapes of one query are gone."""
+    own, preparation = planner._certifier, planner._preparation
+    asked = {
+        "clearances": (preparation._clearances, "model"),
+        "checks": (own.collisions, "_follow"),
+        "world": (own._world, "change"),
+        "scene": (planner.scene, "_follow"),
+    }[where]
+    method, pressed = getattr(*asked), [True]
+
+    def interrupted(*args: object) -> object:
+        done = method(*args)
+        if pressed:
+            pressed.clear()
+            raise KeyboardInterrupt
+        return done
+
+    planner.scene.add(CRATE)
+    before = planner.scene.now
+    monkeypatch.setattr(*asked, interrupted)
+    start, goal = pairs_of("free", 1, seed=3)[0]
+    for change in (
+        lambda: planner.scene.add(BALL),
+        lambda: planner.scene.move("crate", Placement((0.4, -0.3, 0.3))),
+        lambda: planner.plan(start, goal, FREE, scene=[BALL]),
+    ):
+        pressed[:] = [True]
+        with pytest.raises(KeyboardInterrupt):
+            change()
+        assert planner.scene.now is before
+        in_step(planner)
+    with pytest.raises(KeyboardInterrupt), planner.scene.including([BALL]):
+        pressed[:] = [True]  # while they are taken away
+    assert planner.scene.now is before
+    in_step(planner)
+    planner.scene.add(BALL)
+    in_step(planner)
+
+
 def test_threads_that_share_a_planner_have_their_own_shapes(planner: Planner) -> None:
     """And leave none to the other."""
     before, (start, goal) = planner.scene.now, pairs_of("free", 1, seed=3)[0]

@@ -23,7 +23,7 @@ LinkPoses = Callable[[Float[np.ndarray, "D"], str], Float[np.ndarray, "4 4"]]
 class PlanningScene:
     """Shapes around the robot, shapes that it carries, and what may touch.  Every change is in
     force for the next query; what raises SceneError, or RobotError for a shape that can't be
-    bounded, has changed nothing.  While one thread changes it, or
+    bounded, has changed nothing, and so has what is interrupted.  While one thread changes it, or
     its planner answers, others wait.
 
     follow: takes the changed scene, all or nothing.  links: names of all links of the robot.
@@ -125,13 +125,21 @@ class PlanningScene:
         """With more shapes for a while, and no other thread's."""
         with self.lock:
             before = self._now
-            if shapes:
-                self.become(before.adding(*shapes))
             try:
+                if shapes:
+                    self.become(before.adding(*shapes))
                 yield
             finally:
-                if shapes:
-                    self.become(before)
+                if shapes and self._now is not before:
+                    self._end_with(before)
+
+    def _end_with(self, scene: Scene) -> None:
+        """Become it, an interrupt or not."""
+        try:
+            self.become(scene)
+        except KeyboardInterrupt:
+            self.become(scene)
+            raise
 
     def become(self, scene: Scene) -> None:
         """Take all of another scene of the same robot."""
@@ -142,8 +150,17 @@ class PlanningScene:
         if scene.robot is not self.robot:  # it came by pickle
             scene = replace(scene, robot=self.robot)
         with self.lock:
-            self._follow(scene)
-            self._now = scene
+            before = self._now
+            try:
+                self._follow(scene)
+                self._now = scene
+            except Exception:
+                raise  # nobody has followed
+            except BaseException:
+                # an interrupt: some may have followed, and others not
+                self._now = before
+                self._follow(before)
+                raise
 
 
 def _are_same(first: SerialRobot, second: SerialRobot) -> bool:
