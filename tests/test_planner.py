@@ -20,13 +20,17 @@ import pytest
 from constraint_geodesics import Constraint, Planner, Pose, Trajectory, bundle
 from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.constraint import ConstraintError, ConstraintManifold
+from constraint_geodesics.constraints.polynomial import PolynomialConstraint, Relation
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.methods import SearchMethod
 from constraint_geodesics.planner import PlannerError
+from constraint_geodesics.problem import SATISFIED
 from constraint_geodesics.recording.recording import read_recording
 from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.candidates import Answer, Parts, Task, candidates, refined, rows_of
+from constraint_geodesics.search.explanations import _same_pose
+from constraint_geodesics.search.preparation import Query
 from constraint_geodesics.trajectory import read_trajectory
 from tests.planner_fixtures import (
     NAMES,
@@ -393,6 +397,22 @@ def test_an_alternative_goal_is_named_and_can_be_reached(planner, name) -> None:
         other = planner.plan(start, exact, name)
         assert other.status == "solved", other.explanation
     assert same_pose >= 2
+
+
+def test_an_alternative_goal_keeps_what_is_asked_of_other_places_than_the_tool(planner) -> None:
+    """The height of the wrist: other branches with the same tool pose have another one."""
+    seeds = nodes_of("free")[0][:64]
+    goal, place = seeds[0], planner.robot.skeleton(seeds[0])
+    joint = 4
+    height = Relation("height", "m", -float(place[joint + 1, 2]), np.eye(12)[2])
+    own = PolynomialConstraint((height,), joint=joint)
+    manifold = ConstraintManifold(planner.robot, own)
+    assert manifold.violation(goal) <= SATISFIED
+    query = Query(planner._preparation.task(own), "height", goal, goal, 0.0)
+    loose = replace(query, task=planner._preparation.task(planner.constraints["free"]))
+    named, all_of_them = _same_pose(query, seeds), _same_pose(loose, seeds)
+    assert (manifold.violation(named) <= SATISFIED).all()
+    assert 0 < len(named) < len(all_of_them)
 
 
 def test_an_alternative_goal_can_be_reached_as_it_is_printed(planner) -> None:
