@@ -202,6 +202,10 @@ def test_velocities_that_no_path_begins_with_are_refused():
     out = planner.plan(close, goal, free, start_velocity=[1.0, 0, 0, 0, 0, 0])
     assert out.status == "out_of_limits", out.explanation
     assert "can't stop within 0.01" in out.explanation
+    most = packaged_planner()._certifier.limits.acceleration_rad_s2[0]
+    just = np.sqrt(2.0 * most * (0.01 + 1e-7))  # the certificate allows no more than rounding
+    out = planner.plan(close, goal, free, start_velocity=[just, 0, 0, 0, 0, 0])
+    assert out.status == "out_of_limits", out.explanation
     for wrong, message in (([1.0] * 5, "start_velocity has shape"), ([np.nan] * 6, "not finite")):
         with pytest.raises(PlannerError, match=message):
             asked(wrong)
