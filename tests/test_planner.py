@@ -680,8 +680,9 @@ def test_a_path_names_the_shapes_it_was_planned_among(tmp_path) -> None:
         planner.scene.attach(cup, link=planner.robot.tool_link)
         planner.plan(start, goal, "free", scene=[ball]).save(file)
         assert {"ball", "cup"} < set(read_trajectory(file).shapes)
-        with pytest.warns(UserWarning, match=r"path\.csv was planned among ball, which"):
+        with pytest.warns(UserWarning, match=r"path\.csv was planned among ball, which") as told:
             assert planner.check(file).valid
+        assert told[0].filename == __file__
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             planner.scene.add(ball)
@@ -846,6 +847,30 @@ def test_standing_still_is_certified_too() -> None:
         path = own.plan(off, off, "level_cup")
         assert path.status == "not_found"
         assert own.plan(start, start, "level_cup").status == "solved"
+
+
+@pytest.mark.parametrize("scale", ["velocity_scale", "acceleration_scale"])
+def test_what_only_rounding_tells_apart_keeps_the_pace_as_well(planner, scale) -> None:
+    start = pairs_of("free", 1, seed=3)[0][0]
+    path = planner.plan(start, start + 3e-8, "free", **{scale: 1e-6})
+    assert path.status == "solved", path.explanation
+    pace, (step,), duration = path.asked.pace, np.diff(path.joints, axis=0), path.times[-1]
+    assert (np.abs(step) / duration <= pace.velocity).all()
+    assert (2.0 * np.abs(step) / duration**2 <= pace.acceleration).all()
+    assert planner.plan(start, start + 3e-8, "free").times[-1] == 0.001
+
+
+def test_a_goal_a_little_beyond_a_limit_is_refused_as_any_other_is(planner) -> None:
+    """Right at the start, too; and another goal is taken then."""
+    start, goal = pairs_of("free", 1, seed=3)[0]
+    start[0] = planner.robot.upper[0]
+    beyond = start + 5e-8 * np.eye(6)[0]
+    path = planner.plan(start, beyond, "free")
+    assert path.status == "out_of_limits", path.explanation
+    assert "joint1 of the goal is 3.50000005 rad" in path.explanation
+    other = planner.plan(start, [beyond, goal], "free")
+    assert other.status == "solved", other.explanation
+    np.testing.assert_array_equal(other.goal, goal)
 
 
 def test_paths_are_equal_as_objects_only() -> None:

@@ -166,8 +166,9 @@ class Answering:
         regions = tuple(goal.region for goal in goals if goal.region is not None)
         query = replace(query, regions=regions)
         if pursued[0].distance <= COINCIDENT_RAD and query.start_velocity is None:
-            region = pursued[0].region
-            return self.standing(replace(query, goal=pursued[0].goal), region), region
+            own, region = replace(query, goal=pursued[0].goal), pursued[0].region
+            if refused_end(own, "goal", self.certifier.collisions) is None:
+                return self.standing(own, region), region
 
         def certify(one: Pursued, candidate: Candidate) -> tuple[Trajectory, float] | str:
             found = self._certified(query, candidate, one)
@@ -391,6 +392,8 @@ class Answering:
     def standing(self, query: Query, region: Constraint | None = None) -> Trajectory:
         """The path between ends that only rounding tells apart."""
         joints, times = np.stack([query.start, query.goal]), np.array([0.0, STANDING_S])
+        if np.linalg.norm(query.goal - query.start) > 0.0:
+            times = np.maximum(times, self.pace(query).times(joints, None))
         constraint = query.task.manifold.constraint
         certificate = self.certifier.certify(
             joints, constraint, query.start, query.goal, times, region=region

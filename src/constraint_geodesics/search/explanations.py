@@ -46,7 +46,8 @@ def _limit(manifold: ConstraintManifold, end: str, q: Float[np.ndarray, "D"]) ->
         limits = f"its limits are {robot.lower[k]:.4g} and {robot.upper[k]:.4g} {unit}"
         if robot.joint_names[k] in robot.continuous:
             limits += ", whole turns beyond them are for its controller to add"
-        return f"{robot.joint_names[k]} of the {end} is {q[k]:.4g} {unit}: {limits}"
+        digits = 4 if beyond[k] > 1e-3 else 10
+        return f"{robot.joint_names[k]} of the {end} is {q[k]:.{digits}g} {unit}: {limits}"
     return ""
 
 
