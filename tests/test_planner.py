@@ -671,6 +671,17 @@ def test_a_saved_path_is_certified_by_itself(planner, tmp_path) -> None:
         packaged_planner().check(tmp_path / "path.csv", "cup")
 
 
+@pytest.mark.parametrize(
+    ("first", "kind"), [("inf", "not_finite"), ("nan", "not_finite"), ("1e200", "joint_limits")]
+)
+def test_a_path_that_begins_nowhere_is_judged(planner, tmp_path, first, kind) -> None:
+    """Under a constraint that is held where it begins, too."""
+    names = ",".join(planner.robot.joint_names)
+    (tmp_path / "path.csv").write_text(f"{names}\n{first},0,0,0,0,0\n0,0,0,0,0,0\n")
+    certificate = planner.check(tmp_path / "path.csv", Constraint((1,) * 6))
+    assert certificate.violation.kind == kind
+
+
 def test_a_path_names_the_shapes_it_was_planned_among(tmp_path) -> None:
     ball = Sphere("ball", (0.0, 0.0, 3.0), 0.1)
     cup = Cylinder("cup", Pose([0, 0, 0.1], np.eye(3)), length_m=0.1, radius_m=0.03)

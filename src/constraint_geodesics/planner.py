@@ -428,7 +428,7 @@ class Planner:
             for q, name in ((start, "start"), (goal, "goal"))
         )
         # one that is not placed is held as the first row has it, if that is anywhere
-        held = self._held_at(own, np.nan_to_num(joints[0]))
+        held = self._held_at(own, np.where(np.abs(joints[0]) <= LARGEST, joints[0], 0.0))
         return self._certifier.certify(joints, held, first, last, times, start_velocity=moving)
 
     def _named(self, constraint: str | Constraint) -> tuple[Constraint, str]:
