@@ -513,7 +513,7 @@ class _Refused(Sphere):
         raise SystemError("returned a result with an exception set")
 
 
-@pytest.mark.parametrize("where", ["clearances", "checks", "world", "scene"])
+@pytest.mark.parametrize("where", ["clearances", "checks", "filter", "world", "scene"])
 def test_an_interrupted_change_has_changed_nothing(
     planner: Planner, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
@@ -522,6 +522,7 @@ def test_an_interrupted_change_has_changed_nothing(
     asked = {
         "clearances": (preparation._clearances, "model"),
         "checks": (own.collisions, "_follow"),
+        "filter": (own._world, "_filter"),
         "world": (own._world, "change"),
         "scene": (planner.scene, "_follow"),
     }[where]
@@ -541,6 +542,7 @@ def test_an_interrupted_change_has_changed_nothing(
     for change in (
         lambda: planner.scene.add(BALL),
         lambda: planner.scene.move("crate", Placement((0.4, -0.3, 0.3))),
+        lambda: planner.scene.allow("crate", "link5"),
         lambda: planner.plan(start, goal, FREE, scene=[BALL]),
     ):
         pressed[:] = [True]
@@ -548,10 +550,14 @@ def test_an_interrupted_change_has_changed_nothing(
             change()
         assert planner.scene.now is before
         in_step(planner)
+        assert own._world._bullet.getNumBodies() == 1 + len(own._world._shapes)
     with pytest.raises(KeyboardInterrupt), planner.scene.including([BALL]):
         pressed[:] = [True]  # while they are taken away
     assert planner.scene.now is before
     in_step(planner)
+    q = planner.robot.sample(1500, np.random.default_rng(9))
+    with planner.scene.world() as world:
+        np.testing.assert_array_equal(own._world.free(q), world.free(q))
     planner.scene.add(BALL)
     in_step(planner)
 
