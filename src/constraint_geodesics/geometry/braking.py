@@ -160,17 +160,26 @@ def shortest_stop(
 def going_on(
     stop: Float[np.ndarray, "n D"], onward: Float[np.ndarray, "m D"]
 ) -> Float[np.ndarray, "T D"]:
-    """The rows of a stop, then those of a path from its end, with one more on the last line and on
-    the first, close to the corner between them.
+    """The rows of a stop, then those of a path from its end, with more of them close to the corner
+    between the two, and halfway to the next one.
 
     The way may turn back there.  The limits hold in differences, which let an arm pass a corner
-    the faster the longer its lines are; these two are so short that it all but rests in between.
+    the faster the longer its lines are; next to it they are so short that it all but rests in
+    between.  From rest a whole line takes so long that a spline to its end bends it.
     """
-    corner, beside = stop[-1], list[np.ndarray]()
-    for line in (stop[-2] - corner, onward[1] - corner):
-        share = _CORNER / float(np.linalg.norm(line))
-        beside.append(corner + share * line if share < 0.5 else np.empty((0, len(corner))))
-    return np.vstack([stop[:-1], beside[0], corner, beside[1], onward[1:]])
+    corner = stop[-1]
+    before, after = _beside(corner, stop[-2]), _beside(corner, onward[1])
+    return np.vstack([stop[:-1], before[:1], corner, after, onward[1:]])
+
+
+def _beside(corner: np.ndarray, row: np.ndarray) -> Float[np.ndarray, "k D"]:
+    """Rows on the line from a corner to another row: close to it, and halfway; none on a short
+    line.
+    """
+    line = row - corner
+    near = _CORNER / float(np.linalg.norm(line))
+    shares = np.array([near, 0.5] if near < 0.25 else [])
+    return corner + shares[:, None] * line
 
 
 def _ending(rows: np.ndarray, last: int, share: float) -> np.ndarray:
