@@ -9,7 +9,7 @@ import pytest
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
 from constraint_geodesics import Constraint, GoalRegion, Planner, Pose, Sphere, Trajectory
-from constraint_geodesics.geometry.braking import State
+from constraint_geodesics.geometry.braking import State, going_on
 from constraint_geodesics.planner import PlannerError
 from constraint_geodesics.trajectory import read_trajectory
 from tests.planner_fixtures import packaged_planner, pairs_of
@@ -164,6 +164,17 @@ def test_of_several_goals_an_arm_that_must_stop_first_reaches_the_nearest():
     np.testing.assert_array_equal(back.joints[-1], behind)
     assert back.asked.regions == (region.region,)
     assert len(back.statistics.looked_at) > 1
+
+
+def test_rows_are_added_on_the_lines_beside_a_corner_alone():
+    """And none where a line is short, or there is none to go on."""
+    stop, onward = np.array([[0.0, 0.0], [0.1, 0.0]]), np.array([[0.1, 0.0], [0.1, 0.2]])
+    whole = going_on(stop, onward)
+    added = [[0.1 - 1e-5, 0.0], [0.1, 0.0], [0.1, 1e-5], [0.1, 0.1]]
+    np.testing.assert_allclose(whole, [stop[0], *added, onward[1]], atol=1e-15)
+    np.testing.assert_array_equal(going_on(stop, stop[[1, 1]])[-2:], stop[[1, 1]])
+    short = np.array([[0.1, 0.0], [0.1, 1e-5]])
+    np.testing.assert_array_equal(going_on(stop, short)[2:], short)
 
 
 def test_a_start_at_rest_is_planned_as_without_a_velocity():

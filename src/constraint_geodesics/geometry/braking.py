@@ -177,8 +177,8 @@ def _beside(corner: np.ndarray, row: np.ndarray) -> Float[np.ndarray, "k D"]:
     line.
     """
     line = row - corner
-    near = _CORNER / float(np.linalg.norm(line))
-    shares = np.array([near, 0.5] if near < 0.25 else [])
+    length = float(np.linalg.norm(line))
+    shares = np.array([_CORNER / length, 0.5] if length > 4.0 * _CORNER else [])
     return corner + shares[:, None] * line
 
 
