@@ -20,13 +20,17 @@ import pytest
 from constraint_geodesics import Constraint, Planner, Pose, Trajectory, bundle
 from constraint_geodesics.certification.certifier import Certifier, Limits
 from constraint_geodesics.constraints.constraint import ConstraintError, ConstraintManifold
+from constraint_geodesics.constraints.polynomial import PolynomialConstraint, Relation
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.methods import SearchMethod
 from constraint_geodesics.planner import PlannerError
+from constraint_geodesics.problem import SATISFIED
 from constraint_geodesics.recording.recording import read_recording
 from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.candidates import Answer, Parts, Task, candidates, refined, rows_of
+from constraint_geodesics.search.explanations import _same_pose
+from constraint_geodesics.search.preparation import Query
 from constraint_geodesics.trajectory import read_trajectory
 from tests.planner_fixtures import (
     NAMES,
@@ -395,6 +399,22 @@ def test_an_alternative_goal_is_named_and_can_be_reached(planner, name) -> None:
     assert same_pose >= 2
 
 
+def test_an_alternative_goal_keeps_what_is_asked_of_other_places_than_the_tool(planner) -> None:
+    """The height of the wrist: other branches with the same tool pose have another one."""
+    seeds = nodes_of("free")[0][:64]
+    goal, place = seeds[0], planner.robot.skeleton(seeds[0])
+    joint = 4
+    height = Relation("height", "m", -float(place[joint + 1, 2]), np.eye(12)[2])
+    own = PolynomialConstraint((height,), joint=joint)
+    manifold = ConstraintManifold(planner.robot, own)
+    assert manifold.violation(goal) <= SATISFIED
+    query = Query(planner._preparation.task(own), "height", goal, goal, 0.0)
+    loose = replace(query, task=planner._preparation.task(planner.constraints["free"]))
+    named, all_of_them = _same_pose(query, seeds), _same_pose(loose, seeds)
+    assert (manifold.violation(named) <= SATISFIED).all()
+    assert 0 < len(named) < len(all_of_them)
+
+
 def test_an_alternative_goal_can_be_reached_as_it_is_printed(planner) -> None:
     told = 0
     for start, goal in pairs_of("tool_down", 25, seed=12, joined=False):
@@ -651,6 +671,17 @@ def test_a_saved_path_is_certified_by_itself(planner, tmp_path) -> None:
         packaged_planner().check(tmp_path / "path.csv", "cup")
 
 
+@pytest.mark.parametrize(
+    ("first", "kind"), [("inf", "not_finite"), ("nan", "not_finite"), ("1e200", "joint_limits")]
+)
+def test_a_path_that_begins_nowhere_is_judged(planner, tmp_path, first, kind) -> None:
+    """Under a constraint that is held where it begins, too."""
+    names = ",".join(planner.robot.joint_names)
+    (tmp_path / "path.csv").write_text(f"{names}\n{first},0,0,0,0,0\n0,0,0,0,0,0\n")
+    certificate = planner.check(tmp_path / "path.csv", Constraint((1,) * 6))
+    assert certificate.violation.kind == kind
+
+
 def test_a_path_names_the_shapes_it_was_planned_among(tmp_path) -> None:
     ball = Sphere("ball", (0.0, 0.0, 3.0), 0.1)
     cup = Cylinder("cup", Pose([0, 0, 0.1], np.eye(3)), length_m=0.1, radius_m=0.03)
@@ -660,8 +691,9 @@ def test_a_path_names_the_shapes_it_was_planned_among(tmp_path) -> None:
         planner.scene.attach(cup, link=planner.robot.tool_link)
         planner.plan(start, goal, "free", scene=[ball]).save(file)
         assert {"ball", "cup"} < set(read_trajectory(file).shapes)
-        with pytest.warns(UserWarning, match=r"path\.csv was planned among ball, which"):
+        with pytest.warns(UserWarning, match=r"path\.csv was planned among ball, which") as told:
             assert planner.check(file).valid
+        assert told[0].filename == __file__
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             planner.scene.add(ball)
@@ -826,6 +858,30 @@ def test_standing_still_is_certified_too() -> None:
         path = own.plan(off, off, "level_cup")
         assert path.status == "not_found"
         assert own.plan(start, start, "level_cup").status == "solved"
+
+
+@pytest.mark.parametrize("scale", ["velocity_scale", "acceleration_scale"])
+def test_what_only_rounding_tells_apart_keeps_the_pace_as_well(planner, scale) -> None:
+    start = pairs_of("free", 1, seed=3)[0][0]
+    path = planner.plan(start, start + 3e-8, "free", **{scale: 1e-6})
+    assert path.status == "solved", path.explanation
+    pace, (step,), duration = path.asked.pace, np.diff(path.joints, axis=0), path.times[-1]
+    assert (np.abs(step) / duration <= pace.velocity).all()
+    assert (2.0 * np.abs(step) / duration**2 <= pace.acceleration).all()
+    assert planner.plan(start, start + 3e-8, "free").times[-1] == 0.001
+
+
+def test_a_goal_a_little_beyond_a_limit_is_refused_as_any_other_is(planner) -> None:
+    """Right at the start, too; and another goal is taken then."""
+    start, goal = pairs_of("free", 1, seed=3)[0]
+    start[0] = planner.robot.upper[0]
+    beyond = start + 5e-8 * np.eye(6)[0]
+    path = planner.plan(start, beyond, "free")
+    assert path.status == "out_of_limits", path.explanation
+    assert "joint1 of the goal is 3.50000005 rad" in path.explanation
+    other = planner.plan(start, [beyond, goal], "free")
+    assert other.status == "solved", other.explanation
+    np.testing.assert_array_equal(other.goal, goal)
 
 
 def test_paths_are_equal_as_objects_only() -> None:

@@ -6,10 +6,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.interpolate import BPoly
+from scipy.interpolate import BPoly, CubicHermiteSpline
 
-from constraint_geodesics import Constraint, Planner, Sphere, Trajectory
-from constraint_geodesics.geometry.braking import State
+from constraint_geodesics import Constraint, GoalRegion, Planner, Pose, Sphere, Trajectory
+from constraint_geodesics.geometry.braking import State, going_on
 from constraint_geodesics.planner import PlannerError
 from constraint_geodesics.trajectory import read_trajectory
 from tests.planner_fixtures import packaged_planner, pairs_of
@@ -111,6 +111,72 @@ def test_a_path_goes_on_from_where_another_one_is(name):
     assert np.median(longer) < 1.02
 
 
+def beside_its_lines(path: Trajectory) -> float:
+    """How far a controller that follows the message by cubics gets from the waypoints' lines."""
+    points = path.to_joint_trajectory()["points"]
+    places, velocities = (np.array([p[k] for p in points]) for k in ("positions", "velocities"))
+    spline, worst = CubicHermiteSpline(path.times, places, velocities), 0.0
+    for first, last in zip(path.times[:-1], path.times[1:], strict=True):
+        at = spline(np.linspace(first, last, 20))
+        away = np.full(len(at), np.inf)
+        near = np.flatnonzero(np.abs(path.times[:-1] - first) < 0.1)
+        for place, line in zip(places[near], np.diff(places, axis=0)[near], strict=True):
+            share = np.clip((at - place) @ line / (line @ line), 0.0, 1.0)
+            away = np.minimum(away, np.linalg.norm(at - place - share[:, None] * line, axis=1))
+        worst = max(worst, float(away.max()))
+    return worst
+
+
+@pytest.mark.parametrize("name", ["level_cup", "free"])
+def test_an_arm_that_turns_back_comes_to_rest_first(name):
+    """No spline through the message leads beyond the corner."""
+    planner, seen = packaged_planner(), 0
+    for start, goal in pairs_of(name, 4, 5):
+        path = planner.plan(start, goal, name)
+        state = path.state(0.3 * path.times[-1])
+        back = planner.plan(state.configuration, start, name, start_velocity=state.velocity)
+        if back.status != "solved":
+            continue
+        seen += 1
+        lines = np.diff(back.joints, axis=0)
+        lines /= np.linalg.norm(lines, axis=1)[:, None]
+        corner = 1 + int(np.argmin((lines[1:] * lines[:-1]).sum(axis=1)))
+        assert lines[corner] @ lines[corner - 1] < -0.5
+        assert np.linalg.norm(back.state(back.times[corner]).velocity) < 0.02
+        assert beside_its_lines(back) < 1e-3
+        for soon in np.linspace(-0.02, 0.08, 30):
+            stop = back.stop(back.times[corner] + soon)
+            assert stop.status == "stopped"
+            assert stop.certificate is None or stop.certificate.valid
+    assert seen >= 3
+
+
+def test_of_several_goals_an_arm_that_must_stop_first_reaches_the_nearest():
+    """The end of its path is in no region where it is a configuration that was asked for."""
+    planner, (start, goal) = packaged_planner(), pairs_of("free", 1, 5)[0]
+    path = planner.plan(start, goal, "free")
+    at = 0.3 * path.times[-1]
+    state, behind = path.state(at), path.state(at - 0.15).configuration
+    region = GoalRegion(Pose(*planner.robot.forward(start)), tolerance=(0.01,) * 3 + (0.0,) * 3)
+    wanted = [behind, region]
+    back = planner.plan(state.configuration, wanted, "free", start_velocity=state.velocity)
+    assert back.status == "solved", back.explanation
+    np.testing.assert_array_equal(back.joints[-1], behind)
+    assert back.asked.regions == (region.region,)
+    assert len(back.statistics.looked_at) > 1
+
+
+def test_rows_are_added_on_the_lines_beside_a_corner_alone():
+    """And none where a line is short, or there is none to go on."""
+    stop, onward = np.array([[0.0, 0.0], [0.1, 0.0]]), np.array([[0.1, 0.0], [0.1, 0.2]])
+    whole = going_on(stop, onward)
+    added = [[0.1 - 1e-5, 0.0], [0.1, 0.0], [0.1, 1e-5], [0.1, 0.1]]
+    np.testing.assert_allclose(whole, [stop[0], *added, onward[1]], atol=1e-15)
+    np.testing.assert_array_equal(going_on(stop, stop[[1, 1]])[-2:], stop[[1, 1]])
+    short = np.array([[0.1, 0.0], [0.1, 1e-5]])
+    np.testing.assert_array_equal(going_on(stop, short)[2:], short)
+
+
 def test_a_start_at_rest_is_planned_as_without_a_velocity():
     planner = packaged_planner()
     for start, goal in pairs_of(NAME, 5, 2):
@@ -147,6 +213,10 @@ def test_velocities_that_no_path_begins_with_are_refused():
     out = planner.plan(close, goal, free, start_velocity=[1.0, 0, 0, 0, 0, 0])
     assert out.status == "out_of_limits", out.explanation
     assert "can't stop within 0.01" in out.explanation
+    most = packaged_planner()._certifier.limits.acceleration_rad_s2[0]
+    just = np.sqrt(2.0 * most * (0.01 + 1e-7))  # the certificate allows no more than rounding
+    out = planner.plan(close, goal, free, start_velocity=[just, 0, 0, 0, 0, 0])
+    assert out.status == "out_of_limits", out.explanation
     for wrong, message in (([1.0] * 5, "start_velocity has shape"), ([np.nan] * 6, "not finite")):
         with pytest.raises(PlannerError, match=message):
             asked(wrong)
@@ -175,6 +245,18 @@ def test_a_state_is_that_of_the_trajectory_as_it_is_sent():
     for wrong in (-1e-9, path.times[-1] + 1e-9, np.nan, "soon"):
         with pytest.raises(PlannerError, match="at_s = .*must be a time from 0 to"):
             path.state(wrong)
+
+
+def test_who_alters_a_state_leaves_the_path_as_it_was_certified():
+    path = planned(10)[0]
+    joints = path.joints.copy()
+    for handed in (
+        *(path.state(at).configuration for at in (0.0, path.times[3], path.times[-1])),
+        path.goal,
+        path.wanted,
+    ):
+        handed += 0.1
+    np.testing.assert_array_equal(path.joints, joints)
 
 
 def test_a_stop_is_on_the_path_and_as_short_as_the_limits_allow():
@@ -359,6 +441,11 @@ def test_a_stop_that_touches_something_says_so_and_is_there():
         assert answer.certificate.violation.message in answer.explanation
         np.testing.assert_array_equal(answer.start_velocity, path.state(at).velocity)
         assert len(answer.to_joint_trajectory()["points"]) == len(answer.joints) > 2
+        again = answer.stop(0.5 * answer.times[-1])  # on what touches nothing was proven
+        if again.certificate is not None:
+            assert again.certificate.violation == answer.certificate.violation
+            assert again.status == "in_collision"
+            assert answer.certificate.violation.message in again.explanation
         if seen == 3:
             break
     assert seen == 3

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from constraint_geodesics.certification.certifier import Certificate, Certifier
 from constraint_geodesics.constraints.both import both
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
-from constraint_geodesics.geometry.braking import Pace, shortest_stop
+from constraint_geodesics.geometry.braking import Pace, going_on, shortest_stop
 from constraint_geodesics.geometry.errors import GeometryError
 from constraint_geodesics.goals.goal import Goal
 from constraint_geodesics.methods import Method
@@ -25,7 +25,7 @@ from constraint_geodesics.search.explanations import not_connected, refused_end
 from constraint_geodesics.search.preparation import Query
 from constraint_geodesics.search.pursuit import Pursued, shortest, slid
 from constraint_geodesics.search.run_out import refused_velocity, rows_from, run_out, run_outs
-from constraint_geodesics.trajectory import STANDING_S, Asked, Statistics, Trajectory, Way
+from constraint_geodesics.trajectory import STANDING_S, TOUCHES, Asked, Statistics, Trajectory, Way
 
 COINCIDENT_RAD = 1e-7
 """Ends that differ by less in every joint are one configuration."""
@@ -38,8 +38,6 @@ _TIGHTENED = (1.0, 0.7, 0.4)
 """Shares of the allowed violation that a path's waypoints are drawn for, should the certificate ask
 for closer ones.
 """
-TOUCHES = ("self_collision", "workcell_collision", "clearance")
-"""What a certificate finds where a motion meets something."""
 TIMES = "times"
 """What is refused where a motion can't go on along its waypoints."""
 _CLOSER = ("constraint_between_rows", "step")
@@ -144,25 +142,33 @@ class Answering:
         one trajectory; None where that is not certified.
         """
         resting = replace(query, start=tail[-1], start_velocity=None)
-        onward = self.found(resting, goals, budget_s)
+        onward, region = self._reached(resting, goals, budget_s)
         if onward.status != "solved":
             return None
-        whole = np.concatenate([tail, onward.joints[1:]])
-        regions = onward.asked.regions
-        end = End(onward.joints[-1], regions[0] if len(regions) == 1 else None)
-        found = self.judged(query, whole, onward.source, end)
+        whole, looked_at = going_on(tail, onward.joints), onward.statistics.looked_at
+        query = replace(query, regions=onward.asked.regions, looked_at=looked_at)
+        found = self.judged(query, whole, onward.source, End(onward.joints[-1], region))
         return found if isinstance(found, Trajectory) else None
 
     def found(self, query: Query, goals: Sequence[Goal], budget_s: float | None) -> Trajectory:
         """The path to the nearest of some goals, or why there is none; the start is a sound one."""
+        return self._reached(query, goals, budget_s)[0]
+
+    def _reached(
+        self, query: Query, goals: Sequence[Goal], budget_s: float | None
+    ) -> tuple[Trajectory, Constraint | None]:
+        """The same, and the region of the goal that is reached, if it has one."""
         pursued, rest = self._pursued(query, goals)
         if not pursued:
             wanted = " or ".join(one.description for one in goals)
-            return self.nothing(query, "not_found", f"no configuration was found for {wanted}")
+            line = f"no configuration was found for {wanted}"
+            return self.nothing(query, "not_found", line), None
         regions = tuple(goal.region for goal in goals if goal.region is not None)
         query = replace(query, regions=regions)
         if pursued[0].distance <= COINCIDENT_RAD and query.start_velocity is None:
-            return self.standing(replace(query, goal=pursued[0].goal), pursued[0].region)
+            own, region = replace(query, goal=pursued[0].goal), pursued[0].region
+            if refused_end(own, "goal", self.certifier.collisions) is None:
+                return self.standing(own, region), region
 
         def certify(one: Pursued, candidate: Candidate) -> tuple[Trajectory, float] | str:
             found = self._certified(query, candidate, one)
@@ -179,11 +185,12 @@ class Answering:
         found = shortest(pursued, query.task, certify, more, is_connected)
         query = replace(query, looked_at=np.array([one.goal for one in pursued]))
         if found is None:
-            return self._failed(query, pursued)
+            return self._failed(query, pursued), None
         path, reached = found
         if budget_s is not None:
             others = [one for one in pursued if one is not reached and one.answer is None]
-            path = self._improved(query, path, [reached, *others[:_IMPROVED]], budget_s)
+            worth = [reached, *others[:_IMPROVED]]
+            path, reached = self._improved(query, path, worth, budget_s)
         line = path.explanation
         if len(pursued) > 1:
             line += f", the shortest found to any of {len(pursued)} configurations"
@@ -191,7 +198,7 @@ class Answering:
             line += f", from a start moved by {query.snapped_rad:.2g} rad"
         statistics = self._statistics(query, path.source)
         statistics = replace(statistics, ways=path.statistics.ways)
-        return replace(path, explanation=line, statistics=statistics)
+        return replace(path, explanation=line, statistics=statistics), reached.region
 
     def _pursued(self, query: Query, goals: Iterable[Goal]) -> tuple[list[Pursued], list[_Further]]:
         """The goals' configurations, the nearest first, and what more there are."""
@@ -272,12 +279,12 @@ class Answering:
 
     def _improved(
         self, query: Query, path: Trajectory, pursued: Sequence[Pursued], budget_s: float
-    ) -> Trajectory:
-        """The shortest certified path that is found before the time is over; `path` if it remains
-        that.  No curve is begun that would end too late, going by the last of its kind, and for the
-        first ones by the longest.
+    ) -> tuple[Trajectory, Pursued]:
+        """The shortest certified path that is found before the time is over, and where it leads:
+        `path`, to the first of those that are pursued, if it remains that.  No curve is begun that
+        would end too late, going by the last of its kind, and for the first ones by the longest.
         """
-        worth = [one for one in pursued if one.distance < path.length_rad]
+        reached, worth = pursued[0], [one for one in pursued if one.distance < path.length_rad]
         curves = _by_turns([self._improvements(query, one) for one in worth or pursued[:1]])
         spent = time.perf_counter() - query.began
         lasted = deque[float](maxlen=_ROUND * max(len(worth), 1))
@@ -292,10 +299,10 @@ class Answering:
             if candidate is not None and candidate.length < (1.0 - _WORTHWHILE) * path.length_rad:
                 found = self._certified(query, candidate, one)
                 if isinstance(found, Trajectory) and found.length_rad < path.length_rad:
-                    path = found
+                    path, reached = found, one
             before, spent = spent, time.perf_counter() - query.began
             lasted.append(spent - before)
-        return path
+        return path, reached
 
     def _improvements(
         self, query: Query, one: Pursued
@@ -385,6 +392,8 @@ class Answering:
     def standing(self, query: Query, region: Constraint | None = None) -> Trajectory:
         """The path between ends that only rounding tells apart."""
         joints, times = np.stack([query.start, query.goal]), np.array([0.0, STANDING_S])
+        if np.linalg.norm(query.goal - query.start) > 0.0:
+            times = np.maximum(times, self.pace(query).times(joints, None))
         constraint = query.task.manifold.constraint
         certificate = self.certifier.certify(
             joints, constraint, query.start, query.goal, times, region=region

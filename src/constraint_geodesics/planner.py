@@ -9,8 +9,9 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -70,12 +71,30 @@ OWN_CONSTRAINTS = {"free": Constraint((0,) * 6), "level": Constraint((0, 0, 0, 1
 """By name, of a planner that is made from a URDF: nothing held, and the tilt that the start has."""
 
 
+_Given = ParamSpec("_Given")
+_Answer = TypeVar("_Answer")
+
+
+def _in_turn(
+    method: Callable[Concatenate["Planner", _Given], _Answer],
+) -> Callable[Concatenate["Planner", _Given], _Answer]:
+    """The method, begun when no other thread has the planner or changes its scene."""
+
+    @wraps(method)
+    def alone(planner: "Planner", *args: _Given.args, **kwargs: _Given.kwargs) -> _Answer:
+        with planner.scene.lock:
+            return method(planner, *args, **kwargs)
+
+    return alone
+
+
 class Planner:
     """Plans paths of one robot in its workcell under any constraint.  Close it, or use it as a
     context manager.
 
     The roadmap of a constraint that has none yet is made the first time that a query needs it, or
-    by `prepare`; everything is kept for the next query.
+    by `prepare`; everything is kept for the next query.  Threads may share a planner: it answers
+    one at a time, each in the scene as it is then, and no time or limit counts the waiting.
     """
 
     def __init__(self, bundle: Bundle, source: str, method: Method | None = None) -> None:
@@ -180,6 +199,7 @@ class Planner:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @_in_turn
     def close(self) -> None:
         """Free the physics world; a closed planner answers no more."""
         self._closed = True
@@ -197,6 +217,7 @@ class Planner:
         with self._preparation.changing(scene):
             self._certifier.change(scene)
 
+    @_in_turn
     def prepare(self, constraint: str | Constraint) -> None:
         """Make the constraint's roadmap now (about a second), and load the compiled code, so that
         no query waits.
@@ -208,6 +229,7 @@ class Planner:
         if len(nodes):
             self.plan(nodes[0], nodes[-1], constraint)
 
+    @_in_turn
     def nodes(self, constraint: str | Constraint) -> Float[np.ndarray, "n D"]:
         """Configurations of the constraint's roadmap [rad], not to be written to; none where it has
         no roadmap.
@@ -223,6 +245,7 @@ class Planner:
         nodes.flags.writeable = False
         return nodes
 
+    @_in_turn
     def ik(self, pose: Pose) -> Float[np.ndarray, "n D"]:
         """Configurations [rad] free of collision and within the limits whose tool has a pose in the
         base frame: of six joints every branch that is found, whole turns included, of a joint with
@@ -238,6 +261,7 @@ class Planner:
         free = found[self._certifier.collisions.free(found)]
         return spread(free, SPREAD) if robot.dof > POSE_JOINTS else free
 
+    @_in_turn
     def project(self, q: ArrayLike, constraint: str | Constraint) -> Projection:
         """The nearest configuration that keeps a constraint and the joint limits, as far as the
         descent from q [rad] finds it; collisions are not looked at.
@@ -258,6 +282,7 @@ class Planner:
             )
         return found
 
+    @_in_turn
     def plan(
         self,
         start: ArrayLike,
@@ -322,6 +347,7 @@ class Planner:
             query = replace(query, start_velocity=moving)
             return self._answering.answer(query, goals, budget_s)
 
+    @_in_turn
     def replan(
         self, trajectory: Trajectory, at_s: float, *, limit_s: float | None = None
     ) -> Trajectory:
@@ -344,6 +370,7 @@ class Planner:
         limit = np.inf if limit_s is None else limit_s
         return Replanning(self._answering, self._preparation).replan(trajectory, at_s, limit)
 
+    @_in_turn
     def plan_batch(
         self,
         starts: Float[np.ndarray, "B D"],
@@ -368,6 +395,7 @@ class Planner:
                 progress(row + 1)
         return answers
 
+    @_in_turn
     def check(
         self,
         file: str | Path,
@@ -390,7 +418,7 @@ class Planner:
         there = self.scene.now.names
         if missing := [name for name in among if name not in there]:
             line = f"{file} was planned among {', '.join(missing)}, which are not in this scene"
-            warnings.warn(line, stacklevel=2)
+            warnings.warn(line, stacklevel=3)
         if constraint is not None:
             own, _ = self._named(constraint)
         if own is None:
@@ -400,7 +428,7 @@ class Planner:
             for q, name in ((start, "start"), (goal, "goal"))
         )
         # one that is not placed is held as the first row has it, if that is anywhere
-        held = self._held_at(own, np.nan_to_num(joints[0]))
+        held = self._held_at(own, np.where(np.abs(joints[0]) <= LARGEST, joints[0], 0.0))
         return self._certifier.certify(joints, held, first, last, times, start_velocity=moving)
 
     def _named(self, constraint: str | Constraint) -> tuple[Constraint, str]:

@@ -33,8 +33,9 @@ Status = Literal[
     "stopped",
 ]
 """How a query ended, for the planner and every baseline alike.  not_applicable: it cannot work on
-such a problem at all.  stopped: of a motion under way, that it stops on its path, certified, and
-goes no further.  Where the status does not say it all, an explanation does.
+such a problem at all.  stopped: of a motion under way, that it stops on its path and goes no
+further, certified by `replan`; waypoints that `Trajectory.stop` draws anew are not.  Where the
+status does not say it all, an explanation does.
 """
 
 

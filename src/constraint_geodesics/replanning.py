@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.answering import NO_MORE, TIMES, TOUCHES, Answering, End, Refused
-from constraint_geodesics.geometry.braking import Motion, State, ahead
+from constraint_geodesics.answering import NO_MORE, TIMES, Answering, End, Refused
+from constraint_geodesics.geometry.braking import Motion, State, ahead, going_on
 from constraint_geodesics.goals.goal import ConfigurationGoal
 from constraint_geodesics.problem import PlannerError, Status
 from constraint_geodesics.search.candidates import rows_of
@@ -23,7 +23,7 @@ from constraint_geodesics.search.explanations import refused_end
 from constraint_geodesics.search.preparation import Preparation, Query
 from constraint_geodesics.search.repair import onward, over_graph, repaired
 from constraint_geodesics.search.run_out import left_over, rows_from
-from constraint_geodesics.trajectory import REDRAWN, Trajectory, stopping
+from constraint_geodesics.trajectory import REDRAWN, TOUCHES, Trajectory, stopping
 
 _TIGHTENED = (0.7, 0.4)
 """Shares of the allowed violation that waypoints after a stop are drawn for: it ends off the
@@ -141,7 +141,7 @@ class Replanning:
                 rows = rows_of(
                     candidate, share * self.answering.certifier.limits.violation_tolerance
                 )
-                joined = np.concatenate([stop.joints, rows[1:]])
+                joined = going_on(stop.joints, rows)
                 found = self.answering.judged(query, joined, candidate.source, End(query.goal))
                 yield found if isinstance(found, Trajectory) else None
 

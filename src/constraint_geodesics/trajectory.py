@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.certification.certifier import Certificate
+from constraint_geodesics.certification.certifier import Certificate, Violation
 from constraint_geodesics.certification.motion import MotionLimits, check_times
 from constraint_geodesics.constraints.constraint import (
     Constraint,
@@ -46,6 +46,8 @@ REDRAWN = 0.9 * SATISFIED
 """Violation [rad or m] that lines may use which are drawn anew on a path's way."""
 _FRAMES = 10_000
 """Of a recording, at most."""
+TOUCHES = ("self_collision", "workcell_collision", "clearance")
+"""What a certificate finds where a motion meets something."""
 STANDING_S = 0.001
 """Duration of a path from a configuration to itself."""
 
@@ -105,8 +107,10 @@ class Trajectory:
     the end, and at the start unless there is a `start_velocity` [rad/s, or m/s of prismatic
     joints].  explanation: one line for people.  certificate: None without a path.
 
-    Of a motion under way an answer that is not "solved" has waypoints too: those of a stop, which
-    is certified where the status is "stopped" and else is not (`certificate.violation` says why).
+    Of a motion under way an answer that is not "solved" has waypoints too: those of a stop, of
+    which nothing is known that it breaks where the status is "stopped" (its certificate is valid,
+    or None where `stop` drew waypoints anew); else the explanation says what, and so does
+    `certificate.violation` where there is a certificate.
     """
 
     status: Status
@@ -121,7 +125,7 @@ class Trajectory:
     @property
     def goal(self) -> Float[np.ndarray, "D"] | None:
         """The configuration that is reached [rad]; None without a path."""
-        return self.joints[-1] if len(self.joints) else None
+        return self.joints[-1].copy() if len(self.joints) else None
 
     @property
     def constraint(self) -> Constraint:
@@ -264,13 +268,15 @@ class Trajectory:
 
     def stop(self, at_s: float) -> "Trajectory":
         """The hardest stop on the path from its state at a time [s]: the shortest that the limits
-        of its pace allow, of status "stopped".
+        of its pace allow, of status "stopped" unless it is known to break something: then the
+        explanation names it, and the status is "in_collision" where the path's certificate has a
+        contact, else "not_found".
 
         Its lines are those of the path, so what was proven of them holds, in the scene that the
         path was certified in, and its certificate says so.  Where the velocity can't change so much
-        on what is left of a line, waypoints are drawn anew, along the same curve or close by: that
-        is not proven, and the certificate is None.  `planner.replan` certifies a stop in the scene
-        as it is now.
+        on what is left of a line, or leads too far beside it, waypoints are drawn anew, along the
+        same curve or close by: that is not proven, and the certificate is None.  `planner.replan`
+        certifies a stop in the scene as it is now.
         Raises PlannerError without a path, for a time beyond 0 and the duration, or where the arm
         can't stop on the path any more.
         """
@@ -284,18 +290,24 @@ class Trajectory:
         motion, on_path = stop
         line = f"a stop after {motion.times[-1]:.2f} s on the path"
         known = self._inherited(motion) if on_path else None
+        broken = _broken_times(motion, self.asked.pace) if known is None else known.violation
+        status: Status = "stopped"
+        if broken is not None:
+            status = "in_collision" if broken.kind in TOUCHES else "not_found"
+            line = f"{line} is not certified: {broken.message}"
         spent = time.perf_counter() - began
         about = replace(self.statistics, planning_time_s=spent, snapped_rad=0.0)
         about = replace(about, source="stop", looked_at=None)
         start = motion.start_velocity if motion.start_velocity.any() else None
         asked = replace(self.asked, wanted=self.wanted)
         found = motion.joints, motion.times, line, asked, about, known, start
-        return Trajectory("stopped", *found)
+        return Trajectory(status, *found)
 
     @property
     def wanted(self) -> Float[np.ndarray, "D"]:
         """The configuration that a motion is to reach [rad]: its last unless it stops before."""
-        return self.joints[-1] if self.asked.wanted is None else self.asked.wanted
+        wanted = self.joints[-1] if self.asked.wanted is None else self.asked.wanted
+        return wanted.copy()
 
     @property
     def motion(self) -> Motion:
@@ -318,16 +330,13 @@ class Trajectory:
         if self.certificate is None:
             return None
         steps, start = step_lengths(motion.joints), motion.start_velocity
-        acceleration = tuple(self.asked.pace.acceleration.tolist())
-        limits = MotionLimits(self.asked.pace.velocity, acceleration, start)
-        broken, duration = check_times(motion.joints, motion.times, limits)
         return replace(
             self.certificate,
-            violation=self.certificate.violation or next(broken, None),
+            violation=self.certificate.violation or _broken_times(motion, self.asked.pace),
             length_rad=float(steps.sum()),
             max_step_rad=float(steps.max()),
             goal_violation=np.nan,
-            duration_s=duration,
+            duration_s=float(motion.times[-1]),
             time_s=0.0,
             collision_time_s=0.0,
             start_velocity=tuple(start.tolist()) if start.any() else None,
@@ -418,32 +427,49 @@ def stopping(
     """The shortest stop on a motion's way from one of its states, and whether all its lines are the
     motion's; None where there is none.
 
-    A motion that uses its accelerations up may leave none to go on with on what is left of a line:
-    its waypoints are drawn anew then, its curve is begun straight, or it goes straight on.  At last
-    the next waypoint is left out, so that the first line has the time which the motion had: that
-    can break the constraint by the height of a line's curve, a fraction of a mrad.
+    A motion that uses its accelerations up may leave none to go on with on what is left of a line,
+    or its velocity leads too far beside it, at a corner: its waypoints are drawn anew then, its
+    curve is begun straight, or it goes straight on.  At last the next waypoint is left out, so that
+    the first line has the time which the motion had: that can break the constraint by the height of
+    a line's curve, a fraction of a mrad.  Where the times of all are wrong, the first is the
+    answer.
     """
     if not state.velocity.any():
         place, rest = state.configuration, np.zeros_like(state.velocity)
         return Motion(np.stack([place, place]), np.array([0.0, STANDING_S]), rest), True
+    first: tuple[Motion, bool] | None = None
+    for rows, on_path in _ways_to_stop(motion, state, pace, manifold):
+        found = shortest_stop(rows, state.velocity, pace)
+        if found is None:
+            continue
+        if _broken_times(found, pace) is None:
+            return found, on_path
+        first = first or (found, on_path)
+    return first
+
+
+def _ways_to_stop(
+    motion: Motion, state: State, pace: Pace, manifold: ConstraintManifold
+) -> Iterator[tuple[Float[np.ndarray, "n D"], bool]]:
+    """Rows that a motion may stop on, and whether they are its own."""
     rows, velocity = ahead(motion.joints, state), state.velocity
-    found = shortest_stop(rows, velocity, pace)
-    if found is not None:
-        return found, True
+    yield rows, True
     space = space_of(manifold)
     curve = left_over(space, rows) if len(rows) > 1 else None
     curves: Iterator[Candidate] = iter(())
     if curve is not None:
         curves = chain([curve], run_outs(space, curve, velocity, pace))
     straight = run_out(space, state.configuration, velocity, pace)
-    drawn = chain(curves, [] if straight is None else [straight])
-    redrawn = (rows_from(own, rows[0], velocity, pace, REDRAWN) for own in drawn)
-    left_out = [np.delete(rows, 1, axis=0)] if len(rows) > 1 else []
-    for others in chain(redrawn, left_out):
-        found = shortest_stop(others, velocity, pace)
-        if found is not None:
-            return found, False
-    return None
+    for own in chain(curves, [] if straight is None else [straight]):
+        yield rows_from(own, rows[0], velocity, pace, REDRAWN), False
+    if len(rows) > 1:
+        yield np.delete(rows, 1, axis=0), False
+
+
+def _broken_times(motion: Motion, pace: Pace) -> Violation | None:
+    """The first promise on velocities and accelerations that a motion breaks."""
+    limits = MotionLimits(pace.velocity, tuple(pace.acceleration.tolist()), motion.start_velocity)
+    return next(check_times(motion.joints, motion.times, limits)[0], None)
 
 
 def _duration(seconds: float) -> dict[str, int]:

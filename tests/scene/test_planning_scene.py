@@ -1,7 +1,9 @@
 """A scene that changes: what follows it is what would be made anew."""
 
 import pickle
+import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -509,6 +511,85 @@ class _Refused(Sphere):
 
     def add_to(self, bullet: object) -> int:
         raise SystemError("returned a result with an exception set")
+
+
+@pytest.mark.parametrize("where", ["clearances", "checks", "filter", "world", "scene"])
+def test_an_interrupted_change_has_changed_nothing(
+    planner: Planner, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    """Wherever it comes: planner and scene agree, and shapes of one query are gone."""
+    own, preparation = planner._certifier, planner._preparation
+    asked = {
+        "clearances": (preparation._clearances, "model"),
+        "checks": (own.collisions, "_follow"),
+        "filter": (own._world, "_filter"),
+        "world": (own._world, "change"),
+        "scene": (planner.scene, "_follow"),
+    }[where]
+    method, pressed = getattr(*asked), [True]
+
+    def interrupted(*args: object) -> object:
+        done = method(*args)
+        if pressed:
+            pressed.clear()
+            raise KeyboardInterrupt
+        return done
+
+    planner.scene.add(CRATE)
+    before = planner.scene.now
+    monkeypatch.setattr(*asked, interrupted)
+    start, goal = pairs_of("free", 1, seed=3)[0]
+    for change in (
+        lambda: planner.scene.add(BALL),
+        lambda: planner.scene.move("crate", Placement((0.4, -0.3, 0.3))),
+        lambda: planner.scene.allow("crate", "link5"),
+        lambda: planner.plan(start, goal, FREE, scene=[BALL]),
+    ):
+        pressed[:] = [True]
+        with pytest.raises(KeyboardInterrupt):
+            change()
+        assert planner.scene.now is before
+        in_step(planner)
+        assert own._world._bullet.getNumBodies() == 1 + len(own._world._shapes)
+    with pytest.raises(KeyboardInterrupt), planner.scene.including([BALL]):
+        pressed[:] = [True]  # while they are taken away
+    assert planner.scene.now is before
+    in_step(planner)
+    q = planner.robot.sample(1500, np.random.default_rng(9))
+    with planner.scene.world() as world:
+        np.testing.assert_array_equal(own._world.free(q), world.free(q))
+    planner.scene.add(BALL)
+    in_step(planner)
+
+
+def test_threads_that_share_a_planner_have_their_own_shapes(planner: Planner) -> None:
+    """And leave none to the other."""
+    before, (start, goal) = planner.scene.now, pairs_of("free", 1, seed=3)[0]
+    seen = dict[str, list[tuple[str, ...]]]()
+
+    def ask(ball: Sphere) -> None:
+        answers = [planner.plan(start, goal, FREE, scene=[ball]) for _ in range(30)]
+        seen[ball.name] = [tuple(own.name for own in one.scene.workcell) for one in answers]
+
+    def change() -> None:
+        for _ in range(30):
+            planner.scene.add(CRATE)
+            planner.scene.remove("crate")
+
+    balls = [Sphere(name, (0.3, 0.5, 1.0), 0.05) for name in ("one", "two")]
+    waits = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(3) as pool:
+            done = [*(pool.submit(ask, ball) for ball in balls), pool.submit(change)]
+            for one in done:
+                one.result(120.0)
+    finally:
+        sys.setswitchinterval(waits)
+    for own, other in (("one", "two"), ("two", "one")):
+        assert all(own in names and other not in names for names in seen[own])
+    assert planner.scene.now.names == before.names
+    in_step(planner)
 
 
 def test_what_pybullet_breaks_down_at_is_refused_by_its_name(planner: Planner) -> None:

@@ -27,6 +27,8 @@ SPARED = 0.98
 """Share of the accelerations that a motion is planned with: a stop has all of them, so that it can
 nearly always stay on the path.
 """
+_CORNER = 1e-5
+"""How near to a corner the rows beside it are [rad]."""
 _FRACTIONS = 7
 """Bisections of the line on which a motion stops."""
 
@@ -103,9 +105,9 @@ def state_at(motion: Motion, at_s: float) -> State:
     share = _passed(at_s, np.array(marks), speeds)
     place = (1.0 - share) * joints[row - 1] + share * joints[row]
     if np.linalg.norm(joints[row] - place) <= AT_A_ROW:
-        place, row = joints[row], row + 1
+        place, row = joints[row].copy(), row + 1  # no view: who alters it leaves the path alone
     elif np.linalg.norm(joints[row - 1] - place) <= AT_A_ROW:
-        place = joints[row - 1]
+        place = joints[row - 1].copy()
     if np.linalg.norm(velocity) <= AT_REST or row == len(joints):  # at its end it rests
         velocity = np.zeros_like(start)
     return State(place, velocity, row)
@@ -153,6 +155,31 @@ def shortest_stop(
     ended = _ending(rows, last, high)
     times = pace.hardest(ended, velocity)
     return None if times is None else Motion(ended, times, velocity)
+
+
+def going_on(
+    stop: Float[np.ndarray, "n D"], onward: Float[np.ndarray, "m D"]
+) -> Float[np.ndarray, "T D"]:
+    """The rows of a stop, then those of a path from its end, with more of them close to the corner
+    between the two, and halfway to the next one.
+
+    The way may turn back there.  The limits hold in differences, which let an arm pass a corner
+    the faster the longer its lines are; next to it they are so short that it all but rests in
+    between.  From rest a whole line takes so long that a spline to its end bends it.
+    """
+    corner = stop[-1]
+    before, after = _beside(corner, stop[-2]), _beside(corner, onward[1])
+    return np.vstack([stop[:-1], before[:1], corner, after, onward[1:]])
+
+
+def _beside(corner: np.ndarray, row: np.ndarray) -> Float[np.ndarray, "k D"]:
+    """Rows on the line from a corner to another row: close to it, and halfway; none on a short
+    line.
+    """
+    line = row - corner
+    length = float(np.linalg.norm(line))
+    shares = np.array([_CORNER / length, 0.5] if length > 4.0 * _CORNER else [])
+    return corner + shares[:, None] * line
 
 
 def _ending(rows: np.ndarray, last: int, share: float) -> np.ndarray:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,8 @@ LinkPoses = Callable[[Float[np.ndarray, "D"], str], Float[np.ndarray, "4 4"]]
 class PlanningScene:
     """Shapes around the robot, shapes that it carries, and what may touch.  Every change is in
     force for the next query; what raises SceneError, or RobotError for a shape that can't be
-    bounded, has changed nothing.
+    bounded, has changed nothing, and so has what is interrupted.  While one thread changes it, or
+    its planner answers, others wait.
 
     follow: takes the changed scene, all or nothing.  links: names of all links of the robot.
     link_pose: of one of them in the base frame at a configuration [rad].
@@ -35,6 +37,7 @@ class PlanningScene:
         links: Collection[str],
         link_pose: LinkPoses,
     ) -> None:
+        self.lock = RLock()  # the planner's, too
         self._now, self._follow = scene, follow
         self.links, self._link_pose = links, link_pose
 
@@ -73,17 +76,20 @@ class PlanningScene:
         """Put shapes around the robot, in the base frame, beside what is there.  Several at once
         cost little more than one.
         """
-        self.become(self._now.adding(*shapes))
+        with self.lock:
+            self.become(self._now.adding(*shapes))
 
     def remove(self, *names: str) -> None:
         """Take shapes away."""
-        self.become(self._now.removing(*names))
+        with self.lock:
+            self.become(self._now.removing(*names))
 
     def move(self, name: str, pose: Any) -> None:
         """Put a shape's own frame, that about its middle or of its file, elsewhere: in the base
         frame, or for what is attached in its link's.  pose: a Pose, or a Placement.
         """
-        self.become(self._now.moving(name, Placement.of(pose)))
+        with self.lock:
+            self.become(self._now.moving(name, Placement.of(pose)))
 
     def attach(self, shape: Shape, link: str, touching: Sequence[str] = ()) -> None:
         """Let a link carry a shape, placed in the link's frame; a shape around the robot of that
@@ -94,34 +100,46 @@ class PlanningScene:
         if isinstance(touching, str) or not isinstance(touching, Sequence):
             raise SceneError(f"touching = {shown(touching)}: must be a list of names")
         require_texts(link, *touching)
-        self.become(self._now.attaching(Attached(shape, link, tuple(touching))))
+        with self.lock:
+            self.become(self._now.attaching(Attached(shape, link, tuple(touching))))
 
     def detach(self, name: str, at: Float[np.ndarray, "D"] | None = None) -> None:
         """Carry a shape no longer.  at: the configuration [rad] at which it is let go: it stays
         around the robot where it is then; without one it is gone.
         """
-        held = next((one for one in self._now.attached if one.name == name), None)
-        stays = None
-        if at is not None and held is not None:
-            pose = self.link_pose(at, held.link) @ held.shape.at.matrix
-            stays = Placement.of_matrix(pose)
-        self.become(self._now.detaching(name, stays))
+        with self.lock:
+            held = next((one for one in self._now.attached if one.name == name), None)
+            stays = None
+            if at is not None and held is not None:
+                pose = self.link_pose(at, held.link) @ held.shape.at.matrix
+                stays = Placement.of_matrix(pose)
+            self.become(self._now.detaching(name, stays))
 
     def allow(self, first: str, second: str) -> None:
         """Let two bodies touch: shapes, attached or not, or links, by their names."""
-        self.become(self._now.allowing(first, second))
+        with self.lock:
+            self.become(self._now.allowing(first, second))
 
     @contextmanager
     def including(self, shapes: Sequence[Shape]) -> Iterator[None]:
-        """With more shapes for a while."""
-        before = self._now
-        if shapes:
-            self.become(before.adding(*shapes))
+        """With more shapes for a while, and no other thread's."""
+        with self.lock:
+            before = self._now
+            try:
+                if shapes:
+                    self.become(before.adding(*shapes))
+                yield
+            finally:
+                if shapes and self._now is not before:
+                    self._end_with(before)
+
+    def _end_with(self, scene: Scene) -> None:
+        """Become it, an interrupt or not."""
         try:
-            yield
-        finally:
-            if shapes:
-                self.become(before)
+            self.become(scene)
+        except KeyboardInterrupt:
+            self.become(scene)
+            raise
 
     def become(self, scene: Scene) -> None:
         """Take all of another scene of the same robot."""
@@ -131,8 +149,18 @@ class PlanningScene:
             raise SceneError(f"a scene of another robot: this one is {self.robot.name}")
         if scene.robot is not self.robot:  # it came by pickle
             scene = replace(scene, robot=self.robot)
-        self._follow(scene)
-        self._now = scene
+        with self.lock:
+            before = self._now
+            try:
+                self._follow(scene)
+                self._now = scene
+            except Exception:
+                raise  # nobody has followed
+            except BaseException:
+                # an interrupt: some may have followed, and others not
+                self._now = before
+                self._follow(before)
+                raise
 
 
 def _are_same(first: SerialRobot, second: SerialRobot) -> bool:

@@ -185,16 +185,25 @@ class World:
         news = {n: one for n, one in wanted.items() if n not in self._shapes or n in gone}
         made = self._made(news)  # all that can fail, before anything goes
         now = frozenset(map(frozenset, pairs)) | self._never
-        # before a body goes, since PyBullet gives its number to another
-        over = {p for p in self._allowed if p not in now or p & gone}
-        self._filter(over, 1)
-        self._allowed -= over
-        for name in gone:
-            self._bullet.removeBody(self._shapes.pop(name).body)
-        self._shapes |= made
-        self._filter(now - self._allowed, 0)
+        # what is noted of pairs is ahead of what PyBullet knows: after an interrupt a change back
+        # does all of it again
+        try:
+            # before a body goes, since PyBullet gives its number to another
+            over = {p for p in self._allowed if p not in now or p & gone}
+            self._allowed -= over
+            self._filter(over, 1)
+            for name in gone:
+                self._bullet.removeBody(self._shapes.pop(name).body)
+            self._shapes |= made
+        except BaseException:
+            for name, own in made.items():
+                if self._shapes.get(name) is not own:
+                    self._bullet.removeBody(own.body)
+            raise
+        others = now - self._allowed
         # a pair of which one is away is filtered when it comes
         self._allowed = frozenset(p for p in now if all(self._parts(name) for name in p))
+        self._filter(others, 0)
 
     def _made(self, news: Mapping[str, Shape | Attached]) -> dict[str, _Placed]:
         """Bodies of new shapes; none of them where one can't be made."""

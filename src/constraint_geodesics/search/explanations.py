@@ -8,7 +8,7 @@ from jaxtyping import Float
 from constraint_geodesics.certification.collisions import CollisionCheck
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.constraints.projection import retract
-from constraint_geodesics.problem import LIMIT_SLACK, Status, end_refused
+from constraint_geodesics.problem import LIMIT_SLACK, SATISFIED, Status, end_refused
 from constraint_geodesics.search.candidates import Answer
 from constraint_geodesics.search.nearest import projection
 from constraint_geodesics.search.preparation import Query
@@ -46,12 +46,15 @@ def _limit(manifold: ConstraintManifold, end: str, q: Float[np.ndarray, "D"]) ->
         limits = f"its limits are {robot.lower[k]:.4g} and {robot.upper[k]:.4g} {unit}"
         if robot.joint_names[k] in robot.continuous:
             limits += ", whole turns beyond them are for its controller to add"
-        return f"{robot.joint_names[k]} of the {end} is {q[k]:.4g} {unit}: {limits}"
+        digits = 4 if beyond[k] > 1e-3 else 10
+        return f"{robot.joint_names[k]} of the {end} is {q[k]:.{digits}g} {unit}: {limits}"
     return ""
 
 
 def not_connected(query: Query, answer: Answer, collisions: CollisionCheck) -> str:
-    """That start and goal are not joined, and the nearest goal that the start can reach instead."""
+    """That start and goal are not joined, and the nearest goal that the graph joins with the start
+    instead: among the shapes that it was made among, it knows no later ones.
+    """
     line = f"start and goal lie in different components of {query.name}'s graph"
     roadmap = query.task.roadmap()
     if roadmap is None or answer.at_start is None:
@@ -62,21 +65,26 @@ def not_connected(query: Query, answer: Answer, collisions: CollisionCheck) -> s
     seeds = nodes[:: max(len(nodes) // ALTERNATIVES, 1)]
     for q in _same_pose(query, seeds):
         if collisions.is_free(q) and _component(query, roadmap, q) & reached:
-            return f"{line}; the goal's tool pose can be reached from the start as {_listed(q)} rad"
+            return f"{line}; it joins the start with the goal's tool pose at {_listed(q)} rad"
     nearest = next((q for q in nodes if collisions.is_free(q)), None)  # of the scene as it is now
     if nearest is None:
         return line
     away = float(np.linalg.norm(nearest - query.goal))
-    told = f"the nearest configuration that the start can reach, {away:.2f} rad away"
+    told = f"the nearest configuration that it joins with the start, {away:.2f} rad away"
     return f"{line}; {told}, is {_listed(nearest)}"
 
 
 def _same_pose(query: Query, seeds: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "m D"]:
-    """Other configurations with the goal's tool pose, the nearest first."""
-    robot = query.task.manifold.robot
+    """Other configurations with the goal's tool pose that keep the constraint, which may be of more
+    than the tool; the nearest first.
+    """
+    manifold = query.task.manifold
+    robot = manifold.robot
     pose = Constraint((1,) * 6, reference=Pose(*robot.forward(query.goal)))
     result = retract(ConstraintManifold(robot, pose), seeds)
-    found = result.joints[result.converged & (robot.limit_distance(result.joints) >= 0.0)]
+    kept = manifold.violation(result.joints) <= SATISFIED
+    kept &= result.converged & (robot.limit_distance(result.joints) >= 0.0)
+    found = result.joints[kept]
     return found[np.argsort(np.linalg.norm(found - query.goal, axis=1), kind="stable")]
 
 

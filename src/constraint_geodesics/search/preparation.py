@@ -111,15 +111,17 @@ class Preparation:
         except BaseException:
             self._clearances.restore(before)
             raise
-        self._clearance = self._clearances.model(self.checks.apart)
+        # made first and kept last, so that an interrupt leaves nothing half done
+        clearance = self._clearances.model(self.checks.apart)
         around = {shape.name: shape for shape in scene.workcell}
         left = tuple(own for own in self.scene.workcell if own == around.get(own.name))
         held = tuple(one for one in self.scene.attached if one in scene.attached)
         if (left, held) != (self.scene.workcell, self.scene.attached):
-            self.scene = replace(self.scene, workcell=left, attached=held)
-            later = set(scene.names) - set(self.scene.names)
-            self._first_clearance = self._clearances.model(self.checks.apart, later)
-            self._roadmaps = {}
+            first = replace(self.scene, workcell=left, attached=held)
+            later = set(scene.names) - set(first.names)
+            without = self._clearances.model(self.checks.apart, later)
+            self.scene, self._first_clearance, self._roadmaps = first, without, {}
+        self._clearance = clearance
 
     def _band(self) -> BandSettings:
         """With the clearance that this arm can keep."""

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from constraint_geodesics.constraints.kernels import ManifoldArrays, violation_batch
 from constraint_geodesics.geometry.braking import Pace
-from constraint_geodesics.problem import SATISFIED, Status
+from constraint_geodesics.problem import LIMIT_SLACK, SATISFIED, Status
 from constraint_geodesics.search.band import PROJECTION, project, step_lengths
 from constraint_geodesics.search.candidates import Candidate, rows_of
 from constraint_geodesics.search.curve_kernels import curve_points, spline_through
@@ -200,7 +200,7 @@ def refused_velocity(query: Query, pace: Pace) -> tuple[Status, str] | None:
     room = np.where(velocity > 0.0, robot.upper - q, q - robot.lower)
     short = velocity**2 / (2.0 * pace.acceleration) - room
     short[velocity == 0.0] = 0.0
-    if (short > SATISFIED).any():
+    if (short > LIMIT_SLACK).any():  # no more than the certificate allows
         j = int(np.argmax(short))
         line = f"{robot.joint_names[j]} of the start moves at {velocity[j]:.4g} /s"
         return "out_of_limits", f"{line} and can't stop within {room[j]:.4g}, where its limit is"
