@@ -22,6 +22,11 @@ PLANAR = """<robot name="planar">
 <joint name="three" type="prismatic"><origin xyz="0.5 0 0"/><parent link="b"/><child link="tool"/>
 <axis xyz="0 0 1"/><limit lower="-0.1" upper="0.4" velocity="1" effort="1"/></joint></robot>"""
 
+WRIST = """<link name="wrist"/><joint name="four" type="revolute"><parent link="wrist"/>
+<child link="tool"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="1" effort="1"/></joint>
+</robot>"""
+SCARA = PLANAR.replace('<child link="tool"/>', '<child link="wrist"/>').replace("</robot>", WRIST)
+
 
 def robots() -> dict[str, SerialRobot]:
     return {
@@ -69,6 +74,15 @@ def test_whole_turns_are_solutions_of_their_own(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         found[np.argsort(found[:, 0])], [[0.5 - 2.0 * np.pi, 1.0, 0.2], q], atol=1e-6
     )
+
+
+def test_half_a_turn_off_is_no_solution(tmp_path: Path) -> None:
+    # all axes are upright, so nothing turns the tool over, and the way there has no direction
+    (tmp_path / "arm.urdf").write_text(SCARA)
+    robot = load_robot(tmp_path / "arm.urdf", "tool")
+    position, rotation = robot.forward(np.array([0.5, 1.0, 0.2, 0.3]))
+    assert len(solutions(robot, position, rotation))
+    assert not len(solutions(robot, position, rotation @ np.diag([1.0, -1.0, -1.0])))
 
 
 def test_a_pose_out_of_reach_has_no_solution() -> None:

@@ -321,8 +321,14 @@ def _is_new(q, found, count, prismatic):
 def _is_there(chain, position, rotation, q, room):
     """Whether the tool of a configuration (1, D) has the pose, to _LEFT."""
     poses_of(chain, q, room.lanes)
-    _errors(room.lanes.frame, position, rotation, room.errors, room.sizes)
-    return room.sizes[0] <= _LEFT**2
+    frame = room.lanes.frame
+    trace = 0.0
+    for i in range(3):
+        for k in range(3):
+            trace += frame[i, 1 + k, 0] * rotation[i, k]
+    _errors(frame, position, rotation, room.errors, room.sizes)
+    # the errors are 0 where half a turn is left as well: 1 + 2 cos θ tells the two apart
+    return room.sizes[0] <= _LEFT**2 and trace > 1.0
 
 
 @njit(**COMPILE)
