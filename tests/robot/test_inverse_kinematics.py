@@ -126,6 +126,17 @@ def test_a_planar_arm_reaches_a_pose_or_not_by_a_thousandth_of_a_millimetre(tmp_
         assert not len(solutions(robot, position * (1.0 + off), rotation))
 
 
+def test_what_rounding_puts_beyond_a_limit_is_found(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(SCARA)
+    robot = load_robot(tmp_path / "arm.urdf", "tool")
+    for q in robot.sample(20, np.random.default_rng(4)):
+        for at in (robot.lower, robot.upper):
+            q[2:] = at[2:]  # the lift and the wrist
+            found = solutions(robot, *robot.forward(q))
+            assert among(q, found)
+            assert robot.limit_distance(found).min() >= 0.0
+
+
 def test_of_many_whole_turns_the_nearest_are_given() -> None:
     robot = robots()["xarm6"]
     wide = replace(robot, lower=np.full(6, -1e16), upper=np.full(6, 1e16))
