@@ -341,6 +341,24 @@ def test_a_pose_with_tolerances_is_a_region(planner: Planner, tmp_path: Path) ->
     np.testing.assert_allclose(goal.tolerance, (0.01, 0.02, 0.03, 0.1, 0.1, 0.0))
     np.testing.assert_allclose(goal.pose.position, (0.4, 0.1, 0.3))
     np.testing.assert_allclose(goal.pose.rotation, down.as_matrix(), atol=1e-12)
+    for written_as, free in ((3.14, ["yaw"]), (3.0, [])):
+        raw["goal_constraints"] = [of_pose(planner, (0.1, 0.2, written_as), down)]
+        (goal,) = read_moveit_request(written(tmp_path, raw), planner).goals
+        assert list(goal.free) == free
+
+
+def test_an_axis_is_along_the_bases_to_the_digits_that_files_have(
+    planner: Planner, tmp_path: Path
+) -> None:
+    raw, _, _ = a_request(planner)
+    for roll, is_along in ((3.14159, True), (3.1416, True), (math.pi - 1e-4, False)):
+        turn = Rotation.from_euler("x", roll)
+        raw["goal_constraints"] = [of_pose(planner, (0.1, 0.2, 3.14), turn)]
+        if is_along:
+            assert read_moveit_request(written(tmp_path, raw), planner).goals
+        else:
+            with pytest.raises(MoveitError, match="the z axis is free"):
+                read_moveit_request(written(tmp_path, raw), planner)
 
 
 def test_tolerances_about_other_axes_than_the_bases_become_the_least(
@@ -413,6 +431,7 @@ FREE = 4.0
 PATTERNS = [
     *[(None, own) for own in ((0.1, 0.1, 0.1), (1.0, 1.0, 0.2), (0.6, 0.1, 0.9))],
     *[(None, own) for own in ((0.3, 0.2, FREE), (FREE, 0.3, 0.2))],
+    *[(None, own) for own in ((2.0, 2.5, 2.0), (1.8, 2.0, FREE))],
     *[(1, own) for own in ((0.3, 0.2, 0.1), (FREE, FREE, 0.3), (FREE, 0.3, FREE))],
 ]
 TURNS = [(0, 0, 0), (math.pi, 0, 0), (0, 0, math.pi / 2), (math.pi / 2, 0, math.pi / 2)]

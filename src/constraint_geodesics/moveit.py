@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.constraints.constraint import Constraint, Pose
@@ -42,14 +42,18 @@ _ADD = (None, 0, "add", "ADD", "\0", b"\0")
 _WORLD = ("", "world")
 """Names of the base frame beside those of its links."""
 _SAME = 1e-9
-_ALONG = 1e-6
-"""What directions of axes may differ by."""
+_ELSEWHERE = 1e-6
+"""What entries of poses may differ by."""
+_ALONG = 1e-5
+"""What entries of axes' directions may differ by: a turn that is written as 1.5708 is a quarter."""
 _TILTS = ([True, False, False], [False, False, True])
 """What may be free of Euler angles: x, or z, alone."""
 _ROTATION_VECTOR = 1
 """Of moveit_msgs/OrientationConstraint's ways to bound a rotation."""
-_FREE_RAD = math.pi - 1e-6
-"""A tolerance from which on an angle is free."""
+_FREE_RAD = 3.1
+"""A tolerance from which on an angle is free, as files mean it that write 3.14."""
+_WIDEST_RAD = 0.5 * math.pi
+"""Turns up to which none of their Euler angles is larger than the whole."""
 
 
 class MoveitError(ValueError):
@@ -301,7 +305,7 @@ def _require_at_base(raw: Any, scene: PlanningScene) -> None:
             given = {"position": given["translation"], "orientation": given["rotation"]}
         if parent in _WORLD or parent in scene.links:
             expected = np.linalg.inv(_fixed(scene, parent)) @ _fixed(scene, child)
-        if np.abs(_pose(given) - expected).max() > _ALONG:
+        if np.abs(_pose(given) - expected).max() > _ELSEWHERE:
             raise MoveitError(
                 f"fixed_frame_transforms: {child!r} in {parent!r} is elsewhere: the world is taken "
                 "to be the robot's base: write poses in a link's frame"
@@ -494,10 +498,17 @@ def _along_base(half: Float[np.ndarray, "3"], turn: Float[np.ndarray, "3 3"]) ->
     """Half edges along the base's axes of a box within a turned one: those of the same box where it
     is turned by right angles, else of the largest cube in its ball.
     """
-    if np.abs(np.abs(turn).max(axis=0) - 1.0).max() < _ALONG:
+    if _along(turn).all():
         own: list[float] = (np.abs(turn.round()) @ half).tolist()
         return own
     return [float(half.min()) / math.sqrt(3.0)] * 3
+
+
+def _along(turn: Float[np.ndarray, "3 3"]) -> Bool[np.ndarray, "3"]:
+    """Which axes of a rotation are along one of the base's."""
+    entries = np.abs(turn)
+    found: Bool[np.ndarray, "3"] = np.abs(entries - entries.round()).max(axis=0) < _ALONG
+    return found
 
 
 def _frame_of(raw: Any, scene: PlanningScene) -> Float[np.ndarray, "4 4"]:
@@ -512,8 +523,9 @@ def _orientation(
     free.
 
     MoveIt's tolerances are about the axes of the rotation itself, and bound Euler angles x, y, z in
-    turn unless `parameterization` is 1.  The least of them as a cone lies within if none, or x or z
-    alone, is free; rotation vectors lie within if none or two are.  Others are refused.
+    turn unless `parameterization` is 1.  The least of them as a cone, of a quarter turn at most,
+    lies within if none, or x or z alone, is free; rotation vectors lie within if none or two are.
+    Others are refused.
     """
     turn = _frame_of(raw, scene)[:3, :3] @ _turn(raw["orientation"])
     given = [float(raw[f"absolute_{axis}_axis_tolerance"]) for axis in "xyz"]
@@ -528,9 +540,9 @@ def _orientation(
         names = ", ".join(axis for axis, is_free in zip("xyz", free, strict=True) if is_free)
         raise MoveitError(f"{where}: free about {names}: no constraint here lies within that")
     least = min(value for value, is_free in zip(given, free, strict=True) if not is_free)
-    along = np.abs(turn)
-    bases = [int(along[:, axis].argmax()) for axis in range(3)]
-    aligned = [abs(along[bases[axis], axis] - 1.0) < _ALONG for axis in range(3)]
+    if not vectors:
+        least = min(least, _WIDEST_RAD)
+    bases, aligned = np.abs(turn).argmax(axis=0).tolist(), _along(turn)
     found = [least] * 3
     for axis in range(3):
         if free[axis] and not aligned[axis]:
@@ -540,7 +552,7 @@ def _orientation(
             )
         if free[axis]:
             found[bases[axis]] = math.inf
-        elif vectors and all(aligned):
+        elif vectors and aligned.all():
             found[bases[axis]] = given[axis]
     return turn, found
 
