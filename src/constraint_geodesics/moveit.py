@@ -7,6 +7,7 @@ something in them, other path constraints than an orientation's, links other tha
 
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -95,23 +96,26 @@ def add_moveit_scene(file: Path, scene: PlanningScene) -> dict[str, float]:
         now, q = scene.now, _configuration(joints, scene.robot)
         for number, own in enumerate(_list(world, "collision_objects")):
             where = f"world.collision_objects[{number}]"
-            shapes = _shapes(own, where, lambda frame: _fixed(scene, frame))
-            named[str(own["id"])] = [shape.name for shape in shapes]
-            now = now.adding(*shapes)
+            with _naming(where):
+                shapes = _shapes(own, where, lambda frame: _fixed(scene, frame))
+                named[str(own["id"])] = [shape.name for shape in shapes]
+                now = now.adding(*shapes)
         for number, own in enumerate(_list(state, "attached_collision_objects")):
             where = f"robot_state.attached_collision_objects[{number}]"
-            name, parts = str(own["object"]["id"]), _held(own, where, scene, q)
-            around = named.pop(name, [])
-            _require_free([held.name for held in parts], {name, *around}, now.names, where)
-            now = now.removing(*(part for part in around if part != name))
-            named[name] = [held.name for held in parts]
-            for held in parts:
-                now = now.attaching(held)
+            with _naming(where):
+                name, parts = str(own["object"]["id"]), _held(own, where, scene, q)
+                around = named.pop(name, [])
+                _require_free([held.name for held in parts], {name, *around}, now.names, where)
+                now = now.removing(*(part for part in around if part != name))
+                named[name] = [held.name for held in parts]
+                for held in parts:
+                    now = now.attaching(held)
         known = {*scene.links, *scene.now.names, *named}
-        for first, second in _allowed(_entry(raw, "allowed_collision_matrix", {}), known):
-            for a in named.get(first, [first]):
-                for b in named.get(second, [second]):
-                    now = now.allowing(a, b)
+        with _naming("allowed_collision_matrix"):
+            for first, second in _allowed(_entry(raw, "allowed_collision_matrix", {}), known):
+                for a in named.get(first, [first]):
+                    for b in named.get(second, [second]):
+                        now = now.allowing(a, b)
         scene.become(now)
     except (MoveitError, RobotError, SceneError, ShapeError) as error:
         raise MoveitError(f"{file}: {error}") from None
@@ -137,13 +141,15 @@ def read_moveit_request(
         if float(raw.get("max_cartesian_speed") or 0.0) > 0.0:
             raise MoveitError("max_cartesian_speed: speeds are limited joint by joint alone")
         start = _named_joints({**(state or {}), **given}, robot, "start_state")
-        goals = [
-            _goal(own, planner.scene, f"goal_constraints[{number}]")
-            for number, own in enumerate(_list(raw, "goal_constraints"))
-        ]
+        goals = []
+        for number, own in enumerate(_list(raw, "goal_constraints")):
+            where = f"goal_constraints[{number}]"
+            with _naming(where):
+                goals.append(_goal(own, planner.scene, where))
         if not goals:
             raise MoveitError("goal_constraints: there is none")
-        constraint = _path_constraint(_entry(raw, "path_constraints", {}), planner.scene)
+        with _naming("path_constraints"):
+            constraint = _path_constraint(_entry(raw, "path_constraints", {}), planner.scene)
         scales = [_scale(raw, what) for what in ("velocity", "acceleration")]
     except MoveitError as error:
         raise MoveitError(f"{file}: {error}") from None
@@ -178,10 +184,8 @@ def shape_of_record(raw: Mapping[str, Any], where: str) -> Shape:
     """A primitive with a pose of its own in the base frame: a name, type and dimensions as in
     MoveIt, position [m] and orientation_xyzw.  where: the entry, for errors.  Raises MoveitError.
     """
-    try:
+    with _naming(where):
         pose = _pose({"position": raw["position"], "orientation": raw["orientation_xyzw"]})
-    except MoveitError as error:
-        raise MoveitError(f"{where}: {error}") from None
     return _primitive(raw, str(raw["name"]), Placement.of_matrix(pose), where)
 
 
@@ -193,6 +197,17 @@ def _read(file: Path) -> dict[str, Any]:
     if not isinstance(raw, dict):
         raise MoveitError(f"{file}: nothing of MoveIt: must be entries by name")
     return raw
+
+
+@contextmanager
+def _naming(where: str) -> Iterator[None]:
+    """The entry in faults that do not begin with it."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        known = isinstance(error, MoveitError) and str(error).startswith(where)
+        said = str(error) if known else f"{where}: {_said(error)}"
+        raise MoveitError(said) from None
 
 
 def _said(error: Exception) -> str:
@@ -295,17 +310,19 @@ def _fixed(scene: PlanningScene, frame: str) -> Float[np.ndarray, "4 4"]:
 
 def _require_at_base(raw: Any, scene: PlanningScene) -> None:
     """That a scene's transforms say of the world what is taken for granted: it is the base."""
-    for own in _list(raw, "fixed_frame_transforms"):
+    for number, own in enumerate(_list(raw, "fixed_frame_transforms")):
         parent = str(_entry(_entry(own, "header", {}), "frame_id", ""))
         child = str(_entry(own, "child_frame_id", ""))
         if not (child in _WORLD or (parent in _WORLD and child in scene.links)):
             continue
         given, expected = _entry(own, "transform", {}), np.eye(4)
-        if given:
-            given = {"position": given["translation"], "orientation": given["rotation"]}
-        if parent in _WORLD or parent in scene.links:
-            expected = np.linalg.inv(_fixed(scene, parent)) @ _fixed(scene, child)
-        if np.abs(_pose(given) - expected).max() > _ELSEWHERE:
+        with _naming(f"fixed_frame_transforms[{number}]"):
+            if given:
+                given = {"position": given["translation"], "orientation": given["rotation"]}
+            if parent in _WORLD or parent in scene.links:
+                expected = np.linalg.inv(_fixed(scene, parent)) @ _fixed(scene, child)
+            pose = _pose(given)
+        if np.abs(pose - expected).max() > _ELSEWHERE:
             raise MoveitError(
                 f"fixed_frame_transforms: {child!r} in {parent!r} is elsewhere: the world is taken "
                 "to be the robot's base: write poses in a link's frame"
