@@ -7,6 +7,7 @@ import pytest
 
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.scene import SceneError
 from constraint_geodesics.scene.scene_file import read_attached, read_scene
@@ -102,3 +103,31 @@ def test_all_of_a_file_is_added_or_nothing(planner: Planner, tmp_path: Path) -> 
     with pytest.raises(ValueError, match=r"none\.obj"):
         read_scene(tmp_path / "scene.yaml").into(planner.scene)
     assert planner.scene.now is before
+
+
+def test_what_is_attached_takes_no_other_shapes_place(planner: Planner, tmp_path: Path) -> None:
+    (tmp_path / "cell.yaml").write_text(SCENE.replace("bottle", "cup").replace("part: ", "#"))
+    before = planner.scene.now
+    with pytest.raises(SceneError, match="attached.cup: another shape of that name stands"):
+        read_scene(tmp_path / "cell.yaml").into(planner.scene)
+    assert planner.scene.now is before
+    planner.scene.add(Box("cup", (0.4, 0.4, 0.2), (0.06, 0.06, 0.2)))
+    (tmp_path / "cup.yaml").write_text(CUP)
+    with pytest.raises(SceneError, match="another shape"):
+        read_attached(tmp_path / "cup.yaml").into(planner.scene)
+    assert [shape.name for shape in planner.scene.workcell] == ["table", "cup"]
+    planner.scene.remove("cup")
+    planner.scene.add(Box("cup", (0.4, 0.4, 0.2), (0.06, 0.06, 0.1)))  # that is picked up
+    read_attached(tmp_path / "cup.yaml").into(planner.scene)
+    assert [shape.name for shape in planner.scene.workcell] == ["table"]
+    assert [one.name for one in planner.scene.attached] == ["cup"]
+
+
+def test_a_capsule_that_stands_askew_is_picked_up(planner: Planner, tmp_path: Path) -> None:
+    planner.scene.add(Capsule("pen", (0.41, 0.33, 0.2), (0.47, 0.42, 0.22), 0.01))
+    own = "pen: {link: link6, kind: capsule, from_m: [0, 0, 0.1], to_m: [0, 0, %s], radius_m: 0.01}"
+    (tmp_path / "pen.yaml").write_text(own % 0.22)
+    with pytest.raises(SceneError, match="another shape"):
+        read_attached(tmp_path / "pen.yaml").into(planner.scene)
+    (tmp_path / "pen.yaml").write_text(own % 0.21)
+    read_attached(tmp_path / "pen.yaml").into(planner.scene)
