@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from constraint_geodesics.planner import Planner
+from constraint_geodesics.scene.body import Body
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.mesh import Mesh
@@ -131,3 +132,17 @@ def test_a_capsule_that_stands_askew_is_picked_up(planner: Planner, tmp_path: Pa
         read_attached(tmp_path / "pen.yaml").into(planner.scene)
     (tmp_path / "pen.yaml").write_text(own % 0.21)
     read_attached(tmp_path / "pen.yaml").into(planner.scene)
+
+
+def test_a_urdf_is_looked_for_beside_the_file_first(tmp_path: Path) -> None:
+    """Not where the shell is, nor among PyBullet's, which have one of that name."""
+    (tmp_path / "table").mkdir()
+    (tmp_path / "table" / "table.urdf").write_text("<robot name='own'><link name='top'/></robot>")
+    (tmp_path / "cell.yaml").write_text(
+        "shapes: {desk: {kind: urdf, urdf: table/table.urdf}, cube: {kind: urdf, urdf: cube.urdf}}"
+    )
+    desk, cube = read_scene(tmp_path / "cell.yaml").shapes.values()
+    assert isinstance(desk, Body)
+    assert isinstance(cube, Body)
+    assert desk.urdf == tmp_path / "table" / "table.urdf"
+    assert cube.urdf == "cube.urdf"

@@ -21,6 +21,7 @@ from constraint_geodesics.fields import Name
 from constraint_geodesics.formats import NUMBER, SCENE, FormatError
 from constraint_geodesics.params import one_line, read_yaml
 from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.body import Body
 from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.planning_scene import PlanningScene
@@ -82,8 +83,8 @@ class SceneFile(_Record):
 
 
 def read_scene(file: Path) -> SceneFile:
-    """A scene's file; files of meshes are looked for beside it first.  Raises SceneError, one line,
-    for one that can't be read, naming the entry.
+    """A scene's file; meshes and URDFs that it names are looked for beside it first.  Raises
+    SceneError, one line, for one that can't be read, naming the entry.
     """
     return _read(file, SceneFile.model_validate)
 
@@ -110,11 +111,13 @@ def _read(file: Path, checked: Callable[[Any], SceneFile]) -> SceneFile:
 
 
 def _beside(file: Path, found: SceneFile) -> SceneFile:
-    """With meshes that lie beside the file."""
+    """With meshes and URDFs that lie beside the file."""
 
     def placed(shape: Shape) -> Shape:
         if isinstance(shape, Mesh) and (file.parent / shape.file).is_file():
             return replace(shape, file=file.parent / shape.file)
+        if isinstance(shape, Body) and (file.parent / shape.urdf).is_file():
+            return replace(shape, urdf=file.parent / shape.urdf)
         return shape
 
     shapes = {name: placed(shape) for name, shape in found.shapes.items()}
