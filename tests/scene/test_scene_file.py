@@ -84,6 +84,14 @@ def test_a_further_document_may_be_empty(tmp_path: Path, end: str) -> None:
         ("shapes: {b: {kind: sphere, centre_m: [0, 0, .nan], radius_m: 1}}", "centre_m"),
         ("shapes: {b: {kind: point_cloud, points_m: [[1, 2]], radius_m: 1}}", "points"),
         ("attached: {b: {kind: sphere, centre_m: [0, 0, 0], radius_m: 1}}", "link is missing"),
+        (
+            "shapes: {b: {kind: box, centre_m: [0, 0, 0], size_m: [1, 1, 1], rpy_rad: [0, 0, 45]}}",
+            "rpy_rad.2: 45: must be within ±4π: angles are in rad, not degrees",
+        ),
+        (
+            "shapes: {b: {kind: cylinder, length_m: 1, radius_m: 1, pose: {rpy_rad: [-90, 0, 0]}}}",
+            "pose.rpy_rad.0: -90: must be within ±4π",
+        ),
         ("allowed: [[a, b, c]]", "allowed"),
         ("allowed: []\n---\nallowed: []\n", "has 2 documents of YAML: must have one"),
         ("allowed: []\n---\nshapes: [", "not YAML"),
