@@ -237,6 +237,15 @@ BOX = """<?xml version="1.0"?>
 """
 
 
+def test_a_mesh_may_be_a_link_into_a_cache(tmp_path) -> None:
+    """Whose files are named by what is in them."""
+    (tmp_path / "blobs").mkdir()
+    (tmp_path / "blobs" / "5d41402a").write_text(BOX)
+    (tmp_path / "tip.dae").symlink_to(tmp_path / "blobs" / "5d41402a")
+    params = with_hand(tmp_path, 'filename="tip.dae"')
+    assert hand_of(robot_from(params)).shape == (4, 3)
+
+
 @pytest.mark.parametrize("up", ["Z_UP", "Y_UP", "X_UP", None])
 def test_a_collada_mesh_is_the_one_that_pybullet_reads(tmp_path, up: str | None) -> None:
     upright = "<up_axis>Z_UP</up_axis>"

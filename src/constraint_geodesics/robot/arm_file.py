@@ -59,7 +59,8 @@ def _tree_of(
     for mesh in tree.iter("mesh"):
         found = find_mesh(mesh.get("filename", ""), own.file)
         if found is not None:
-            mesh.set("filename", str(found.resolve()))
+            # a link's own name tells the kind of a mesh that lies in a cache under another one
+            mesh.set("filename", str(found.parent.resolve() / found.name))
     for link in tree.findall("link"):
         for visual in link.findall("visual"):
             if not _is_drawn(visual, own.file):  # PyBullet would refuse the whole robot
