@@ -85,6 +85,10 @@ def test_a_start_that_is_off_is_moved_on_request(geodesics) -> None:
         ((*PANDA, Q, "--goal-pose", "0.4 0.2 0.4"), "--goal-pose.*six finite numbers"),
         ((*PANDA, Q, "--goal-pose", POSE, "--goal-free", "yow"), "free = 'yow'"),
         ((*PANDA, Q, "--goal-pose", POSE, "--goal-tolerance", "0.1 0.1"), "tolerance has 2"),
+        (
+            (*PANDA, Q, "--goal-pose", POSE, "--goal-tolerance", "0 0 0 10 10 0"),
+            r"tolerance\[roll\] = 10: must be at most π",
+        ),
         ((*PANDA, Q, "--goal-pose", POSE, "--constraint", "level_cup"), "must be one of free"),
         ((*PANDA, Q, "--goal-pose", POSE, "--velocity-scale", "2"), "velocity_scale = 2"),
         ((*PANDA[:2], Q, "--goal-pose", POSE), "which link.*geodesics robot"),

@@ -224,8 +224,31 @@ def set_in(raw: Any, path: str, value: Any) -> Any:
         ("world.collision_objects.0.header.frame_id", "link6", "moves with the arm"),
         ("world.collision_objects.0.header.frame_id", "map", "no link of the robot"),
         ("world.collision_objects.0.primitive_poses.0.orientation", [0, 0, 0, 0], "no orientation"),
-        ("world.collision_objects.0.primitive_poses.0.position", [0, 0], "3 finite numbers"),
-        ("world.collision_objects.0.id", "table", "already"),
+        (
+            "world.collision_objects.1.primitive_poses.0.position",
+            [0, 0],
+            "own.yaml: world.collision_objects[1]: [0, 0]: must be 3 finite numbers",
+        ),
+        (
+            "world.collision_objects.2.primitives.0",
+            {"type": 1},
+            "own.yaml: world.collision_objects[2]: 'dimensions' is missing",
+        ),
+        (
+            "world.collision_objects.0.id",
+            "table",
+            "own.yaml: world.collision_objects[0]: there is a shape called 'table' already",
+        ),
+        (
+            "robot_state.attached_collision_objects.0.object",
+            {"id": "cup"},
+            "own.yaml: robot_state.attached_collision_objects[0]: 'cup' has neither",
+        ),
+        (
+            "fixed_frame_transforms",
+            [{"child_frame_id": "world", "transform": {"translation": [0, 0, 0]}}],
+            "own.yaml: fixed_frame_transforms[0]: 'rotation' is missing",
+        ),
         ("world.collision_objects.3.meshes.0.triangles", [], "no faces"),
         ("world.collision_objects", {"crate": 1}, "must be a list"),
         ("world.octomap.octomap.data", [1, 2], "octomap"),
@@ -341,6 +364,24 @@ def test_a_pose_with_tolerances_is_a_region(planner: Planner, tmp_path: Path) ->
     np.testing.assert_allclose(goal.tolerance, (0.01, 0.02, 0.03, 0.1, 0.1, 0.0))
     np.testing.assert_allclose(goal.pose.position, (0.4, 0.1, 0.3))
     np.testing.assert_allclose(goal.pose.rotation, down.as_matrix(), atol=1e-12)
+    for written_as, free in ((3.14, ["yaw"]), (3.0, [])):
+        raw["goal_constraints"] = [of_pose(planner, (0.1, 0.2, written_as), down)]
+        (goal,) = read_moveit_request(written(tmp_path, raw), planner).goals
+        assert list(goal.free) == free
+
+
+def test_an_axis_is_along_the_bases_to_the_digits_that_files_have(
+    planner: Planner, tmp_path: Path
+) -> None:
+    raw, _, _ = a_request(planner)
+    for roll, is_along in ((3.14159, True), (3.1416, True), (math.pi - 1e-4, False)):
+        turn = Rotation.from_euler("x", roll)
+        raw["goal_constraints"] = [of_pose(planner, (0.1, 0.2, 3.14), turn)]
+        if is_along:
+            assert read_moveit_request(written(tmp_path, raw), planner).goals
+        else:
+            with pytest.raises(MoveitError, match="the z axis is free"):
+                read_moveit_request(written(tmp_path, raw), planner)
 
 
 def test_tolerances_about_other_axes_than_the_bases_become_the_least(
@@ -380,7 +421,16 @@ def test_a_held_orientation_is_a_constraint(planner: Planner, tmp_path: Path) ->
             "elbow",
             "elbow is no joint that is planned",
         ),
-        ("goal_constraints.0.joint_constraints.0.position", "far", "could not convert"),
+        (
+            "goal_constraints.0.joint_constraints.0.position",
+            "far",
+            "own.yaml: goal_constraints[0]: could not convert",
+        ),
+        (
+            "path_constraints",
+            {"orientation_constraints": [{"orientation": [0, 0, 0, 1]}]},
+            "own.yaml: path_constraints: 'absolute_x_axis_tolerance' is missing",
+        ),
         ("start_state.joint_state.name", ["joint1"], "1 names, 6 positions"),
         ("max_velocity_scaling_factor", "fast", "could not convert"),
         ("max_cartesian_speed", 0.2, "max_cartesian_speed"),
@@ -413,6 +463,7 @@ FREE = 4.0
 PATTERNS = [
     *[(None, own) for own in ((0.1, 0.1, 0.1), (1.0, 1.0, 0.2), (0.6, 0.1, 0.9))],
     *[(None, own) for own in ((0.3, 0.2, FREE), (FREE, 0.3, 0.2))],
+    *[(None, own) for own in ((2.0, 2.5, 2.0), (1.8, 2.0, FREE))],
     *[(1, own) for own in ((0.3, 0.2, 0.1), (FREE, FREE, 0.3), (FREE, 0.3, FREE))],
 ]
 TURNS = [(0, 0, 0), (math.pi, 0, 0), (0, 0, math.pi / 2), (math.pi / 2, 0, math.pi / 2)]

@@ -1,5 +1,6 @@
 """Numbers and names as params.yaml may hold them, checked by Pydantic."""
 
+import math
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
@@ -35,6 +36,19 @@ def _different(seeds: tuple[int, ...]) -> tuple[int, ...]:
 Seeds = Annotated[tuple[Seed, ...], Field(min_length=1), AfterValidator(_different)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 Vector3 = tuple[Finite, Finite, Finite]
+_TURNS_RAD = 4.0 * math.pi
+"""No pose is given with angles that are larger, but in degrees."""
+
+
+def _no_degrees(angle: float) -> float:
+    if abs(angle) > _TURNS_RAD:
+        raise ValueError(f"{angle:g}: must be within ±4π: angles are in rad, not degrees")
+    return angle
+
+
+Angle = Annotated[Finite, AfterValidator(_no_degrees)]
+Angles3 = tuple[Angle, Angle, Angle]
+"""Roll, pitch and yaw."""
 
 
 def _no_flag(value: Any) -> Any:

@@ -7,13 +7,14 @@ something in them, other path constraints than an orientation's, links other tha
 
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.constraints.constraint import Constraint, Pose
@@ -42,14 +43,18 @@ _ADD = (None, 0, "add", "ADD", "\0", b"\0")
 _WORLD = ("", "world")
 """Names of the base frame beside those of its links."""
 _SAME = 1e-9
-_ALONG = 1e-6
-"""What directions of axes may differ by."""
+_ELSEWHERE = 1e-6
+"""What entries of poses may differ by."""
+_ALONG = 1e-5
+"""What entries of axes' directions may differ by: a turn that is written as 1.5708 is a quarter."""
 _TILTS = ([True, False, False], [False, False, True])
 """What may be free of Euler angles: x, or z, alone."""
 _ROTATION_VECTOR = 1
 """Of moveit_msgs/OrientationConstraint's ways to bound a rotation."""
-_FREE_RAD = math.pi - 1e-6
-"""A tolerance from which on an angle is free."""
+_FREE_RAD = 3.1
+"""A tolerance from which on an angle is free, as files mean it that write 3.14."""
+_WIDEST_RAD = 0.5 * math.pi
+"""Turns up to which none of their Euler angles is larger than the whole."""
 
 
 class MoveitError(ValueError):
@@ -91,23 +96,26 @@ def add_moveit_scene(file: Path, scene: PlanningScene) -> dict[str, float]:
         now, q = scene.now, _configuration(joints, scene.robot)
         for number, own in enumerate(_list(world, "collision_objects")):
             where = f"world.collision_objects[{number}]"
-            shapes = _shapes(own, where, lambda frame: _fixed(scene, frame))
-            named[str(own["id"])] = [shape.name for shape in shapes]
-            now = now.adding(*shapes)
+            with _naming(where):
+                shapes = _shapes(own, where, lambda frame: _fixed(scene, frame))
+                named[str(own["id"])] = [shape.name for shape in shapes]
+                now = now.adding(*shapes)
         for number, own in enumerate(_list(state, "attached_collision_objects")):
             where = f"robot_state.attached_collision_objects[{number}]"
-            name, parts = str(own["object"]["id"]), _held(own, where, scene, q)
-            around = named.pop(name, [])
-            _require_free([held.name for held in parts], {name, *around}, now.names, where)
-            now = now.removing(*(part for part in around if part != name))
-            named[name] = [held.name for held in parts]
-            for held in parts:
-                now = now.attaching(held)
+            with _naming(where):
+                name, parts = str(own["object"]["id"]), _held(own, where, scene, q)
+                around = named.pop(name, [])
+                _require_free([held.name for held in parts], {name, *around}, now.names, where)
+                now = now.removing(*(part for part in around if part != name))
+                named[name] = [held.name for held in parts]
+                for held in parts:
+                    now = now.attaching(held)
         known = {*scene.links, *scene.now.names, *named}
-        for first, second in _allowed(_entry(raw, "allowed_collision_matrix", {}), known):
-            for a in named.get(first, [first]):
-                for b in named.get(second, [second]):
-                    now = now.allowing(a, b)
+        with _naming("allowed_collision_matrix"):
+            for first, second in _allowed(_entry(raw, "allowed_collision_matrix", {}), known):
+                for a in named.get(first, [first]):
+                    for b in named.get(second, [second]):
+                        now = now.allowing(a, b)
         scene.become(now)
     except (MoveitError, RobotError, SceneError, ShapeError) as error:
         raise MoveitError(f"{file}: {error}") from None
@@ -133,13 +141,15 @@ def read_moveit_request(
         if float(raw.get("max_cartesian_speed") or 0.0) > 0.0:
             raise MoveitError("max_cartesian_speed: speeds are limited joint by joint alone")
         start = _named_joints({**(state or {}), **given}, robot, "start_state")
-        goals = [
-            _goal(own, planner.scene, f"goal_constraints[{number}]")
-            for number, own in enumerate(_list(raw, "goal_constraints"))
-        ]
+        goals = []
+        for number, own in enumerate(_list(raw, "goal_constraints")):
+            where = f"goal_constraints[{number}]"
+            with _naming(where):
+                goals.append(_goal(own, planner.scene, where))
         if not goals:
             raise MoveitError("goal_constraints: there is none")
-        constraint = _path_constraint(_entry(raw, "path_constraints", {}), planner.scene)
+        with _naming("path_constraints"):
+            constraint = _path_constraint(_entry(raw, "path_constraints", {}), planner.scene)
         scales = [_scale(raw, what) for what in ("velocity", "acceleration")]
     except MoveitError as error:
         raise MoveitError(f"{file}: {error}") from None
@@ -174,10 +184,8 @@ def shape_of_record(raw: Mapping[str, Any], where: str) -> Shape:
     """A primitive with a pose of its own in the base frame: a name, type and dimensions as in
     MoveIt, position [m] and orientation_xyzw.  where: the entry, for errors.  Raises MoveitError.
     """
-    try:
+    with _naming(where):
         pose = _pose({"position": raw["position"], "orientation": raw["orientation_xyzw"]})
-    except MoveitError as error:
-        raise MoveitError(f"{where}: {error}") from None
     return _primitive(raw, str(raw["name"]), Placement.of_matrix(pose), where)
 
 
@@ -189,6 +197,17 @@ def _read(file: Path) -> dict[str, Any]:
     if not isinstance(raw, dict):
         raise MoveitError(f"{file}: nothing of MoveIt: must be entries by name")
     return raw
+
+
+@contextmanager
+def _naming(where: str) -> Iterator[None]:
+    """The entry in faults that do not begin with it."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        known = isinstance(error, MoveitError) and str(error).startswith(where)
+        said = str(error) if known else f"{where}: {_said(error)}"
+        raise MoveitError(said) from None
 
 
 def _said(error: Exception) -> str:
@@ -291,17 +310,19 @@ def _fixed(scene: PlanningScene, frame: str) -> Float[np.ndarray, "4 4"]:
 
 def _require_at_base(raw: Any, scene: PlanningScene) -> None:
     """That a scene's transforms say of the world what is taken for granted: it is the base."""
-    for own in _list(raw, "fixed_frame_transforms"):
+    for number, own in enumerate(_list(raw, "fixed_frame_transforms")):
         parent = str(_entry(_entry(own, "header", {}), "frame_id", ""))
         child = str(_entry(own, "child_frame_id", ""))
         if not (child in _WORLD or (parent in _WORLD and child in scene.links)):
             continue
         given, expected = _entry(own, "transform", {}), np.eye(4)
-        if given:
-            given = {"position": given["translation"], "orientation": given["rotation"]}
-        if parent in _WORLD or parent in scene.links:
-            expected = np.linalg.inv(_fixed(scene, parent)) @ _fixed(scene, child)
-        if np.abs(_pose(given) - expected).max() > _ALONG:
+        with _naming(f"fixed_frame_transforms[{number}]"):
+            if given:
+                given = {"position": given["translation"], "orientation": given["rotation"]}
+            if parent in _WORLD or parent in scene.links:
+                expected = np.linalg.inv(_fixed(scene, parent)) @ _fixed(scene, child)
+            pose = _pose(given)
+        if np.abs(pose - expected).max() > _ELSEWHERE:
             raise MoveitError(
                 f"fixed_frame_transforms: {child!r} in {parent!r} is elsewhere: the world is taken "
                 "to be the robot's base: write poses in a link's frame"
@@ -494,10 +515,17 @@ def _along_base(half: Float[np.ndarray, "3"], turn: Float[np.ndarray, "3 3"]) ->
     """Half edges along the base's axes of a box within a turned one: those of the same box where it
     is turned by right angles, else of the largest cube in its ball.
     """
-    if np.abs(np.abs(turn).max(axis=0) - 1.0).max() < _ALONG:
+    if _along(turn).all():
         own: list[float] = (np.abs(turn.round()) @ half).tolist()
         return own
     return [float(half.min()) / math.sqrt(3.0)] * 3
+
+
+def _along(turn: Float[np.ndarray, "3 3"]) -> Bool[np.ndarray, "3"]:
+    """Which axes of a rotation are along one of the base's."""
+    entries = np.abs(turn)
+    found: Bool[np.ndarray, "3"] = np.abs(entries - entries.round()).max(axis=0) < _ALONG
+    return found
 
 
 def _frame_of(raw: Any, scene: PlanningScene) -> Float[np.ndarray, "4 4"]:
@@ -512,8 +540,9 @@ def _orientation(
     free.
 
     MoveIt's tolerances are about the axes of the rotation itself, and bound Euler angles x, y, z in
-    turn unless `parameterization` is 1.  The least of them as a cone lies within if none, or x or z
-    alone, is free; rotation vectors lie within if none or two are.  Others are refused.
+    turn unless `parameterization` is 1.  The least of them as a cone, of a quarter turn at most,
+    lies within if none, or x or z alone, is free; rotation vectors lie within if none or two are.
+    Others are refused.
     """
     turn = _frame_of(raw, scene)[:3, :3] @ _turn(raw["orientation"])
     given = [float(raw[f"absolute_{axis}_axis_tolerance"]) for axis in "xyz"]
@@ -528,9 +557,9 @@ def _orientation(
         names = ", ".join(axis for axis, is_free in zip("xyz", free, strict=True) if is_free)
         raise MoveitError(f"{where}: free about {names}: no constraint here lies within that")
     least = min(value for value, is_free in zip(given, free, strict=True) if not is_free)
-    along = np.abs(turn)
-    bases = [int(along[:, axis].argmax()) for axis in range(3)]
-    aligned = [abs(along[bases[axis], axis] - 1.0) < _ALONG for axis in range(3)]
+    if not vectors:
+        least = min(least, _WIDEST_RAD)
+    bases, aligned = np.abs(turn).argmax(axis=0).tolist(), _along(turn)
     found = [least] * 3
     for axis in range(3):
         if free[axis] and not aligned[axis]:
@@ -540,7 +569,7 @@ def _orientation(
             )
         if free[axis]:
             found[bases[axis]] = math.inf
-        elif vectors and all(aligned):
+        elif vectors and aligned.all():
             found[bases[axis]] = given[axis]
     return turn, found
 

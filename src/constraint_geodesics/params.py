@@ -19,6 +19,7 @@ from pydantic import (
 
 from constraint_geodesics.errors import ParamsError as ParamsError
 from constraint_geodesics.fields import (
+    Angles3,
     Bit,
     ChartDim,
     Count,
@@ -52,7 +53,7 @@ class PoseParams(_Record):
     """A pose: of a tool in the base frame, of a tool's own frame in its link."""
 
     position_m: Vector3
-    rpy_rad: Vector3
+    rpy_rad: Angles3
 
 
 class RobotParams(_Record):

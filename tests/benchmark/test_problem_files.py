@@ -108,10 +108,11 @@ def test_values_within_their_limits_are_held_as_they_are(tmp_path) -> None:
 
 def test_another_arm_can_be_named_by_the_file_or_by_who_asks(tmp_path) -> None:
     record = small_file()
-    del record["robot"]
     record |= {"urdf": PANDA.urdf, "tool_link": "panda_grasptarget"}
     found = read_problems(written(record, tmp_path / "own.json"))
-    assert found[0].scene.robot.tool_link == "panda_grasptarget"
+    assert found[0].scene.robot.tool_link == "panda_grasptarget"  # in the place of its robot
+    del record["robot"]
+    assert read_problems(written(record, tmp_path / "own.json"))[0].arm == found[0].arm
     given = read_problems(written(small_file(), tmp_path / "small.json"), PANDA)
     assert given[0].scene.robot.tool_link == "panda_hand"
 
@@ -143,6 +144,8 @@ BAD = [
     (lambda r: r.update(robot="pr2"), "robot='pr2': known are panda: say which with --urdf"),
     (lambda r: r.pop("robot"), "robot=None: known are panda"),
     (lambda r: r.pop("joints"), "joints is missing"),
+    (lambda r: r.update(urdf="kuka_iiwa/model.urdf"), "tool_link is missing: urdf and tool_link"),
+    (lambda r: r.update(tool_link="panda_link8"), "urdf is missing: urdf and tool_link"),
     (lambda r: r.update(scenes={}), "scenes"),
     (lambda r: r.update(joints=JOINTS[:6]), "those of franka_panda/panda.urdf to panda_hand are"),
     (lambda r: first(r).update(start=READY[:6]), "scenes.posts[0].start: 6 numbers for 7 joints"),

@@ -27,6 +27,10 @@ def pose_of(robot, q) -> Pose:
             r"tolerance\[roll\] = nan",
         ),
         ({"axes": (0, 0, 0, 1, 1, 0), "tolerance": (0.1, 0, 0, 0, 0, 0)}, r"tolerance\[x\] = 0.1"),
+        (
+            {"axes": (0, 0, 0, 1, 1, 0), "tolerance": (0, 0, 0, 10, 10, 0)},
+            r"tolerance\[roll\] = 10: must be at most π, it is in rad",
+        ),
     ],
 )
 def test_a_constraint_that_cannot_be_meant_is_refused(arguments, message) -> None:

@@ -50,6 +50,9 @@ ARM = """<robot name="arm">
 """
 TURN_LIMIT = '<limit lower="-2" upper="2" velocity="1" effort="1"/>'
 LIFT_LIMIT = '<limit lower="0.1" upper="0.5" velocity="1" effort="1"/>'
+BOUNDED = ARM.replace("continuous", "revolute").replace(
+    '<limit velocity="2"', '<limit lower="-1" upper="1" velocity="2"'
+)
 FOLLOW = '<mimic joint="grip" multiplier="0.5" offset="0.01"/>'
 EXTRA = '<joint name="{}" type="fixed"><parent link="{}"/><child link="{}"/></joint></robot>'
 
@@ -320,6 +323,30 @@ def test_an_arm_written_alone_is_the_same_arm(arm_file: Path, tmp_path: Path) ->
     there, turned = robot.forward(q)
     np.testing.assert_allclose(there, position + rotation @ tool[:3, 3], atol=1e-12)
     np.testing.assert_allclose(turned, rotation @ tool[:3, :3], atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", ["0.7071 0.7071 0", "0 2 0"])
+def test_an_axis_of_any_length_is_a_direction(arm_file: Path, axis: str) -> None:
+    """PyBullet slides links by the axis as it is written."""
+    own = f'<axis xyz="{axis}"/>{LIFT_LIMIT}'
+    arm_file.write_text(BOUNDED.replace(f'<axis xyz="0 1 0"/>{LIFT_LIMIT}', own))
+    robot = robot_from(RobotParams(urdf=str(arm_file), tool_link="hand"))
+    written = load_robot(arm_file, "hand")
+    with World(robot) as world:
+        for q in robot.sample(5, np.random.default_rng(0)):
+            (there,) = world.link_poses(q, ["hand"])
+            np.testing.assert_allclose(robot.forward(q)[0], written.forward(q)[0], atol=1e-12)
+            np.testing.assert_allclose(there[:3, 3], written.forward(q)[0], atol=1e-7)
+
+
+def test_a_joint_that_rests_beside_0_is_held_there(arm_file: Path) -> None:
+    """By PyBullet too, of a robot that parameters name by its URDF alone."""
+    arm_file.write_text(BOUNDED.replace('lower="0" upper="0.04"', 'lower="0.03" upper="0.04"'))
+    robot = robot_from(RobotParams(urdf=str(arm_file), tool_link="hand"))
+    q = np.array([0.1, 0.2, 0.3])
+    with World(robot) as world:
+        hand, left = world.link_poses(q, ["hand", "left"])
+    np.testing.assert_allclose((np.linalg.inv(hand) @ left)[:3, 3], (0.0, 0.03, 0.0), atol=1e-6)
 
 
 def test_a_gripper_is_held_where_pybullet_puts_it(tmp_path: Path) -> None:

@@ -22,6 +22,11 @@ PLANAR = """<robot name="planar">
 <joint name="three" type="prismatic"><origin xyz="0.5 0 0"/><parent link="b"/><child link="tool"/>
 <axis xyz="0 0 1"/><limit lower="-0.1" upper="0.4" velocity="1" effort="1"/></joint></robot>"""
 
+WRIST = """<link name="wrist"/><joint name="four" type="revolute"><parent link="wrist"/>
+<child link="tool"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="1" effort="1"/></joint>
+</robot>"""
+SCARA = PLANAR.replace('<child link="tool"/>', '<child link="wrist"/>').replace("</robot>", WRIST)
+
 
 def robots() -> dict[str, SerialRobot]:
     return {
@@ -71,6 +76,15 @@ def test_whole_turns_are_solutions_of_their_own(tmp_path: Path) -> None:
     )
 
 
+def test_half_a_turn_off_is_no_solution(tmp_path: Path) -> None:
+    # all axes are upright, so nothing turns the tool over, and the way there has no direction
+    (tmp_path / "arm.urdf").write_text(SCARA)
+    robot = load_robot(tmp_path / "arm.urdf", "tool")
+    position, rotation = robot.forward(np.array([0.5, 1.0, 0.2, 0.3]))
+    assert len(solutions(robot, position, rotation))
+    assert not len(solutions(robot, position, rotation @ np.diag([1.0, -1.0, -1.0])))
+
+
 def test_a_pose_out_of_reach_has_no_solution() -> None:
     robot = robots()["xarm6"]
     assert not len(solutions(robot, np.array([3.0, 0.0, 0.0]), np.eye(3)))
@@ -110,6 +124,17 @@ def test_a_planar_arm_reaches_a_pose_or_not_by_a_thousandth_of_a_millimetre(tmp_
     # in its plane the tool's direction and distance hang together
     for off in (1e-6, 5e-5):
         assert not len(solutions(robot, position * (1.0 + off), rotation))
+
+
+def test_what_rounding_puts_beyond_a_limit_is_found(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(SCARA)
+    robot = load_robot(tmp_path / "arm.urdf", "tool")
+    for q in robot.sample(20, np.random.default_rng(4)):
+        for at in (robot.lower, robot.upper):
+            q[2:] = at[2:]  # the lift and the wrist
+            found = solutions(robot, *robot.forward(q))
+            assert among(q, found)
+            assert robot.limit_distance(found).min() >= 0.0
 
 
 def test_of_many_whole_turns_the_nearest_are_given() -> None:

@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 
 from constraint_geodesics.planner import Planner
+from constraint_geodesics.scene.body import Body
 from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.scene import SceneError
 from constraint_geodesics.scene.scene_file import read_attached, read_scene
@@ -82,6 +84,14 @@ def test_a_further_document_may_be_empty(tmp_path: Path, end: str) -> None:
         ("shapes: {b: {kind: sphere, centre_m: [0, 0, .nan], radius_m: 1}}", "centre_m"),
         ("shapes: {b: {kind: point_cloud, points_m: [[1, 2]], radius_m: 1}}", "points"),
         ("attached: {b: {kind: sphere, centre_m: [0, 0, 0], radius_m: 1}}", "link is missing"),
+        (
+            "shapes: {b: {kind: box, centre_m: [0, 0, 0], size_m: [1, 1, 1], rpy_rad: [0, 0, 45]}}",
+            "rpy_rad.2: 45: must be within ±4π: angles are in rad, not degrees",
+        ),
+        (
+            "shapes: {b: {kind: cylinder, length_m: 1, radius_m: 1, pose: {rpy_rad: [-90, 0, 0]}}}",
+            "pose.rpy_rad.0: -90: must be within ±4π",
+        ),
         ("allowed: [[a, b, c]]", "allowed"),
         ("allowed: []\n---\nallowed: []\n", "has 2 documents of YAML: must have one"),
         ("allowed: []\n---\nshapes: [", "not YAML"),
@@ -102,3 +112,45 @@ def test_all_of_a_file_is_added_or_nothing(planner: Planner, tmp_path: Path) -> 
     with pytest.raises(ValueError, match=r"none\.obj"):
         read_scene(tmp_path / "scene.yaml").into(planner.scene)
     assert planner.scene.now is before
+
+
+def test_what_is_attached_takes_no_other_shapes_place(planner: Planner, tmp_path: Path) -> None:
+    (tmp_path / "cell.yaml").write_text(SCENE.replace("bottle", "cup").replace("part: ", "#"))
+    before = planner.scene.now
+    with pytest.raises(SceneError, match="attached.cup: another shape of that name stands"):
+        read_scene(tmp_path / "cell.yaml").into(planner.scene)
+    assert planner.scene.now is before
+    planner.scene.add(Box("cup", (0.4, 0.4, 0.2), (0.06, 0.06, 0.2)))
+    (tmp_path / "cup.yaml").write_text(CUP)
+    with pytest.raises(SceneError, match="another shape"):
+        read_attached(tmp_path / "cup.yaml").into(planner.scene)
+    assert [shape.name for shape in planner.scene.workcell] == ["table", "cup"]
+    planner.scene.remove("cup")
+    planner.scene.add(Box("cup", (0.4, 0.4, 0.2), (0.06, 0.06, 0.1)))  # that is picked up
+    read_attached(tmp_path / "cup.yaml").into(planner.scene)
+    assert [shape.name for shape in planner.scene.workcell] == ["table"]
+    assert [one.name for one in planner.scene.attached] == ["cup"]
+
+
+def test_a_capsule_that_stands_askew_is_picked_up(planner: Planner, tmp_path: Path) -> None:
+    planner.scene.add(Capsule("pen", (0.41, 0.33, 0.2), (0.47, 0.42, 0.22), 0.01))
+    own = "pen: {link: link6, kind: capsule, from_m: [0, 0, 0.1], to_m: [0, 0, %s], radius_m: 0.01}"
+    (tmp_path / "pen.yaml").write_text(own % 0.22)
+    with pytest.raises(SceneError, match="another shape"):
+        read_attached(tmp_path / "pen.yaml").into(planner.scene)
+    (tmp_path / "pen.yaml").write_text(own % 0.21)
+    read_attached(tmp_path / "pen.yaml").into(planner.scene)
+
+
+def test_a_urdf_is_looked_for_beside_the_file_first(tmp_path: Path) -> None:
+    """Not where the shell is, nor among PyBullet's, which have one of that name."""
+    (tmp_path / "table").mkdir()
+    (tmp_path / "table" / "table.urdf").write_text("<robot name='own'><link name='top'/></robot>")
+    (tmp_path / "cell.yaml").write_text(
+        "shapes: {desk: {kind: urdf, urdf: table/table.urdf}, cube: {kind: urdf, urdf: cube.urdf}}"
+    )
+    desk, cube = read_scene(tmp_path / "cell.yaml").shapes.values()
+    assert isinstance(desk, Body)
+    assert isinstance(cube, Body)
+    assert desk.urdf == tmp_path / "table" / "table.urdf"
+    assert cube.urdf == "cube.urdf"

@@ -79,6 +79,38 @@ def test_an_open_mesh_is_covered_too() -> None:
     assert outside(np.zeros((1, 3)), pieces)[0] > 0.02
 
 
+def bin_of(sides: int, faces_a_side: int = 1) -> Triangles:
+    """Sides of a box from its floor up, each with corners of its own, as files have them that shade
+    sides flat; some as often as they are seen.
+    """
+    quads = ["0231", "0154", "2673", "0462", "1375", "4576"][:sides]
+    signs = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float)
+    corners = np.concatenate([signs[list(map(int, quad))] * (0.4, 0.3, 0.2) for quad in quads])
+    faces = np.concatenate([[[k, k + 1, k + 2], [k, k + 2, k + 3]] for k in range(0, 4 * sides, 4)])
+    return Triangles(corners, np.concatenate([faces, faces[:, ::-1]][:faces_a_side]))
+
+
+@pytest.mark.parametrize("faces_a_side", [1, 2])
+def test_a_bin_without_a_lid_is_open(faces_a_side: int) -> None:
+    (piece,) = convex_pieces(bin_of(6, faces_a_side))
+    assert len(piece.corners) == 8
+    mesh = bin_of(5, faces_a_side)
+    pieces = convex_pieces(mesh)
+    assert outside(mesh.places().mean(axis=1), pieces).max() < 1e-9
+    assert outside(np.array([[0.2, 0.15, 0.12]]), pieces)[0] > 0.05
+
+
+def test_a_convex_mesh_whose_edges_meet_in_their_middles_is_one_piece() -> None:
+    box = bin_of(6)
+    a, b = box.corners[box.faces[0, :2]]
+    middle = len(box.corners)
+    faces = np.array([[box.faces[0, 0], middle, box.faces[0, 2]], [middle, *box.faces[0, 1:]]])
+    mesh = Triangles(
+        np.concatenate([box.corners, [0.5 * (a + b)]]), np.concatenate([box.faces[1:], faces])
+    )
+    assert len(convex_pieces(mesh)) == 1
+
+
 def written(folder: Path, mesh: Triangles) -> dict[str, Path]:
     """The same mesh in each kind of file."""
     corners = "".join(f"v {x} {y} {z}\n" for x, y, z in mesh.corners)

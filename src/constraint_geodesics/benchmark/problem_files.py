@@ -190,6 +190,9 @@ def _scene(arm: UrdfArm, robot: SerialRobot, records: Sequence[_ShapeRecord], wh
 def _arm_named(record: _FileRecord) -> UrdfArm:
     if record.urdf is not None and record.tool_link is not None:
         return UrdfArm(record.urdf, record.tool_link)
+    if record.urdf is not None or record.tool_link is not None:
+        missing = "tool_link" if record.tool_link is None else "urdf"
+        raise ProblemFileError(f"{missing} is missing: urdf and tool_link go together")
     return arm_of(record.robot, "robot")
 
 

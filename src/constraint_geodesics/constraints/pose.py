@@ -74,6 +74,10 @@ class PoseConstraint(Constraint):
                 raise ConstraintError(
                     f"tolerance[{axis}] = {tolerance:g}: must be finite and not negative"
                 )
+            if axis in AXES[3:] and tolerance > math.pi:
+                raise ConstraintError(
+                    f"tolerance[{axis}] = {tolerance:g}: must be at most π, it is in rad"
+                )
             if tolerance and not held:
                 raise ConstraintError(
                     f"tolerance[{axis}] = {tolerance}: the axis is free, so it can have none"

@@ -2,7 +2,8 @@
 certifier's) take for the same machine.
 
 Joints that are held become fixed where they are held, continuous ones revolute with two turns of
-room, and the tool's own frame a link; meshes are named by their whole paths.
+room, axes that links slide along of unit length, and the tool's own frame a link; meshes are named
+by their whole paths.
 """
 
 import copy
@@ -58,7 +59,8 @@ def _tree_of(
     for mesh in tree.iter("mesh"):
         found = find_mesh(mesh.get("filename", ""), own.file)
         if found is not None:
-            mesh.set("filename", str(found.resolve()))
+            # a link's own name tells the kind of a mesh that lies in a cache under another one
+            mesh.set("filename", str(found.parent.resolve() / found.name))
     for link in tree.findall("link"):
         for visual in link.findall("visual"):
             if not _is_drawn(visual, own.file):  # PyBullet would refuse the whole robot
@@ -72,6 +74,10 @@ def _tree_of(
             _fix(element, joint, arm.held.get(joint.name, 0.0))
         elif joint.kind == "continuous":
             _bound(element)
+        elif joint.is_scaled:
+            unit = _axis(element) / joint.axis_length
+            for entry in element.findall("axis"):
+                entry.set("xyz", " ".join(map(repr, unit.tolist())))
     if tool is None:
         return tree, arm.tool_link
     name = TOOL
@@ -122,12 +128,16 @@ def _bound(element: ElementTree.Element) -> None:
     limit.set("upper", repr(_TURNS))
 
 
+def _axis(joint: ElementTree.Element) -> Float[np.ndarray, "3"]:
+    """As it is written, of any length."""
+    entry = joint.find("axis")
+    text = "1 0 0" if entry is None else entry.get("xyz", "1 0 0")
+    return np.array([float(word) for word in text.split()])
+
+
 def _motion(element: ElementTree.Element, kind: str, value: float) -> Float[np.ndarray, "4 4"]:
     """What a joint's value moves its link by."""
-    entry = element.find("axis")
-    text = "1 0 0" if entry is None else entry.get("xyz", "1 0 0")
-    axis = np.array([float(word) for word in text.split()])
-    pose = np.eye(4)
+    axis, pose = _axis(element), np.eye(4)
     if kind == "prismatic":
         pose[:3, 3] = value * axis / np.linalg.norm(axis)
     else:

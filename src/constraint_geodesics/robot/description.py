@@ -22,6 +22,7 @@ _KINDS = (*MOVABLE, "fixed", "floating", "planar")
 _XACRO = "xacro"
 _PACKAGE = "package://"
 _SHORTEST_AXIS, _LARGEST = 1e-9, 1e6
+_ROUNDING = 1e-12
 _LONGEST = 250
 """Names that are longer end PyBullet's process at some length."""
 _WIDEST = 1000.0
@@ -44,7 +45,8 @@ class Mimic(NamedTuple):
 class Joint:
     """A joint of a URDF.  lower, upper [rad or m], infinite for a continuous one and where there
     are none; velocity [1/s], infinite where none is given.  fault: the line that says why it can't
-    move, which is none where it is not to; "" for one that can.
+    move, which is none where it is not to; "" for one that can.  axis_length: of the direction that
+    is written.
     """
 
     name: str
@@ -56,6 +58,12 @@ class Joint:
     velocity: float = math.inf
     mimic: Mimic | None = None
     fault: str = ""
+    axis_length: float = 1.0
+
+    @property
+    def is_scaled(self) -> bool:
+        """Whether it slides by more or less than its value, to who takes the axis as it is."""
+        return self.kind == "prismatic" and abs(self.axis_length - 1.0) > _ROUNDING
 
     @property
     def is_movable(self) -> bool:
@@ -199,7 +207,7 @@ class _Reader:
         self._numbers(element.find("origin"), where, ("xyz", "rpy"))
         if kind not in MOVABLE:
             return Joint(name, kind, parent, child)
-        self._check_axis(element.find("axis"), where)
+        axis_length = self._axis_length(element.find("axis"), where)
         limit, mimic = element.find("limit"), self._mimic(element.find("mimic"), where)
         given = {} if limit is None else dict(limit.attrib)
         lower, upper, speed = (
@@ -214,7 +222,7 @@ class _Reader:
         if kind == "continuous" or lower > upper:
             lower, upper = -math.inf, math.inf
         speed = math.inf if speed is None else speed
-        return Joint(name, kind, parent, child, lower, upper, speed, mimic, line)
+        return Joint(name, kind, parent, child, lower, upper, speed, mimic, line, axis_length)
 
     def _end(self, joint: ElementTree.Element, end: str) -> str:
         element = joint.find(end)
@@ -224,10 +232,12 @@ class _Reader:
             raise self.fault(where, f"has no <{end} link=…>", "name the link")
         return link
 
-    def _check_axis(self, axis: ElementTree.Element | None, where: str) -> None:
+    def _axis_length(self, axis: ElementTree.Element | None, where: str) -> float:
         numbers = self._numbers(axis, where, ("xyz",))
-        if numbers and math.hypot(*numbers[0]) < _SHORTEST_AXIS:
+        length = math.hypot(*numbers[0]) if numbers else 1.0
+        if length < _SHORTEST_AXIS:
             raise self.fault(where, "has an axis of length 0", 'give a direction, as xyz="0 0 1"')
+        return length
 
     def _unfit(
         self, kind: str, lower: float | None, upper: float | None, speed: float | None
@@ -395,6 +405,15 @@ class Arm:
     tool_link: str
     moved: tuple[Joint, ...]
     held: Mapping[str, float]
+
+    @property
+    def is_as_written(self) -> bool:
+        """Whether all readers of its own URDF take that for this machine: PyBullet leaves at 0 what
+        is held, and slides a link by the length of the axis.
+        """
+        return not any(self.held.values()) and not any(
+            joint.kind == "continuous" or joint.is_scaled for joint in self.moved
+        )
 
     def lines(self) -> Iterator[str]:
         """What was understood, for people."""

@@ -32,6 +32,8 @@ the pose is out of reach or the arm singular.
 """
 _LEFT = 1e-9
 """So the error is looked at, which may be so large at most [m, rad]."""
+_BEYOND = 1e-9
+"""How far beyond a limit a solution may lie [rad or m], by rounding, before it is put onto it."""
 
 
 class Search(NamedTuple):
@@ -125,13 +127,14 @@ def whole_turns(
     """Configurations [rad or m] with all whole turns of some joints that keep the limits, or the
     _TURNS nearest to `near`; none of one that breaks a limit otherwise.
     """
-    first = np.where(turning, np.ceil((robot.lower - q) / _TURN), 0.0)
-    last = np.where(turning, np.floor((robot.upper - q) / _TURN), 0.0)
+    lower, upper = robot.lower - _BEYOND, robot.upper + _BEYOND
+    first = np.where(turning, np.ceil((lower - q) / _TURN), 0.0)
+    last = np.where(turning, np.floor((upper - q) / _TURN), 0.0)
     middle = np.zeros(robot.dof) if near is None else near
     begin = np.clip(np.round((middle - q) / _TURN) - _TURNS // 2, first, last - _TURNS + 1.0)
     first = np.where(last - first >= _TURNS, begin, first)
     last = np.minimum(last, first + _TURNS - 1.0)
-    inside = (turning | ((robot.lower <= q) & (q <= robot.upper))).all(axis=1)
+    inside = (turning | ((lower <= q) & (q <= upper))).all(axis=1)
     ways = inside * np.maximum(last - first + 1.0, 0.0).prod(axis=1)
     found = [(q + _TURN * first)[ways == 1.0]]
     for own, low, high in zip(*(rows[ways > 1.0] for rows in (q, first, last)), strict=True):
@@ -321,8 +324,14 @@ def _is_new(q, found, count, prismatic):
 def _is_there(chain, position, rotation, q, room):
     """Whether the tool of a configuration (1, D) has the pose, to _LEFT."""
     poses_of(chain, q, room.lanes)
-    _errors(room.lanes.frame, position, rotation, room.errors, room.sizes)
-    return room.sizes[0] <= _LEFT**2
+    frame = room.lanes.frame
+    trace = 0.0
+    for i in range(3):
+        for k in range(3):
+            trace += frame[i, 1 + k, 0] * rotation[i, k]
+    _errors(frame, position, rotation, room.errors, room.sizes)
+    # the errors are 0 where half a turn is left as well: 1 + 2 cos θ tells the two apart
+    return room.sizes[0] <= _LEFT**2 and trace > 1.0
 
 
 @njit(**COMPILE)

@@ -42,7 +42,7 @@ from constraint_geodesics.text_files import kept_json, write_text
 ADJACENT, FOUND = "adjacent", "found"
 """What `RobotParams.may_touch` says where it names no SRDF."""
 _AS_OBJ: Mapping[str, Callable[[Path], str]] = {".dae": as_obj, ".stl": stl_as_obj}
-_FORMAT = "3"
+_FORMAT = "4"
 """Of the files in the cache; another one where they are made in another way."""
 
 

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from constraint_geodesics.fields import Vector3
+from constraint_geodesics.fields import Angles3, Vector3
 from constraint_geodesics.robot.kinematics import rotation_from_rpy
 from constraint_geodesics.scene.pieces import Piece, read_pieces
 from constraint_geodesics.scene.shape import PlacedUrdf, Placement, Shape
@@ -21,7 +21,7 @@ class Body(Shape):
     name: str
     urdf: str | Path
     position_m: Vector3 = (0.0, 0.0, 0.0)
-    rpy_rad: Vector3 = (0.0, 0.0, 0.0)
+    rpy_rad: Angles3 = (0.0, 0.0, 0.0)
     exempt_links: tuple[str, ...] = ()
     kind: Literal["urdf"] = "urdf"
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from constraint_geodesics.fields import Positive, Vector3
+from constraint_geodesics.fields import Angles3, Positive, Vector3
 from constraint_geodesics.scene.pieces import Piece
 from constraint_geodesics.scene.shape import Placement, RoundedBox, Shape, Triple, add_body
 
@@ -20,7 +20,7 @@ class Box(Shape):
     size_m: tuple[Positive, Positive, Positive]
     exempt_links: tuple[str, ...] = ()
     kind: Literal["box"] = "box"
-    rpy_rad: Vector3 = (0.0, 0.0, 0.0)
+    rpy_rad: Angles3 = (0.0, 0.0, 0.0)
 
     @property
     def at(self) -> Placement:

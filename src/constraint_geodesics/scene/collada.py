@@ -2,8 +2,8 @@
 none ends the process.
 
 Positions alone are read, of triangles, strips and fans of them, polygons and their lists, where the
-scene places them, in metres and with z up, as PyBullet takes them.  Lines have no faces; what else
-might have some and can't be read is a fault.
+scene places them, in metres.  The file's <up_axis> turns nothing: neither PyBullet nor ROS looks at
+it in a robot's mesh.  Lines have no faces; what else might have some and can't be read is a fault.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -16,11 +16,6 @@ from jaxtyping import Float
 from constraint_geodesics.robot.kinematics import RobotError, rotation_about
 from constraint_geodesics.xml_files import XmlFileError, read_xml
 
-_UPRIGHT = {
-    "Z_UP": np.eye(3),
-    "Y_UP": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-    "X_UP": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
-}
 _LINES = ("lines", "linestrips")
 Element = ElementTree.Element
 
@@ -53,9 +48,8 @@ def _parts(mesh: Path) -> Iterator[tuple[Float[np.ndarray, "n 3"], list[list[int
     for element in root.iter():  # Collada's own names carry its address
         element.tag = element.tag.rsplit("}", 1)[-1]
     named = {element.get("id"): element for element in root.iter() if element.get("id")}
-    unit, up = root.find("asset/unit"), root.findtext("asset/up_axis", "Y_UP").strip()
-    frame = np.eye(4)
-    frame[:3, :3] = _UPRIGHT[up] * (1.0 if unit is None else float(unit.get("meter", "1")))
+    unit, frame = root.find("asset/unit"), np.eye(4)
+    frame[:3, :3] *= 1.0 if unit is None else float(unit.get("meter", "1"))
     scene = root.find("scene/instance_visual_scene")
     if scene is None:
         raise ValueError("no scene")

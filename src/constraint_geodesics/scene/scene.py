@@ -141,8 +141,7 @@ def robot_from(params: RobotParams) -> SerialRobot:
     file = find_urdf(params.urdf)
     plain = not (params.hold or params.tool or params.may_touch != ADJACENT)
     if plain:
-        arm = arm_to(read_description(file), params.tool_link)
-        plain = all(joint.kind != "continuous" for joint in arm.moved)
+        plain = arm_to(read_description(file), params.tool_link).is_as_written
     if plain:
         robot = load_robot(file, params.tool_link, params.limits_rad)
     else:

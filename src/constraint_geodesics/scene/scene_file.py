@@ -21,11 +21,15 @@ from constraint_geodesics.fields import Name
 from constraint_geodesics.formats import NUMBER, SCENE, FormatError
 from constraint_geodesics.params import one_line, read_yaml
 from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.body import Body
+from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.planning_scene import PlanningScene
 from constraint_geodesics.scene.scene import SceneError
-from constraint_geodesics.scene.shape import Shape
+from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.shapes import AnyShape
+
+_ROUNDING_M = 1e-9
 
 
 class _Record(BaseModel):
@@ -63,9 +67,15 @@ class SceneFile(_Record):
         return found
 
     def into(self, scene: PlanningScene) -> None:
-        """Add all of it to a planner's scene, or nothing."""
+        """Add all of it to a planner's scene, or nothing.  What stands there is attached where it
+        is that shape; another one of its name is refused, which would take its place unseen.
+        """
         now = scene.now.adding(*self.shapes.values())
-        for held in self.attached.values():
+        around = {shape.name: shape for shape in now.workcell}
+        for name, held in self.attached.items():
+            if name in around and not _is_same(around[name], held.shape):
+                line = "another shape of that name stands in the scene: give one another name"
+                raise SceneError(f"attached.{name}: {line}")
             now = now.attaching(Attached(held.shape, held.link, held.touching))
         for first, second in self.allowed:
             now = now.allowing(first, second)
@@ -73,8 +83,8 @@ class SceneFile(_Record):
 
 
 def read_scene(file: Path) -> SceneFile:
-    """A scene's file; files of meshes are looked for beside it first.  Raises SceneError, one line,
-    for one that can't be read, naming the entry.
+    """A scene's file; meshes and URDFs that it names are looked for beside it first.  Raises
+    SceneError, one line, for one that can't be read, naming the entry.
     """
     return _read(file, SceneFile.model_validate)
 
@@ -101,11 +111,13 @@ def _read(file: Path, checked: Callable[[Any], SceneFile]) -> SceneFile:
 
 
 def _beside(file: Path, found: SceneFile) -> SceneFile:
-    """With meshes that lie beside the file."""
+    """With meshes and URDFs that lie beside the file."""
 
     def placed(shape: Shape) -> Shape:
         if isinstance(shape, Mesh) and (file.parent / shape.file).is_file():
             return replace(shape, file=file.parent / shape.file)
+        if isinstance(shape, Body) and (file.parent / shape.urdf).is_file():
+            return replace(shape, urdf=file.parent / shape.urdf)
         return shape
 
     shapes = {name: placed(shape) for name, shape in found.shapes.items()}
@@ -114,6 +126,16 @@ def _beside(file: Path, found: SceneFile) -> SceneFile:
         for name, held in found.attached.items()
     }
     return found.model_copy(update={"shapes": shapes, "attached": attached})
+
+
+def _is_same(one: Shape, other: Shape) -> bool:
+    """Whether two shapes differ at most in where they are."""
+    first, second = one.placed(Placement()), other.placed(Placement())
+    if isinstance(first, Capsule) and isinstance(second, Capsule):  # their ends are rounded
+        if abs(first.length_m - second.length_m) > _ROUNDING_M:
+            return False
+        second = replace(second, from_m=first.from_m, to_m=first.to_m)
+    return first == second
 
 
 def _shape(name: str, given: Any) -> Any:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import ConfigDict
 
-from constraint_geodesics.fields import Vector3
+from constraint_geodesics.fields import Angles3, Vector3
 from constraint_geodesics.robot.kinematics import RobotError, rotation_from_rpy, rpy_of
 from constraint_geodesics.scene.pieces import Piece, box_corners
 from constraint_geodesics.values import LARGEST, are_usable, checked_path, numbers, shown
@@ -81,7 +81,7 @@ class Placement:
     """
 
     position_m: Vector3 = (0.0, 0.0, 0.0)
-    rpy_rad: Vector3 = (0.0, 0.0, 0.0)
+    rpy_rad: Angles3 = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         for name in ("position_m", "rpy_rad"):

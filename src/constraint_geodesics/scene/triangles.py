@@ -24,6 +24,10 @@ from constraint_geodesics.text_files import read_text
 KINDS = (".obj", ".stl", ".dae")
 BESIDE_M = 0.002
 """How far a triangle may stick out of its part before it is divided [m]."""
+_SAME_PLACE = 9
+"""Decimals of corners [m] that are one."""
+_GAPS = 1e-3
+"""Share of a hull that its mesh may leave open."""
 _HALVINGS = 12
 _THRESHOLD = 0.1
 """CoACD's concavity, of the mesh's size, from which on a part is divided."""
@@ -81,8 +85,9 @@ def _of_stl(file: Path) -> Triangles:
 
 
 def convex_pieces(mesh: Triangles) -> tuple[Piece, ...]:
-    """Convex pieces that cover all triangles: the hull where the mesh is convex, else hulls of the
-    triangles that belong to each part of a decomposition by CoACD [Wei et al., SIGGRAPH 2022].
+    """Convex pieces that cover all triangles: the hull where the mesh is convex and closed, else
+    hulls of the triangles that belong to each part of a decomposition by CoACD [Wei et al.,
+    SIGGRAPH 2022].
 
     Raises RobotError for a mesh without volume, MissingExtraError without that library.
     """
@@ -93,12 +98,13 @@ def convex_pieces(mesh: Triangles) -> tuple[Piece, ...]:
             "a mesh without volume can't be bounded: take a box in its place"
         ) from None
     # a face lies on the hull where all its corners lie on one plane of it
-    if all(
+    is_shell = all(
         ((-_beyond(own, hull)).max(axis=1).min(axis=1) <= NOT_CONVEX).all()
         for own in _blocks(mesh.places(), hull)
-    ):
+    )
+    if is_shell and _is_closed(mesh, hull):
         return (Piece(mesh.corners[hull.vertices]),)
-    return tuple(_covering(mesh.places(), _parts(mesh)))
+    return tuple(_covering(mesh.places(), _parts(mesh, is_shell or _is_open(mesh))))
 
 
 def _beyond(places: Float[np.ndarray, "m 3 3"], hull: ConvexHull) -> Float[np.ndarray, "m 3 f"]:
@@ -113,8 +119,10 @@ def _blocks(places: Float[np.ndarray, "m 3 3"], hull: ConvexHull) -> list[np.nda
     return np.array_split(places, min(count, max(len(places), 1)))
 
 
-def _parts(mesh: Triangles) -> list[ConvexHull]:
-    """The decomposition's parts, which follow the mesh but for some percent of its size."""
+def _parts(mesh: Triangles, is_open: bool) -> list[ConvexHull]:
+    """The decomposition's parts, which follow the mesh but for some percent of its size; CoACD
+    closes an open one first, as a thin shell.
+    """
     require("meshes")
     import coacd
 
@@ -123,7 +131,7 @@ def _parts(mesh: Triangles) -> list[ConvexHull]:
         coacd.Mesh(mesh.corners, mesh.faces),
         threshold=_THRESHOLD,
         max_convex_hull=_MOST_PARTS,
-        preprocess_mode="auto" if _is_open(mesh) else "off",
+        preprocess_mode="auto" if is_open else "off",
         resolution=300,
         mcts_nodes=5,
         mcts_iterations=10,
@@ -133,8 +141,21 @@ def _parts(mesh: Triangles) -> list[ConvexHull]:
     return [ConvexHull(corners) for corners, _ in found]
 
 
+def _is_closed(mesh: Triangles, hull: ConvexHull) -> bool:
+    """Whether a mesh whose faces lie on its hull leaves no way into it, as a bin without a lid
+    does: no edge is open, or the faces are as large as the hull, as where edges meet in their
+    middles.  Corners at one place are one, and faces that are there twice, from either side, too.
+    """
+    corners, which = np.unique(mesh.corners.round(_SAME_PLACE), axis=0, return_inverse=True)
+    faces = np.unique(np.sort(which.reshape(-1)[mesh.faces], axis=1), axis=0)
+    joined = Triangles(corners, faces)
+    a, b, c = joined.places().transpose(1, 0, 2)
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    return not _is_open(joined) or bool(area >= (1.0 - _GAPS) * hull.area)
+
+
 def _is_open(mesh: Triangles) -> bool:
-    """Whether an edge has one face alone, as where a scan ends: CoACD closes such a mesh first."""
+    """Whether an edge has one face alone, as where a scan ends."""
     edges = np.sort(np.concatenate([mesh.faces[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
     return bool((np.unique(edges, axis=0, return_counts=True)[1] == 1).any())
 
