@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.planner_fixtures import packaged_bundle
 from tests.scene.judge import Judge
 from tests.scene.random_scenes import FREE, RandomScene
 
@@ -43,9 +44,8 @@ def planner_of(arm: str) -> Planner:
     if arm == "panda":
         urdf = "franka_panda/panda.urdf"
         return Planner.from_urdf(urdf, "panda_hand", hold=FINGERS, workcell=[crate])
-    with Planner.load() as packaged:
-        bundle = packaged.bundle
-    return Planner(replace(bundle, workcell=bundle.workcell.including(crate)), "with a crate")
+    own = packaged_bundle()
+    return Planner(replace(own, workcell=own.workcell.including(crate)), "with a crate")
 
 
 @pytest.fixture(scope="module", autouse=True)
