@@ -136,11 +136,11 @@ Open = Callable[[Path], Any]
 """Makes a hostile file in a folder and opens it."""
 CASES: dict[str, Open] = {}
 SAID: dict[str, str] = {}
-"""Words of the line that refuses each: by another's the file was refused for something else."""
+"""Words of the line that refuses each: without them it was refused for something else."""
 
 
 def case(name: str, said: str = "") -> Callable[[Open], Open]:
-    """Keep a function as one hostile file, and what it is refused with; nothing is harmless."""
+    """Keep a function as one hostile file; said: of the line that refuses it, if it does harm."""
 
     def kept(made: Open) -> Open:
         assert name not in CASES
