@@ -7,6 +7,7 @@ import pytest
 
 from constraint_geodesics import bundle
 from constraint_geodesics.constraints.constraint import Pose
+from constraint_geodesics.planner import Planner
 from tests.planner_fixtures import packaged_planner, pairs_of
 from tests.test_cli_plan import called, error_line, strict, words_of
 
@@ -44,6 +45,22 @@ def test_a_path_to_a_region_of_another_arm_is_planned_written_and_certified(
     assert (code, out.split(":")[0]) == (0, "valid")
     slower = geodesics(*words, "--json", "--velocity-scale", "0.1")[1]
     assert strict(slower)["duration_s"] > 2.0 * answer["duration_s"]
+
+
+def test_a_tool_pose_moves_what_is_brought_to_the_goal(geodesics) -> None:
+    numbers = "0.01 0.02 0.1 0.1 -0.4 2.0"
+    words = ("plan", *PANDA, Q, "--goal-pose", POSE, "--constraint", "free", "--json")
+    code, out, _ = geodesics(*words, "--trajectory", "--tool-pose", numbers)
+    assert code == 0, out
+    last = np.array(strict(out)["trajectory"]["points"][-1]["positions"])
+    with Planner.from_urdf(PANDA[1], PANDA[3]) as bare:
+        position, rotation = bare.robot.forward(last)
+    tool, goal = (
+        Pose.from_rpy(own[:3], own[3:])
+        for own in ([float(word) for word in text.split()] for text in (numbers, POSE))
+    )
+    np.testing.assert_allclose(position + rotation @ tool.position, goal.position, atol=1e-4)
+    np.testing.assert_allclose(rotation @ tool.rotation, goal.rotation, atol=1e-4)
 
 
 def test_configurations_of_a_pose_are_printed(geodesics) -> None:

@@ -77,7 +77,9 @@ def test_a_file_in_degrees_is_refused_with_its_first_row(geodesics, tmp_path) ->
 def test_no_configuration_in_rad_is_taken_for_degrees() -> None:
     """Nor one that is a whole turn off, nor what would be out of reach in degrees too."""
     robot = packaged_planner().robot
-    for q in nodes_of("free")[:200]:
+    nodes = nodes_of("free")[0][:200]
+    assert nodes.shape == (200, robot.dof)
+    for q in nodes:
         for off in (0.0, 2.0 * np.pi, -2.0 * np.pi):
             refuse_degrees({"--start": (q + off).tolist()}, robot)
     refuse_degrees({"--start": [1e4] * robot.dof, "--goal": None}, robot)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from numba.core.runtime import _nrt_python, rtsys
 
-from constraint_geodesics import Planner
+from constraint_geodesics import Planner, bundle
 from constraint_geodesics.kernel_digest import PACKAGE
 
 INNER = "from numba import njit\n\n\n@njit(cache=True)\ndef inner(x):\n    return x + {}\n"
@@ -67,7 +67,7 @@ def test_a_moved_checkout_keeps_what_is_compiled(package: Path, tmp_path: Path) 
 
 def test_kernels_that_count_no_references_lose_no_memory() -> None:
     # a kernel of `compiled.LEAF` that called what returns an array would never free it
-    with Planner.load() as planner:
+    with Planner.load(bundle.PACKAGED) as planner:
         start, goal = planner.nodes("level_cup")[[0, -1]]
         planner.plan(start, goal, "level_cup")
         _nrt_python.memsys_enable_stats()

@@ -10,6 +10,7 @@ import pytest
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
+from constraint_geodesics import bundle
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.goals.region import GoalRegion
@@ -92,7 +93,7 @@ def a_scene(robot_names: tuple[str, ...]) -> dict[str, Any]:
 
 @pytest.fixture
 def planner() -> Iterator[Planner]:
-    with Planner.load() as loaded:
+    with Planner.load(bundle.PACKAGED) as loaded:
         yield loaded
 
 

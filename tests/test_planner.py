@@ -4,6 +4,7 @@ to.
 
 import hashlib
 import json
+import pickle
 import re
 import subprocess
 import sys
@@ -749,6 +750,26 @@ def test_a_corrupted_line_is_named(tmp_path, line, text, said) -> None:
     assert one_line(str(error.value))
 
 
+def test_a_file_must_have_the_ends_that_it_is_asked_for(planner, tmp_path) -> None:
+    path = solved("level_cup")[0]
+    path.save(tmp_path / "path.csv")
+    start, goal = path.joints[[0, -1]]
+    assert planner.check(tmp_path / "path.csv", start=start, goal=goal).valid
+    for wrong in (1e-3, -1e-3):
+        for end, q in (("start", start), ("goal", goal)):
+            ends = {"start": start, "goal": goal, end: q + wrong * np.eye(len(q))[3]}
+            certificate = planner.check(tmp_path / "path.csv", **ends)
+            assert not certificate.valid
+            assert certificate.violation.kind == f"{end}_missed"
+    with pytest.raises(PlannerError, match="start has shape"):
+        planner.check(tmp_path / "path.csv", start=start[:5])
+
+
+def test_a_planner_is_not_pickled(planner) -> None:
+    with pytest.raises(TypeError, match="holds a physics world: make one in each process"):
+        pickle.dumps(planner)
+
+
 def test_files_that_hold_no_path_are_refused(tmp_path) -> None:
     (tmp_path / "empty.csv").write_text("")
     (tmp_path / "header.csv").write_text("time_s,joint1\n")
@@ -765,12 +786,16 @@ def test_columns_are_the_joints_that_their_names_say(planner, tmp_path, change) 
     about, _, _, header, *rows = (tmp_path / "path.csv").read_text().splitlines()
     names = header.split(",")
     headers = {
-        "reversed": [",".join([names[0], *names[:0:-1]])],
-        "foreign": ["time_s,a,b,c,d,e,f"],
-        "none": [],
+        "reversed": (
+            [",".join([names[0], *names[:0:-1]])],
+            "columns are time_s, joint6.*must be joint1",
+        ),
+        "foreign": (["time_s,a,b,c,d,e,f"], "columns are time_s, a, b.*must be joint1"),
+        "none": ([], "a header line with the joints' names is needed"),
     }
-    (tmp_path / "path.csv").write_text("\n".join([about, *headers[change], *rows]))
-    with pytest.raises(PlannerError):
+    header, said = headers[change]
+    (tmp_path / "path.csv").write_text("\n".join([about, *header, *rows]))
+    with pytest.raises(PlannerError, match=said):
         read_trajectory(tmp_path / "path.csv", planner.scene.robot.joint_names)
 
 

@@ -306,6 +306,24 @@ def test_a_closed_planner_answers_nothing() -> None:
             ask()
 
 
+def test_a_path_to_a_pose_ends_with_the_tool_there() -> None:
+    """The tool's own frame, not its link's."""
+    tool = Pose.from_rpy((0.01, 0.02, 0.1), (0.1, -0.4, 2.0))
+    with Planner.from_urdf(*IIWA) as bare, Planner.from_urdf(*IIWA, tool=tool) as planner:
+        for start, q in free_pairs(planner, 3, seed=4):
+            goal = Pose(*planner.robot.forward(q))
+            path = planner.plan(start, goal, "free")
+            assert path.status == "solved", path.explanation
+            position, rotation = bare.robot.forward(path.joints[-1])
+            np.testing.assert_allclose(
+                position + rotation @ tool.position, goal.position, atol=1e-4
+            )
+            np.testing.assert_allclose(rotation @ tool.rotation, goal.rotation, atol=1e-4)
+            link = planner.scene.link_pose(path.joints[-1], IIWA[1])
+            np.testing.assert_allclose(link[:3, 3], position, atol=1e-9)
+            np.testing.assert_allclose(link[:3, :3], rotation, atol=1e-9)
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_joint_is_held_at_a_number(value) -> None:
     with pytest.raises(RobotError, match="panda.urdf: hold.panda_finger_joint1=.*finite number"):

@@ -484,6 +484,8 @@ def test_after_its_time_no_other_path_is_tried():
         assert answer.status == "stopped"
         assert "1e-09 s are over" in answer.explanation
         break
+    else:
+        pytest.fail("nothing could be put on the way")
     for wrong in (0.0, -1.0, np.inf, "soon"):
         with pytest.raises(PlannerError, match="limit_s = .*positive number of seconds"):
             planner.replan(path, at, limit_s=wrong)

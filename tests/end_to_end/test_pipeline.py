@@ -7,7 +7,11 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -48,6 +52,24 @@ for name, *items in (
 """Studies of stages/dvc.yaml in one process: each for itself would import the same for seconds."""
 BENCHMARK = "stages/dvc.yaml:report_benchmark"
 LEARNED = "data/recordings/train_geodesics/planner-level_cup/query0-learned_geodesic-seed0.rrd"
+
+
+@contextmanager
+def restored(*places: Path) -> Iterator[None]:
+    """Files and folders of the checkout that all tests share, as they were whatever happens."""
+    with TemporaryDirectory() as kept:
+        copies = {place: Path(kept) / str(k) for k, place in enumerate(places)}
+        for place, copy in copies.items():
+            (shutil.copytree if place.is_dir() else shutil.copy2)(place, copy)
+        try:
+            yield
+        finally:
+            for place, copy in copies.items():
+                if copy.is_dir():
+                    shutil.rmtree(place, ignore_errors=True)
+                    shutil.copytree(copy, place)
+                else:
+                    place.write_bytes(copy.read_bytes())
 
 
 def stages_to_run(folder: Path) -> set[str]:
@@ -218,55 +240,47 @@ def test_what_the_first_view_shows_is_there(finished: Path) -> None:
             assert shown >= {*view.tags, *view.metrics} - {"scene", "dvc_experiment"}, view.key
 
 
-def test_the_same_seeds_give_the_same_figures_and_recordings(finished: Path) -> None:
-    before = {
-        name: (finished / name).read_bytes()
-        for name in (
-            "reports/train_geodesics/planner-level_cup.csv",
-            "reports/train_geodesics/planner-level_cup.json",
-            LEARNED,
-        )
-    }
+def test_the_same_seeds_give_the_same_figures_and_recordings(
+    finished: Path, tmp_path: Path
+) -> None:
+    table = "reports/train_geodesics/planner-level_cup.csv"
+    figures = "reports/train_geodesics/planner-level_cup.json"
+    before = {name: tmp_path / Path(name).name for name in (table, figures, LEARNED)}
+    for name, copy in before.items():
+        shutil.copy2(finished / name, copy)
     # run by hand, the stage leaves DVC's record of what is up to date alone; equal recordings
     # differ in their bytes
     output = "data/recordings/train_geodesics/planner-level_cup"
-    shutil.copytree(finished / output, finished / ".geodesics" / "outputs" / output)
     command = [sys.executable, "stages/train_geodesics.py", "planner", "level_cup"]
-    subprocess.run(
-        command, cwd=finished, env=smoke.environment(finished), check=True, capture_output=True
-    )
-    for name in before:
-        if name.endswith(".csv"):
-            old, new = (
-                pd.read_csv(file).drop(columns="time_s")
-                for file in (_kept(finished, before[name]), finished / name)
-            )
-            pd.testing.assert_frame_equal(old, new, rtol=0, atol=1e-6)
-    assert (finished / "reports/train_geodesics/planner-level_cup.json").read_bytes() == before[
-        "reports/train_geodesics/planner-level_cup.json"
-    ]
-    assert same_recordings(_kept(finished, before[LEARNED], ".rrd"), finished / LEARNED)
-    for name, content in before.items():
-        (finished / name).write_bytes(content)
-    shutil.rmtree(finished / output)
-    shutil.move(finished / ".geodesics" / "outputs" / output, finished / output)
+    with restored(finished / output, *(finished / name for name in before)):
+        subprocess.run(
+            command, cwd=finished, env=smoke.environment(finished), check=True, capture_output=True
+        )
+        old, new = (
+            pd.read_csv(file).drop(columns="time_s") for file in (before[table], finished / table)
+        )
+        pd.testing.assert_frame_equal(old, new, rtol=0, atol=1e-6)
+        assert (finished / figures).read_bytes() == before[figures].read_bytes()
+        assert same_recordings(before[LEARNED], finished / LEARNED)
+    for name, copy in before.items():
+        assert (finished / name).read_bytes() == copy.read_bytes()
 
 
-def _kept(folder: Path, content: bytes, suffix: str = ".csv") -> Path:
-    file = folder / ".geodesics" / f"kept{suffix}"
-    file.write_bytes(content)
-    return file
+def changed_by(finished: Path, change: Callable[[dict[str, Any]], None]) -> set[str]:
+    """Stages to run after a change of the parameters, which is taken back."""
+    file = finished / "params.yaml"
+    with restored(file):
+        params = yaml.safe_load(file.read_text())
+        change(params)
+        file.write_text(yaml.safe_dump(params, sort_keys=False))
+        return stages_to_run(finished)
 
 
 def test_a_tolerance_reruns_its_constraint_only(finished: Path) -> None:
-    file = finished / "params.yaml"
-    kept = file.read_text()
-    params = yaml.safe_load(kept)
-    params["constraints"]["level_cup"]["tolerance"] = [0, 0, 0, 0.05, 0.05, 0]
-    file.write_text(yaml.safe_dump(params, sort_keys=False))
-    changed = stages_to_run(finished)
-    file.write_text(kept)
-    assert changed == {
+    tolerance = [0, 0, 0, 0.05, 0.05, 0]
+    assert changed_by(
+        finished, lambda params: params["constraints"]["level_cup"].update(tolerance=tolerance)
+    ) == {
         "label_joints@level_cup",
         "extract_submanifold@paper-level_cup",
         "extract_submanifold@planner-level_cup",
@@ -279,17 +293,11 @@ def test_a_tolerance_reruns_its_constraint_only(finished: Path) -> None:
 
 
 def test_a_new_constraint_reruns_what_is_its_own_or_shared(finished: Path) -> None:
-    file = finished / "params.yaml"
-    kept = file.read_text()
-    params = yaml.safe_load(kept)
-    params["constraints"]["upright"] = {
-        **params["constraints"]["level_cup"],
-        "description": "another",
-    }
-    file.write_text(yaml.safe_dump(params, sort_keys=False))
-    changed = stages_to_run(finished)
-    file.write_text(kept)
-    assert changed == {
+    def another(params: dict[str, Any]) -> None:
+        level = params["constraints"]["level_cup"]
+        params["constraints"]["upright"] = {**level, "description": "another"}
+
+    assert changed_by(finished, another) == {
         "label_joints@upright",
         "extract_submanifold@paper-upright",
         "extract_submanifold@planner-upright",
@@ -301,13 +309,21 @@ def test_a_new_constraint_reruns_what_is_its_own_or_shared(finished: Path) -> No
 
 def test_a_colour_retrains_nothing_and_a_comment_runs_nothing(finished: Path) -> None:
     file = finished / "src" / "constraint_geodesics" / "palette.py"
-    kept, stages = file.read_text(), []
-    for text in (kept + "# a comment\n", kept.replace('"#0072B2"', '"#0072B3"', 1), kept):
+    kept = file.read_text()
+    another = kept.replace('"#0072B2"', '"#0072B3"', 1)
+    assert another != kept
+
+    def digested(text: str) -> set[str]:
         file.write_text(text)
         assert "digest_code" in stages_to_run(finished)
         assert smoke.dvc(finished, "repro", "digest_code").returncode == 0
-        stages.append(stages_to_run(finished))
-    assert stages == [set(), {"record_paths", "report"}, set()]
+        return stages_to_run(finished)
+
+    try:
+        assert digested(kept + "# a comment\n") == set()
+        assert digested(another) == {"record_paths", "report"}
+    finally:  # DVC's record of the code as well
+        assert digested(kept) == set()
 
 
 def test_the_studies_of_make_bench_run_and_the_report_shows_them(finished: Path) -> None:

@@ -18,11 +18,19 @@ from constraint_geodesics.benchmark.problem_files import read_problems
 from constraint_geodesics.bundle import read_bundle
 from constraint_geodesics.identification.demonstrations import demonstrations_from
 from constraint_geodesics.identification.files import load_constraint
-from constraint_geodesics.learning.dataset import read_joints, read_queries
+from constraint_geodesics.learning.dataset import (
+    POSE_COLUMNS,
+    RPY_COLUMNS,
+    Shard,
+    read_joints,
+    read_queries,
+    write_joints,
+)
 from constraint_geodesics.moveit import add_moveit_scene, read_moveit_request
 from constraint_geodesics.params import load_params
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.mesh import Mesh
+from constraint_geodesics.scene.planning_scene import PlanningScene
 from constraint_geodesics.scene.scene_file import read_attached, read_scene
 from tests.benchmark.problem_fixtures import JOINTS, small_file
 from tests.faults.bad_input import Bad, written
@@ -79,7 +87,7 @@ def cases(planner: Planner, folder: Path) -> Iterator[Bad]:
     yield from _paths(planner, read["path"], folder)
     yield from _scenes(read["scene"], read["attached"], folder)
     yield from _moveit(planner, read["moveit_scene"], read["moveit_request"], folder)
-    yield from _problems(read["problems"], folder)
+    yield from _problems(planner, read["problems"], folder)
     yield from _tables(planner, read, folder)
     yield from _robots(read["arm"], folder)
     yield from _constraints(planner, read["constraint"], folder)
@@ -89,7 +97,7 @@ def cases(planner: Planner, folder: Path) -> Iterator[Bad]:
 def _case(
     name: str, read: Reader, folder: Path, file: str, content: str | bytes, *said: str
 ) -> Bad:
-    place = folder / name.replace(" ", "_").replace("/", "_")
+    place = folder / "given"  # where no word stands that a line must hold for its own sake
     return Bad(name, lambda: read(written(place, file, content)), (file, *said))
 
 
@@ -185,9 +193,7 @@ def _scenes(scene: Reader, attached: Reader, folder: Path) -> Iterator[Bad]:
         ("radius 0", {"shapes": {"m": {**_cloud([[0, 0, 0]]), "radius_m": 0}}}, "radius_m"),
     ):
         text = json.dumps(raw)
-        yield Bad(
-            f"scene {name}", lambda t=text, n=name: scene(written(folder, f"{n}.yaml", t)), (said,)
-        )
+        yield Bad(f"scene {name}", lambda t=text: scene(written(folder, "own.yaml", t)), (said,))
     held = {**box, "link": "link6"}
     for name, raw, said in (
         ("no link", {"cup": box}, "cup.link"),
@@ -199,9 +205,7 @@ def _scenes(scene: Reader, attached: Reader, folder: Path) -> Iterator[Bad]:
     ):
         text = json.dumps(raw)
         yield Bad(
-            f"attached {name}",
-            lambda t=text, n=name: attached(written(folder, f"{n}.yaml", t)),
-            (said,),
+            f"attached {name}", lambda t=text: attached(written(folder, "own.yaml", t)), (said,)
         )
 
 
@@ -210,19 +214,29 @@ def _cloud(points: list[Any]) -> dict[str, Any]:
 
 
 def _spoiled(
-    kind: str, raw: Any, read: Reader, folder: Path, changes: tuple[tuple[tuple, Any], ...]
+    kind: str,
+    raw: Any,
+    read: Reader,
+    folder: Path,
+    scene: PlanningScene,
+    changes: tuple[tuple[Any, ...], ...],
 ) -> Iterator[Bad]:
-    """A good file with one entry made bad, by its path; the last name of it is told."""
-    for number, (path, bad) in enumerate(changes):
+    """A good file with one entry made bad, by its path; the last name of it is told, or what stands
+    behind the bad value.  The file itself is read, and the scene left as it was.
+    """
+    suffix, before = "json" if kind == "problems" else "yaml", scene.now
+    read(written(folder / "given", f"good.{suffix}", json.dumps(raw)))
+    scene.become(before)
+    for number, (path, bad, *said) in enumerate(changes):
         changed = copy.deepcopy(raw)
         inner = changed
         for part in path[:-1]:
             inner = inner[part]
         inner[path[-1]] = bad
         name = ".".join(map(str, path))
-        suffix = "json" if kind == "problems" else "yaml"
-        file = f"{kind}{number}.{suffix}"
-        yield _case(f"{kind} {name}={bad!r}"[:60], read, folder, file, json.dumps(changed))
+        told = said or [part for part in path if isinstance(part, str)][-1:]
+        file, text = f"file{number}.{suffix}", json.dumps(changed)
+        yield _case(f"{kind} {name}={bad!r}"[:60], read, folder, file, text, *told)
 
 
 def _moveit(planner: Planner, scene: Reader, request: Reader, folder: Path) -> Iterator[Bad]:
@@ -234,37 +248,38 @@ def _moveit(planner: Planner, scene: Reader, request: Reader, folder: Path) -> I
     raw = {"world": {"collision_objects": [own]}, "robot_state": state}
     place = ("world", "collision_objects", 0)
     turn = (*place, "primitive_poses", 0, "orientation")
-    changes: tuple[tuple[tuple, Any], ...] = (
-        (("world",), 5),
+    none = "no planning scene of MoveIt"
+    changes: tuple[tuple[Any, ...], ...] = (
+        (("world",), 5, none),
         (("world", "collision_objects"), {}),
-        (place, 5),
-        ((*place, "id"), "link6"),
+        (place, 5, none),
+        ((*place, "id"), "link6", "'link6' is a link"),
         ((*place, "operation"), "remove"),
         ((*place, "primitives"), []),
-        ((*place, "primitives", 0, "type"), 4),
-        ((*place, "primitives", 0, "type"), "tree"),
+        ((*place, "primitives", 0, "type"), 4, "is a cone"),
+        ((*place, "primitives", 0, "type"), "tree", "is a tree"),
         ((*place, "primitives", 0, "dimensions"), [0.1]),
         ((*place, "primitives", 0, "dimensions"), [0.1, 0.1, math.nan]),
         ((*place, "primitives", 0, "dimensions"), [0.1, 0.1, -1]),
-        ((*place, "primitives", 0, "dimensions"), [0.1, 0.1, 1e300]),
-        ((*place, "primitives", 0, "dimensions"), "large"),
+        ((*place, "primitives", 0, "dimensions"), [0.1, 0.1, 1e300], "size_m"),
+        ((*place, "primitives", 0, "dimensions"), "large", none),
         ((*place, "primitive_poses"), []),
-        ((*place, "primitive_poses", 0, "position"), {"x": 0.0}),
-        ((*place, "primitive_poses", 0, "position", "x"), math.inf),
-        ((*place, "primitive_poses", 0, "position", "x"), 1e300),
-        ((*turn, "w"), 0.0),
-        ((*turn, "w"), "up"),
-        ((*place, "header", "frame_id"), "moon"),
-        ((*place, "header", "frame_id"), "link6"),
-        ((*place, "planes"), [{"coef": [0, 0, 1, 0]}]),
+        ((*place, "primitive_poses", 0, "position"), {"x": 0.0}, "'y' is missing"),
+        ((*place, "primitive_poses", 0, "position", "x"), math.inf, "{'x': 'Infinity'"),
+        ((*place, "primitive_poses", 0, "position", "x"), 1e300, "position_m = (1e+300"),
+        ((*turn, "w"), 0.0, "no orientation"),
+        ((*turn, "w"), "up", "'up'"),
+        ((*place, "header", "frame_id"), "moon", "frame 'moon'"),
+        ((*place, "header", "frame_id"), "link6", "frame 'link6': moves"),
+        ((*place, "planes"), [{"coef": [0, 0, 1, 0]}], "has a plane"),
         (("robot_state", "joint_state", "position"), []),
-        (("robot_state", "joint_state", "position"), [math.nan]),
-        (("robot_state", "joint_state", "position"), ["far"]),
+        (("robot_state", "joint_state", "position"), [math.nan], "joint1 is nan"),
+        (("robot_state", "joint_state", "position"), ["far"], "'far'"),
         (("link_padding",), [{"link_name": "link1", "padding": 0.1}]),
         (("allowed_collision_matrix",), {"entry_names": ["a"], "entry_values": []}),
-        (("allowed_collision_matrix",), 5),
+        (("allowed_collision_matrix",), 5, none),
     )
-    yield from _spoiled("moveit_scene", raw, scene, folder, changes)
+    yield from _spoiled("moveit_scene", raw, scene, folder, planner.scene, changes)
     names = list(planner.robot.joint_names)
     start = {"joint_state": {"name": names, "position": [0.0] * 6}}
     goal = [{"joint_name": name, "position": 0.1} for name in names]
@@ -277,24 +292,41 @@ def _moveit(planner: Planner, scene: Reader, request: Reader, folder: Path) -> I
         asked,
         request,
         folder,
+        planner.scene,
         (
-            (("start_state",), 5),
+            (("start_state",), 5, "no motion request of MoveIt"),
             (("start_state", "joint_state", "name"), names[:5]),
-            (("start_state", "joint_state", "position"), [math.nan] * 6),
+            (("start_state", "joint_state", "position"), [math.nan] * 6, "joint1 is nan"),
             (("start_state", "joint_state", "velocity"), [1.0] * 6),
             (("goal_constraints",), []),
             (("goal_constraints",), 5),
             (("goal_constraints",), [{}]),
-            (("goal_constraints", 0, "joint_constraints", 0, "joint_name"), "elbow"),
-            (("goal_constraints", 0, "joint_constraints", 0, "position"), "far"),
-            (("goal_constraints", 0, "joint_constraints", 0, "position"), math.nan),
-            (("goal_constraints", 0, "joint_constraints", 0, "position"), 1e300),
+            (
+                ("goal_constraints", 0, "joint_constraints", 0, "joint_name"),
+                "elbow",
+                "elbow is no joint",
+            ),
+            (("goal_constraints", 0, "joint_constraints", 0, "position"), "far", "'far'"),
+            (
+                ("goal_constraints", 0, "joint_constraints", 0, "position"),
+                math.nan,
+                "joint1 is nan",
+            ),
+            (
+                ("goal_constraints", 0, "joint_constraints", 0, "position"),
+                1e300,
+                "joint1 is 1e+300",
+            ),
             (("goal_constraints", 0, "position_constraints"), [{}]),
-            (("path_constraints",), 5),
+            (("path_constraints",), 5, "no motion request of MoveIt"),
             (("path_constraints",), {"joint_constraints": [{}]}),
             (("path_constraints",), {"orientation_constraints": [tilt, tilt]}),
             (("path_constraints",), {"orientation_constraints": [{**tilt, "link_name": "link5"}]}),
-            (("path_constraints",), {"orientation_constraints": [{"link_name": "link6"}]}),
+            (
+                ("path_constraints",),
+                {"orientation_constraints": [{"link_name": "link6"}]},
+                "'orientation' is missing",
+            ),
             (
                 ("path_constraints",),
                 {"orientation_constraints": [{**tilt, "absolute_x_axis_tolerance": math.nan}]},
@@ -304,7 +336,7 @@ def _moveit(planner: Planner, scene: Reader, request: Reader, folder: Path) -> I
                 {"orientation_constraints": [{**tilt, "absolute_x_axis_tolerance": -1}]},
             ),
             (("trajectory_constraints",), {"constraints": [held]}),
-            (("max_velocity_scaling_factor",), "fast"),
+            (("max_velocity_scaling_factor",), "fast", "'fast'"),
             (("max_velocity_scaling_factor",), math.nan),
             (("max_velocity_scaling_factor",), 2.0),
             (("max_acceleration_scaling_factor",), -1),
@@ -313,7 +345,7 @@ def _moveit(planner: Planner, scene: Reader, request: Reader, folder: Path) -> I
     )
 
 
-def _problems(read: Reader, folder: Path) -> Iterator[Bad]:
+def _problems(planner: Planner, read: Reader, folder: Path) -> Iterator[Bad]:
     group = next(iter(small_file()["scenes"]))
     first = ("scenes", group, 0)
     yield from _spoiled(
@@ -321,6 +353,7 @@ def _problems(read: Reader, folder: Path) -> Iterator[Bad]:
         small_file(),
         read,
         folder,
+        planner.scene,
         (
             (("robot",), "pr2"),
             (("robot",), 5),
@@ -329,12 +362,12 @@ def _problems(read: Reader, folder: Path) -> Iterator[Bad]:
             (("scenes",), {}),
             (("scenes",), []),
             (("scenes", group), []),
-            (first, 5),
+            (first, 5, f"scenes.{group}.0=5"),
             ((*first, "start"), [0.0]),
             ((*first, "start"), [math.nan] * 7),
             ((*first, "goal"), ["far"] * 7),
             ((*first, "goal"), [1e300] * 7),
-            ((*first, "held"), {"thumb": 0.1}),
+            ((*first, "held"), {"thumb": 0.1}, "'thumb' can't be held"),
             ((*first, "shapes"), {}),
             ((*first, "speed"), 1),
         ),
@@ -356,65 +389,88 @@ def _tables(planner: Planner, read: dict[str, Reader], folder: Path) -> Iterator
 
     gap = rows.copy()
     gap[3, 2] = np.nan
-    for name, content in (
-        ("few rows", text(rows[:3])),
-        ("NaN", text(gap)),
-        ("five joints", text(rows[:, :5])),
-        ("eight columns", text(np.hstack([rows, rows[:, :2]]))),
-        ("degrees", text(np.degrees(rows))),
-        ("one configuration", text(np.tile(rows[:1], (20, 1)))),
-        ("word", text(rows) + "a,b,c,d,e,f\n"),
-        ("ragged", text(rows) + "1,2\n"),
-        ("header alone", names + "\n"),
-        ("no numbers of demonstrations", text(np.hstack([rows[:, :1], rows]))),
-        ("1e300", text(rows * 1e300)),
-        ("long cell", "x" * 200_000 + "\n" + text(rows)),
+    good = written(folder, "good shown.csv", text(rows))
+    assert len(demonstrations_from(good, planner.robot)[0][0]) == len(rows)
+    for name, content, said in (
+        ("few rows", text(rows[:3]), "3 rows in all"),
+        ("NaN", text(gap), "row 3: not a finite number"),
+        ("five joints", text(rows[:, :5]), "(20, 5)"),
+        ("eight columns", text(np.hstack([rows, rows[:, :2]])), "(20, 8)"),
+        ("degrees", text(np.degrees(rows)), "look like degrees"),
+        ("one configuration", text(np.tile(rows[:1], (20, 1))), "the same configuration"),
+        ("1e300", text(rows * 1e300), "another robot's"),
     ):
-        yield (
-            _case(f"shown {name}", read["shown"], folder, "shown.csv", content)
-            if name
-            in ("word", "ragged", "header alone", "no numbers of demonstrations", "long cell")
-            else Bad(
-                f"shown {name}",
-                lambda c=content, n=name: read["shown"](written(folder, f"shown {n}.csv", c)),
-                (),
-            )
+        yield Bad(
+            f"shown {name}", lambda c=content: read["shown"](written(folder, "own.csv", c)), (said,)
         )
-    table = pd.DataFrame({"observation.state": [[0.0] * 5] * 20, "episode_index": 0})
-    for name, frame in (
-        ("no column", pd.DataFrame({"state": [[0.0] * 6] * 20})),
-        ("five joints", table),
-        ("words", pd.DataFrame({"observation.state": ["here"] * 20})),
-        ("ragged", pd.DataFrame({"observation.state": [[0.0] * (5 + k % 2) for k in range(20)]})),
+    numbered = text(np.hstack([rows[:, :1], rows]))
+    for name, content, said in (
+        ("word", text(rows) + "a,b,c,d,e,f\n", "'a'"),
+        ("ragged", text(rows) + "1,2\n", "not a table of numbers"),
+        ("header alone", names + "\n", "no rows of numbers"),
+        ("no numbers of demonstrations", numbered, "must be the demonstration's number"),
+        ("long cell", "x" * 200_000 + "\n" + text(rows), "field larger"),
     ):
-        yield Bad(f"shown parquet {name}", lambda f=frame: read["shown"](_parquet(folder, f)), ())
-    joints = pd.DataFrame({f"joint_{k + 1}": rows[:, k] for k in range(6)})
-    for name, frame in (
-        ("no columns", pd.DataFrame({"a": [1.0]})),
-        ("no rows", joints[:0]),
-        ("joints alone", joints),
-        ("NaN", joints.assign(joint_1=np.nan)),
-        ("words", joints.assign(joint_1="far")),
+        yield _case(f"shown {name}", read["shown"], folder, "own.csv", content, said)
+    table = pd.DataFrame({"observation.state": list(rows), "episode_index": 0})
+    assert len(demonstrations_from(_parquet(folder, table), planner.robot)[0][0]) == len(rows)
+    for name, states, said in (
+        ("no column", None, "'observation.state'"),
+        ("five joints", [[0.0] * 5] * 20, "(20, 5)"),
+        ("words", ["here"] * 20, "'here'"),
+        ("ragged", [[0.0] * (5 + k % 2) for k in range(20)], "own.parquet"),
     ):
-        asked = Bad(
-            f"joints {name}", lambda f=frame: read["joints"](_parquet(folder, f)), ("own.",)
+        frame = table.drop(columns="observation.state")
+        frame = frame if states is None else frame.assign(**{"observation.state": states})
+        yield Bad(
+            f"shown parquet {name}", lambda f=frame: read["shown"](_parquet(folder, f)), (said,)
         )
-        yield asked
+    joints = _data_set(rows)
+    own = folder / "whole.parquet"
+    write_joints([Shard(joints, len(rows), 0, 0)], own, {})
+    assert len(read_joints(own).joints) == len(rows)
+    without = [name for name in joints if name.startswith("tool_")]
+    for name, frame, said in (
+        ("no columns", pd.DataFrame({"a": [1.0]}), "column 'a'"),
+        ("no rows", joints[:0], "has no rows"),
+        ("no places of the tool", joints.drop(columns=without), "column 'tool_x'"),
+        ("NaN", joints.assign(joint_1=np.nan), "'joint_1' contains null"),
+        ("words", joints.assign(joint_1="far"), "'joint_1' to have type"),
+        ("another column", joints.assign(joint=0.0), "column 'joint'"),
+        ("NaN for a place", joints.assign(tool_z=np.nan), "tool_z"),
+        ("numbers for flags", joints.assign(self_collision=0.5), "self_collision"),
+        ("beyond the limits", joints.assign(limit_distance=-1.0), "limit_distance"),
+        ("off the constraint", joints.assign(residual=1e-3), "residual"),
+    ):
+        yield Bad(
+            f"joints {name}",
+            lambda f=frame: read["joints"](_parquet(folder, f)),
+            ("own.parquet", said),
+        )
     ends = pd.DataFrame({f"{e}_{k}": rows[:, k] for e in ("start", "goal") for k in range(6)})
-    for name, frame in (
-        ("no goals", ends.filter(like="start")),
-        ("NaN", ends.assign(goal_2=np.nan)),
-        ("words", ends.assign(goal_2="far")),
-        ("no rows", ends[:0]),
-        ("no index", None),
+    good = written(folder, "good.csv", ends.rename_axis("query").to_csv())
+    assert len(read_queries(good).starts) == len(rows)
+    for name, frame, said in (
+        ("no goals", ends.filter(like="start"), "goals (20, 0)"),
+        ("NaN", ends.assign(goal_2=np.nan), "query 0: must be finite"),
+        ("words", ends.assign(goal_2="far"), "'far'"),
+        ("no rows", ends[:0], "starts (0, 6)"),
+        ("no index", None, "Index query invalid"),
     ):
         content = "a,b\n1,2\n" if frame is None else frame.rename_axis("query").to_csv()
-        yield _case(f"queries {name}", read["queries"], folder, "queries.csv", content)
+        yield _case(f"queries {name}", read["queries"], folder, "own.csv", content, said)
+
+
+def _data_set(rows: np.ndarray) -> pd.DataFrame:
+    """As the pipeline draws one, of which `write_joints` makes a file."""
+    columns: dict[str, Any] = {f"joint_{k + 1}": rows[:, k] for k in range(6)}
+    columns |= dict.fromkeys((*POSE_COLUMNS, *RPY_COLUMNS, "limit_distance"), 0.1)
+    return pd.DataFrame(columns | dict.fromkeys(("self_collision", "workcell_collision"), False))
 
 
 def _parquet(folder: Path, frame: pd.DataFrame) -> Path:
     file = folder / "own.parquet"
-    frame.to_parquet(file)
+    frame.to_parquet(file, index=False)
     return file
 
 
@@ -455,24 +511,25 @@ def _constraints(planner: Planner, read: Reader, folder: Path) -> Iterator[Bad]:
         raw,
         read,
         folder,
+        planner.scene,
         (
             (("format",), 99),
             (("format",), None),
-            (("robot",), 5),
-            (("robot", "name"), "pr2"),
-            (("robot", "tool_link"), "hand"),
-            (("constraint",), None),
-            (("constraint",), "level"),
+            (("robot",), 5, "not a constraint"),
+            (("robot", "name"), "pr2", "found for pr2"),
+            (("robot", "tool_link"), "hand", "found for xarm6 with the tool hand"),
+            (("constraint",), None, "None: no constraint"),
+            (("constraint",), "level", "'level': no constraint"),
             (("constraint", "kind"), "os"),
             (("constraint", "axes"), [1, 2]),
             (("constraint", "axes"), [2] * 6),
             (("constraint", "axes"), "level"),
             (("constraint", "tolerance"), [math.nan] * 6),
             (("constraint", "tolerance"), [-1] * 6),
-            (("constraint", "tolerance"), None),
-            (("constraint", "reference"), 5),
-            (("constraint", "reference"), {"position_m": [0, 0, 0]}),
-            (("constraint", "reference", "position_m"), [0, 0, math.inf]),
+            (("constraint", "tolerance"), None, "pose: "),
+            (("constraint", "reference"), 5, "pose: "),
+            (("constraint", "reference"), {"position_m": [0, 0, 0]}, "'rotation' is missing"),
+            (("constraint", "reference", "position_m"), [0, 0, math.inf], "position = "),
             (("constraint", "reference", "rotation"), [[0] * 3] * 3),
         ),
     )

@@ -278,9 +278,14 @@ def test_who_is_too_many_is_told_to_come_again(asked: Asked, served: str) -> Non
     [
         (b"", {"Content-Length": "1000001"}, 413, "1000001 bytes: at most 1000000"),
         (None, {}, 411, "Content-Length"),
-        (b"[", {}, 400, ""),
-        (b'{"dataframe_records": [{}]}', {}, 400, ""),
-        (b'{"dataframe_records": [{"start": null, "goal": [], "constraint": 3}]}', {}, 400, ""),
+        (b"[", {}, 400, "is a valid JSON formatted string"),
+        (b'{"dataframe_records": [{}]}', {}, 400, "missing inputs ['start', 'goal', 'constraint']"),
+        (
+            b'{"dataframe_records": [{"start": null, "goal": [], "constraint": 3}]}',
+            {},
+            400,
+            "convert column start",
+        ),
     ],
     ids=["too long", "no length", "no JSON", "nothing asked", "no query"],
 )

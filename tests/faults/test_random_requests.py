@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from constraint_geodesics.constraints.constraint import Pose
+from constraint_geodesics.goals.region import GoalRegion
 from constraint_geodesics.pipeline.code import code_digest
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import Status
@@ -99,6 +101,31 @@ def test_the_oracle_sees_what_is_wrong(spoil: str) -> None:
     assert any(spoil in fault for fault in faults), faults
 
 
+@pytest.mark.parametrize("kind", [Pose, GoalRegion, list])
+def test_the_oracle_sees_an_end_that_is_no_goal(kind: type) -> None:
+    """A path that stops before a pose, a region, or all of a list."""
+    planner, seen = packaged_planner(), 0
+    for number in range(2000):
+        asked = request(planner, number)
+        if asked.kind != "poses" or not isinstance(asked.words["goal"], kind):
+            continue
+        path = planner.plan(**asked.words)
+        if path.status != "solved" or "scene" in asked.words:
+            continue
+        assert not _end_faults(planner, asked, path.joints)
+        at_start = _end_faults(planner, asked, path.joints[:1])
+        if kind is GoalRegion:  # where it ends a little off it may be in it still
+            seen += any("the goal is off" in said for said in at_start)
+        elif at_start:
+            back = path.joints[-2] - path.joints[-1]
+            short = path.joints.copy()
+            short[-1] += 2e-3 * back / np.linalg.norm(back)
+            seen += any("the goal is off" in said for said in _end_faults(planner, asked, short))
+        if seen == 3:
+            return
+    raise AssertionError(f"seen {seen} times")
+
+
 def _solved(planner: Planner) -> tuple[Trajectory, Request]:
     for number in range(1000):
         asked = request(planner, number)
@@ -168,7 +195,7 @@ def _faults(
     beyond = float(np.maximum(robot.lower - rows, rows - robot.upper).max())
     if beyond > SLACK:
         found.append(f"limits: beyond by {beyond:.3g}")
-    off = _off(planner, path, rows)
+    off = _off(planner, path.constraint, rows)
     if off > OFF:
         found.append(f"constraint: off by {off:.3g}")
     found += _end_faults(planner, asked, joints)
@@ -184,9 +211,8 @@ def _dense(joints: np.ndarray, step: float) -> np.ndarray:
     return np.concatenate(found)
 
 
-def _off(planner: Planner, path: Trajectory, rows: np.ndarray) -> float:
-    """By how much rows are off the constraint at most, by SciPy's rotations."""
-    constraint = path.constraint
+def _off(planner: Planner, constraint: Any, rows: np.ndarray) -> float:
+    """By how much rows are off a constraint at most, by SciPy's rotations."""
     axes = np.array(constraint.axes, bool)
     if not axes.any():
         return 0.0
@@ -228,12 +254,24 @@ def _end_faults(planner: Planner, asked: Request, joints: np.ndarray) -> list[st
     moved = float(np.abs(joints[0] - words["start"]).max())
     if moved > (0.01 if words.get("snap") else SLACK):
         found.append(f"end: the start is off by {moved:.3g}")
-    goal = words["goal"]
-    if isinstance(goal, np.ndarray):
-        missed = float(np.abs(joints[-1] - goal).max())
-        if missed > SLACK:
-            found.append(f"end: the goal is off by {missed:.3g}")
+    goals = words["goal"] if isinstance(words["goal"], list) else [words["goal"]]
+    share, missed = min(_missed(planner, goal, joints[-1]) for goal in goals)
+    if share > 1.0:
+        found.append(f"end: the goal is off by {missed:.3g}")
     return found
+
+
+def _missed(planner: Planner, goal: Any, q: np.ndarray) -> tuple[float, float]:
+    """By how much a configuration misses a goal: as a share of what it may, and itself."""
+    if isinstance(goal, GoalRegion):
+        missed, most = _off(planner, goal.region, q[None]), OFF
+    elif isinstance(goal, Pose):
+        place, turn = planner.robot.forward(q)
+        away = Rotation.from_matrix(turn @ goal.rotation.T).magnitude()
+        missed, most = max(float(np.abs(place - goal.position).max()), float(away)), OFF
+    else:
+        missed, most = float(np.abs(q - goal).max()), SLACK
+    return missed / most, missed
 
 
 def _motion_faults(

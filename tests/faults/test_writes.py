@@ -24,6 +24,7 @@ import pandas as pd
 import pytest
 import torch
 from matplotlib.figure import Figure
+from PIL import Image
 
 from constraint_geodesics.benchmark.row import (
     COLUMNS,
@@ -220,7 +221,11 @@ ARTIFACTS: dict[str, Artifact] = {
         lambda folder: vars(read_queries(folder / "queries.csv")),
         sealed=False,
     ),
-    "picture": Artifact(_picture, ("path.png",), lambda folder: {}, sealed=False),
+    "picture": Artifact(
+        _picture,
+        ("path.png",),
+        lambda folder: {"pixels": np.asarray(Image.open(folder / "path.png"))},
+    ),
 }
 
 ERRORS = (errno.ENOSPC, errno.EIO, errno.EMFILE, errno.ENOMEM)
@@ -302,6 +307,8 @@ def test_a_write_that_fails_leaves_the_previous_file_whole(
     old, new = contents(folder), contents(tmp_path / "new")
     assert set(own.files) == set(old)
     before, after, read = own.read(folder), own.read(tmp_path / "new"), list[dict[str, Any]]()
+    assert before
+    assert not same(before, after)
     began = TRIED["injected"]
     sizes = [len(content) for content in new.values()]
     for size in sorted({0, 1, *(int(share * max(sizes)) for share in (0.3, 0.99))}):
@@ -321,7 +328,10 @@ def test_a_write_that_fails_leaves_the_previous_file_whole(
                 break
             TRIED["injected"] += 1
             now = error_of(lambda: read.append(own.read(folder)))
-            if now is None:  # all of the one or all of the other
+            if failed is None:  # what says nothing has written
+                assert now is None
+                assert same(read[-1], after)
+            elif now is None:  # all of the one or all of the other
                 assert same(read[-1], before) or same(read[-1], after)
             else:  # of several files some are new: it is refused
                 assert len(own.files) > 1
@@ -331,27 +341,31 @@ def test_a_write_that_fails_leaves_the_previous_file_whole(
     assert contents(folder).keys() == old.keys()
 
 
-@pytest.mark.parametrize("name", ARTIFACTS)
+@pytest.mark.parametrize("name", sorted(set(ARTIFACTS) - {"picture"}))  # which nothing here reads
 def test_a_file_that_was_damaged_is_refused_or_says_what_it_said(
     name: str, tmp_path: Path, effort: Effort
 ) -> None:
     own, rng = ARTIFACTS[name], random.Random(name)
     own.write(tmp_path, 0)
-    right, whole, began = own.read(tmp_path), contents(tmp_path), TRIED["injected"]
+    right, whole, judged = own.read(tmp_path), contents(tmp_path), 0
     for file, content in whole.items():
         cuts = [content[:place] for place in cut_at(len(content), rng, effort.faults)]
         flips = [flipped(content, rng) for _ in range(effort.faults * own.flips)]
         for changed in (*cuts, *flips):
             (tmp_path / file).write_bytes(changed)
-            TRIED["injected"] += 1
             found = dict[str, Any]()
             refused = error_of(lambda found=found: found.update(own.read(tmp_path)))
+            if refused is None and not own.sealed:
+                continue  # it may say anything now
+            judged += 1
+            TRIED["injected"] += 1
             if refused is not None:
                 assert is_one_line(refused, tmp_path)
-            elif own.sealed:
+            else:
                 assert same(found, right), f"{file}: {len(changed)} of {len(content)} bytes"
         (tmp_path / file).write_bytes(content)
-    TRIED["survived"] += TRIED["injected"] - began
+    assert judged >= len(whole), "a file that was emptied at least"
+    TRIED["survived"] += judged
 
 
 def test_a_kept_row_that_was_damaged_is_asked_again(tmp_path: Path, effort: Effort) -> None:

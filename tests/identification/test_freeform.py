@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from constraint_geodesics import bundle
 from constraint_geodesics.certification.certificate import CertificationError
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.both import Both
@@ -79,7 +80,7 @@ def test_paths_on_a_surface_are_certified_and_say_what_is_left_open(rows, scene,
     assert isinstance(loaded, Both)
     assert loaded.key == found.supported.key
     degrees = mm = solved = 0.0
-    with Planner.load() as planner:
+    with Planner.load(bundle.PACKAGED) as planner:
         first = rows[0]
         order = np.argsort(np.linalg.norm(rows - first, axis=1))
         for other in rows[order[20:200:30]]:
@@ -184,7 +185,7 @@ def test_a_path_goes_around_a_hole_in_what_was_shown(scene) -> None:
         return float(HOLE_M - away.min())
 
     through = 0
-    with Planner.load() as planner:
+    with Planner.load(bundle.PACKAGED) as planner:
         tip = scene.robot.forward(rows)[0]
         beside = np.flatnonzero(np.linalg.norm(tip - HOLE, axis=1) < 0.06)
         for one in beside[:60]:

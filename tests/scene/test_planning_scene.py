@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.planner_fixtures import pairs_of
+from tests.planner_fixtures import nodes_of, pairs_of
 
+from constraint_geodesics import bundle
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import Constraint, Pose
 from constraint_geodesics.planner import Planner
@@ -44,7 +45,7 @@ CARRIED = (
 
 @pytest.fixture
 def planner() -> Iterator[Planner]:
-    with Planner.load() as loaded:
+    with Planner.load(bundle.PACKAGED) as loaded:
         yield loaded
 
 
@@ -173,14 +174,21 @@ def test_what_touches_the_carrier_is_said_to(planner: Planner) -> None:
     """A shape that overlaps other links is refused for good, until it may touch them."""
     wide = Box("wide", (0.0, 0.0, 0.0), (0.2, 0.2, 0.1))
     planner.scene.attach(wide, "link6")
-    start, goal = pairs_of("free", 1, seed=3)[0]
-    assert planner.plan(start, goal, "free").status == "in_collision"
+    nodes = nodes_of("free")[0]
+    assert not planner._certifier.collisions.free(nodes).any()
     planner.scene.detach("wide")
     planner.scene.attach(wide, "link6", touching=("link5", "link4"))
-    assert planner.plan(start, start, "free").status in ("solved", "in_collision")
+    start, goal = nodes[planner._certifier.collisions.free(nodes)][[0, -1]]
+    path = planner.plan(start, goal, "free")
+    assert path.status == "solved", path.explanation
     said = planner._certifier.collisions.rests_on
     assert "wide on link6" in said
     assert "wide with link5" in said
+    planner.scene.detach("wide")
+    planner.scene.attach(wide, "link6")
+    refused = planner.plan(start, goal, "free")
+    assert refused.status == "in_collision"
+    assert "wide with link5" in refused.explanation
 
 
 def test_a_change_that_fails_changes_nothing(planner: Planner, tmp_path: Path) -> None:
@@ -382,11 +390,11 @@ def test_what_is_away_is_allowed_to_touch_once_it_comes_back(planner: Planner) -
 def fixtured(tmp_path: Path) -> Iterator[tuple[Planner, Path]]:
     """A planner that was made with a mesh, whose file is gone since, and with a crate."""
     file = cube(tmp_path / "own.obj", 0.05)
-    with Planner.load() as packaged:
-        bundle = packaged.bundle
+    with Planner.load(bundle.PACKAGED) as packaged:
+        own = packaged.bundle
     mesh = Mesh("fixture", file, Placement((0.0, 2.0, 1.0)))
-    around = bundle.workcell.including(mesh, CRATE)
-    with Planner(replace(bundle, workcell=around), "with a mesh") as made:
+    around = own.workcell.including(mesh, CRATE)
+    with Planner(replace(own, workcell=around), "with a mesh") as made:
         file.unlink()
         yield made, file
 

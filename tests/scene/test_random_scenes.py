@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.planner_fixtures import packaged_bundle
 from tests.scene.judge import Judge
 from tests.scene.random_scenes import FREE, RandomScene
 
@@ -43,9 +44,8 @@ def planner_of(arm: str) -> Planner:
     if arm == "panda":
         urdf = "franka_panda/panda.urdf"
         return Planner.from_urdf(urdf, "panda_hand", hold=FINGERS, workcell=[crate])
-    with Planner.load() as packaged:
-        bundle = packaged.bundle
-    return Planner(replace(bundle, workcell=bundle.workcell.including(crate)), "with a crate")
+    own = packaged_bundle()
+    return Planner(replace(own, workcell=own.workcell.including(crate)), "with a crate")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -71,8 +71,10 @@ def test_random_changes(arm: str, seed: int, tmp_path: Path) -> None:
         random.read_anew()
         while len(free_places(random)) < 20:
             random.take_away()  # what touches for good
-        lines_are_judged(random)
-        paths_are_judged(random)
+        touching, paths = lines_are_judged(random), paths_are_judged(random)
+        if not MORE:  # of scenes by the hundred some are too full
+            assert touching >= 10
+            assert paths >= 1
         is_as_made_anew(random)
     except BaseException:
         print(*random.log, sep="\n")
@@ -113,9 +115,10 @@ def is_as_made_anew(random: RandomScene) -> None:
         assert (np.array(near) <= np.array(again) + 1e-6).all()
 
 
-def lines_are_judged(random: RandomScene) -> None:
-    """Short lines of which some touch: none of those that do is certified, PyBullet's world says
-    the same of all but surfaces, and hardly any place is refused that touches nothing.
+def lines_are_judged(random: RandomScene) -> int:
+    """Short lines, and how many of them touch something: none of those that do is certified,
+    PyBullet's world says the same of all but surfaces, and hardly any place is refused that touches
+    nothing.
     """
     own, robot, rng = random.planner._certifier, random.planner.robot, random.rng
     free = free_places(random)[: LINES // 2]
@@ -123,8 +126,10 @@ def lines_are_judged(random: RandomScene) -> None:
     ends = starts + rng.normal(size=starts.shape) * 0.4
     shapes = (*random.now.workcell, *(one.shape for one in random.now.attached))
     surfaces = {shape.name for shape in shapes if isinstance(shape, (Mesh, PointCloud))}
+    touched = 0
     with Judge(random.now, random.bricks) as judge:
         apart = np.array([row for row in starts if judge.deepest(row)[0] > 0.0])
+        assert len(apart) >= 20
         assert own._world is not None
         assert own._world.free(apart).mean() > 0.9
         assert own.collisions.free(apart).mean() > 0.9
@@ -136,13 +141,17 @@ def lines_are_judged(random: RandomScene) -> None:
                 if surfaces.isdisjoint(names):
                     assert not own._world.is_free(row), names
             if touching:
+                touched += 1
                 assert own.collisions.along(line).violation is not None
+    return touched
 
 
-def paths_are_judged(random: RandomScene) -> None:
-    """Some of them through shapes of one query alone, and around one that is on the way."""
+def paths_are_judged(random: RandomScene) -> int:
+    """How many paths were: some of them through shapes of one query alone, and around one that is
+    on the way.
+    """
     planner, rng, now = random.planner, random.rng, random.now
-    free = free_places(random)
+    free, judged = free_places(random), 0
     for number in range(QUERIES if len(free) > 1 else 0):
         start, goal = free[rng.choice(len(free), 2, replace=False)]
         middle = planner.scene.link_pose(0.5 * (start + goal), random.links[-1])
@@ -156,6 +165,8 @@ def paths_are_judged(random: RandomScene) -> None:
         assert asked.workcell == (*now.workcell, beside, on_way)
         assert (asked.attached, asked.allowed) == (now.attached, now.allowed)
         assert_free(asked, random, path.joints)
+        judged += 1
+    return judged
 
 
 def assert_free(scene: Scene, random: RandomScene, joints: np.ndarray) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from constraint_geodesics import bundle
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.body import Body
 from constraint_geodesics.scene.box import Box
@@ -29,7 +30,7 @@ CUP = "cup: {link: link6, kind: box, centre_m: [0, 0, 0.08], size_m: [0.06, 0.06
 
 @pytest.fixture
 def planner() -> Iterator[Planner]:
-    with Planner.load() as loaded:
+    with Planner.load(bundle.PACKAGED) as loaded:
         yield loaded
 
 

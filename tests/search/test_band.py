@@ -438,12 +438,13 @@ def test_bands_of_one_segment_or_of_no_numbers_end(spaces) -> None:
 @pytest.mark.parametrize("name", EVERY)
 def test_a_curve_runs_through_its_ends_and_on_the_constraint(spaces, name) -> None:
     manifold, space = spaces.manifolds[name], spaces.clear(name)
-    robot, shares = manifold.robot, np.linspace(0.0, 1.0, 200)
+    robot, shares, judged = manifold.robot, np.linspace(0.0, 1.0, 200), 0
     for nodes in spaces.lines(name, 16, 5, seed=9):
         band = relax(spaces.open(name), nodes, BandSettings())
         curve, sound = spline_through(band.nodes)
         if band.violation > 1e-6 or not sound:
             continue
+        judged += 1
         points, left = curve_points(space, curve, shares, PROJECTION)
         assert points[0].tobytes() == nodes[0].tobytes()
         assert points[-1].tobytes() == nodes[-1].tobytes()
@@ -460,6 +461,7 @@ def test_a_curve_runs_through_its_ends_and_on_the_constraint(spaces, name) -> No
         again, _ = curve_points(spaces.open(name), curve, on_it, PROJECTION)
         np.testing.assert_allclose(again, band.nodes, atol=1e-6)
         assert length(points) == pytest.approx(whole, rel=0.05)
+    assert judged >= 3
 
 
 @pytest.mark.parametrize("name", EVERY)

@@ -3,7 +3,7 @@ scratch.
 """
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ from constraint_geodesics.search.roadmap import (
     resample,
     shortest_way,
 )
-from constraint_geodesics.search.space import space_of
+from constraint_geodesics.search.space import Space, space_of
 
 MARGIN = 0.006
 
@@ -64,7 +64,8 @@ class Query:
             [self.roadmap.lengths, self.at_start.lengths, self.at_goal.lengths]
         )
         matrix = np.zeros((n + 2, n + 2))
-        matrix[first, second] = matrix[second, first] = lengths
+        # an end that is a node is joined to it by an edge of no length, which is none in a matrix
+        matrix[first, second] = matrix[second, first] = np.maximum(lengths, 1e-12)
         return sparse.csr_array(matrix)
 
 
@@ -273,12 +274,31 @@ def test_graphs_of_few_nodes_have_few_edges(made) -> None:
     assert len(few.edges) <= 6
 
 
+def that_hold(query: Query, space: Space) -> Query:
+    """The same with the edges alone that hold when each is measured again in a space."""
+    roadmap = query.roadmap
+    holds = np.isfinite(measured(space, roadmap.joints, roadmap.edges))
+    kept = replace(roadmap, edges=roadmap.edges[holds], lengths=roadmap.lengths[holds])
+    ends = []
+    for q, joined in ((query.start, query.at_start), (query.goal, query.at_goal)):
+        from_end = np.stack([np.full(len(joined.nodes), len(roadmap.joints)), joined.nodes], axis=1)
+        holds = np.isfinite(measured(space, np.vstack([roadmap.joints, q]), from_end))
+        ends.append(Joined(joined.nodes[holds], joined.lengths[holds]))
+    return Query(kept, query.start, query.goal, *ends)
+
+
+def measured(space: Space, nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    lengths = np.empty(len(edges))
+    edge_lengths(space, nodes, np.ascontiguousarray(edges, np.int64), lengths)
+    return lengths
+
+
 def test_edges_that_something_new_stands_on_are_left_out(made) -> None:
     """The shortest way over a graph of another workcell is that over the edges which hold in this
-    one.
+    one: Dijkstra's, of all edges measured again in it.
     """
     roadmap, robot = made.roadmap, made.manifold.robot
-    rng, changed = np.random.default_rng(9), 0
+    rng, changed, found = np.random.default_rng(9), 0, 0
     for _ in range(12):
         start, goal = roadmap.joints[
             rng.choice(np.flatnonzero(roadmap.labels == 0), 2, replace=False)
@@ -293,12 +313,20 @@ def test_edges_that_something_new_stands_on_are_left_out(made) -> None:
             continue
         space = space_of(made.manifold, model, MARGIN)
         after = shortest_way(roadmap, start, goal, at_start, at_goal, space)
-        assert after is None or after.tobytes() != before.tobytes()
+        query = that_hold(Query(roadmap, start, goal, at_start, at_goal), space)
+        again = query.adjacency()
+        n = len(roadmap.joints)
+        shortest = float(csgraph.dijkstra(again, directed=False, indices=n)[n + 1])
+        assert (after is not None) == np.isfinite(shortest)
         changed += 1
-        if after is None or len(after) < 5:
+        if after is None:
             continue
-        lengths = np.empty(len(after) - 3)
-        corners = np.arange(1, len(after) - 1)
-        edge_lengths(space, after, np.stack([corners[:-1], corners[1:]], axis=1), lengths)
-        assert np.isfinite(lengths).all()
-    assert changed >= 4
+        found += 1
+        assert after.tobytes() != before.tobytes()
+        numbers = {joints.tobytes(): i for i, joints in enumerate(roadmap.joints)}
+        nodes = [n, *(numbers[corner.tobytes()] for corner in after[1:-1]), n + 1]
+        steps = [again[a, b] for a, b in itertools.pairwise(nodes)]
+        assert min(steps) > 0.0, "only along edges that hold"
+        assert sum(steps) == pytest.approx(shortest, rel=1e-9)
+    assert changed >= 8
+    assert found >= 6

@@ -1,8 +1,8 @@
 """Ways among thin plates and rods."""
 
 import numpy as np
+from tests.planner_fixtures import packaged_bundle
 
-from constraint_geodesics.bundle import open_bundle
 from constraint_geodesics.studies.thin_shapes import (
     PLATE_M,
     ROD_M,
@@ -20,8 +20,8 @@ def test_half_of_the_shapes_are_plates_and_half_rods() -> None:
 
 
 def test_the_planner_finds_what_trees_find() -> None:
-    bundle, _ = open_bundle()
-    found = try_thicket(Thicket(bundle, ("level_cup",), 4, seed=0))
+    own = packaged_bundle()
+    found = try_thicket(Thicket(own, ("level_cup",), 4, seed=0))
     assert found.asked == 4
     assert 2 <= found.sampled == found.both <= found.planned
-    assert found == try_thicket(Thicket(bundle, ("level_cup",), 4, seed=0))
+    assert found == try_thicket(Thicket(own, ("level_cup",), 4, seed=0))
