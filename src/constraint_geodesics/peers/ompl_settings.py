@@ -26,7 +26,7 @@ class OmplSettings(BaselineSettings):
     space: Literal["projected", "atlas", "tangent_bundle"] = "projected"
     budget_s: Positive = 2.0
     iterations: Count = 1_000_000
-    delta_rad: Positive = 0.05
+    delta_rad: Positive = 0.1
     range_rad: Positive = 2.0
     own_charts: bool = True
     chart_radius_rad: Positive = 1.0
