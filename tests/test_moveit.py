@@ -256,7 +256,7 @@ def set_in(raw: Any, path: str, value: Any) -> Any:
         ("robot_state.attached_collision_objects.0.link_name", "hand", "'hand'"),
         ("robot_state.joint_state.position", [0.0], "6 names, 1 positions"),
         ("allowed_collision_matrix.entry_values", [], "4 names, 0 rows"),
-        ("world", 3, "no planning scene"),
+        ("world", 3, "world = 3: must be entries"),
         ("world.collision_objects.0.operation", 1, "objects are added alone"),
         ("link_padding", [{"link_name": "link3", "padding": 0.01}], "link_padding"),
         ("link_scale", [{"link_name": "link3", "scale": 1.1}], "link_scale"),

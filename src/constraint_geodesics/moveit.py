@@ -33,7 +33,7 @@ from constraint_geodesics.scene.planning_scene import PlanningScene
 from constraint_geodesics.scene.shape import Placement, Shape, ShapeError
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.text_files import write_text
-from constraint_geodesics.values import LARGEST
+from constraint_geodesics.values import LARGEST, shown
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _KINDS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
@@ -215,8 +215,14 @@ def _said(error: Exception) -> str:
 
 
 def _entry(raw: Any, name: str, default: Any) -> Any:
+    if not isinstance(raw, dict):
+        raise MoveitError(f"{shown(raw)}: must be entries by name")
     found = raw.get(name)
-    return default if found is None else found
+    if found is None:
+        return default
+    if isinstance(default, dict) and not isinstance(found, dict):
+        raise MoveitError(f"{name} = {shown(found)}: must be entries by name")
+    return found
 
 
 def _list(raw: Any, name: str) -> list[Any]:

@@ -248,11 +248,10 @@ def _moveit(planner: Planner, scene: Reader, request: Reader, folder: Path) -> I
     raw = {"world": {"collision_objects": [own]}, "robot_state": state}
     place = ("world", "collision_objects", 0)
     turn = (*place, "primitive_poses", 0, "orientation")
-    none = "no planning scene of MoveIt"
     changes: tuple[tuple[Any, ...], ...] = (
-        (("world",), 5, none),
+        (("world",), 5),
         (("world", "collision_objects"), {}),
-        (place, 5, none),
+        (place, 5, "world.collision_objects[0]"),
         ((*place, "id"), "link6", "'link6' is a link"),
         ((*place, "operation"), "remove"),
         ((*place, "primitives"), []),
@@ -262,7 +261,7 @@ def _moveit(planner: Planner, scene: Reader, request: Reader, folder: Path) -> I
         ((*place, "primitives", 0, "dimensions"), [0.1, 0.1, math.nan]),
         ((*place, "primitives", 0, "dimensions"), [0.1, 0.1, -1]),
         ((*place, "primitives", 0, "dimensions"), [0.1, 0.1, 1e300], "size_m"),
-        ((*place, "primitives", 0, "dimensions"), "large", none),
+        ((*place, "primitives", 0, "dimensions"), "large", "world.collision_objects[0]"),
         ((*place, "primitive_poses"), []),
         ((*place, "primitive_poses", 0, "position"), {"x": 0.0}, "'y' is missing"),
         ((*place, "primitive_poses", 0, "position", "x"), math.inf, "{'x': 'Infinity'"),
@@ -277,7 +276,7 @@ def _moveit(planner: Planner, scene: Reader, request: Reader, folder: Path) -> I
         (("robot_state", "joint_state", "position"), ["far"], "'far'"),
         (("link_padding",), [{"link_name": "link1", "padding": 0.1}]),
         (("allowed_collision_matrix",), {"entry_names": ["a"], "entry_values": []}),
-        (("allowed_collision_matrix",), 5, none),
+        (("allowed_collision_matrix",), 5),
     )
     yield from _spoiled("moveit_scene", raw, scene, folder, planner.scene, changes)
     names = list(planner.robot.joint_names)
@@ -294,7 +293,7 @@ def _moveit(planner: Planner, scene: Reader, request: Reader, folder: Path) -> I
         folder,
         planner.scene,
         (
-            (("start_state",), 5, "no motion request of MoveIt"),
+            (("start_state",), 5),
             (("start_state", "joint_state", "name"), names[:5]),
             (("start_state", "joint_state", "position"), [math.nan] * 6, "joint1 is nan"),
             (("start_state", "joint_state", "velocity"), [1.0] * 6),
@@ -318,7 +317,7 @@ def _moveit(planner: Planner, scene: Reader, request: Reader, folder: Path) -> I
                 "joint1 is 1e+300",
             ),
             (("goal_constraints", 0, "position_constraints"), [{}]),
-            (("path_constraints",), 5, "no motion request of MoveIt"),
+            (("path_constraints",), 5),
             (("path_constraints",), {"joint_constraints": [{}]}),
             (("path_constraints",), {"orientation_constraints": [tilt, tilt]}),
             (("path_constraints",), {"orientation_constraints": [{**tilt, "link_name": "link5"}]}),
@@ -526,8 +525,8 @@ def _constraints(planner: Planner, read: Reader, folder: Path) -> Iterator[Bad]:
             (("constraint", "axes"), "level"),
             (("constraint", "tolerance"), [math.nan] * 6),
             (("constraint", "tolerance"), [-1] * 6),
-            (("constraint", "tolerance"), None, "pose: "),
-            (("constraint", "reference"), 5, "pose: "),
+            (("constraint", "tolerance"), None, "tolerance = None"),
+            (("constraint", "reference"), 5, "reference = 5"),
             (("constraint", "reference"), {"position_m": [0, 0, 0]}, "'rotation' is missing"),
             (("constraint", "reference", "position_m"), [0, 0, math.inf], "position = "),
             (("constraint", "reference", "rotation"), [[0] * 3] * 3),

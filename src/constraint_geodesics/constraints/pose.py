@@ -208,13 +208,15 @@ class PoseConstraint(Constraint):
     @classmethod
     def from_json(cls, about: Mapping[str, Any], robot: SerialRobot | None) -> "PoseConstraint":
         """What `to_json` wrote."""
-        pose = about["reference"]
+        pose, tolerance = about["reference"], about["tolerance"]
+        if not isinstance(pose, dict | None):
+            raise ConstraintError(f"reference = {shown(pose)}: must be a pose")
         reference = (
             None
             if pose is None
             else Pose(np.array(pose["position_m"], float), np.array(pose["rotation"], float))
         )
-        return cls(tuple(about["axes"]), tuple(about["tolerance"]), reference)
+        return cls(tuple(about["axes"]), tolerance, reference)
 
     @classmethod
     def from_params(cls, params: Any, robot: SerialRobot) -> "PoseConstraint":
