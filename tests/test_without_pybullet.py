@@ -128,7 +128,8 @@ def test_what_the_proof_leaves_open_is_refused(monkeypatch) -> None:
 
 def test_pairs_that_may_touch_are_asked_for_in_one_line(tmp_path) -> None:
     words = ["geodesics", "robot", str(ROBOT), "--tool-link", "tool"]
-    program = COMMAND.replace("sys.argv", 'import os; os.environ["XDG_CACHE_HOME"] = "."; sys.argv')
+    cache = f"import os; os.environ['XDG_CACHE_HOME'] = {str(tmp_path)!r}; sys.argv"
+    program = COMMAND.replace("sys.argv", cache)
     done = run(program.format(words=words), tmp_path)
     assert done.returncode == 0, done.stderr
     (line,) = [own for own in done.stdout.splitlines() if "PyBullet" in own]
