@@ -71,7 +71,7 @@ bench: env  ## all planners on all queries, and the studies (hours; go on after 
 	dvc repro --keep-going stages/dvc.yaml stages/sweep/dvc.yaml; failed=$$?; \
 	dvc repro --single-item --force report && exit $$failed
 
-bench-quick: env  ## the same table on one query of each constraint and scene (minutes), after `dvc repro build_planner`
+bench-quick: env  ## the same table on one query of each constraint and scene (minutes), after `make repro`
 	geodesics bench
 
 draw-queries: env  ## draw the benchmark's queries of constraints that have none, after `make repro`: CONSTRAINT=... draws those again

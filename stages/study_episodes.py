@@ -61,7 +61,8 @@ def _record(layout: Layout, tasks: Sequence[runs.Task], rows: Sequence[Mapping[s
             continue
         constraint = task.constraint
         with study.carrying(planner, constraint):
-            episode = study.drawn(planner, constraint, task.number, task.seed)
+            ends = runs.ends(planner, constraint, task.seed)
+            episode = study.drawn(planner, constraint, task.number, task.seed, ends)
         for controller, own in row["motions"].items():
             name = f"episode{task.number}-{controller.split()[0].lower()}.rrd"
             file = layout.recordings(STAGE, constraint) / name

@@ -219,8 +219,8 @@ class Planner:
 
     @_in_turn
     def prepare(self, constraint: str | Constraint) -> None:
-        """Make the constraint's roadmap now (about a second), and load the compiled code, so that
-        no query waits.
+        """Make the constraint's roadmap now (one to eight seconds), and load the compiled code, so
+        that no query waits.
 
         Raises PlannerError if it holds an axis but has no reference: its roadmap would be another
         for every start.
@@ -370,7 +370,6 @@ class Planner:
         limit = np.inf if limit_s is None else limit_s
         return Replanning(self._answering, self._preparation).replan(trajectory, at_s, limit)
 
-    @_in_turn
     def plan_batch(
         self,
         starts: Float[np.ndarray, "B D"],
@@ -380,8 +379,9 @@ class Planner:
         progress: Callable[[int], None] | None = None,
     ) -> list[Trajectory]:
         """The paths of B queries of one constraint, one for each, in their order; progress is
-        called with the number done.  Raises PlannerError, before anything is planned, if starts and
-        goals have not the same shape (B, D), a row is not finite, or the constraint is unknown.
+        called with the number done; other threads have their turn between queries.  Raises
+        PlannerError, before anything is planned, if starts and goals have not the same shape
+        (B, D), a row is not finite, or the constraint is unknown.
         """
         self._require_open()
         self._named(constraint)

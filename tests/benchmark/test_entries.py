@@ -1,5 +1,6 @@
 """What the benchmark runs: planners by name, fewer of them, and what makes a row out of date."""
 
+import importlib.util
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from constraint_geodesics.benchmark.entries import (
     fewer,
     seeds_of,
     spread,
+    training_times,
     with_planners,
 )
 from constraint_geodesics.benchmark.queries import read_queries
@@ -216,3 +218,25 @@ def test_the_planner_answers_in_the_scene_of_its_query_and_in_no_other(params, t
     for scene, status in ((before, "solved"), (blocked, "in_collision"), (before, "solved")):
         with build(["planner"], scene, "free", manifold) as (made, _):
             assert made["planner"].plan(problem, 0).status == status
+
+
+def test_the_planner_without_its_roadmap_is_a_baseline_and_its_roadmaps_cost_time(
+    params, tmp_path
+) -> None:
+    file = Path(__file__).resolve().parents[2] / "stages" / "report_benchmark.py"
+    spec = importlib.util.spec_from_file_location("report_benchmark", file)
+    assert spec is not None
+    assert spec.loader is not None
+    stage = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(stage)
+    ours, own = stage.own_names(all_settings(params))
+    assert ours == {"planner": 0.0, "planner 0.1 s": 0.1, "planner 1 s": 1.0}
+    assert {"without trees", "graph + band"} <= set(own)
+    assert not {"without graph", "trees + band", "learned", "learned + band"} & {*ours, *own}
+    layout = Layout(tmp_path)
+    for name, seconds in (("build_planner", 5.0), ("build_learned", 2.0), ("train_policies", 9.0)):
+        note_stage_time(layout.stage_times, name, (), seconds)
+    spent = training_times(params, layout)
+    assert spent["planner"] == spent["band from many starts"] == 5.0
+    assert spent["without graph"] == spent["BiRRT"] == 0.0
+    assert spent["learned"] == 16.0

@@ -6,6 +6,7 @@ from contextlib import closing
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
 from constraint_geodesics.benchmark.planner_arena import export_arena
 from constraint_geodesics.benchmark.row import COLUMNS, LATENT, read_table, table_of, write_table
@@ -236,3 +237,14 @@ def test_a_second_run_is_compared_row_by_row() -> None:
 def test_rows_that_do_not_apply_are_not_failures_of_all_constraints(table) -> None:
     pooled = benchmark_summary(all_constraints(table), "ours").set_index("planner")
     assert pooled.loc["short", ["queries", "success"]].tolist() == [1, 1.0]
+
+
+def test_a_share_of_few_queries_is_never_sure() -> None:
+    for solved in (0, 3, 9):
+        known = [row("ours", q, 0, 1.0 if q < solved else np.nan, 0.1) for q in range(9)]
+        others = [row("peer", q, 0, 1.0, 0.1) for q in range(9)]
+        told = benchmark_summary(table_of(known + others), "ours").set_index("planner").loc["ours"]
+        exact = stats.binomtest(solved, 9).proportion_ci(0.95, "exact")
+        assert told["success_low"] == pytest.approx(exact.low)
+        assert told["success_high"] == pytest.approx(exact.high)
+        assert told["success_low"] < told["success_high"]

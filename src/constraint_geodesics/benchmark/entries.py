@@ -204,7 +204,7 @@ def _shared_parts(run: Run) -> list[Any]:
 
 
 def _code_of(kind: str, settings: BaselineSettings) -> str:
-    wrapped = settings.band or settings.restarts_s is not None
+    wrapped = settings.band or settings.restarts_s is not None or settings.random
     return code_digest(f"peers.{kind}", *["peers.wrappers"] * wrapped)
 
 
@@ -229,7 +229,8 @@ def training_times(params: Params, layout: Layout) -> dict[str, float]:
     seconds = dict(zip(frame["stage"], frame["seconds"], strict=True))
     searched = params.geodesics.searched[0]
     needed = {
-        name: (*own.trained, *["build_planner"] * own.uses_bundle) for name, own in settings.items()
+        name: (*own.trained, *["build_planner"] * own.uses_roadmaps)
+        for name, own in settings.items()
     }
     return {
         name: sum(

@@ -93,6 +93,11 @@ class BaselineSettings(BaseModel):
         return self.made_by
 
     @property
+    def uses_roadmaps(self) -> bool:
+        """Whether the planner's roadmaps are among what it uses of the planner's files."""
+        return self.uses_bundle
+
+    @property
     def ends_by_counting(self) -> bool:
         """Whether it gives the same path at any speed of the machine; a time limit that is reached
         only where nothing is found does not count.

@@ -14,10 +14,8 @@ from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.search.candidates import ALL_PARTS, Parts
 
-Part = Literal["straight", "policy", "graph", "refinement", "tree"]
-"""What an entry may switch off; "policy" is what the learned methods add, no part of the planner's
-own.
-"""
+Part = Literal["straight", "graph", "refinement", "tree"]
+"""What an entry may switch off."""
 
 
 class PlannerSettings(BaselineSettings):
@@ -40,7 +38,7 @@ class PlannerSettings(BaselineSettings):
         """All share one planner of each method, whose scene changes from query to query."""
         if self.method not in context.shared:
             context.shared[self.method] = _opened(context, self.method)
-        parts = replace(ALL_PARTS, **dict.fromkeys(self.switched_off - {"policy"}, False))
+        parts = replace(ALL_PARTS, **dict.fromkeys(self.switched_off, False))
         planner = context.shared[self.method]
         return OwnPlanner(planner, planner.scene.now, parts, self.budget_s)
 
@@ -56,6 +54,11 @@ class PlannerSettings(BaselineSettings):
         if self.method == "planner":
             return ()
         return (*GRAPH, "train_policies", "build_learned")
+
+    @property
+    def uses_roadmaps(self) -> bool:
+        """Unless they are switched off."""
+        return "graph" not in self.switched_off
 
     @property
     def ends_by_counting(self) -> bool:

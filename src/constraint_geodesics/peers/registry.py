@@ -15,17 +15,19 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.palette import FAMILIES
 from constraint_geodesics.params import BaselineParams, Params, one_line
 from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings, Context
-from constraint_geodesics.peers.wrappers import BandAfter, Remembered, Restarted, UntilSound
+from constraint_geodesics.peers.wrappers import (
+    AGAIN_S,
+    BandAfter,
+    Remembered,
+    Restarted,
+    UntilSound,
+)
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.problem import PathPlanner
 from constraint_geodesics.scene.scene import Scene
 
 MARK = "\nBASELINE = "
 """How a file here says that it holds a kind of baseline."""
-AGAIN_S = 2.0
-"""Time [s] in which a planner that draws at random, and has no limit of its own, is asked again
-while its path is not sound.
-"""
 
 
 @lru_cache(maxsize=1)

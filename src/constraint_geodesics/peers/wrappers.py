@@ -22,8 +22,16 @@ from constraint_geodesics.search.band import BandSettings, step_lengths
 from constraint_geodesics.search.candidates import Candidate, Task, less_and_less_relaxed, refined
 from constraint_geodesics.search.roadmap import resample
 
-KEPT_ANSWERS = 16
-"""Answers that a planner with a band after it is remembered for: more than it has seeds."""
+KEPT_ANSWERS = 256
+"""Answers that a planner with a band after it is remembered for: more than its seeds and their
+second tries.
+"""
+AGAIN_S = 2.0
+"""Time [s] in which a planner that draws at random, and has no limit of its own, is asked again
+while its path is not sound.
+"""
+TRIES = 2
+"""How often it is asked at least, where its first try takes all its time."""
 SEEDS = 100_000
 """Restarts of one seed draw from their own range of seeds."""
 
@@ -46,19 +54,18 @@ class Restarted:
         return f"{self.inner.name}, restarted for {self.budget_s:g} s"
 
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
-        """The first of the shortest paths, or what the first attempt answered where none found
-        one.
+        """The first of the shortest sound paths, or what the first attempt answered where none
+        found one.
         """
         began = time.perf_counter()
-        best, attempts, iterations = None, 0, 0
+        best, shortest, attempts, iterations = None, np.inf, 0, 0
         while True:
             answer = self.inner.plan(problem, SEEDS * seed + attempts)
             attempts += 1
             iterations += answer.iterations
-            if _is_unsound(problem, answer):
-                answer = _unsound(problem, attempts)
-            if best is None or _length(answer) < _length(best):
-                best = answer
+            length = np.inf if _is_unsound(problem, answer) else _length(answer)
+            if best is None or length < shortest:
+                best, shortest = answer, length
             spent = time.perf_counter() - began
             if (
                 answer.status not in ("solved", "not_found")
@@ -70,7 +77,8 @@ class Restarted:
 @dataclass(frozen=True)
 class UntilSound:
     """A planner that is asked again with another seed while its path is not sound, for `budget_s`
-    [s] in all: one that looks at single configurations may touch something between them.
+    [s] in all, TRIES times at least: one that looks at single configurations may touch something
+    between them.
 
     An attempt that has begun is not interrupted.  Where the problem can't tell, the first answers.
     """
@@ -84,11 +92,11 @@ class UntilSound:
         return self.inner.name
 
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
-        """The first sound path, the looks at paths within its time; "not_found" where the time is
-        over, any other answer as it is.
+        """The first sound path, the looks at paths within its time; once that is over the last one,
+        sound or not, which is what the planner claims; any other answer as it is.
         """
         spent_s, attempts, iterations = 0.0, 0, 0
-        while spent_s < self.budget_s:
+        while True:
             answer = self.inner.plan(problem, SEEDS * seed + attempts)
             attempts += 1
             iterations += answer.iterations
@@ -96,19 +104,13 @@ class UntilSound:
             unsound = _is_unsound(problem, answer)
             # a remembered answer holds its own time
             spent_s += answer.time_s + time.perf_counter() - began
-            if not unsound:
+            if not unsound or (attempts >= TRIES and spent_s >= self.budget_s):
                 return replace(answer, time_s=spent_s, iterations=iterations)
-        return replace(_unsound(problem, attempts), time_s=spent_s, iterations=iterations)
 
 
 def _is_unsound(problem: PlanningProblem, answer: Solution) -> bool:
     known = problem.is_sound is not None and answer.status == "solved"
     return known and not problem.is_sound(answer.joints)  # type: ignore[misc]
-
-
-def _unsound(problem: PlanningProblem, attempts: int) -> Solution:
-    nothing = np.empty((0, len(problem.start)))
-    return Solution("not_found", nothing, 0.0, 0, f"none of {attempts} paths is sound")
 
 
 def _length(answer: Solution) -> float:

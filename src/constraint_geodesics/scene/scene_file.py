@@ -22,14 +22,11 @@ from constraint_geodesics.formats import NUMBER, SCENE, FormatError
 from constraint_geodesics.params import one_line, read_yaml
 from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.body import Body
-from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.planning_scene import PlanningScene
-from constraint_geodesics.scene.scene import SceneError
-from constraint_geodesics.scene.shape import Placement, Shape
+from constraint_geodesics.scene.scene import SceneError, is_same_shape
+from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.shapes import AnyShape
-
-_ROUNDING_M = 1e-9
 
 
 class _Record(BaseModel):
@@ -73,7 +70,7 @@ class SceneFile(_Record):
         now = scene.now.adding(*self.shapes.values())
         around = {shape.name: shape for shape in now.workcell}
         for name, held in self.attached.items():
-            if name in around and not _is_same(around[name], held.shape):
+            if name in around and not is_same_shape(around[name], held.shape):
                 line = "another shape of that name stands in the scene: give one another name"
                 raise SceneError(f"attached.{name}: {line}")
             now = now.attaching(Attached(held.shape, held.link, held.touching))
@@ -126,16 +123,6 @@ def _beside(file: Path, found: SceneFile) -> SceneFile:
         for name, held in found.attached.items()
     }
     return found.model_copy(update={"shapes": shapes, "attached": attached})
-
-
-def _is_same(one: Shape, other: Shape) -> bool:
-    """Whether two shapes differ at most in where they are."""
-    first, second = one.placed(Placement()), other.placed(Placement())
-    if isinstance(first, Capsule) and isinstance(second, Capsule):  # their ends are rounded
-        if abs(first.length_m - second.length_m) > _ROUNDING_M:
-            return False
-        second = replace(second, from_m=first.from_m, to_m=first.to_m)
-    return first == second
 
 
 def _shape(name: str, given: Any) -> Any:

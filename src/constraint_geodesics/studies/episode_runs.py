@@ -142,7 +142,7 @@ def ran(planner: Planner, constraint: str, number: int, seed: int) -> dict[str, 
     found = dict[str, Any](runs=[], answers=[], motions={})
     with study.carrying(planner, constraint):
         _prepare(planner, constraint)
-        episode = study.drawn(planner, constraint, number, seed, _ends(planner, constraint, seed))
+        episode = study.drawn(planner, constraint, number, seed, ends(planner, constraint, seed))
         start = episode.first.joints[0]
         known = planner.scene.now
         whole = planner.plan(start, episode.goal, constraint, scene=episode.obstacles)
@@ -160,8 +160,10 @@ def ran(planner: Planner, constraint: str, number: int, seed: int) -> dict[str, 
 
 
 @cache
-def _ends(planner: Planner, constraint: str, seed: int) -> Float[np.ndarray, "n D"]:
-    """Free configurations that are none of the roadmap's."""
+def ends(planner: Planner, constraint: str, seed: int) -> Float[np.ndarray, "n D"]:
+    """Free configurations, none of the roadmap's, that a constraint's episodes go between; in the
+    scene as it is.
+    """
     scene = planner.scene.now
     manifold = ConstraintManifold(planner.robot, planner.constraints[constraint])
     queries = draw_queries(scene, manifold, constraint, ENDS, seed)
@@ -177,8 +179,10 @@ def _prepare(planner: Planner, constraint: str) -> None:
     path = planner.plan(nodes[0], nodes[-1], constraint)
     if path.status == "solved":
         planner.replan(path, 0.5 * float(path.times[-1]))
+        half = study.stop_on(path, 0.5 * float(path.times[-1]))
         with _from_scratch(planner, path.scene, 0) as controller:
-            controller.resting(path)
+            if half is not None:
+                controller.resting(half)
 
 
 def _from_scratch(planner: Planner, scene: Scene, seed: int) -> FromScratch:
