@@ -66,6 +66,7 @@ smoke: env  ## the same pipeline on small parameters, in a copy of this checkout
 
 bench: env  ## all planners on all queries, and the studies (hours; go on after an interruption by calling it again)
 	geodesics params
+	geodesics recover
 	python stages/draw_benchmark_queries.py
 	@# a study that can't be made, as that of problems from a file that is not here, stops no other
 	dvc repro --keep-going stages/dvc.yaml stages/sweep/dvc.yaml; failed=$$?; \

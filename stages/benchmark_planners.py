@@ -1,5 +1,6 @@
 """Stage: some planners of the benchmark on the pipeline's queries of one constraint (Table I)."""
 
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,7 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
         with written(file) as part:
             table.to_csv(part, index=False)
         run.report(comparison_figures(table), layout.report(STAGE, constraint))
+    shutil.rmtree(scratch, ignore_errors=True)  # asked again, it measures again
 
 
 if __name__ == "__main__":

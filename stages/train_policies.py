@@ -38,8 +38,9 @@ def main(params: Params, layout: Layout) -> None:
         asked.append((scene, policy_problem(params, space, scene, manifold, joints)))
     problem = training_problem(params, asked)
     about = subject_of(params, manifold=chart, reward=settings.reward)
+    more = params.policies.model_dump(mode="json", include={"training_length_degree", "obstacles"})
     with tracked_stage(
-        Work(STAGE, chart, settings.of_training("length_degree"), sources, about),
+        Work(STAGE, chart, settings.of_training("length_degree") | more, sources, about),
         params.tracking.experiment,
         layout.root,
     ) as run:

@@ -497,7 +497,10 @@ def _urdf_names(root: Path, here: Surroundings) -> dict[str, str]:
         described.append((str(card), json.loads(card.read_text("utf-8"))))
     named: dict[str, str] = {}
     for where, parameters in described:
-        bodies = parameters["workcell"].get("shapes", {}).values()
+        bodies = [
+            *(parameters["workcell"].get("shapes") or {}).values(),
+            *((parameters.get("carried") or {}).get("shapes") or {}).values(),
+        ]
         named.setdefault(parameters["robot"]["urdf"], where)
         for urdf in (body["urdf"] for body in bodies if "urdf" in body):
             named.setdefault(urdf, where)
@@ -556,7 +559,8 @@ def check_recordings(root: Path, here: Surroundings) -> Answers:
 def _of_versions(
     versions: Mapping[tuple[int, ...], int], files: int, installed: str
 ) -> Iterator[Answer]:
-    own, again = numbers(installed)[:2], "or record them again: dvc repro"
+    own = numbers(installed)[:2]
+    again = "or record them again: dvc repro --single-item --force record_paths"
     for version, count in sorted(versions.items()):
         name = ".".join(map(str, version))
         these = f"{count} of {files} are of Rerun {name}"
@@ -735,9 +739,11 @@ def check_pipeline(root: Path, here: Surroundings, longest_s: float = LONGEST_ST
     elif "is not a git repository" in line:
         yield _note(f"DVC refuses to run outside of a git repository: {unseen}")
     elif "dvc.lock" in line:
-        kept = (root / ".geodesics/locks/dvc.lock").is_file()
-        mend = "geodesics recover" if kept else "git checkout -- dvc.lock"
-        yield _problem(f"DVC can't read dvc.lock: {line[:200]}", mend)
+        found = re.search(r"(?:stages/(?:sweep/)?)?dvc\.lock", line)
+        broken = "dvc.lock" if found is None else found.group()
+        kept = (root / ".geodesics/locks" / broken).is_file()
+        mend = "geodesics recover" if kept else f"git checkout -- {broken}"
+        yield _problem(f"DVC can't read {broken}: {line[:200]}", mend)
     else:
         named = "mend the file that the message names"
         yield _problem(f"DVC can't read the pipeline: {line[:200]}", named)

@@ -371,7 +371,7 @@ class RewardParams(_Record):
     c: Positive
     length_weight: NonNegative
     reduction_weight: NonNegative
-    inclusion_weight: NonNegative
+    inclusion_weight: NonNegative = 0.0
     feasible_weight: NonNegative = 0.0
     set_weight: NonNegative = 0.0
 
@@ -439,10 +439,7 @@ class PolicyParams(_Record):
 
     @model_validator(mode="after")
     def _fitting(self) -> "PolicyParams":
-        if self.environments % self.heads:
-            raise ValueError(
-                f"environments={self.environments}: must be a multiple of heads={self.heads}"
-            )
+        _require_multiple(self.environments, self.heads)
         if not self.heads <= self.rollouts >= self.kept:
             raise ValueError(
                 f"rollouts={self.rollouts}: must be at least heads={self.heads} and "
@@ -451,13 +448,18 @@ class PolicyParams(_Record):
         return self
 
 
+def _require_multiple(environments: int, heads: int) -> None:
+    if environments % heads:
+        raise ValueError(f"environments={environments}: must be a multiple of heads={heads}")
+
+
 class GeodesicParams(_Record):
     """Policy search of geodesics."""
 
     seeds: Seeds
     searched: Annotated[tuple[Name, ...], Field(min_length=1)]
     illustrated: tuple[Name, ...]
-    illustrated_constraints: tuple[Name, ...]
+    illustrated_constraints: Annotated[tuple[Name, ...], Field(min_length=1)]
     analytic_steps: Count
     analytic_episode_steps: Count
     analytic: tuple[Literal["plane", "sphere", "torus"], ...]
@@ -471,10 +473,15 @@ class GeodesicParams(_Record):
     ppo: PpoParams
     rollouts: Count
     checkpoint_steps: Count
-    heads: Count = 1
-    random_starts: Annotated[float, Field(ge=0, le=1)] = 0.5
-    kept: Count = 4
-    rounds: Count = 3
+    heads: Count
+    random_starts: Annotated[float, Field(ge=0, le=1)]
+    kept: Count
+    rounds: Count
+
+    @model_validator(mode="after")
+    def _fitting(self) -> "GeodesicParams":
+        _require_multiple(self.environments, self.heads)
+        return self
 
     def on_analytic(self) -> "GeodesicParams":
         """The settings on manifolds with a known answer."""
@@ -492,6 +499,9 @@ class GeodesicParams(_Record):
             "environments",
             "episode_steps",
             "heads",
+            "random_starts",
+            "kept",
+            "rounds",
             "reward",
             "ppo",
         }
@@ -756,6 +766,10 @@ class Params(_Record):
         ):
             if name not in taken:
                 raise ValueError(f"{study}={name!r}: must be one of {sorted(taken)}")
+        twice = set(geodesics.searched) & set(geodesics.illustrated)
+        if twice:
+            line = f"{sorted(twice)[0]!r} is among geodesics.searched: its files are one stage's"
+            raise ValueError(f"geodesics.illustrated: {line}")
         for entry, names, known in (
             ("geodesics.searched", geodesics.searched, self.manifolds),
             ("geodesics.illustrated", geodesics.illustrated, self.manifolds),

@@ -383,7 +383,9 @@ class Trajectory:
         robot = self.scene.robot
         violation = ConstraintManifold(robot, self.constraint).violation(self.joints)
         skeletons, bound = robot.skeleton(self.joints), self.violation_bound_rad
-        drawn = DrawnPath(self.times, self.joints, robot.joint_names, skeletons, violation, bound)
+        units = ["m" if sliding else "rad" for sliding in robot.chain.prismatic]
+        motion = self.times, self.joints, robot.joint_names, units
+        drawn = DrawnPath(*motion, skeletons, violation, bound)
         save_png(path_figure(drawn, f"{self.constraint_name}: {self.explanation}"), Path(file))
 
     def summary(self) -> dict[str, str | float | int | None]:

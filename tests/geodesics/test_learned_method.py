@@ -19,6 +19,7 @@ from constraint_geodesics.geodesics.learned_method import (
     MANIFOLD,
     POLICY,
     SUBMANIFOLDS,
+    _free_configurations,
     read_learned,
 )
 from constraint_geodesics.problem import PlannerError
@@ -49,6 +50,19 @@ def test_its_paths_are_the_policies_and_certified(planner, name) -> None:
         points = path.at(np.linspace(0.0, 1.0, 50))
         assert manifold_of(planner, name).violation(points).max() <= 1e-6
     assert solved >= 3
+
+
+@pytest.mark.parametrize("name", ["level_cup", "slide", "fixed_orientation"])
+def test_random_curves_bend_towards_what_is_within_limits_and_clear(name) -> None:
+    with Planner.load(bundle.PACKAGED, "learned") as planner:
+        manifold = manifold_of(planner, name)
+        task = planner._preparation.task(manifold.constraint)
+        drawn = _free_configurations(task)
+        assert 20 <= len(drawn) < 1000
+        assert planner.robot.limit_distance(drawn).min() >= 0.0
+        assert manifold.violation(drawn).max() <= 1e-4
+        with planner.scene.now.world() as world:
+            assert world.free(drawn).all()
 
 
 def test_refinement_makes_its_paths_no_longer() -> None:

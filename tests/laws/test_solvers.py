@@ -268,6 +268,19 @@ def test_what_a_wall_separates_is_not_connected() -> None:
     assert through.status == "not_found"
 
 
+@pytest.mark.parametrize("shift", [0.0, 0.003, 0.006, 0.009, 0.012])
+def test_a_long_edge_passes_no_thin_wall(shift) -> None:
+    blocked = torch.zeros(201, 201, dtype=torch.bool)
+    blocked[:, 100] = True
+    values = torch.ones(201, 201, dtype=torch.float64)
+    manifold = GridManifold(values, (-1.0, -1.0), (1.0, 1.0), blocked)
+    problem = ChartProblem(manifold, PinnedSpline(2, 4), ChartBox((-1.0, -1.0), (1.0, 1.0)))
+    graph = GraphSolver.over_grid(manifold, (-1.0, -1.0), (1.0, 1.0), (41, 41))
+    start, goal = np.array([[0.5, -0.75 + shift]]), np.array([[0.5, 0.75 + shift]])
+    (apart,) = geodesics_between(graph, problem, start, goal)
+    assert apart.status == "not_connected"
+
+
 def test_ends_in_a_blocked_cell_are_refused_with_their_place() -> None:
     manifold = wall(gap=True)
     problem = ChartProblem(manifold, CUBIC, ChartBox((-1.0, -1.0), (1.0, 1.0)))

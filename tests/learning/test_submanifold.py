@@ -6,11 +6,10 @@ import pytest
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import ShardTask, draw_free
 from constraint_geodesics.learning.submanifold import (
-    UNKNOWN,
     GraphSubmanifold,
     GridSubmanifold,
     Surface,
-    component_of,
+    components_of,
     extract,
     load_submanifold,
     save_submanifold,
@@ -67,8 +66,8 @@ def test_graph_edges_hold_and_components_are_answers(scene, params, tmp_path) ->
         assert len(sizes) >= 2, "tool down falls into several sheets"
         assert (np.diff(sizes) <= 0).all()
         node = int(np.flatnonzero(found.labels == 1)[0])
-        assert component_of(found, surface, found.joints[node], small) == 1
-        assert component_of(found, surface, np.full(6, 50.0), small) == UNKNOWN
+        assert components_of(found, surface, found.joints[node], small) == {1}
+        assert components_of(found, surface, np.full(6, 50.0), small) == set()
     direct = np.linalg.norm(
         found.joints[found.edges[:, 0]] - found.joints[found.edges[:, 1]], axis=1
     )

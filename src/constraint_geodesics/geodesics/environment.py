@@ -143,7 +143,9 @@ class CurveEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return observe(self.params, self.states)[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """One change of the curve; episodes are only ever truncated."""
+        """One change of the curve; the last of an episode ends it for good, since the observation
+        says how many are left.
+        """
         if self.states is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         self.states, reward = advance(
@@ -153,8 +155,8 @@ class CurveEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return (
             observation,
             float(reward[0]),
-            False,
             bool(self.states.step[0] >= self.params.episode_steps),
+            False,
             {},
         )
 

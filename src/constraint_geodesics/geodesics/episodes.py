@@ -155,10 +155,12 @@ def placed(problem: GeodesicProblem, states: CurveStates, phi: Phi) -> CurveStat
 
 def contributions(heads: int, states: CurveStates) -> Float[np.ndarray, "B"]:
     """What each curve of a set adds to it: how much cheaper the set's best feasible curve is for
-    it, in units of the straight line's cost, at most 1; 0 for all but the best.
+    it, in units of the straight line's cost, at most 1; 0 for all but the best, and for one alone.
 
     Heads that answer a query alike earn nothing from each other's company, so that they part.
     """
+    if heads == 1:
+        return np.zeros(len(states.best_feasible))
     usable = np.isfinite(states.best_feasible)
     price = states.best_feasible / np.maximum(states.straight_cost, 1e-9)
     price = np.where(usable, price, NOTHING_FOUND).reshape(-1, heads)

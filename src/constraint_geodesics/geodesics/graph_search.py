@@ -22,7 +22,7 @@ from constraint_geodesics.geodesics.gradient import GradientSolver
 from constraint_geodesics.geodesics.images import nearest_image, with_goals_bits
 from constraint_geodesics.geodesics.problem import ChartProblem, Ends, Geodesic
 from constraint_geodesics.geodesics.solver import LENGTH_TOLERANCE, Candidates, Work, shortest_of
-from constraint_geodesics.geodesics.taut import Corners, Taut, drawn_along, pulled_along
+from constraint_geodesics.geodesics.taut import LOOKED_UP, Corners, Taut, drawn_along, pulled_along
 from constraint_geodesics.geometry.curves import CurveFamily, Curves, PinnedPolynomial
 from constraint_geodesics.geometry.graph import nearest_neighbour_edges, shortest_path
 from constraint_geodesics.geometry.length import estimate_length
@@ -328,7 +328,11 @@ def _lengths_of_lines(manifold: Manifold, first: Tensor, last: Tensor) -> Tensor
     lengths = estimate_length(manifold, lines).length
     if not isinstance(manifold, BoundedManifold):
         return lengths
-    t = torch.linspace(0.0, 1.0, ON_EDGE, dtype=first.dtype)[:, None]
+    count = ON_EDGE
+    if isinstance(manifold, WalledManifold):  # a long line passes thin walls between few points
+        longest = float(torch.linalg.vector_norm(last - first, dim=-1).max())
+        count = max(count, math.ceil(LOOKED_UP * longest / manifold.step) + 1)
+    t = torch.linspace(0.0, 1.0, count, dtype=first.dtype)[:, None]
     points = (1 - t) * first[:, None] + t * last[:, None]
     inside = manifold.contains(points).all(-1)
     if isinstance(manifold, WalledManifold):

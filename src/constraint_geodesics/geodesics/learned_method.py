@@ -266,7 +266,7 @@ def _free_configurations(task: Task) -> Float[np.ndarray, "n D"]:
     """
     robot, rng = task.manifold.robot, np.random.default_rng(0)
     found = retract(task.manifold, robot.sample(PAST, rng))
-    kept = found.converged & (robot.limit_distance(found.joints) >= 0.0).all(axis=-1)
+    kept = found.converged & (robot.limit_distance(found.joints) >= 0.0)
     joints = found.joints[kept]
     free = joints[task.clearance.clearance(robot, joints, TOUCHING_M) >= TOUCHING_M]
     return free if len(free) else found.joints

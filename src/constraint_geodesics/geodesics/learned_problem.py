@@ -192,7 +192,8 @@ class LearnedProblem:
         fine, coarse = rule.length(shape).numpy(), rule.half.length(shape[:, ::2]).numpy()
         joints = corrected(mean, t, ends.q_start, ends.q_goal)
         outside = -np.minimum(self.manifold.robot.limit_distance(joints), 0.0).sum(-1)
-        factor = 1.0 + self.inclusion_weight * self.manifold.violation(mean).mean(-1)
+        along = self.manifold.violation(mean) @ rule.own_weights.numpy()  # points crowd at the ends
+        factor = 1.0 + self.inclusion_weight * along
         cost = (fine + np.abs(fine - coarse)) * factor + outside
         return Costs(fine, cost, outside == 0.0)
 

@@ -191,7 +191,7 @@ def _first_accepted(
     """The cheapest feasible candidate of the first round with one that passes the exact check."""
     evaluations = 0
     for met in asked:
-        evaluations += len(met.phi)
+        evaluations += met.looks or len(met.phi)
         row = next((int(r) for r in met.usable[:MOST_CHECKED] if accept(met.phi[r])), None)
         if row is None:
             continue
@@ -253,7 +253,8 @@ def ppo_model(environment: VecEnv, params: GeodesicParams, seed: int) -> PPO:
         clip_range=ppo.clip,
         ent_coef=ppo.entropy,
         learning_rate=lambda left: (
-            ppo.learning_rate_end + left * (ppo.learning_rate - ppo.learning_rate_end)
+            # the last rollout goes beyond the steps asked for: what is left is negative then
+            ppo.learning_rate_end + max(left, 0.0) * (ppo.learning_rate - ppo.learning_rate_end)
         ),
         policy_kwargs={"net_arch": list(ppo.hidden), "log_std_init": -0.5},
     )

@@ -86,7 +86,8 @@ def on_grid(
     data: Float[np.ndarray, "n N"],
     params: SubmanifoldParams,
 ) -> GridSubmanifold:
-    """Inclusion map of the decoded poses over the part of the plane that the data reaches, Fig. 4b.
+    """Inclusion map of the decoded poses over the data's bounding box in the plane, Fig. 4b; limits
+    and collisions are not looked at.
 
     An axis held exactly leaves a set too thin for any grid: it counts as kept within the grid's
     resolution.
@@ -135,20 +136,18 @@ def check_edges(
     return np.where(holds, lengths, np.inf)
 
 
-def component_of(
+def components_of(
     submanifold: GraphSubmanifold,
     surface: Surface,
     q: Float[np.ndarray, "D"],
     params: SubmanifoldParams,
-) -> int:
-    """Component of the nearest node that an edge from q reaches; UNKNOWN if there is none."""
+) -> set[int]:
+    """Components of the nodes near q that an edge from it reaches; none if there is none."""
     near = np.argsort(np.linalg.norm(submanifold.joints - q, axis=-1))
     near = near[: 4 * params.neighbours]
     nodes = submanifold.joints[near]
     lengths = check_edges(surface, np.broadcast_to(q, nodes.shape), nodes, params.edge_points)
-    if not np.isfinite(lengths).any():
-        return UNKNOWN
-    return int(submanifold.labels[near[np.argmin(lengths)]])
+    return set(submanifold.labels[near[np.isfinite(lengths)]].tolist())
 
 
 def within_resolution(

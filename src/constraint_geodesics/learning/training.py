@@ -74,9 +74,11 @@ class _MeanPhase(_Phase):
         self.log("loss", loss, on_step=False, on_epoch=True, prog_bar=True)
         return loss
 
-    def validation_step(self, batch: list[Tensor]) -> None:
+    def validation_step(self, batch: list[Tensor], batch_idx: int) -> None:
         (q,) = batch
-        noise = torch.zeros(len(q), self.vae.latent_dim)
+        # drawn as in training, so that both are the same loss, and the same in every epoch
+        drawn = torch.Generator().manual_seed(batch_idx)
+        noise = torch.randn(len(q), self.vae.latent_dim, generator=drawn)
         loss, reconstruction = evidence_loss(self.vae, q, self.params.beta, noise)
         self.log_dict(
             {"held_out_loss": loss, "held_out_reconstruction": reconstruction}, prog_bar=True

@@ -13,7 +13,7 @@ import yaml
 
 from constraint_geodesics.text_files import write_bytes
 
-NAMES = ("dvc.lock", "stages/dvc.lock")
+NAMES = ("dvc.lock", "stages/dvc.lock", "stages/sweep/dvc.lock")
 
 
 def keep_locks(root: Path) -> None:

@@ -78,6 +78,7 @@ def space_view(
     # a grid at z = 0 would flicker with the top of a table there
     grid = rrb.LineGrid3D(visible=False)
     shown = {"contents": contents, "eye_controls": eyes, "line_grid": grid, **more}
+    shown["background"] = _PAPER  # black is drawn too, which a dark theme would swallow
     return rrb.Spatial3DView(origin="/", name=name, **shown)
 
 

@@ -15,7 +15,6 @@ from constraint_geodesics.palette import (
     BLUE,
     GOAL,
     GREEN,
-    GREY,
     LIGHT,
     ORANGE,
     PURPLE,
@@ -30,13 +29,14 @@ _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK)
 
 
 class DrawnPath(NamedTuple):
-    """What is drawn of a path: times [s], waypoints [rad] under the joints' names, base, joint
-    origins and tool of each [m], its violation and the bound on it [rad or m].
+    """What is drawn of a path: times [s], waypoints under the joints' names in their units (rad or
+    m), base, joint origins and tool of each [m], its violation and the bound on it [rad or m].
     """
 
     times: Float[np.ndarray, "T"]
     joints: Float[np.ndarray, "T D"]
     names: Sequence[str]
+    units: Sequence[str]
     skeletons: Float[np.ndarray, "T n 3"]
     violation: Float[np.ndarray, "T"]
     bound: float
@@ -53,7 +53,7 @@ def path_figure(path: DrawnPath, title: str) -> Figure:
     for k, name in enumerate(path.names):
         colour = _COLOURS[k % len(_COLOURS)]
         axes.plot(path.times, path.joints[:, k], color=colour, lw=1.4, label=name)
-    axes.set_ylabel("joint position [rad]")
+    axes.set_ylabel(f"joint position [{' or '.join(dict.fromkeys(path.units))}]")
     axes.legend(ncols=3, fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(0.0, 1.28))
     below = figure.add_subplot(grid[1, 1], sharex=axes)
     violation, bound = np.maximum(path.violation, 1e-12), max(path.bound, 1e-12)
@@ -87,5 +87,3 @@ def _draw_arm(figure: Figure, place: object, skeletons: Float[np.ndarray, "T n 3
     axes.set_zlim(min(0.0, centre[2] - half), centre[2] + half)
     axes.legend(fontsize=7, frameon=False, loc="upper left")
     axes.view_init(elev=22, azim=-58)
-    x, y = 0.4 * np.array([[-1, 1, 1, -1, -1], [-1, -1, 1, 1, -1]])
-    axes.plot(x, y, np.zeros(5), color=GREY, lw=0.6)  # the table's edge

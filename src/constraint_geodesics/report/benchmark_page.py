@@ -169,8 +169,9 @@ def _case_section(summary: pd.DataFrame, recorded: Mapping[Case, Sequence[Record
         note = f"{counted(case)}; from reports/benchmark/summary.csv"
         blocks.append(_of_planners(f"{constraint}, scene {scene}", note, case_cells(case), links))
     told = (
-        "Recorded paths stand below the table that they belong to. The benchmark makes no MLflow "
-        "runs: its rows are in reports/benchmark.csv, and in data/benchmark.db for Planner Arena."
+        "Recorded paths stand below the table that they belong to. All rows are in "
+        "reports/benchmark.csv, and in data/benchmark.db for Planner Arena; MLflow has a run for "
+        "each planner that is drawn (its view Planners)."
     )
     return Section("cases", "Every constraint and scene", told, folded=blocks)
 

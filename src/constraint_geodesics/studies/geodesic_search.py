@@ -49,7 +49,7 @@ from constraint_geodesics.learning.submanifold import (
     GraphSubmanifold,
     Submanifold,
     Surface,
-    component_of,
+    components_of,
 )
 from constraint_geodesics.params import GeodesicParams, JudgeParams, Params, SubmanifoldParams
 from constraint_geodesics.scene.clearance import clearance_model
@@ -212,8 +212,8 @@ def connected_queries(
     connected, seconds = [], []
     for pair in zip(queries.starts, queries.goals, strict=True):
         began = time.perf_counter()
-        a, b = (component_of(submanifold, surface, q, params) for q in pair)
-        connected.append(a == b or min(a, b) < 0)
+        a, b = (components_of(submanifold, surface, q, params) for q in pair)
+        connected.append(bool(a & b) or not (a and b))
         seconds.append(time.perf_counter() - began)
     return np.array(connected), np.array(seconds)
 

@@ -39,14 +39,14 @@ DESCRIPTION = (
 def register_planner(run: StageRun, folder: Path, code: Path, example: Mapping[str, Any]) -> str:
     """Register a planner's files and let the alias `champion` point to them; returns the version.
 
-    Files that the champion has already make no new version.  A run of a DVC experiment registers
+    Files and code that a version has already make no new one.  A run of a DVC experiment registers
     its planner, but leaves the champion where it is.
 
     folder: as `Bundle.write` writes it.  code: the file that answers with them.  example: one
     query.
     Raises TrackingError if the store does not take it.
     """
-    digest = folder_digest(folder)
+    digest = _digest_of(folder, code)
     with explained(run.tracking_uri):
         client = client_of(run.tracking_uri)
         if not client.search_registered_models(f"name = '{PLANNER_MODEL}'"):
@@ -113,6 +113,13 @@ def installed_requirements() -> list[str]:
         if each.marker is None or any(each.marker.evaluate({"extra": extra}) for extra in _EXTRAS)
     }
     return [f"{name}=={metadata.version(name)}" for name in sorted(named - {own})]
+
+
+def _digest_of(folder: Path, code: Path) -> str:
+    """Of a planner's files and of what answers with them: this package's version, and its file."""
+    version = metadata.version("constraint-geodesics")
+    parts = folder_digest(folder), hashlib.sha256(code.read_bytes()).hexdigest(), version
+    return hashlib.sha256(" ".join(parts).encode()).hexdigest()
 
 
 def folder_digest(folder: Path) -> str:
