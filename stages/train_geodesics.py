@@ -32,6 +32,8 @@ from constraint_geodesics.tracking.comparison import of_seeds
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "train_geodesics"
+SEARCHED = ("length_degree", "rollouts", "kept", "rounds")
+"""What a search is told besides what its policy is trained with."""
 
 
 def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None:
@@ -66,7 +68,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         )
     about = subject_of(params, constraint=constraint, manifold=manifold, reward=settings.reward)
     with tracked_stage(
-        Work(STAGE, item, settings.of_training("length_degree", "rollouts"), sources, about),
+        Work(STAGE, item, settings.of_training(*SEARCHED), sources, about),
         params.tracking.experiment,
         layout.root,
     ) as run:

@@ -170,7 +170,7 @@ REFUSED: list[tuple[Change, tuple[str, ...]]] = [
         ("manifolds.paper.latent_dim=7", "at most 6"),
     ),
     (
-        lambda p: p["geodesics"].update(searched=["paper"]),
+        lambda p: p["geodesics"].update(searched=["paper"], illustrated=[]),
         ("geodesics.searched='paper'", "retract must be true"),
     ),
     (

@@ -500,8 +500,6 @@ class GeodesicParams(_Record):
             "episode_steps",
             "heads",
             "random_starts",
-            "kept",
-            "rounds",
             "reward",
             "ppo",
         }

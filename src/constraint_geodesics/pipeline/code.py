@@ -25,6 +25,10 @@ FOUND_BY_NAME = {
 """What a module reaches without an import statement: kinds that params.yaml names."""
 NO_RESULT = ("__init__", "cli", "params", "pipeline", "tracking")
 """Rooms that change no result: parameters are dependencies by their values."""
+REGISTERED = ("tracking/registry.py", "tracking/served_model.py")
+"""Who registers the planner, and the code that goes with it: a result where a stage's own script
+imports the first.
+"""
 DEFAULTS = ("planner.py", ("PlannerParams", "JudgeParams"))
 """The module whose results also hang on what params.py has for these where nobody says another."""
 
@@ -38,7 +42,7 @@ def code_of(script: Path, package: Path) -> dict[str, str]:
     first = list(_imported(script, package))
     draws = any(_room(file, package) in DRAWING for file in first)
     left_out = NO_RESULT if draws else NO_RESULT + DRAWING
-    found: set[Path] = set()
+    registers, found = set(first), set[Path]()
     left = first
     while left:
         file = left.pop()
@@ -48,6 +52,8 @@ def code_of(script: Path, package: Path) -> dict[str, str]:
             for pattern in FOUND_BY_NAME.get(file.relative_to(package).as_posix(), ()):
                 left += package.glob(pattern)
     found |= {page for file in found for page in file.parent.glob("templates/*")}
+    if package / REGISTERED[0] in registers:
+        found.add(package / REGISTERED[1])
     files = {file.relative_to(package).as_posix(): digest(file) for file in sorted(found)}
     if DEFAULTS[0] in files:
         files["defaults"] = _of_defaults()

@@ -141,6 +141,7 @@ def _break_even_section(layout: Layout, costs: pd.DataFrame) -> Section:
 
 def _growth_section(layout: Layout) -> Section:
     slopes = pd.read_csv(layout.root / "reports" / "growth" / "slopes.csv", comment="#")
+    slopes = slopes[slopes["points"] > 2]  # any two points lie on a line
     told = (
         "Seconds against joints, held task axes, obstacles, queries, latent dimensions and "
         "rows, on one thread."
@@ -197,7 +198,7 @@ def growth_cells(slopes: pd.DataFrame) -> Cells:
             *(fixed(row[name]) for name in ("slope", "standard_error")),
             str(row["points"]),
         )
-        for row in slopes[slopes["points"] > 2].to_dict("records")  # any two lie on a line
+        for row in slopes.to_dict("records")
     ]
 
 

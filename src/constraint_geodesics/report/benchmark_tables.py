@@ -53,10 +53,9 @@ TABLE_I = (
 FEW = 20
 """Queries below which a 95th percentile is that of the worst one, and not shown."""
 PYTHON_NOTE = (
-    "† is OMPL's: it asks the compiled check, which all share, through Python for every state of "
-    "its search. What draws at random is asked again while its path is not certified, within its "
-    "time. Where a planner cannot work under a constraint (OMPL's atlas and tangent bundle have no "
-    "tangent space for a tolerance) it has no rows of it here."
+    "† is OMPL's: it asks through Python for every state of its search. Where a planner cannot "
+    "work under a constraint (OMPL's atlas and tangent bundle have no tangent space for a "
+    "tolerance) it has no rows of it here."
 )
 _LEARNED = "learned"
 """The planner of the benchmark that the paper's learned geodesics stand next to."""

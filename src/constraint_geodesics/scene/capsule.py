@@ -13,6 +13,9 @@ from constraint_geodesics.robot.kinematics import rpy_of
 from constraint_geodesics.scene.pieces import Piece
 from constraint_geodesics.scene.shape import Placement, RoundedBox, Shape, add_body
 
+ROUNDING_M = 1e-9
+"""Difference of two lengths below which they are one."""
+
 
 @dataclass(frozen=True)
 class Capsule(Shape):
@@ -46,6 +49,12 @@ class Capsule(Shape):
         middle, half = np.array(at.position_m), 0.5 * self.length_m * at.turn[:, 2]
         first, last = (middle - half).tolist(), (middle + half).tolist()
         return replace(self, from_m=tuple(first), to_m=tuple(last))
+
+    def is_like(self, other: Shape) -> bool:
+        """Its ends are rounded where it is placed, and with them its length."""
+        if not isinstance(other, Capsule) or abs(self.length_m - other.length_m) > ROUNDING_M:
+            return False
+        return self == replace(other, from_m=self.from_m, to_m=self.to_m)
 
     def add_to(self, bullet: Any) -> int:
         """A capsule of PyBullet, which has it along its z axis."""

@@ -9,14 +9,11 @@ from constraint_geodesics.robot.description import arm_to, read_description
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, load_robot
 from constraint_geodesics.scene.arm import ADJACENT, load_arm
 from constraint_geodesics.scene.attached import Attached
-from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.names import SceneError as SceneError
 from constraint_geodesics.scene.names import require_texts, shapes_of
 from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.urdf import find_urdf, has_pybullet
 from constraint_geodesics.scene.world import World
-
-_ROUNDING_M = 1e-9
 
 
 @dataclass(frozen=True)
@@ -94,7 +91,7 @@ class Scene:
             raise SceneError(f"{held.name!r} is attached already: detach it first")
         found = self
         for shape in self.workcell:
-            if shape.name == held.name and not is_same_shape(shape, held.shape):
+            if shape.name == held.name and not shape.is_like(held.shape):
                 found = found._forgetting(held.name)
         around = tuple(shape for shape in self.workcell if shape.name != held.name)
         return replace(found, workcell=around, attached=(*found.attached, held))
@@ -158,13 +155,3 @@ def robot_from(params: RobotParams) -> SerialRobot:
 def workcell_from(params: WorkcellParams) -> tuple[Shape, ...]:
     """The shapes that params.yaml lists."""
     return tuple(params.shapes.values())
-
-
-def is_same_shape(one: Shape, other: Shape) -> bool:
-    """Whether two shapes differ at most in where they are."""
-    first, second = one.placed(Placement()), other.placed(Placement())
-    if isinstance(first, Capsule) and isinstance(second, Capsule):  # their ends are rounded
-        if abs(first.length_m - second.length_m) > _ROUNDING_M:
-            return False
-        second = replace(second, from_m=first.from_m, to_m=first.to_m)
-    return first == second

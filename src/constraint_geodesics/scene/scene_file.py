@@ -24,7 +24,7 @@ from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.body import Body
 from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.planning_scene import PlanningScene
-from constraint_geodesics.scene.scene import SceneError, is_same_shape
+from constraint_geodesics.scene.scene import SceneError
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.shapes import AnyShape
 
@@ -70,7 +70,7 @@ class SceneFile(_Record):
         now = scene.now.adding(*self.shapes.values())
         around = {shape.name: shape for shape in now.workcell}
         for name, held in self.attached.items():
-            if name in around and not is_same_shape(around[name], held.shape):
+            if name in around and not around[name].is_like(held.shape):
                 line = "another shape of that name stands in the scene: give one another name"
                 raise SceneError(f"attached.{name}: {line}")
             now = now.attaching(Attached(held.shape, held.link, held.touching))

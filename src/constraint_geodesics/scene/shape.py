@@ -190,6 +190,10 @@ class Shape(ABC):
     def placed(self, at: Placement) -> Self:
         """The same shape with its own frame elsewhere."""
 
+    def is_like(self, other: "Shape") -> bool:
+        """Whether both differ at most in where they are."""
+        return self.placed(Placement()) == other.placed(Placement())
+
     @abstractmethod
     def add_to(self, bullet: Any) -> int:
         """Make its body in a world, with `bullet`'s functions of PyBullet; the body's index."""
