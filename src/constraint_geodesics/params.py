@@ -371,7 +371,7 @@ class RewardParams(_Record):
     c: Positive
     length_weight: NonNegative
     reduction_weight: NonNegative
-    inclusion_weight: NonNegative = 0.0
+    inclusion_weight: NonNegative
     feasible_weight: NonNegative = 0.0
     set_weight: NonNegative = 0.0
 
