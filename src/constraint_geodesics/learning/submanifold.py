@@ -26,7 +26,6 @@ from constraint_geodesics.text_files import read_json, reading, write_text, writ
 
 Free = Callable[[Float[np.ndarray, "m D"]], Bool[np.ndarray, "m"]]
 """Which configurations touch neither the arm itself nor the workcell."""
-UNKNOWN = -1
 
 ARRAYS, CARD = "submanifold.npz", "submanifold.json"
 

@@ -109,8 +109,9 @@ class UntilSound:
 
 
 def _is_unsound(problem: PlanningProblem, answer: Solution) -> bool:
-    known = problem.is_sound is not None and answer.status == "solved"
-    return known and not problem.is_sound(answer.joints)  # type: ignore[misc]
+    if problem.is_sound is None or answer.status != "solved":
+        return False
+    return not problem.is_sound(answer.joints)
 
 
 def _length(answer: Solution) -> float:
