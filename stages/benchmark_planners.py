@@ -41,9 +41,12 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     every = params.benchmark.model_copy(update={"queries": len(queries)})
     own = with_planners(params.model_copy(update={"benchmark": every}), entries)
     kept = PathKeeper(scratch / "paths")
+    measured_on = [layout.manifold(name) for name in params.manifolds]
     about = subject_of(params, constraint=constraint)
     with tracked_stage(
-        Work(STAGE, constraint, compared, [source], about), params.tracking.experiment, layout.root
+        Work(STAGE, constraint, compared, [source, *measured_on], about),
+        params.tracking.experiment,
+        layout.root,
     ) as run:
         table = answered(Run(own, layout, queries, scratch, list(params.manifolds), kept))
         rows: list[Any] = table.to_dict("records")

@@ -21,7 +21,8 @@ STAGE = "build_learned"
 def main(params: Params, layout: Layout) -> None:
     """Write data/learned/."""
     manifold, name = params.geodesics.searched[0], params.policies.chart
-    inputs = [layout.manifold(manifold), layout.policies(name)]
+    graphs = [layout.submanifold(manifold, constraint) for constraint in params.constraints]
+    inputs = [layout.manifold(manifold), layout.policies(name), *graphs]
     about = subject_of(params, manifold=manifold)
     work = Work(STAGE, "learned", {"chart": name}, inputs, about)
     with tracked_stage(work, params.tracking.experiment, layout.root) as run:

@@ -26,18 +26,19 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
     """Write data/submanifolds/<manifold>-<constraint>/ and its figures."""
     item = f"{manifold}-{constraint}"
     sources = [layout.joints("free"), layout.joints(constraint)]
+    learned = layout.manifold(manifold)
     scene = Scene.from_params(params, constraint)
     constrained = constraint_manifold(scene.robot, params.constraints[constraint])
     about = subject_of(params, constraint=constraint, manifold=manifold)
     with (
         tracked_stage(
-            Work(STAGE, item, params.submanifold, sources, about),
+            Work(STAGE, item, params.submanifold, [*sources, learned], about),
             params.tracking.experiment,
             layout.root,
         ) as run,
         scene.world() as world,
     ):
-        chart = LearnedManifold.load(layout.manifold(manifold))
+        chart = LearnedManifold.load(learned)
         free, on_constraint = (read_joints(source).free_joints for source in sources)
         surface = Surface(chart, constrained, world.free)
         found = extract(surface, free, on_constraint, params.submanifold)

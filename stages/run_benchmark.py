@@ -20,7 +20,8 @@ def main(params: Params, layout: Layout) -> None:
     and some recordings.
     """
     asked = params.benchmark.model_dump(mode="json", exclude={"planners"})
-    work = Work(STAGE, STAGE, asked, [layout.planner])
+    read = [layout.planner, layout.learned, layout.submanifolds, layout.path_diffusion]
+    work = Work(STAGE, STAGE, asked, [folder for folder in read if folder.is_dir()])
     with tracked_stage(work, params.tracking.experiment, layout.root) as run:
         own = committed_run(params, layout, layout.benchmark_rows, layout.benchmark_recordings)
         table = answered(own)

@@ -32,7 +32,7 @@ from constraint_geodesics.tracking.comparison import of_seeds
 from constraint_geodesics.tracking.experiment import Work, subject_of, tracked_stage
 
 STAGE = "train_geodesics"
-SEARCHED = ("length_degree", "rollouts", "kept", "rounds")
+SEARCHED: tuple[str, ...] = ("length_degree", "rollouts", "kept", "rounds")
 """What a search is told besides what its policy is trained with."""
 
 
@@ -49,18 +49,21 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         read_joints(sources[0]).free_joints,
     )
     policies: dict[int, MeanPolicy] = {}
-    settings = params.geodesics
+    settings, read, told = params.geodesics, [layout.manifold(manifold)], SEARCHED
     if params.manifolds[manifold].retract:
         name = params.policies.chart
         chart = chart_named(name, layout.manifold(name), scene.robot)
         problem = policy_problem(params, chart, scene, constrained, joints)
         folder = layout.policies(name)
+        read.append(folder)
         policies = {seed: MeanPolicy.load(folder, seed) for seed in settings.seeds}
         settings = params.policy_settings().model_copy(update={"seeds": settings.seeds})
     else:
+        told = (*SEARCHED, "inclusion_weight")
         problem = geodesic_problem(params, learned, constrained, joints, manifold)
     queries = read_queries(sources[1])
-    submanifold = load_submanifold(layout.submanifold(manifold, constraint))
+    read.append(layout.submanifold(manifold, constraint))
+    submanifold = load_submanifold(read[-1])
     with scene.world() as world:
         surface = Surface(learned, constrained, world.free)
         connected, connection_s = connected_queries(
@@ -68,7 +71,7 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         )
     about = subject_of(params, constraint=constraint, manifold=manifold, reward=settings.reward)
     with tracked_stage(
-        Work(STAGE, item, settings.of_training(*SEARCHED), sources, about),
+        Work(STAGE, item, settings.of_training(*told), [*sources, *read], about),
         params.tracking.experiment,
         layout.root,
     ) as run:

@@ -371,7 +371,6 @@ class RewardParams(_Record):
     c: Positive
     length_weight: NonNegative
     reduction_weight: NonNegative
-    inclusion_weight: NonNegative
     feasible_weight: NonNegative = 0.0
     set_weight: NonNegative = 0.0
 
@@ -454,7 +453,10 @@ def _require_multiple(environments: int, heads: int) -> None:
 
 
 class GeodesicParams(_Record):
-    """Policy search of geodesics."""
+    """Policy search of geodesics.
+
+    inclusion_weight: of leaving the sub-manifold, in a curve's cost, where it is not retracted.
+    """
 
     seeds: Seeds
     searched: Annotated[tuple[Name, ...], Field(min_length=1)]
@@ -469,6 +471,7 @@ class GeodesicParams(_Record):
     steps: Count
     environments: Count
     episode_steps: Count
+    inclusion_weight: NonNegative
     reward: RewardParams
     ppo: PpoParams
     rollouts: Count

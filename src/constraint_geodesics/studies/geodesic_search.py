@@ -230,7 +230,7 @@ def geodesic_problem(
     """
     geodesics = params.geodesics
     curve = PinnedPolynomial(chart.dim, geodesics.degree)
-    retract, weight = params.manifolds[name].retract, geodesics.reward.inclusion_weight
+    retract, weight = params.manifolds[name].retract, geodesics.inclusion_weight
     return LearnedProblem(chart, manifold, curve, joints, geodesics.length_degree, retract, weight)
 
 
