@@ -93,6 +93,15 @@ def test_the_first_sound_path_is_the_answer_with_the_time_of_all_attempts(proble
     assert 0.75 <= found.time_s < 1.0
 
 
+def test_after_a_path_that_is_not_sound_shorter_steps_are_asked_for(problem) -> None:
+    inner, finer = Listed((5.0, 1.0)), Listed((4.0, 3.0, 1.0))
+    found = UntilSound(inner, 10.0, finer).plan(shorter_than(2.0, problem), 0)
+    assert (found.joints[-1, 0], inner.seeds, finer.seeds) == (1.0, [0], [1, 2, 3])
+    inner, finer = Listed((1.0, 5.0, 1.0)), Listed((1.5,))
+    found = Restarted(inner, 0.02, finer).plan(shorter_than(2.0, problem), 0)
+    assert (found.joints[-1, 0], inner.seeds, finer.seeds[0]) == (1.0, [0, 1], 2)
+
+
 def test_once_the_time_for_sound_paths_is_over_the_last_one_is_what_is_claimed(problem) -> None:
     inner = Listed((5.0, 4.0, 3.0), each_s=0.25)
     found = UntilSound(inner, 0.6).plan(shorter_than(2.0, problem), 0)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict
 
@@ -110,9 +110,16 @@ class BaselineSettings(BaseModel):
         return 0.0
 
     @property
-    def bare(self) -> "BaselineSettings":
+    def bare(self) -> Self:
         """The same without a band."""
         return self.model_copy(update={"band": False})
+
+    @property
+    def finer(self) -> Self:
+        """The same with half its step between two looks, which is asked after a path that touches
+        something between them; itself where it has no such step.
+        """
+        return self
 
 
 @lru_cache(maxsize=4)

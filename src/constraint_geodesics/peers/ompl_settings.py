@@ -1,6 +1,6 @@
 """What OMPL's planners share: their state space and how they walk in it, without loading ompl."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
@@ -49,3 +49,8 @@ class OmplSettings(BaselineSettings):
     def given_s(self) -> float:
         """The budget."""
         return self.budget_s
+
+    @property
+    def finer(self) -> Self:
+        """With half of `delta_rad`."""
+        return self.model_copy(update={"delta_rad": self.delta_rad / 2.0})

@@ -112,23 +112,30 @@ def made_together(
 ) -> tuple[dict[str, PathPlanner], dict[str, float]]:
     """Planners by name, and the seconds that making each one took: one with a band after it
     shortens the very paths of the one without.  Those that draw at random are asked again while
-    their path is not sound, for their own limit or `again_s`.  Raises BaselineError if one can't be
-    made.
+    their path is not sound, for their own limit or `again_s`, with half their step where they have
+    one.  Raises BaselineError if one can't be made.
     """
     first = {own.bare for own in settings.values() if own.band and own.restarts_s is None}
+    first |= {bare.finer for bare in first}
     remembered: dict[BaselineSettings, PathPlanner] = {}
+
+    def planner_of(name: str, own: BaselineSettings) -> PathPlanner:
+        bare = own.bare
+        if bare in first and bare not in remembered:
+            remembered[bare] = Remembered(_made(name, own, context))
+        inner = remembered.get(bare) or _made(name, own, context)
+        return BandAfter(inner) if own.band else inner
+
     made: dict[str, PathPlanner] = {}
     took: dict[str, float] = {}
     for name, own in settings.items():
         began = time.perf_counter()
-        if own.bare in first and own.bare not in remembered:
-            remembered[own.bare] = Remembered(_made(name, own, context))
-        inner = remembered.get(own.bare) or _made(name, own, context)
-        found = BandAfter(inner) if own.band else inner
+        found = planner_of(name, own)
+        finer = None if own.finer == own else planner_of(name, own.finer)
         if own.restarts_s is not None:
-            found = Restarted(found, own.restarts_s)
+            found = Restarted(found, own.restarts_s, finer)
         elif own.random:
-            found = UntilSound(found, own.given_s or again_s)
+            found = UntilSound(found, own.given_s or again_s, finer)
         made[name] = found
         took[name] = time.perf_counter() - began
     return made, took

@@ -42,11 +42,13 @@ class Restarted:
 
     An attempt that has begun is not interrupted; one that would not end in time by the mean of
     those before is not begun.  An answer that no other seed can change (a refusal, a misfit) ends
-    the search at once.  A path that is not sound counts for nothing where the problem can tell.
+    the search at once.  A path that is not sound counts for nothing where the problem can tell;
+    after one `finer` is asked, the planner with shorter steps, where there is one.
     """
 
     inner: PathPlanner
     budget_s: float
+    finer: PathPlanner | None = None
 
     @property
     def name(self) -> str:
@@ -59,11 +61,14 @@ class Restarted:
         """
         began = time.perf_counter()
         best, shortest, attempts, iterations = None, np.inf, 0, 0
+        asked = self.inner
         while True:
-            answer = self.inner.plan(problem, SEEDS * seed + attempts)
+            answer = asked.plan(problem, SEEDS * seed + attempts)
             attempts += 1
             iterations += answer.iterations
-            length = np.inf if _is_unsound(problem, answer) else _length(answer)
+            length = _length(answer)
+            if _is_unsound(problem, answer):
+                length, asked = np.inf, self.finer or self.inner
             if best is None or length < shortest:
                 best, shortest = answer, length
             spent = time.perf_counter() - began
@@ -78,13 +83,15 @@ class Restarted:
 class UntilSound:
     """A planner that is asked again with another seed while its path is not sound, for `budget_s`
     [s] in all, TRIES times at least: one that looks at single configurations may touch something
-    between them.
+    between them.  After the first attempt `finer` is asked, the planner with shorter steps, where
+    there is one.
 
     An attempt that has begun is not interrupted.  Where the problem can't tell, the first answers.
     """
 
     inner: PathPlanner
     budget_s: float
+    finer: PathPlanner | None = None
 
     @property
     def name(self) -> str:
@@ -96,8 +103,10 @@ class UntilSound:
         sound or not, which is what the planner claims; any other answer as it is.
         """
         spent_s, attempts, iterations = 0.0, 0, 0
+        asked = self.inner
         while True:
-            answer = self.inner.plan(problem, SEEDS * seed + attempts)
+            answer = asked.plan(problem, SEEDS * seed + attempts)
+            asked = self.finer or self.inner
             attempts += 1
             iterations += answer.iterations
             began = time.perf_counter()

@@ -74,9 +74,12 @@ class FromScratch(AbstractContextManager["FromScratch"]):
         self.scene, self.seed, self._opened = scene, seed, ExitStack()
         self._certifier = self._opened.enter_context(Certifier(scene, limits))
         self._clearances = Clearances(scene, self._certifier.collisions.apart)
-        settings = BirrtSettings()
-        search = SamplingPlanner(settings.search, settings, row_spacing_rad)
-        self._planner = UntilSound(BandAfter(search), SOUND_S)
+        coarse = BirrtSettings()
+        first, finer = (
+            BandAfter(SamplingPlanner(own.search, own, row_spacing_rad))
+            for own in (coarse, coarse.finer)
+        )
+        self._planner = UntilSound(first, SOUND_S, finer)
 
     def __exit__(self, *_: object) -> None:
         self._opened.close()
