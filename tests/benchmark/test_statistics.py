@@ -226,14 +226,10 @@ def test_a_second_run_is_compared_row_by_row() -> None:
         time_s=first["time_s"].where(first["planner"] == "same", 7.0),
     )
     told = repeated(first, again).set_index("planner")
-    assert told.loc["same", ["rows", "same_validity", "length_difference", "overlap"]].tolist() == [
-        5,
-        True,
-        0.0,
-        True,
-    ]
+    figures = ["rows", "same_validity", "length_difference", "ratio", "ratio_low", "ratio_high"]
+    assert told.loc["same", figures].tolist() == [5, True, 0.0, 1.0, 1.0, 1.0]
     assert told.loc["other", "length_difference"] == pytest.approx(0.5)
-    assert not told.loc["other", "overlap"]
+    assert told.loc["other", "ratio"] == pytest.approx(70.0)
     refused = repeated(first, again.assign(valid=False)).set_index("planner")
     assert not refused["same_validity"].any()
 
