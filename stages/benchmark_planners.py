@@ -41,14 +41,13 @@ def main(params: Params, layout: Layout, constraint: str) -> None:
     every = params.benchmark.model_copy(update={"queries": len(queries)})
     own = with_planners(params.model_copy(update={"benchmark": every}), entries)
     kept = PathKeeper(scratch / "paths")
-    measured_on = [layout.manifold(name) for name in params.manifolds]
+    whole = Run(own, layout, queries, scratch, list(params.manifolds), kept)
+    read = [source, *(layout.manifold(name) for name in whole.measured_on)]
     about = subject_of(params, constraint=constraint)
     with tracked_stage(
-        Work(STAGE, constraint, compared, [source, *measured_on], about),
-        params.tracking.experiment,
-        layout.root,
+        Work(STAGE, constraint, compared, read, about), params.tracking.experiment, layout.root
     ) as run:
-        table = answered(Run(own, layout, queries, scratch, list(params.manifolds), kept))
+        table = answered(whole)
         rows: list[Any] = table.to_dict("records")
         paths = [kept.path(row, dof) for row in rows]
         # one planner of each kind stands next to the learned geodesics: its kind is its name there

@@ -21,7 +21,9 @@ def main(params: Params, layout: Layout) -> None:
     """
     asked = params.benchmark.model_dump(mode="json", exclude={"planners"})
     read = [layout.planner, layout.learned, layout.submanifolds, layout.path_diffusion]
-    work = Work(STAGE, STAGE, asked, [folder for folder in read if folder.is_dir()])
+    read += [layout.manifold(name) for name in params.manifolds]
+    read += [layout.benchmark_queries(name) for name in params.all_constraints]
+    work = Work(STAGE, STAGE, asked, [path for path in read if path.exists()])
     with tracked_stage(work, params.tracking.experiment, layout.root) as run:
         own = committed_run(params, layout, layout.benchmark_rows, layout.benchmark_recordings)
         table = answered(own)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from tests.planner_fixtures import manifold_of, packaged_planner, pairs_of
 
+from constraint_geodesics.benchmark import runner
 from constraint_geodesics.benchmark.queries import (
     Query,
     QueryError,
@@ -141,6 +142,27 @@ def test_a_row_that_killed_its_process_twice_is_a_failure(batch) -> None:
         )
         assert band["valid"] == (kills == 1)
         assert band["reason"] == reason
+
+
+def test_a_planner_that_kills_its_process_before_it_is_timed_is_given_up_too(batch) -> None:
+    class Dying:
+        name = "band"
+
+        def plan(self, problem, seed):
+            raise SystemExit(1)
+
+    @contextmanager
+    def dying(names, scene, constraint, manifold):
+        yield {"band": Dying()}, {"band": 0.0}
+
+    own = replace(batch, queries=batch.queries[:1], baselines=ASKED[:1], build=dying)
+    for _ in range(2):
+        runner._WARM.clear()  # as in a new process
+        with pytest.raises(SystemExit):
+            run_batch(own)
+    runner._WARM.clear()
+    assert run_batch(own) == 1
+    assert batch_rows(own)[0]["reason"] == "the process died in it twice"
 
 
 def test_rows_that_are_not_asked_for_any_more_do_not_count(batch) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.planner_fixtures import manifold_of, packaged_planner, pairs_of
 
-from constraint_geodesics.peers.wrappers import Restarted, UntilSound
+from constraint_geodesics.peers.wrappers import Remembered, Restarted, UntilSound
 from constraint_geodesics.problem import PlanningProblem, Solution
 
 
@@ -94,12 +94,26 @@ def test_the_first_sound_path_is_the_answer_with_the_time_of_all_attempts(proble
 
 
 def test_after_a_path_that_is_not_sound_shorter_steps_are_asked_for(problem) -> None:
-    inner, finer = Listed((5.0, 1.0)), Listed((4.0, 3.0, 1.0))
-    found = UntilSound(inner, 10.0, finer).plan(shorter_than(2.0, problem), 0)
-    assert (found.joints[-1, 0], inner.seeds, finer.seeds) == (1.0, [0], [1, 2, 3])
-    inner, finer = Listed((1.0, 5.0, 1.0)), Listed((1.5,))
-    found = Restarted(inner, 0.02, finer).plan(shorter_than(2.0, problem), 0)
-    assert (found.joints[-1, 0], inner.seeds, finer.seeds[0]) == (1.0, [0, 1], 2)
+    inner, halved = Listed((5.0, 1.0)), Listed((4.0, 3.0, 1.0))
+    found = UntilSound(inner, 10.0, halved).plan(shorter_than(2.0, problem), 0)
+    assert (found.joints[-1, 0], inner.seeds, halved.seeds) == (1.0, [0], [1, 2, 3])
+
+
+def test_an_attempt_that_finds_nothing_after_one_that_was_not_sound_ends_nothing(problem) -> None:
+    inner = Listed((5.0, np.nan, 1.0), each_s=0.1)
+    found = UntilSound(inner, 10.0).plan(shorter_than(2.0, problem), 0)
+    assert (found.joints[-1, 0], len(inner.seeds)) == (1.0, 3)
+
+
+def test_every_answer_to_the_last_problem_is_remembered(problem) -> None:
+    inner = Listed((1.0,))
+    kept = Remembered(inner)
+    for seed in [*range(1000), *range(1000)]:
+        kept.plan(problem, seed)
+    assert inner.seeds == list(range(1000))
+    kept.plan(replace(problem), 0)
+    assert inner.seeds[-1] == 0
+    assert len(inner.seeds) == 1001
 
 
 def test_once_the_time_for_sound_paths_is_over_the_last_one_is_what_is_claimed(problem) -> None:

@@ -159,7 +159,7 @@ def _baselines(run: Run, constraint: str, first: int, parts: Sequence[Any]) -> t
         if first >= count:
             continue
         about = [entry.kind, own.model_dump(mode="json")]
-        made_of = [_code_of(entry.kind, own), _data_of(run, own)]
+        made_of = [_code_of(entry.kind), _data_of(run, own)]
         found.append(
             Baseline(
                 name=name,
@@ -203,9 +203,8 @@ def _shared_parts(run: Run) -> list[Any]:
     ]
 
 
-def _code_of(kind: str, settings: BaselineSettings) -> str:
-    wrapped = settings.band or settings.restarts_s is not None or settings.random
-    return code_digest(f"peers.{kind}", *["peers.wrappers"] * wrapped)
+def _code_of(kind: str) -> str:
+    return code_digest(f"peers.{kind}", "peers.making")
 
 
 def _data_of(run: Run, settings: BaselineSettings) -> str:

@@ -258,13 +258,13 @@ def _asked(
     """A planner's answer, and the memory it took [MB].  One that is new to this process answers
     once before it is timed: that loads its code.
     """
+    if _started(batch, job) > 1:
+        nothing = np.empty((0, len(problem.start)))
+        return Solution("not_found", nothing, 0.0, 0, "the process died in it twice"), math.nan
     warm = (job.baseline.name, job.query.scene)
     if warm not in _WARM:
         _planned(planner, replace(problem), job.seed)  # another object: not to be remembered
         _WARM.add(warm)
-    if _started(batch, job) > 1:
-        nothing = np.empty((0, len(problem.start)))
-        return Solution("not_found", nothing, 0.0, 0, "the process died in it twice"), math.nan
     return _measured_memory(lambda: _planned(planner, problem, job.seed))
 
 

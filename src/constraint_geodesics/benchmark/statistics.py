@@ -277,8 +277,8 @@ def repeated(first: pd.DataFrame, again: pd.DataFrame) -> pd.DataFrame:
 
     rows: that both have.  same_validity; length_difference: the largest relative one of rows valid
     in both.  time_s, time_again_s: medians of the first and of the second run.  ratio_*: the median
-    over queries of the second time over the first of the same row, with its 95 % bootstrap
-    interval.
+    over queries of the second time over the first of the same row, of a query's seeds the median,
+    with its 95 % bootstrap interval; rows that took no time or do not apply have no part in it.
     """
     keys, table = [*CASE, "planner", "query", "seed"], []
     both = first.merge(again, on=keys, suffixes=("", "_again"))
@@ -292,8 +292,11 @@ def repeated(first: pd.DataFrame, again: pd.DataFrame) -> pd.DataFrame:
             "length_difference": float(relative.max()) if len(relative) else 0.0,
         }
         times = {"time_s": own["time_s"].median(), "time_again_s": own["time_s_again"].median()}
-        ratio = (own["time_s_again"] / own["time_s"]).groupby([own[k] for k in (*CASE, "query")])
-        low, middle, high = _interval(ratio.median().to_numpy(), np.median)
+        timed = own[(own["time_s"] > 0.0) & (own["status"] != "not_applicable")]
+        ratios = (timed["time_s_again"] / timed["time_s"]).groupby(
+            [timed[k] for k in (*CASE, "query")]
+        )
+        low, middle, high = _interval(ratios.median().to_numpy(), np.median)
         table.append(row | times | {"ratio": middle, "ratio_low": low, "ratio_high": high})
     return pd.DataFrame(table)
 

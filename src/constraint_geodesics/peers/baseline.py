@@ -107,7 +107,7 @@ class BaselineSettings(BaseModel):
     @property
     def given_s(self) -> float:
         """Time that it is given for a query [s]; 0 where it is given none."""
-        return 0.0
+        return self.restarts_s or 0.0
 
     @property
     def bare(self) -> Self:
@@ -115,9 +115,9 @@ class BaselineSettings(BaseModel):
         return self.model_copy(update={"band": False})
 
     @property
-    def finer(self) -> Self:
-        """The same with half its step between two looks, which is asked after a path that touches
-        something between them; itself where it has no such step.
+    def with_half_step(self) -> Self:
+        """The same with half its step between two looks, which is asked after a path that was not
+        certified; itself where it has no such step.
         """
         return self
 

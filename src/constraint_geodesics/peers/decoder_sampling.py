@@ -80,9 +80,6 @@ class DecoderSampling:
             problem, self.settings, partial(next, samples), seed, deadline
         )
         rows = None if joints is None else rows_along(manifold, joints)
-        if rows is not None and not problem.keeps_clear(rows):
-            touches = "its path touches something between its rows"
-            return answer(None, problem, began, iterations, touches)
         return answer(rows, problem, began, iterations)
 
     def _misfit(self, manifold: ConstraintManifold) -> str:

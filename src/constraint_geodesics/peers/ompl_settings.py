@@ -47,10 +47,10 @@ class OmplSettings(BaselineSettings):
 
     @property
     def given_s(self) -> float:
-        """The budget."""
-        return self.budget_s
+        """That of the restarts, or the budget."""
+        return self.restarts_s or self.budget_s
 
     @property
-    def finer(self) -> Self:
+    def with_half_step(self) -> Self:
         """With half of `delta_rad`."""
         return self.model_copy(update={"delta_rad": self.delta_rad / 2.0})

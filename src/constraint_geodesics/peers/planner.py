@@ -67,8 +67,8 @@ class PlannerSettings(BaselineSettings):
 
     @property
     def given_s(self) -> float:
-        """The budget."""
-        return self.budget_s or 0.0
+        """That of the restarts, or the budget."""
+        return self.restarts_s or self.budget_s or 0.0
 
 
 @dataclass(frozen=True)

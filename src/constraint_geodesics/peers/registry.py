@@ -1,7 +1,6 @@
 """The baselines by their kinds: found among the files here, loaded when one is asked for."""
 
 import json
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,13 +14,7 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.palette import FAMILIES
 from constraint_geodesics.params import BaselineParams, Params, one_line
 from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings, Context
-from constraint_geodesics.peers.wrappers import (
-    AGAIN_S,
-    BandAfter,
-    Remembered,
-    Restarted,
-    UntilSound,
-)
+from constraint_geodesics.peers.making import made_together
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.problem import PathPlanner
 from constraint_geodesics.scene.scene import Scene
@@ -105,44 +98,3 @@ class BaselineBuilder:
         settings = {name: settings_of(name, known[name]) for name in names}
         context = Context(scene, constraint, manifold, self.params, Layout(self.root), {})
         yield made_together(settings, context)
-
-
-def made_together(
-    settings: Mapping[str, BaselineSettings], context: Context, again_s: float = AGAIN_S
-) -> tuple[dict[str, PathPlanner], dict[str, float]]:
-    """Planners by name, and the seconds that making each one took: one with a band after it
-    shortens the very paths of the one without.  Those that draw at random are asked again while
-    their path is not sound, for their own limit or `again_s`, with half their step where they have
-    one.  Raises BaselineError if one can't be made.
-    """
-    first = {own.bare for own in settings.values() if own.band and own.restarts_s is None}
-    first |= {bare.finer for bare in first}
-    remembered: dict[BaselineSettings, PathPlanner] = {}
-
-    def planner_of(name: str, own: BaselineSettings) -> PathPlanner:
-        bare = own.bare
-        if bare in first and bare not in remembered:
-            remembered[bare] = Remembered(_made(name, own, context))
-        inner = remembered.get(bare) or _made(name, own, context)
-        return BandAfter(inner) if own.band else inner
-
-    made: dict[str, PathPlanner] = {}
-    took: dict[str, float] = {}
-    for name, own in settings.items():
-        began = time.perf_counter()
-        found = planner_of(name, own)
-        finer = None if own.finer == own else planner_of(name, own.finer)
-        if own.restarts_s is not None:
-            found = Restarted(found, own.restarts_s, finer)
-        elif own.random:
-            found = UntilSound(found, own.given_s or again_s, finer)
-        made[name] = found
-        took[name] = time.perf_counter() - began
-    return made, took
-
-
-def _made(name: str, settings: BaselineSettings, context: Context) -> PathPlanner:
-    try:
-        return settings.make(context)
-    except ValueError as error:
-        raise BaselineError(f"benchmark.planners.{name}: {error}") from None

@@ -3,7 +3,6 @@ is sound, and a memory.
 """
 
 import time
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -22,14 +21,6 @@ from constraint_geodesics.search.band import BandSettings, step_lengths
 from constraint_geodesics.search.candidates import Candidate, Task, less_and_less_relaxed, refined
 from constraint_geodesics.search.roadmap import resample
 
-KEPT_ANSWERS = 256
-"""Answers that a planner with a band after it is remembered for: more than its seeds and their
-second tries.
-"""
-AGAIN_S = 2.0
-"""Time [s] in which a planner that draws at random, and has no limit of its own, is asked again
-while its path is not sound.
-"""
 TRIES = 2
 """How often it is asked at least, where its first try takes all its time."""
 SEEDS = 100_000
@@ -42,13 +33,11 @@ class Restarted:
 
     An attempt that has begun is not interrupted; one that would not end in time by the mean of
     those before is not begun.  An answer that no other seed can change (a refusal, a misfit) ends
-    the search at once.  A path that is not sound counts for nothing where the problem can tell;
-    after one `finer` is asked, the planner with shorter steps, where there is one.
+    the search at once.  A path that is not sound counts for nothing where the problem can tell.
     """
 
     inner: PathPlanner
     budget_s: float
-    finer: PathPlanner | None = None
 
     @property
     def name(self) -> str:
@@ -61,14 +50,11 @@ class Restarted:
         """
         began = time.perf_counter()
         best, shortest, attempts, iterations = None, np.inf, 0, 0
-        asked = self.inner
         while True:
-            answer = asked.plan(problem, SEEDS * seed + attempts)
+            answer = self.inner.plan(problem, SEEDS * seed + attempts)
             attempts += 1
             iterations += answer.iterations
-            length = _length(answer)
-            if _is_unsound(problem, answer):
-                length, asked = np.inf, self.finer or self.inner
+            length = np.inf if _is_unsound(problem, answer) else _length(answer)
             if best is None or length < shortest:
                 best, shortest = answer, length
             spent = time.perf_counter() - began
@@ -83,15 +69,15 @@ class Restarted:
 class UntilSound:
     """A planner that is asked again with another seed while its path is not sound, for `budget_s`
     [s] in all, TRIES times at least: one that looks at single configurations may touch something
-    between them.  After the first attempt `finer` is asked, the planner with shorter steps, where
-    there is one.
+    between them.  `second` is asked from the second attempt on, where there is one.
 
-    An attempt that has begun is not interrupted.  Where the problem can't tell, the first answers.
+    An attempt that has begun is not interrupted, and one that finds nothing, after one that was not
+    sound, is followed by another too.  Where the problem can't tell, the first answers.
     """
 
     inner: PathPlanner
     budget_s: float
-    finer: PathPlanner | None = None
+    second: PathPlanner | None = None
 
     @property
     def name(self) -> str:
@@ -99,21 +85,21 @@ class UntilSound:
         return self.inner.name
 
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
-        """The first sound path, the looks at paths within its time; once that is over the last one,
-        sound or not, which is what the planner claims; any other answer as it is.
+        """The first sound path, the looks at paths within its time; once that is over the last
+        answer, sound or not, which is what the planner claims; any other answer as it is.
         """
         spent_s, attempts, iterations = 0.0, 0, 0
         asked = self.inner
         while True:
             answer = asked.plan(problem, SEEDS * seed + attempts)
-            asked = self.finer or self.inner
+            asked = self.second or self.inner
             attempts += 1
             iterations += answer.iterations
             began = time.perf_counter()
-            unsound = _is_unsound(problem, answer)
+            again = _is_unsound(problem, answer) or (attempts > 1 and answer.status == "not_found")
             # a remembered answer holds its own time
             spent_s += answer.time_s + time.perf_counter() - began
-            if not unsound or (attempts >= TRIES and spent_s >= self.budget_s):
+            if not again or (attempts >= TRIES and spent_s >= self.budget_s):
                 return replace(answer, time_s=spent_s, iterations=iterations)
 
 
@@ -186,16 +172,15 @@ def _bands_along(task: Task, joints: Float[np.ndarray, "T D"]) -> Iterator[Candi
 
 @dataclass(frozen=True)
 class Remembered:
-    """A planner whose last answers are kept, so that a band after it shortens the very path that
-    its own row shows.
+    """A planner whose answers to the last problem are kept, so that a band after it shortens the
+    very path that its own row shows.
 
     An answer holds the time it took, whoever asks for it again.
     """
 
     inner: PathPlanner
-    _last: deque[tuple[PlanningProblem, int, Solution]] = field(
-        default_factory=lambda: deque(maxlen=KEPT_ANSWERS)
-    )
+    _problem: list[PlanningProblem] = field(default_factory=list)
+    _answers: dict[int, Solution] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -206,9 +191,9 @@ class Remembered:
         """The planner's answer; for the same problem, as an object, and seed it is not asked
         again.
         """
-        for asked, own_seed, answer in self._last:
-            if asked is problem and own_seed == seed:
-                return answer
-        answer = self.inner.plan(problem, seed)
-        self._last.append((problem, seed, answer))
-        return answer
+        if not self._problem or self._problem[0] is not problem:
+            self._problem[:] = [problem]
+            self._answers.clear()
+        if seed not in self._answers:
+            self._answers[seed] = self.inner.plan(problem, seed)
+        return self._answers[seed]

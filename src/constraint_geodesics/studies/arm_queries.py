@@ -2,7 +2,6 @@
 BiRRT's, and beside the best of what a pose or a region could mean.
 """
 
-import itertools
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold, Pose
 from constraint_geodesics.goals.region import GoalRegion
 from constraint_geodesics.peers.birrt import BirrtSettings
+from constraint_geodesics.peers.making import until_sound
 from constraint_geodesics.peers.ompl import SamplingPlanner
 from constraint_geodesics.peers.wrappers import band_after
 from constraint_geodesics.planner import Planner, limits_of
@@ -100,25 +100,22 @@ class BiRRT:
     def ask(self, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]) -> Found:
         """The shorter of both paths, where one is certified; the time is without the band's.
 
-        A path that is not certified (it jumped from one part of the constraint to another) is
-        followed by another attempt, until BIRRT_S have passed.
+        A path that is not certified, with a band or without (it jumped from one part of the
+        constraint to another), is followed by another attempt with half the steps, until BIRRT_S
+        have passed.
         """
         spacing = self.planner.bundle.judge.row_spacing_rad
-        problem = problem_of(start, goal, self.manifold, self.certifier, self.clearance)
-        status, spent_s = "not_certified", 0.0
-        for seed in itertools.count():
-            settings = BirrtSettings(budget_s=BIRRT_S - spent_s)
-            found = SamplingPlanner("birrt", settings, spacing).plan(problem, seed)
-            spent_s += found.time_s
-            if found.status != "solved":
-                status = status if seed else found.status
-                break
-            lengths = self._certified(problem, found)
-            if lengths:
-                return Found("solved", min(lengths), 1e3 * spent_s)
-            if spent_s >= BIRRT_S:
-                break
-        return Found(status, np.nan, 1e3 * spent_s)
+        known = problem_of(start, goal, self.manifold, self.certifier, self.clearance)
+        found = until_sound(
+            lambda own: SamplingPlanner(own.search, own, spacing),
+            BirrtSettings(budget_s=BIRRT_S),
+            BIRRT_S,
+        ).plan(known, 0)
+        lengths = self._certified(known, found) if found.status == "solved" else []
+        if not lengths:
+            status = "not_certified" if found.status == "solved" else found.status
+            return Found(status, np.nan, 1e3 * found.time_s)
+        return Found("solved", min(lengths), 1e3 * found.time_s)
 
     def _certified(self, problem: PlanningProblem, found: Solution) -> list[float]:
         """Lengths [rad] of a path and of the same with a band, of each that is certified."""

@@ -22,8 +22,10 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.geometry.braking import ahead
 from constraint_geodesics.learning.dataset import draw_queries
 from constraint_geodesics.peers.birrt import BirrtSettings
-from constraint_geodesics.peers.wrappers import BandAfter, UntilSound
+from constraint_geodesics.peers.making import until_sound
+from constraint_geodesics.peers.wrappers import BandAfter
 from constraint_geodesics.planner import Planner, limits_of
+from constraint_geodesics.problem import PathPlanner
 from constraint_geodesics.scene.clearance import Clearances
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.shape import Shape
@@ -62,7 +64,8 @@ class Task:
 
 class FromScratch(AbstractContextManager["FromScratch"]):
     """The classical answer: where the rest of the path touches what was seen the arm stops on it,
-    and BiRRT with a band after it plans from rest, until its path is certified.
+    and BiRRT with a band after it plans from rest, until its path is certified, from the second
+    attempt on with half its steps.
 
     It asks compiled distances, what is left of a path is looked at by the planner's own proof, and
     the scene's changes are as incremental as the planner's; limits: what paths are certified for.
@@ -74,12 +77,11 @@ class FromScratch(AbstractContextManager["FromScratch"]):
         self.scene, self.seed, self._opened = scene, seed, ExitStack()
         self._certifier = self._opened.enter_context(Certifier(scene, limits))
         self._clearances = Clearances(scene, self._certifier.collisions.apart)
-        coarse = BirrtSettings()
-        first, finer = (
-            BandAfter(SamplingPlanner(own.search, own, row_spacing_rad))
-            for own in (coarse, coarse.finer)
-        )
-        self._planner = UntilSound(first, SOUND_S, finer)
+
+        def banded(own: BirrtSettings) -> PathPlanner:
+            return BandAfter(SamplingPlanner(own.search, own, row_spacing_rad))
+
+        self._planner = until_sound(banded, BirrtSettings(), SOUND_S)
 
     def __exit__(self, *_: object) -> None:
         self._opened.close()

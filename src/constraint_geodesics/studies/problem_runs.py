@@ -41,8 +41,9 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.params import BaselineParams, Params
 from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings, Context
+from constraint_geodesics.peers.making import made_together
 from constraint_geodesics.peers.ompl_settings import OmplSettings
-from constraint_geodesics.peers.registry import after, kind_of, made_together, settings_of
+from constraint_geodesics.peers.registry import after, kind_of, settings_of
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine

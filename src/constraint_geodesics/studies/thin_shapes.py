@@ -14,6 +14,7 @@ from constraint_geodesics.certification.collisions import CollisionCheck
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.peers.birrt import BirrtSettings
+from constraint_geodesics.peers.making import until_sound
 from constraint_geodesics.peers.ompl import SamplingPlanner
 from constraint_geodesics.planner import Planner, limits_of
 from constraint_geodesics.scene.box import Box
@@ -75,7 +76,9 @@ def try_thicket(task: Thicket) -> Solved:
     workcell = task.bundle.workcell.model_copy(update={"shapes": shapes})
     judge = task.bundle.judge
     settings = BirrtSettings(iterations=ITERATIONS, budget_s=BUDGET_S)
-    sampling = SamplingPlanner("birrt", settings, judge.row_spacing_rad)
+    sampling = until_sound(
+        lambda own: SamplingPlanner(own.search, own, judge.row_spacing_rad), settings, BUDGET_S
+    )
     solved: list[tuple[bool, bool]] = []
     bundle = replace(task.bundle, workcell=workcell)
     limits = limits_of(bundle.planner, judge, robot_from(bundle.robot))
