@@ -19,14 +19,15 @@ STAGE = "ablate_manifold"
 def main(params: Params, layout: Layout, manifold: str) -> None:
     """Write reports/ablate_manifold/<manifold>.json."""
     source, own = layout.joints("free"), {"degree", "ablated_segments"}
+    learned = layout.manifold(manifold)
     about = params.geodesics.model_dump(include=own) | {"pairs": params.geometry.pairs}
     with (
         tracked_stage(
-            Work(STAGE, manifold, about, [source]), params.tracking.experiment, layout.root
+            Work(STAGE, manifold, about, [source, learned]), params.tracking.experiment, layout.root
         ) as run,
         Scene.from_params(params).world() as world,
     ):
-        chart = LearnedManifold.load(layout.manifold(manifold))
+        chart = LearnedManifold.load(learned)
         joints = read_joints(source).free_joints
         ablation = LearnedAblation(
             chart, joints, params.geodesics, params.geometry.pairs, world.free

@@ -33,7 +33,8 @@ STAGE = "benchmark_demonstrations"
 def main(params: Params, layout: Layout) -> None:
     """Write reports/demonstrations.csv.gz, demonstrations.json and demonstrations.png."""
     own, reports = params.demonstrations, layout.root / "reports"
-    with tracked_stage(Work(STAGE, STAGE, own, []), params.tracking.experiment, layout.root) as run:
+    work = Work(STAGE, STAGE, own, [layout.planner])
+    with tracked_stage(work, params.tracking.experiment, layout.root) as run:
         cells = cells_of(params, layout, STAGE)
         found = parallel_map(measure, cells, params.compute, description="demonstrations")
         table = pd.DataFrame([row for rows in found for row in rows])

@@ -34,8 +34,9 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         chart, retracted.curve, Samples(chart.encode(read_joints(sources[0]).free_joints))
     )
     names = [str(name) for name in settings.analytic]
+    read = [*sources, layout.manifold(manifold), *(layout.analytic(name) for name in names)]
     with tracked_stage(
-        Work(STAGE, manifold, params.geometry, sources), params.tracking.experiment, layout.root
+        Work(STAGE, manifold, params.geometry, read), params.tracking.experiment, layout.root
     ) as run:
         benchmark = GeometryBenchmark(plain, retracted, settings, params.geometry)
         figures = benchmark.figures(

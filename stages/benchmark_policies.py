@@ -29,8 +29,9 @@ def main(params: Params, layout: Layout) -> None:
         for scene in (KEEP_OUT, TABLE)
         for constraint in params.all_constraints
     ]
+    read = [folder, layout.planner, layout.path_diffusion, layout.root / "data" / "manifolds"]
     with tracked_stage(
-        Work(STAGE, name, params.policies, [folder]), params.tracking.experiment, layout.root
+        Work(STAGE, name, params.policies, read), params.tracking.experiment, layout.root
     ) as run:
         tables = parallel_map(
             run_policies, tasks, params.compute, description=f"policies' proposals {name}"

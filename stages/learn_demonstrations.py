@@ -23,7 +23,8 @@ STAGE = "learn_demonstrations"
 def main(params: Params, layout: Layout) -> None:
     """Write reports/learned_demonstrations.csv.gz and learned_demonstrations.json."""
     own, reports = params.demonstrations, layout.root / "reports"
-    with tracked_stage(Work(STAGE, STAGE, own, []), params.tracking.experiment, layout.root) as run:
+    work = Work(STAGE, STAGE, own, [layout.planner])
+    with tracked_stage(work, params.tracking.experiment, layout.root) as run:
         cells = cells_of(params, layout, STAGE)
         found = parallel_map(measure, cells, params.compute, description="learned of rows")
         table = pd.DataFrame([row for rows in found for row in rows])

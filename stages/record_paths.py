@@ -34,7 +34,9 @@ def main(params: Params, layout: Layout) -> None:
     pairs += [(m, c) for m in searched.illustrated for c in shown]
     tables = [Recordable(params, layout, constraint, manifold) for manifold, constraint in pairs]
     tables += [Recordable(params, layout, constraint) for constraint in params.constraints]
-    work = Work(STAGE, STAGE, {"frames": params.recording.frames})
+    own = ("manifolds", "submanifolds", "geodesics", "benchmark", "executions")
+    read = [layout.root / "data" / name for name in own]
+    work = Work(STAGE, STAGE, {"frames": params.recording.frames}, read)
     with tracked_stage(work, params.tracking.experiment, layout.root) as run:
         record_executed(params, layout, params.studies.constraint)
         parallel_map(record_table, tables, params.compute, description="record")

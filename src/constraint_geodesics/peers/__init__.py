@@ -3,7 +3,8 @@
 A new one is a file here and a line in params.yaml:
 1. `peers/<kind>.py` holds a `BaselineSettings` (baseline.py) whose defaults are the strongest
    settings that are known, and whose class variables say what is known of the kind: its family of
-   colours, whether chance plays a part, what its search asks, which trained files it needs.
+   colours, whether chance plays a part, what its search asks, which trained files it needs.  One
+   that steps along its paths says in `with_half_step` what is asked after one that failed.
 2. Its `make(context)` returns the planner: anything with a `name` and `plan(problem, seed)` that
    answers with a `Solution` (problem.py).  Heavy libraries are imported there, not at the top.
 3. The file ends with `BASELINE = <that class>`: this is how registry.py finds it.

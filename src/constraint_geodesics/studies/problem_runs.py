@@ -3,9 +3,9 @@ answer, and the figures of the rows.
 
 All are asked the same problems, one after another in one process on one thread, and judged alike:
 by the certifier, and by PyBullet at configurations DENSE_RAD apart on every path that is answered,
-in a world of its own.  The baselines have the certifier's compiled check for single configurations,
-and are asked again with another seed until the certifier takes their path, as the planner does
-before it answers; all of that is in their time.  A path counts that is there within the limit.
+in a world of its own.  The baselines have the certifier's compiled check, and are asked again with
+another seed and half their step until the certifier takes their path, as the planner does before it
+answers; all of that is in their time.  A path counts that is there within the limit.
 """
 
 import time
