@@ -55,8 +55,8 @@ FEW = 20
 PYTHON_NOTE = (
     "† is OMPL's: it asks through Python for every state of its search. All ask the certifier's "
     "compiled check; what draws at random is asked again while its path is not certified, OMPL's "
-    "with half the step: one that takes all its time has one more whole try. Where a planner cannot "
-    "work under a constraint (OMPL's atlas and tangent bundle have no tangent space for a "
+    "with half the step: one that takes all its time has one more whole try. Where a planner "
+    "cannot work under a constraint (OMPL's atlas and tangent bundle have no tangent space for a "
     "tolerance) it has no rows of it here."
 )
 _LEARNED = "learned"
