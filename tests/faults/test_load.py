@@ -23,7 +23,7 @@ import pytest
 from constraint_geodesics.benchmark.queries import read_queries
 from constraint_geodesics.bundle import PACKAGED
 from constraint_geodesics.pipeline.threads import one_thread
-from tests.faults.effort import Effort, count
+from tests.faults.effort import Effort, counting
 from tests.planner_fixtures import packaged_planner
 from tests.tracking.test_experiment import server
 from tests.tracking.test_registry import registered
@@ -209,16 +209,15 @@ def served(root: Path, asked: Asked) -> Iterator[str]:
 def test_every_answer_is_the_planners_own_whoever_else_asks(
     root: Path, asked: Asked, served: str, effort: Effort
 ) -> None:
-    figures = {}
-    for clients in (8,) if effort.name == "quick" else (1, 8, 32):
-        load = loaded(served, asked, clients, effort.load_s)
-        figures |= load.figures(f"clients_{clients}")
-        assert (load.wrong, load.lost) == (0, 0)
-        assert load.growth_mb < GROWTH_MB
-        assert len(load.seconds) > clients
-    if effort.name != "quick":
-        figures |= _on_two_processes(root, asked, effort)
-    count("load", effort, **figures)
+    with counting("load", effort) as row:
+        for clients in (8,) if effort.name == "quick" else (1, 8, 32):
+            load = loaded(served, asked, clients, effort.load_s)
+            row |= load.figures(f"clients_{clients}")
+            assert (load.wrong, load.lost) == (0, 0)
+            assert load.growth_mb < GROWTH_MB
+            assert len(load.seconds) > clients
+        if effort.name != "quick":
+            row |= _on_two_processes(root, asked, effort)
 
 
 def _on_two_processes(root: Path, asked: Asked, effort: Effort) -> dict[str, float]:
