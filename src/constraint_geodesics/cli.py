@@ -16,9 +16,9 @@ import typer
 from constraint_geodesics import cli_demo, cli_identify, cli_planning, completion
 from constraint_geodesics.cli_problems import ProblemOptions, bench_problems
 from constraint_geodesics.errors import ParamsError
-from constraint_geodesics.extras import MissingExtraError, require
+from constraint_geodesics.extras import require
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
+from constraint_geodesics.pipeline.stage import SHOWN, WRONG_USAGE, complain
 from constraint_geodesics.pipeline.threads import ONE_THREAD
 from constraint_geodesics.progress import waiting
 from constraint_geodesics.text_files import is_number, write_text
@@ -82,7 +82,7 @@ def main() -> None:
     _require_quotes(sys.argv[1:])
     try:
         app()
-    except (ValueError, OSError, RuntimeError, MissingExtraError) as error:
+    except SHOWN as error:
         raise SystemExit(complain(error)) from None
 
 
