@@ -104,14 +104,36 @@ def package() -> None:
     learned method where there is one.
     """
     import shutil
+    import tempfile
 
     layout = Layout()
     if not (layout.planner / "planner.json").is_file():
         raise OSError(f"{layout.planner}: holds no planner; `dvc repro build_planner` makes it")
-    shutil.copytree(layout.planner, layout.pretrained, dirs_exist_ok=True)
-    if layout.learned.is_dir():
-        shutil.copytree(layout.learned, layout.pretrained / "learned", dirs_exist_ok=True)
+    target = layout.pretrained
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(".part", ".", target.parent) as beside:
+        made, before = Path(beside) / "made", Path(beside) / "before"
+        if target.is_dir():  # what these folders have no new file of stays
+            shutil.copytree(target, made)
+        shutil.copytree(layout.planner, made, dirs_exist_ok=True)
+        if layout.learned.is_dir():
+            shutil.copytree(layout.learned, made / "learned", dirs_exist_ok=True)
+        _swap(made, target, before)
     print(f"{layout.planner} -> {layout.pretrained}")
+
+
+def _swap(made: Path, target: Path, before: Path) -> None:
+    """A folder in the place of another, which goes to `before`; if it can't be put there, the other
+    is put back.
+    """
+    if target.is_dir():
+        target.rename(before)
+    try:
+        made.rename(target)
+    except OSError:
+        if before.is_dir():
+            before.rename(target)
+        raise
 
 
 @app.command("params")
