@@ -169,6 +169,7 @@ SPACE ?= stages/sweep/space.yaml
 
 sweep: env  ## try settings of policies, ranked by `geodesics results --experiments`, after `make repro`: SPACE=... (minutes to hours; go on after an interruption by calling it again)
 	geodesics params
+	geodesics recover
 	dvc repro --quiet digest_code
 	python stages/run_sweep.py $(SPACE)
 	geodesics results --experiments

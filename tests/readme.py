@@ -127,13 +127,39 @@ def with_numbers(text: str) -> str:
     return QUOTED.sub(_requoted, text)
 
 
+def with_efforts(text: str) -> str:
+    """A page's text with the effort and the commit of each row of reports/reliability.json, and its
+    numbers.
+    """
+    rows = json.loads((ROOT / "reports" / "reliability.json").read_text())
+    alike: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for name, row in sorted(rows.items()):
+        commit = f"`{row['commit']}`" if row.get("commit") else "not kept"
+        alike[f"`make {COMMANDS[row['effort']]}`", commit].append(name)
+    head = "| effort | commit | took [s] | rows |\n|---|---|---:|---|"
+    lines = [f"| {' | '.join((*own, _together(rows, alike[own])))} |" for own in sorted(alike)]
+    return with_numbers(replaced(text, "efforts", "\n".join([head, *lines])))
+
+
+COMMANDS = {"quick": "test", "faults": "test-faults", "soak": "soak"}
+"""What runs tests/faults with each effort."""
+
+
+def _together(rows: dict[str, dict[str, float]], names: list[str]) -> str:
+    """Cells of rows of one effort and commit: for how long their tests ran, and their names."""
+    seconds = [rows[name]["seconds"] for name in names if "seconds" in rows[name]]
+    took = f"{sum(seconds):.0f}" if len(seconds) == len(names) else "–"
+    return f"{took} | {', '.join(f'`{name}`' for name in names)}"
+
+
 PAGES = {
     README: with_planners,
     RESULTS: filled,
     EXPERIMENTS: lambda text: with_pipeline(with_stage_times(text)),
 }
-NUMBERED = ("scenes.md", "problems.md", "scaling.md", "reliability.md")
+NUMBERED = ("scenes.md", "problems.md", "scaling.md")
 PAGES |= {ROOT / "docs" / page: with_numbers for page in NUMBERED}
+PAGES[ROOT / "docs" / "reliability.md"] = with_efforts
 """What brings each page up to date."""
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
 """A planner's files: what is written is read again, and nothing that was altered is."""
 
+import errno
 import json
+import os
 import re
 import shutil
 from dataclasses import replace
@@ -219,3 +221,35 @@ def test_the_package_takes_what_the_pipeline_built(packaged: Bundle, tmp_path, m
     cli.package()
     assert set(read_bundle(layout.pretrained).roadmaps) == set(packaged.roadmaps)
     assert (layout.pretrained / "learned" / "learned.json").is_file()
+    assert [own.name for own in layout.pretrained.parent.iterdir()] == [layout.pretrained.name]
+
+
+@pytest.mark.parametrize("at", ["copy", "swap"])
+def test_a_copy_that_fails_leaves_the_packaged_planner(at: str, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    layout = Layout()
+    for folder, text in ((layout.planner, "new"), (layout.pretrained, "old")):
+        folder.mkdir(parents=True)
+        for name in ("planner.json", "roadmaps.safetensors"):
+            (folder / name).write_text(text)
+    roadmaps, rename = layout.planner / "roadmaps.safetensors", Path.rename
+
+    def refused(own, target):
+        if own.name == "made":
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(target))
+        return rename(own, target)
+
+    with monkeypatch.context() as patch:
+        if at == "copy":
+            roadmaps.unlink()
+            roadmaps.symlink_to("nowhere")
+        else:
+            patch.setattr(Path, "rename", refused)
+        with pytest.raises(OSError, match=r"No such file|Input/output error"):
+            cli.package()
+    assert {own.read_text() for own in layout.pretrained.iterdir()} == {"old"}
+    assert [own.name for own in layout.pretrained.parent.iterdir()] == [layout.pretrained.name]
+    roadmaps.unlink()
+    roadmaps.write_text("new")
+    cli.package()
+    assert {own.read_text() for own in layout.pretrained.iterdir()} == {"new"}

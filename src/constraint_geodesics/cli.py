@@ -16,9 +16,9 @@ import typer
 from constraint_geodesics import cli_demo, cli_identify, cli_planning, completion
 from constraint_geodesics.cli_problems import ProblemOptions, bench_problems
 from constraint_geodesics.errors import ParamsError
-from constraint_geodesics.extras import MissingExtraError, require
+from constraint_geodesics.extras import require
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
+from constraint_geodesics.pipeline.stage import SHOWN, WRONG_USAGE, complain
 from constraint_geodesics.pipeline.threads import ONE_THREAD
 from constraint_geodesics.progress import waiting
 from constraint_geodesics.text_files import is_number, write_text
@@ -82,7 +82,7 @@ def main() -> None:
     _require_quotes(sys.argv[1:])
     try:
         app()
-    except (ValueError, OSError, RuntimeError, MissingExtraError) as error:
+    except SHOWN as error:
         raise SystemExit(complain(error)) from None
 
 
@@ -104,14 +104,36 @@ def package() -> None:
     learned method where there is one.
     """
     import shutil
+    import tempfile
 
     layout = Layout()
     if not (layout.planner / "planner.json").is_file():
         raise OSError(f"{layout.planner}: holds no planner; `dvc repro build_planner` makes it")
-    shutil.copytree(layout.planner, layout.pretrained, dirs_exist_ok=True)
-    if layout.learned.is_dir():
-        shutil.copytree(layout.learned, layout.pretrained / "learned", dirs_exist_ok=True)
+    target = layout.pretrained
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(".part", ".", target.parent) as beside:
+        made, before = Path(beside) / "made", Path(beside) / "before"
+        if target.is_dir():  # what these folders have no new file of stays
+            shutil.copytree(target, made)
+        shutil.copytree(layout.planner, made, dirs_exist_ok=True)
+        if layout.learned.is_dir():
+            shutil.copytree(layout.learned, made / "learned", dirs_exist_ok=True)
+        _swap(made, target, before)
     print(f"{layout.planner} -> {layout.pretrained}")
+
+
+def _swap(made: Path, target: Path, before: Path) -> None:
+    """A folder in the place of another, which goes to `before`; if it can't be put there, the other
+    is put back.
+    """
+    if target.is_dir():
+        target.rename(before)
+    try:
+        made.rename(target)
+    except OSError:
+        if before.is_dir():
+            before.rename(target)
+        raise
 
 
 @app.command("params")

@@ -11,7 +11,7 @@ from typing import Any
 
 from constraint_geodesics.gate import _planner_problems, check_params
 from constraint_geodesics.params import ParamsError, params_of, read_yaml
-from tests.faults.bad_input import Bad
+from tests.faults.bad_input import Bad, written
 
 ROOT = Path(__file__).resolve().parents[2]
 MAY_BE_MISSING = (
@@ -111,7 +111,9 @@ def _with(raw: Any, path: tuple, bad: Any) -> None:
 
 
 def gate_cases() -> Iterator[Bad]:
-    """Faults that only the files behind the parameters show, or other parameters."""
+    """Faults that only the files behind the parameters show, or other parameters.  Writes one of
+    these files to the current folder.
+    """
 
     def bad(name: str, said: tuple[str, ...], *path: Any, to: Any) -> Bad:
         def ask() -> None:
@@ -121,7 +123,8 @@ def gate_cases() -> Iterator[Bad]:
 
         return Bad(name, ask, said)
 
-    robot, table = ("robot",), ("workcell", "shapes", "table")
+    robot, shapes = ("robot",), ("workcell", "shapes")
+    table = (*shapes, "table")
     planners = ("benchmark", "planners")
     yield bad("tool link", ("robot: ", "'hand'"), *robot, "tool_link", to="hand")
     yield bad("URDF", ("robot: ", "no/arm.urdf"), *robot, "urdf", to="no/arm.urdf")
@@ -134,8 +137,13 @@ def gate_cases() -> Iterator[Bad]:
     yield bad("limits wider", ("robot: ", "joint1"), *robot, "limits_rad", to=wider)
     yield bad("exempt link", ("workcell: ", "'arm'"), *table, "exempt_links", to=["arm"])
     door = {"kind": "urdf", "urdf": "no/door.urdf"}
-    yield bad("workcell", ("workcell: ", "no/door.urdf"), "workcell", "shapes", "door", to=door)
+    yield bad("workcell", ("workcell: ", "no/door.urdf"), *shapes, "door", to=door)
     yield bad("carried", ("carried: ", "no/door.urdf"), "carried", "shapes", "door", to=door)
+    broken = written(Path(), "broken.urdf", '<robot name="door"><link name="leaf">')
+    leaf = {"kind": "urdf", "urdf": str(broken)}
+    yield bad(
+        "workcell, broken XML", ("workcell: ", str(broken), "no XML"), *shapes, "leaf", to=leaf
+    )
     raised = [0, 0, 0.3]
     yield bad("all touches", ("constraints: ", "free"), *table, "centre_m", to=raised)
     far = [9.0, 0.0, 0.2]

@@ -2,11 +2,21 @@
 
 import json
 import os
+import subprocess
 import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import pytest
 from filelock import FileLock
+
+from constraint_geodesics.text_files import write_text
+
+ROOT = Path(__file__).resolve().parents[2]
 
 COUNTS = "GEODESICS_RELIABILITY"
 """The environment's name of the JSON file that counts are written to; without it there are none."""
@@ -33,23 +43,67 @@ SOAK = Effort("soak", kills=20, requests=100_000, load_s=300.0, faults=2_000)
 """In `make soak`, hours."""
 
 
-def count(part: str, effort: Effort, **figures: float | int | str) -> None:
-    """Keep figures of one part of these tests, in the place of what the file had of the part.
+Row = dict[str, Any]
+"""What the file has of one part of these tests."""
 
-    A part that fewer were tried of than the file tells of leaves the file as it is: `make soak`'s
-    figures stay when `make test-faults` follows.
+
+@contextmanager
+def counting(part: str, effort: Effort) -> Iterator[Row]:
+    """Within, the figures of one part of these tests are measured; they take the place of its row.
+
+    The row is taken out of the file first, and a body that fails, is interrupted or killed, or
+    measures nothing leaves none: no figure outlives the test that it rests on.  A row of more
+    effort comes back when the body has passed, so `make soak`'s figures, with their commit, stay
+    when `make test-faults` follows.  It comes back also where the body is skipped.
+    """
+    before, row, began = _exchanged(part, None), Row(), time.monotonic()
+    try:
+        yield row
+    except pytest.skip.Exception:
+        _exchanged(part, before)
+        raise
+    if not row:
+        return
+    if before and _order(before["effort"]) > _order(effort.name):
+        _exchanged(part, before)
+        return
+    about = {"commit": _commit(), "seconds": round(time.monotonic() - began, 1)}
+    _exchanged(part, {"effort": effort.name, **about, **row})
+
+
+def all_passed(session: pytest.Session, failed: int) -> bool:
+    """Whether no test failed since so many had, and all were run: nobody interrupted them."""
+    return session.testsfailed == failed and session.exitstatus != pytest.ExitCode.INTERRUPTED
+
+
+def _exchanged(part: str, row: Row | None) -> Row | None:
+    """Put a row in the place of what the file has of a part, none where it is None; returns what
+    the file had.
     """
     if COUNTS not in os.environ:
-        return
+        return None
     file = Path(os.environ[COUNTS])
     with FileLock(Path(tempfile.gettempdir()) / f"{file.name}.lock"):
-        counts = json.loads(file.read_text()) if file.exists() else {}
-        before = counts.get(part)
-        if before and _order(before["effort"]) > _order(effort.name):
-            return
-        counts[part] = {"effort": effort.name, **figures}
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(dict(sorted(counts.items())), indent=1) + "\n")
+        rows: dict[str, Row] = json.loads(file.read_text()) if file.exists() else {}
+        before = rows.pop(part, None)
+        if row is not None:
+            rows[part] = row
+        if row != before:
+            write_text(file, json.dumps(dict(sorted(rows.items())), indent=1) + "\n")
+    return before
+
+
+def _commit() -> str:
+    """Its short hash, with a + where files besides reports are not as it has them; blank where
+    there is no Git.
+    """
+    found = _git("rev-parse", "--short", "HEAD")
+    return found + "+" * bool(found and _git("status", "--porcelain", "--", ".", ":!reports"))
+
+
+def _git(*words: str) -> str:
+    done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    return done.stdout.strip()
 
 
 def _order(name: str) -> int:

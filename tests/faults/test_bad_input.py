@@ -3,6 +3,7 @@ is a traceback, hangs, or is taken for something else.
 """
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ from constraint_geodesics import cli, text_files
 from constraint_geodesics.params import params_of, read_yaml
 from tests.faults import bad_calls, bad_files, bad_params
 from tests.faults.bad_input import Bad, Tally
-from tests.faults.effort import Effort, count
+from tests.faults.effort import Effort, all_passed, counting
 from tests.planner_fixtures import packaged_planner
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,6 +23,7 @@ SOME = 8
 """Each so many of the bad entries of params.yaml is tried where there is little time."""
 TOP = tuple(read_yaml(ROOT / "params.yaml"))
 ENDS = ("--start", "0 0 0 0 0 0", "--goal", "0 0 0 0 0 0")
+MODEL = "plan {ends} --constraint free --planner models:/arm/1"
 SHELL: list[tuple[str, int, str]] = [
     ("plan", 2, "--start is missing"),
     ("plan --start x --goal 0 --constraint free", 2, "--start 'x'"),
@@ -78,16 +80,24 @@ SHELL: list[tuple[str, int, str]] = [
     ("bench --problems no.json", 2, "no.json"),
     ("bench --problems params.yaml --time-limit nan", 2, "--time-limit nan"),
     ("magic", 2, "magic"),
+    ("plan {ends} --constraint free --planner s3://bucket/x", 1, "s3://bucket/x: "),
+    (f"MLFLOW_TRACKING_URI=http://user:secret@127.0.0.1:9 {MODEL}", 1, "127.0.0.1:9"),
+    (f"MLFLOW_TRACKING_URI=sqlite:////proc/nowhere/runs.db {MODEL}", 1, "/proc/nowhere/runs.db"),
+    (f"MLFLOW_TRACKING_URI=sqlite:///params.yaml {MODEL}", 1, "params.yaml"),
+    (f"MLFLOW_TRACKING_URI=nonsense://runs {MODEL}", 1, "nonsense://runs"),
 ]
+"""Words, with variables of the environment before them, the exit code, and what the line says."""
 
 
 @pytest.fixture(scope="module")
-def tally(effort: Effort) -> Iterator[Tally]:
-    """Of all cases of this file, counted at its end."""
-    found = Tally()
-    yield found
-    kinds = {name: getattr(found, name) for name in ("tracebacks", "accepted", "hung", "unnamed")}
-    count("bad_input", effort, cases=found.cases, **kinds)
+def tally(effort: Effort, request: pytest.FixtureRequest) -> Iterator[Tally]:
+    """Of all cases of this file, counted at its end if no test has failed."""
+    found, failed = Tally(), request.session.testsfailed
+    with counting("bad_input", effort) as row:
+        yield found
+        if all_passed(request.session, failed):
+            kinds = ("cases", "tracebacks", "accepted", "hung", "unnamed")
+            row |= {name: getattr(found, name) for name in kinds}
 
 
 @pytest.fixture(autouse=True)
@@ -157,6 +167,12 @@ def test_the_shell(
     (tmp_path / "params.yaml").write_bytes((ROOT / "params.yaml").read_bytes())
     (tmp_path / "broken.yaml").write_text("robot: [")
     os.mkfifo(tmp_path / "pipe.csv")
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")  # or keys would be asked for
+    named = re.match(r"(?:(\w+)=(\S+) )?(.*)", words)
+    assert named is not None
+    name, value, words = named.groups()
+    if name:
+        monkeypatch.setenv(name, value)
     given = [part for word in words.split() for part in (ENDS if word == "{ends}" else (word,))]
     monkeypatch.setattr(sys, "argv", ["geodesics", *given])
     tally.cases += 1
@@ -171,6 +187,7 @@ def test_the_shell(
     assert ended.value.code == code, told.err
     assert said in line
     assert "Traceback" not in told.err
+    assert "secret" not in told.err
     assert not told.out
 
 

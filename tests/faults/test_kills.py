@@ -37,7 +37,7 @@ from constraint_geodesics.tracking.left import AtWorkError, left_runs
 from constraint_geodesics.tracking.sending import recover
 from constraint_geodesics.tracking.store import TrackingError, open_store, tracking_uri, ui_command
 from tests.end_to_end import smoke
-from tests.faults.effort import SOAK, Effort, count
+from tests.faults.effort import SOAK, Effort, counting
 
 STAGE = """
 import sys
@@ -393,6 +393,26 @@ def timeless(value: Any) -> Any:
 def test_stages_that_are_killed_again_and_again_end_as_if_they_had_not(
     pair: Pair, effort: Effort
 ) -> None:
+    with counting("kills", effort) as row:
+        _kill_all(pair, effort)
+        _recover(pair)
+        last = smoke.dvc(pair.hurt, "repro")
+        assert last.returncode == 0, last.stderr
+        lost, found = differences(pair), statuses(pair.hurt)
+        row["injected"] = sum(pair.kills().values())
+        row["survived"] = row["injected"] if not lost else 0
+        row["results_lost"] = len(lost)
+        row["runs_left_running"] = sum(own.count("RUNNING") for own in found.values())
+        assert not lost
+        assert not row["runs_left_running"]
+        # not the last of each: what is run again by force and killed before it wrote is still done
+        assert all("FINISHED" in own for own in found.values())
+        assert "Running stage" not in smoke.dvc(pair.hurt, "repro").stdout
+        assert not left_runs(pair.hurt)
+
+
+def _kill_all(pair: Pair, effort: Effort) -> None:
+    """A stage of each kind, as often as asked for."""
     for stage in one_of_each(pair.whole):
         late = 0  # times that it was done by then
         while (done := pair.kills().get(stage, 0)) < effort.kills:
@@ -401,9 +421,13 @@ def test_stages_that_are_killed_again_and_again_end_as_if_they_had_not(
             else:
                 late += 1
                 assert late <= LATEST, f"{stage} was done {late} times before it was killed"
+
+
+def _recover(pair: Pair) -> None:
+    """From a dvc.lock that was cut short too, as DVC leaves it, killed while it writes."""
     cut = pair.hurt / "dvc.lock"
     keep = cut.read_bytes()
-    cut.write_bytes(keep[: len(keep) * 2 // 3 + 7])  # as DVC leaves it, killed while it writes
+    cut.write_bytes(keep[: len(keep) * 2 // 3 + 7])
     recovered = subprocess.run(
         [sys.executable, "-m", "constraint_geodesics.cli", "recover"],
         cwd=pair.hurt,
@@ -412,25 +436,6 @@ def test_stages_that_are_killed_again_and_again_end_as_if_they_had_not(
         text=True,
     )
     assert recovered.returncode == 0, recovered.stderr
-    last = smoke.dvc(pair.hurt, "repro")
-    assert last.returncode == 0, last.stderr
-    lost, found = differences(pair), statuses(pair.hurt)
-    running = sum(own.count("RUNNING") for own in found.values())
-    injected = sum(pair.kills().values())
-    count(
-        "kills",
-        effort,
-        injected=injected,
-        survived=injected if not lost else 0,
-        results_lost=len(lost),
-        runs_left_running=running,
-    )
-    assert not lost
-    assert not running
-    # not the last of each: what is run again by force and killed before it wrote is still done
-    assert all("FINISHED" in own for own in found.values())
-    assert "Running stage" not in smoke.dvc(pair.hurt, "repro").stdout
-    assert not left_runs(pair.hurt)
 
 
 @pytest.mark.long

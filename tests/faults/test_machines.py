@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from constraint_geodesics.studies.geodesic_search import (
     curve_family,
     run_analytic,
 )
-from tests.faults.effort import Effort, count
+from tests.faults.effort import Effort, counting
 from tests.pipeline.cluster import cluster
 
 pytestmark = [pytest.mark.timeout(900), pytest.mark.long]
@@ -164,13 +165,24 @@ class Work:
         found += seeds(self.params, self.folder, SEEDS)
         return found + [Job(run_batch, batch) for batch in self.batches]
 
-    def results(self, compute: ComputeParams) -> tuple[list[str], pd.DataFrame]:
-        """Digests of labels and seeds, and the benchmark's rows."""
+    def results(self, compute: ComputeParams) -> "Results":
         found = parallel_map(do, self.jobs, compute)
         return [digest(own) for own in found[:-QUERIES]], rows(self.batches)
 
 
-def same(ours: tuple[list[str], pd.DataFrame], theirs: tuple[list[str], pd.DataFrame]) -> None:
+Results = tuple[list[str], pd.DataFrame]
+"""Digests of labels and seeds, and the benchmark's rows."""
+
+
+def differing(ours: Results, theirs: Results) -> int:
+    """How many results are not the same to the bit; those that only one has differ."""
+    pairs = (ours[0], theirs[0]), tuple(own.to_dict("records") for own in (ours[1], theirs[1]))
+    return sum(
+        repr(own) != repr(other) for two in pairs for own, other in zip_longest(*two)
+    )  # by what they say: two numbers that are none are the same
+
+
+def same(ours: Results, theirs: Results) -> None:
     assert ours[0] == theirs[0]
     pd.testing.assert_frame_equal(ours[1], theirs[1], check_exact=True)
 
@@ -178,57 +190,71 @@ def same(ours: tuple[list[str], pd.DataFrame], theirs: tuple[list[str], pd.DataF
 def test_the_same_seed_is_the_same_on_any_number_of_workers_and_on_dask(
     scene: Scene, params: Params, tmp_path: Path, effort: Effort
 ) -> None:
-    plain = Work(scene, params, tmp_path / "plain").results(ONE)
-    assert len(plain[1]) == QUERIES * len(PLANNERS)
-    for workers in (2, 4):
-        own = ComputeParams(backend="loky", workers=workers)
-        same(Work(scene, params, tmp_path / f"loky {workers}").results(own), plain)
-    for workers in (1, 2, 4):
-        folder = tmp_path / f"dask {workers}"
-        folder.mkdir()
-        with cluster(folder, workers) as machines:
-            same(Work(scene, params, folder / "work").results(machines.compute), plain)
-    compared = len(plain[0]) + len(plain[1])
-    count("determinism", effort, results=compared, ways=6, different=0)
+    with counting("determinism", effort) as row:
+        plain = Work(scene, params, tmp_path / "plain").results(ONE)
+        assert len(plain[1]) == QUERIES * len(PLANNERS)
+        others = list[Results]()
+        for workers in (2, 4):
+            own = ComputeParams(backend="loky", workers=workers)
+            others.append(Work(scene, params, tmp_path / f"loky {workers}").results(own))
+        for workers in (1, 2, 4):
+            folder = tmp_path / f"dask {workers}"
+            folder.mkdir()
+            with cluster(folder, workers) as machines:
+                others.append(Work(scene, params, folder / "work").results(machines.compute))
+        row["results"] = len(plain[0]) + len(plain[1])
+        row["ways"] = 1 + len(others)
+        row["different"] = sum(differing(own, plain) for own in others)
+        for own in others:
+            same(own, plain)
 
 
 def test_work_goes_on_without_a_worker_that_was_killed(
     scene: Scene, params: Params, tmp_path: Path, effort: Effort
 ) -> None:
-    plain = Work(scene, params, tmp_path / "plain").results(ONE)
-    with cluster(tmp_path, allowed_failures=3) as machines:
-        work = Work(scene, params, tmp_path / "work")
-        found = {}
-        for place, result in as_finished(do, work.jobs, machines.compute):
-            found[place] = result
-            if len(found) == 4:
-                machines.workers[0].send_signal(signal.SIGKILL)
-    ordered = [digest(found[place]) for place in range(len(found) - QUERIES)]
-    same((ordered, rows(work.batches)), plain)
-    count("dask_worker_killed", effort, tasks=len(found), lost=0, different=0)
+    with counting("dask_worker_killed", effort) as row:
+        plain = Work(scene, params, tmp_path / "plain").results(ONE)
+        with cluster(tmp_path, allowed_failures=3) as machines:
+            work = Work(scene, params, tmp_path / "work")
+            found = {}
+            for place, result in as_finished(do, work.jobs, machines.compute):
+                found[place] = result
+                if len(found) == 4:
+                    machines.workers[0].send_signal(signal.SIGKILL)
+        row["tasks"] = len(work.jobs)
+        row["lost"] = len(work.jobs) - len(found)
+        assert not row["lost"]
+        ordered = [digest(found[place]) for place in range(len(found) - QUERIES)]
+        row["different"] = differing((ordered, rows(work.batches)), plain)
+        same((ordered, rows(work.batches)), plain)
 
 
 def test_a_scheduler_that_was_killed_is_one_line_and_a_repeated_call_finishes(
     scene: Scene, params: Params, tmp_path: Path, effort: Effort
 ) -> None:
-    plain = Work(scene, params, tmp_path / "plain").results(ONE)
-    work = Work(scene, params, tmp_path / "work")
-    done = list[int]()
-    for folder in (tmp_path / "first", tmp_path / "second"):
-        folder.mkdir()
-    with cluster(tmp_path / "first") as machines:
-        began = math.nan
-        with pytest.raises(ComputeError, match=LOST) as caught:
-            for place, _ in as_finished(do, list(reversed(work.jobs)), machines.compute):
-                done.append(place)
-                if len(done) == 2:
-                    machines.scheduler.send_signal(signal.SIGKILL)
-                    began = time.monotonic()
-        took = time.monotonic() - began
-    assert "\n" not in str(caught.value)
-    assert took < 30.0
-    left = sum(rows_to_do(batch) for batch in work.batches)
-    with cluster(tmp_path / "second") as machines:
-        same(work.results(machines.compute), plain)
-    count("dask_scheduler_killed", effort, tasks=len(work.jobs), lost=0, different=0)
-    assert left < len(plain[1]), "what was done is not done again"
+    with counting("dask_scheduler_killed", effort) as row:
+        plain = Work(scene, params, tmp_path / "plain").results(ONE)
+        work = Work(scene, params, tmp_path / "work")
+        done = list[int]()
+        for folder in (tmp_path / "first", tmp_path / "second"):
+            folder.mkdir()
+        with cluster(tmp_path / "first") as machines:
+            began = math.nan
+            with pytest.raises(ComputeError, match=LOST) as caught:
+                for place, _ in as_finished(do, list(reversed(work.jobs)), machines.compute):
+                    done.append(place)
+                    if len(done) == 2:
+                        machines.scheduler.send_signal(signal.SIGKILL)
+                        began = time.monotonic()
+            took = time.monotonic() - began
+        assert "\n" not in str(caught.value)
+        assert took < 30.0
+        left = sum(rows_to_do(batch) for batch in work.batches)
+        assert left < len(plain[1]), "what was done is not done again"
+        with cluster(tmp_path / "second") as machines:
+            again = work.results(machines.compute)
+        row["tasks"] = len(work.jobs)
+        row["lost"] = sum(rows_to_do(batch) for batch in work.batches)
+        row["different"] = differing(again, plain)
+        assert not row["lost"]
+        same(again, plain)

@@ -20,7 +20,7 @@ from constraint_geodesics.pipeline.code import code_digest
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import Status
 from constraint_geodesics.trajectory import Trajectory
-from tests.faults.effort import Effort, count
+from tests.faults.effort import Effort, counting
 from tests.faults.requests import A_SCENE, SEED, Request, request, scene_of
 from tests.planner_fixtures import packaged_planner
 from tests.scene.judge import Judge
@@ -53,8 +53,20 @@ class Figures:
 
 @pytest.mark.timeout(24 * 3600)  # `make soak` takes hours
 def test_random_requests(effort: Effort) -> None:
-    planner, figures = packaged_planner(), _begun(effort)
-    first = planner.scene.now
+    with counting("random_requests", effort) as row:
+        figures = _asked(packaged_planner(), effort)
+        row |= {name: own for name, own in asdict(figures).items() if isinstance(own, int)}
+        row["solved"] = figures.statuses["solved"]
+        assert not figures.wrong, "\n".join(figures.wrong[:20])
+        assert figures.answered > 0.3 * figures.requests
+        assert figures.statuses["solved"] > 0.1 * figures.requests
+        assert figures.refused > 0.05 * figures.requests
+        assert figures.configurations > 10 * figures.requests
+
+
+def _asked(planner: Planner, effort: Effort) -> Figures:
+    """All requests, in their scenes."""
+    figures, first = _begun(effort), planner.scene.now
     try:
         while figures.requests < effort.requests:
             block = figures.requests // A_SCENE
@@ -68,15 +80,8 @@ def test_random_requests(effort: Effort) -> None:
                 _keep(effort, figures)
     finally:
         planner.scene.become(first)
-    about = {name: value for name, value in asdict(figures).items() if isinstance(value, int)}
-    about["solved"] = figures.statuses["solved"]
-    count("random_requests", effort, **about)
     _keep(effort, figures)
-    assert not figures.wrong, "\n".join(figures.wrong[:20])
-    assert figures.answered > 0.3 * figures.requests
-    assert figures.statuses["solved"] > 0.1 * figures.requests
-    assert figures.refused > 0.05 * figures.requests
-    assert figures.configurations > 10 * figures.requests
+    return figures
 
 
 @pytest.mark.parametrize("spoil", ["collision", "constraint", "limits", "end", "velocity"])

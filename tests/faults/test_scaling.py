@@ -17,7 +17,7 @@ from constraint_geodesics.params import ComputeParams, Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
-from tests.faults.effort import Effort, count
+from tests.faults.effort import Effort, counting
 from tests.faults.test_machines import batches, labels, seeds
 from tests.faults.test_servers import dvc
 from tests.pipeline.cluster import cluster
@@ -53,20 +53,20 @@ def test_what_is_paid_beside_the_work(
     scene: Scene, params: Params, tmp_path: Path, effort: Effort, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    figures = {
-        **_tasks(tmp_path),
-        "worker_start_s": round(took(_first_plan), 2),
-        "sent_shard_kb": sent(list(labels(scene, params, 2))),
-        "sent_seed_kb": sent(list(seeds(params, tmp_path, 2))),
-        "sent_query_batch_kb": sent(list(batches(scene, params, tmp_path, 2))),
-        **_runs(tmp_path),
-        "dvc_stage_s": _stages(tmp_path),
-        **_queries(),
-    }
-    assert max(figures["loky_task_ms"], figures["dask_task_ms"]) < 100.0, "a batch takes a second"
-    assert figures["sent_query_batch_kb"] < 10_000.0
-    assert figures["dvc_stage_s"] < 5.0
-    count("scaling", effort, **figures)
+    with counting("scaling", effort) as row:
+        row |= {
+            **_tasks(tmp_path),
+            "worker_start_s": round(took(_first_plan), 2),
+            "sent_shard_kb": sent(list(labels(scene, params, 2))),
+            "sent_seed_kb": sent(list(seeds(params, tmp_path, 2))),
+            "sent_query_batch_kb": sent(list(batches(scene, params, tmp_path, 2))),
+            **_runs(tmp_path),
+            "dvc_stage_s": _stages(tmp_path),
+            **_queries(),
+        }
+        assert max(row["loky_task_ms"], row["dask_task_ms"]) < 100.0, "a batch takes a second"
+        assert row["sent_query_batch_kb"] < 10_000.0
+        assert row["dvc_stage_s"] < 5.0
 
 
 def _tasks(folder: Path) -> dict[str, float]:

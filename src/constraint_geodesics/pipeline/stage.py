@@ -1,6 +1,7 @@
 """How a stage starts, and how an error ends a program."""
 
 import inspect
+import math
 import os
 import sys
 import time
@@ -13,12 +14,16 @@ from constraint_geodesics.extras import MissingExtraError
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.threads import one_thread
 from constraint_geodesics.progress import waiting
-from constraint_geodesics.text_files import reading, write_text
+from constraint_geodesics.text_files import is_number, read_text, write_text
 
 if TYPE_CHECKING:
     from constraint_geodesics.params import Params
 
 WRONG_USAGE = 2
+SHOWN = (ValueError, OSError, RuntimeError, MissingExtraError, MemoryError)
+"""Errors that end a program with one line: what went wrong lies in what it was given, or in the
+machine.
+"""
 
 
 def run_stage(stage: Callable[..., None], arguments: Sequence[str]) -> None:
@@ -40,7 +45,7 @@ def run_stage(stage: Callable[..., None], arguments: Sequence[str]) -> None:
         with one_thread(), waiting(" ".join([name, *arguments])):
             stage(params, Layout(), *arguments)
         note_stage_time(Layout().stage_times, name, arguments, time.perf_counter() - began)
-    except (ValueError, OSError, RuntimeError, MissingExtraError) as error:
+    except SHOWN as error:
         if os.environ.get("GEODESICS_TRACEBACK"):
             raise
         raise SystemExit(complain(error)) from None
@@ -49,21 +54,41 @@ def run_stage(stage: Callable[..., None], arguments: Sequence[str]) -> None:
 def note_stage_time(file: Path, stage: str, names: Sequence[str], seconds: float) -> None:
     """Keep how long the last finished run of each stage took, workers and all: what training costs
     is read from it.
+
+    Lines that can't be read, as a merge leaves some, are left out: the work is done, and must not
+    fail for them.
     """
-    with reading(file):
-        lines = file.read_text().splitlines()[1:] if file.is_file() else []
-        kept = dict(line.split(",") for line in lines)
+    kept = _stage_times(file)
     kept[" ".join([stage, *names])] = f"{seconds:.1f}"
     table = ["stage,seconds", *(f"{own},{kept[own]}" for own in sorted(kept))]
     write_text(file, "\n".join(table) + "\n")
 
 
+def _stage_times(file: Path) -> dict[str, str]:
+    """Seconds by stage, of the lines that can be read."""
+    if not file.is_file():
+        return {}
+    cells = [line.split(",") for line in read_text(file, errors="replace").splitlines()]
+    return {own[0]: own[1] for own in cells if len(own) == 2 and own[0] and _is_time(own[1])}
+
+
+def _is_time(text: str) -> bool:
+    return is_number(text) and math.isfinite(float(text))
+
+
 def complain(error: Exception, code: int | None = None) -> int:
     """Print an error in one line; returns the exit code, by default that of its kind."""
-    print(f"error: {_plain(str(error))}", file=sys.stderr)
+    print(f"error: {_plain(_said(error))}", file=sys.stderr)
     if code is not None:
         return code
     return WRONG_USAGE if isinstance(error, WrongUsageError | MissingExtraError) else 1
+
+
+def _said(error: Exception) -> str:
+    """What it says; Python's own lack of memory says nothing."""
+    if not isinstance(error, MemoryError):
+        return str(error)
+    return f"this machine's memory is not enough: {error}".removesuffix(": ")
 
 
 def _plain(text: str) -> str:

@@ -179,6 +179,8 @@ def fetch_artifacts(address: str, root: Path = Path()) -> Iterator[Path]:
 
     Raises TrackingError if there is no such model or run, or the store can't be reached.
     """
+    from sqlalchemy.exc import SQLAlchemyError
+
     mlflow, uri = mlflow_module(), tracking_uri(root)
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -193,8 +195,11 @@ def fetch_artifacts(address: str, root: Path = Path()) -> Iterator[Path]:
                 found = Path(fetched)
             elif not found.exists():
                 raise FileNotFoundError(f"its files are missing in {found}")
+        except SQLAlchemyError as error:
+            line = f"{address}: MLflow store {_without_password(uri)}: {_said(error, 200)}"
+            raise TrackingError(line) from None
         except (mlflow.exceptions.MlflowException, OSError) as error:
-            raise TrackingError(f"{address}: {' '.join(str(error).split())[:200]}") from None
+            raise TrackingError(f"{address}: {_said(error, 200)}") from None
         except ImportError as error:  # a kind of store that needs a library of its own
             raise TrackingError(f"{address}: {error}: install it") from None
         own = found / "artifacts" / "planner"
@@ -208,6 +213,7 @@ def _beside_store(uri: str, address: str) -> Path | None:
     database = _sqlite_file(uri)
     if database is not None and not database.is_file():  # MLflow would make one
         raise FileNotFoundError(f"there are no runs yet: {database} is missing")
+    check_database(uri)
     source = "" if database is None else _stored_at(uri, address)
     if database is None or not source.startswith("mlflow-artifacts:"):
         return None
@@ -261,9 +267,14 @@ def explained(uri: str) -> Iterator[None]:
     try:
         yield
     except (mlflow_module().MlflowException, SQLAlchemyError, OSError, ImportError) as error:
-        message = f"MLflow store {uri}: {' '.join(str(error).split())[:300]}"
+        message = f"MLflow store {_without_password(uri)}: {_said(error, 300)}"
         refused = getattr(error, "error_code", "") in REFUSED
-        raise TrackingError(_without_password(message), refused) from error
+        raise TrackingError(message, refused) from error
+
+
+def _said(error: Exception, most: int) -> str:
+    """In one line, without a password, of which a cut would leave a part."""
+    return _without_password(" ".join(str(error).split()))[:most]
 
 
 def _without_password(text: str) -> str:
