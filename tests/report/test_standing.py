@@ -132,6 +132,9 @@ def test_both_are_compared_over_the_queries_that_both_were_asked():
     )
     (pair,) = compared(rows, ["PRM", "BiRRT"]).to_dict("records")
     assert (pair["queries"], pair["time_s"], pair["baseline_time_s"]) == (2, 0.001, 0.005)
+    rows.loc[rows["query"] == 0, "best_known_rad"] = np.nan
+    (pair,) = compared(rows, ["PRM"]).to_dict("records")
+    assert (pair["asked"], pair["queries"]) == (2, 1), "nobody has solved the first"
 
 
 def test_each_family_is_represented_by_the_best_in_its_worse_scene():

@@ -133,24 +133,27 @@ def compared(rows: pd.DataFrame, baselines: Sequence[str]) -> pd.DataFrame:
     """The planner and each baseline over the solvable queries that both were asked, all
     constraints together: one row a scene and baseline.
 
-    queries; success, time_s (median) and ratio_p95 (of length over the best known, failures
-    infinite), and the same of the baseline behind `baseline_`.
+    asked: queries that both were asked, solvable or not.  queries: those of them that are solvable;
+    success, time_s (median) and ratio_p95 (of length over the best known, failures infinite), and
+    the same of the baseline behind `baseline_`.
     """
     pooled = all_constraints(rows)
-    pooled = pooled.assign(ratio=ratio_of(pooled))[pooled["best_known_rad"].notna()]
+    pooled = pooled.assign(ratio=ratio_of(pooled), solvable=pooled["best_known_rad"].notna())
     names = [f"{whose}{name}" for whose in ("", "baseline_") for name in _figures(pooled)]
     table: list[dict[str, Any]] = []
     for scene in WHERE:
         case = pooled[pooled["scene"] == scene]
         mine = case[case["planner"] == PLANNER]
         for baseline in baselines:
-            theirs = case[(case["planner"] == baseline) & case["query"].isin(mine["query"])]
+            both = case[(case["planner"] == baseline) & case["query"].isin(mine["query"])]
+            theirs = both[both["solvable"]]
             same = mine[mine["query"].isin(theirs["query"])]
             if len(theirs):
                 figures = (*_figures(same).values(), *_figures(theirs).values())
-                about = {"scene": scene, "baseline": baseline, "queries": same["query"].nunique()}
+                about = {"scene": scene, "baseline": baseline, "asked": both["query"].nunique()}
+                about["queries"] = same["query"].nunique()
                 table.append(about | dict(zip(names, figures, strict=True)))
-    return pd.DataFrame(table, columns=["scene", "baseline", "queries", *names])
+    return pd.DataFrame(table, columns=["scene", "baseline", "asked", "queries", *names])
 
 
 def _figures(own: pd.DataFrame) -> dict[str, float]:
