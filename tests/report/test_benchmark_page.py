@@ -15,10 +15,10 @@ from constraint_geodesics.palette import planner_colour
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.benchmark_page import write_benchmark_page
 from constraint_geodesics.report.benchmark_tables import ahead_markdown, verdict_cells
-from constraint_geodesics.report.chooser import SHOWN
 from constraint_geodesics.report.results import ReportError
 from constraint_geodesics.report.standing import (
     CHOICE,
+    SHOWN,
     best_of_families,
     equal_time,
     losses,

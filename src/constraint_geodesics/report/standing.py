@@ -32,6 +32,8 @@ CHOICE = (
     "more in every scene."
 )
 """Who stands for the rest, and in which order: `best_of_families`."""
+SHOWN = 4
+"""Planners that a chart shows at first beside ours: their curves can be told apart."""
 
 
 class Loss(NamedTuple):
@@ -67,6 +69,14 @@ def best_of_families(overview: pd.DataFrame) -> list[str]:
     rest = figures.assign(family=families)[asked & (families != planner_family(PLANNER))]
     ordered = rest.sort_values(["solved", "length"], ascending=[False, True], kind="stable")
     return [str(name) for name in ordered.drop_duplicates("family").index]
+
+
+def shown_at_first(overview: pd.DataFrame) -> list[str]:
+    """The planner and the first of `best_of_families`: what a chart of the benchmark begins with.
+
+    overview: the benchmark's summary with all constraints together.
+    """
+    return [PLANNER, *best_of_families(overview)[:SHOWN]]
 
 
 def winner(budgets: pd.DataFrame) -> str:
