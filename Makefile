@@ -110,7 +110,7 @@ screenshots: env .venv/browser  ## make the documentation's pictures again, from
 	python -m tests.browser.hero
 	python -m tests.browser.screenshots
 
-first-screens: env .venv/browser  ## pictures of the first screens that people see, to be looked at: .geodesics/screens
+first-screens: env .venv/browser plan docs  ## pictures of the first screens that people see, to be looked at, after `make repro` and `make bench`: .geodesics/screens
 	@python tests/browser/chromium.py
 	python -m tests.browser.first_screens
 

@@ -26,6 +26,7 @@ from constraint_geodesics.recording.png import save_png
 from constraint_geodesics.report import benchmark_figures as figures
 from constraint_geodesics.report import benchmark_tables as tables
 from constraint_geodesics.report.cells import markdown_table
+from constraint_geodesics.report.standing import WHERE, shown_at_first
 from constraint_geodesics.text_files import write_text, written
 from constraint_geodesics.tracking.comparison import BENCHMARK, cells_of
 from constraint_geodesics.tracking.experiment import StageRun, Work, tracked_stage
@@ -71,8 +72,9 @@ def write(params: Params, layout: Layout, run: StageRun) -> None:
     costs = found["break_even"]
     drawn = [name for name in params.benchmark.drawn if name in settings]
     styles = figures.styles_of(drawn, colours(settings))
+    told_apart = figures.styles_of(shown_at_first(found["overview"]), colours(settings))
     for name, figure in (
-        ("overview", figures.overview(all_constraints(rows), styles)),
+        ("overview", figures.overview(all_constraints(rows), told_apart, WHERE)),
         ("break_even", figures.break_even(costs[costs["success"] >= SERVES], styles)),
     ):
         save_png(figure, folder / f"{name}.png")

@@ -4,6 +4,7 @@ names exist.
 That its commands run is in tests/test_docs_commands.py.
 """
 
+import ast
 import inspect
 import json
 import re
@@ -554,6 +555,21 @@ def test_the_api_names_all_that_the_package_exports() -> None:
     assert all(f"`{name}`" in API["api.md"] for name in constraint_geodesics.__all__)
 
 
+def test_the_api_names_all_that_the_pages_import() -> None:
+    text = "\n".join(API.values())
+    for page in having("python"):
+        for block in blocks(page, "python"):
+            for node in ast.walk(ast.parse(block)):
+                if isinstance(node, ast.ImportFrom) and node.module:
+                    module = import_module(node.module)
+                    for name in (own.name for own in node.names):
+                        if module.__name__.partition(".")[0] == PACKAGE.name:
+                            home = getattr(getattr(module, name), "__module__", node.module)
+                            paths = {f"{where}.{name}" for where in (node.module, home)}
+                            named = paths & set(DOCUMENTED) or f"`{name}`" in text
+                            assert named, f"{page}: {node.module}.{name} stands on no page api*.md"
+
+
 def documented(path: str) -> Iterator[tuple[str, str]]:
     """An object and its public members that have a docstring of their own, by their paths."""
     module, _, name = path.rpartition(".")
@@ -595,7 +611,11 @@ def test_every_error_that_the_api_names_is_on_its_page(site: Path) -> None:
         parsed.feed((site / page.replace(".md", ".html")).read_text())
         named |= set(re.findall(r"\b[A-Z]\w+Error\b", parsed.text))
     assert len(named) > 5
-    assert named <= {path.rpartition(".")[2] for path in DOCUMENTED} | {"KeyError", "TypeError"}
+    assert named <= {path.rpartition(".")[2] for path in DOCUMENTED} | {
+        "KeyError",
+        "TypeError",
+        "ValueError",
+    }
 
 
 @NO_MKDOCS

@@ -3,8 +3,8 @@
     python -m tests.browser.first_screens [FOLDER]
 
 README as a web page, both pages of the report and the documentation's first page, each on a
-desktop, at night and on a phone; the page that `geodesics ui` opens; three recordings in Rerun's
-viewer.
+desktop, at night and on a phone; the page that `geodesics ui` opens, and two seeds compared there;
+three recordings in Rerun's viewer.
 What this checkout has not made is named, with the command that makes it.
 """
 
@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 from markdown_it import MarkdownIt
 
-from constraint_geodesics.palette import planner_colour
+from constraint_geodesics.palette import BLUE, planner_colour
 from tests.browser.chromium import ROOT, chromium, visit
-from tests.browser.dashboard import SIDE_PANEL_CLOSED
-from tests.browser.screenshots import MissingRunError, copied_dashboard, rerun, settled
+from tests.browser.dashboard import SIDE_PANEL_CLOSED, base_of
+from tests.browser.screenshots import MissingRunError, copied_dashboard, rerun, settled, two_seeds
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -28,7 +28,12 @@ if TYPE_CHECKING:
 SIZES: dict[str, dict[str, Any]] = {
     "desktop": {"viewport": {"width": 1280, "height": 800}},
     "night": {"viewport": {"width": 1280, "height": 800}, "color_scheme": "dark"},
-    "phone": {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2},
+    "phone": {
+        "viewport": {"width": 390, "height": 844},
+        "device_scale_factor": 2,
+        "is_mobile": True,
+        "has_touch": True,
+    },
 }
 STYLE = """
 :root { color-scheme: light dark }
@@ -46,11 +51,15 @@ PAGES = {
 }
 """Files, and the commands that make them."""
 OWN = ROOT / "data/recordings"
+PLANNED = planner_colour("planner")
 RECORDINGS = {
-    "planned": (ROOT / "first_path/path.rrd", "make plan"),
-    "executed": (OWN / "execute_paths/level_cup/query0-planned-path.rrd", "make repro"),
-    "episode": (OWN / "study_episodes/episode0.rrd", "make bench"),
+    "planned": (ROOT / "first_path/path.rrd", "make plan", PLANNED),
+    "executed": (OWN / "execute_paths/level_cup/query0-planned-path.rrd", "make repro", PLANNED),
+    "episode": (OWN / "study_episodes/level_cup/episode0-replan.rrd", "make bench", BLUE),
 }
+"""Files, the commands that make them, and a colour that each draws from its first second on: of the
+planner's path, or of the path that an episode follows.
+"""
 
 
 @contextlib.contextmanager
@@ -75,7 +84,8 @@ def page_shot(browser: "Browser", address: str, size: str) -> bytes:
     with visit(browser, **SIZES[size]) as (page, traffic):
         page.goto(address)
         page.wait_for_load_state("networkidle")
-        wide, room = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+        wide = page.evaluate("document.documentElement.scrollWidth")
+        room = SIZES[size]["viewport"]["width"]  # a phone's own width grows with what it shows
         if wide > room:
             print(f"{address} on a {size}: {wide} pixels wide, {room} are there", file=sys.stderr)
         if traffic.outside:
@@ -92,6 +102,12 @@ def ui_shot(browser: "Browser") -> bytes:
         return settled(page)
 
 
+def comparison_shot(browser: "Browser") -> bytes:
+    """Two seeds of one stage, their curves in one chart."""
+    with copied_dashboard() as address:
+        return two_seeds(browser, base_of(address))
+
+
 def shots(browser: "Browser", readme: Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
     """Every picture's name, and how it is taken."""
     for name, (file, made_by) in PAGES.items():
@@ -100,8 +116,9 @@ def shots(browser: "Browser", readme: Path) -> Iterator[tuple[str, Callable[[], 
             shot = partial(page_shot, browser, page.as_uri(), size)
             yield f"{name}-{size}", partial(_of_file, file, made_by, shot)
     yield "dashboard", partial(ui_shot, browser)
-    for name, (file, made_by) in RECORDINGS.items():
-        shot = partial(rerun([file], [planner_colour("planner")]), browser, "")
+    yield "comparison", partial(comparison_shot, browser)
+    for name, (file, made_by, colour) in RECORDINGS.items():
+        shot = partial(rerun([file], [colour]), browser, "")
         yield f"recording-{name}", partial(_of_file, file, made_by, shot)
 
 

@@ -15,10 +15,10 @@ from constraint_geodesics.palette import planner_colour
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.benchmark_page import write_benchmark_page
 from constraint_geodesics.report.benchmark_tables import ahead_markdown, verdict_cells
-from constraint_geodesics.report.chooser import SHOWN
 from constraint_geodesics.report.results import ReportError
 from constraint_geodesics.report.standing import (
     CHOICE,
+    SHOWN,
     best_of_families,
     equal_time,
     losses,
@@ -65,9 +65,11 @@ def test_the_page_opens_with_who_is_ahead_and_where_the_planner_loses(layout, pa
     first = text.index(f"<strong>Ahead at equal time: {winner(budgets)}.</strong>")
     assert first < text.index(equal_time(budgets))
     assert first < text.index(planner_result(table_of(layout, "overview")))
-    for title, sentence in losses(rows, budgets).items():
-        place = text.index(f"<strong>{title}</strong>: {sentence}")
-        assert first < place < text.index('id="overview"')
+    for loss in losses(rows, budgets):
+        place = text.index(f"<strong>{loss.title}</strong>: {loss.sentence}")
+        assert first < text.index('id="chooser"') < place, "narrow screens show the chart before"
+        for detail in loss.details:
+            assert place < text.index(f"<li>{detail}</li>") < text.index('id="overview"')
 
 
 def test_other_verdicts_give_the_page_another_winner(layout, page, params):
@@ -142,7 +144,7 @@ def test_verdicts_are_counted_from_the_budgets(layout, page):
         ]
         assert int(counts[1]) == int(case.agg(lambda v: "ahead" in set(v)).sum())
         assert sum(map(int, counts)) == int(of) == case.ngroups
-    assert len(page.tables["Baselines that are ahead"]) == 1 + int(
+    assert len(page.tables["Baselines and parts that are ahead"]) == 1 + int(
         (budgets["verdict"] == "ahead").sum()
     )
 

@@ -5,10 +5,18 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-from tests.report.test_standing import summary
+from tests.report.test_standing import answers, summary
 
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.report.front import NOT_RUN, learning, opening, planner_row
+from constraint_geodesics.report.front import (
+    NOT_RUN,
+    SAME,
+    SAME_NOTE,
+    learning,
+    opening,
+    planner_row,
+)
+from constraint_geodesics.report.standing import ASKED
 from constraint_geodesics.studies.proposals import PLANNER, POLICY, STILL
 
 ABOUT = {"commit": "0123456789abcdef", "date": "2026-01-01", "processor": "a processor"}
@@ -63,6 +71,24 @@ def test_the_row_stands_beside_the_best_of_the_rest_with_its_commit(layout):
     assert "commit 0123456789ab, 2026-01-01" in row.note
     write_overview(layout, *own, *summary("PRM", (0.95, 0.9), (1.2, 2.0)), *birrt)
     assert [cells[0] for cells in planner_row(layout).rows] == ["planner", "PRM"]
+
+
+def test_the_planner_is_also_shown_on_the_queries_of_the_best_of_the_rest(layout):
+    fewer = summary("PRM", (0.95, 0.9), (1.2, 2.0), queries=ASKED)
+    many = summary("planner", (1.0, 0.9), (1.001, 1.5), queries=2 * ASKED)
+    write_overview(layout, *many, *fewer)
+    assert [cells[0] for cells in planner_row(layout).rows] == ["planner", "PRM"], "no rows here"
+    answered = [
+        row
+        for scene in ("table", "keep_out")
+        for name, time_s, queries in (("planner", 0.004, 2 * ASKED), ("PRM", 0.1, ASKED))
+        for row in answers(name, time_s, 2.2, scene=scene, queries=queries)
+    ]
+    pd.DataFrame(answered).to_csv(layout.benchmark_table, index=False)
+    row = planner_row(layout)
+    assert row.rows[-1] == [SAME, *["30 × 1", "100.0%", "1.100", "4"] * 2]
+    assert row.planners == ["planner", "PRM", "planner"]
+    assert SAME_NOTE in row.note
 
 
 def test_what_learning_adds_is_what_its_intervals_show(layout, params):

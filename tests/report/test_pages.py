@@ -431,7 +431,9 @@ def test_links_to_runs_are_filters_that_mlflow_takes(checked):
         address = urlsplit(link)
         path, _, query = address.fragment.partition("?")
         assert path == "/experiments/1/runs"
-        (text,) = parse_qs(query)["searchFilter"]
+        asked = parse_qs(query)
+        assert asked["workflowType"] == ["machine_learning"], "not the page of language models"
+        (text,) = asked["searchFilter"]
         stage, item = SearchUtils.parse_search_filter(text)
         assert (stage["key"], stage["comparator"], item["key"]) == ("stage", "=", "item")
         wanted.add((stage["value"], item["value"]))

@@ -75,7 +75,8 @@ def test_the_winner_is_who_is_ahead_in_more_cases_than_behind():
 
 def test_a_planner_that_nobody_beats_loses_nowhere():
     rows = pd.DataFrame(answers("planner", 0.001, 2.0) + answers("BiRRT", 0.1, 2.1))
-    assert list(losses(rows, verdicts(BiRRT=["behind"]))) == ["Nowhere"]
+    (loss,) = losses(rows, verdicts(BiRRT=["behind"]))
+    assert loss.title == "Nowhere"
 
 
 def test_what_is_sooner_or_shorter_is_named_with_both_figures():
@@ -89,25 +90,36 @@ def test_what_is_sooner_or_shorter_is_named_with_both_figures():
             *answers("SLSQP", 2.0, 2.3, scene="keep_out"),
         ]
     )
-    told = losses(rows, verdicts(BiRRT=["behind"], PRM=["behind"], SLSQP=["behind"]))
-    assert told == {
-        "At the median": "“BiRRT” in the workcell, in 5 ms against 10 (it solves 100.0%, the "
-        "planner 100.0%); 1 more that solve less than half.",
-        "At the 95th percentile of length, whatever time it takes": "“SLSQP” in the workcell, "
-        "1.000 times the best known against 1.050 on 4 queries, in 2,000 ms against 10.",
-    }
+    sooner, shorter = losses(rows, verdicts(BiRRT=["behind"], PRM=["behind"], SLSQP=["behind"]))
+    assert sooner.title == "Sooner at the median"
+    assert sooner.sentence == "1 in the workcell, the largest gap 5 ms against 10."
+    assert sooner.details == [
+        "“BiRRT” in the workcell, in 5 ms against 10 (it solves 100.0%, the planner 100.0%)",
+        "1 more that solve less than half",
+    ]
+    assert (
+        shorter.sentence
+        == "1 in the workcell, the largest gap 1.000 times the best known against 1.050."
+    )
+    assert shorter.details == [
+        "“SLSQP” in the workcell, 1.000 times the best known against 1.050 on 4 queries, in 2,000 "
+        "ms against 10"
+    ]
 
 
 def test_within_the_same_time_few_queries_are_only_counted():
     rows = pd.DataFrame(answers("planner", 0.001, 2.0) + answers("BiRRT", 0.1, 2.1))
     budgets = verdicts(BiRRT=["ahead", "behind", "ahead"], PRM=["ahead"])
-    assert losses(rows, budgets)["Within the same time"] == (
-        "in 10 ms in the workcell, “BiRRT” under level_cup and “PRM” under level_cup; in 1 s in "
-        "the workcell, “BiRRT” under level_cup."
+    (loss,) = losses(rows, budgets)
+    assert loss.sentence == (
+        "in 10 ms under 1 constraint in the workcell; in 1 s under 1 constraint in the workcell."
     )
-    assert losses(rows, budgets.assign(queries=FEW - 1))["Within the same time"] == (
-        f"3 comparisons over fewer than {FEW} queries stand in a table below."
-    )
+    assert loss.details == [
+        "in 10 ms in the workcell, “BiRRT” under level_cup and “PRM” under level_cup",
+        "in 1 s in the workcell, “BiRRT” under level_cup",
+    ]
+    (loss,) = losses(rows, budgets.assign(queries=FEW - 1))
+    assert loss.sentence == f"3 comparisons over fewer than {FEW} queries stand in a table below."
 
 
 def test_both_are_compared_over_the_queries_that_both_were_asked():
@@ -120,6 +132,9 @@ def test_both_are_compared_over_the_queries_that_both_were_asked():
     )
     (pair,) = compared(rows, ["PRM", "BiRRT"]).to_dict("records")
     assert (pair["queries"], pair["time_s"], pair["baseline_time_s"]) == (2, 0.001, 0.005)
+    rows.loc[rows["query"] == 0, "best_known_rad"] = np.nan
+    (pair,) = compared(rows, ["PRM"]).to_dict("records")
+    assert (pair["asked"], pair["queries"]) == (2, 1), "nobody has solved the first"
 
 
 def test_each_family_is_represented_by_the_best_in_its_worse_scene():
@@ -149,4 +164,4 @@ def test_the_planners_result_is_said_of_both_scenes():
 @pytest.mark.parametrize("verdict", ["tied", "neither"])
 def test_a_tie_is_no_loss(verdict):
     rows = pd.DataFrame(answers("planner", 0.001, 2.0) + answers("BiRRT", 0.001, 2.0))
-    assert list(losses(rows, verdicts(BiRRT=[verdict]))) == ["Nowhere"]
+    assert [loss.title for loss in losses(rows, verdicts(BiRRT=[verdict]))] == ["Nowhere"]

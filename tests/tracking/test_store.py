@@ -69,11 +69,25 @@ def test_the_page_is_that_of_the_experiment_that_ran_last(copy: Path) -> None:
     address, _, page = runs_page(copy / "below", 5001).partition("/#/")
     assert address == "http://127.0.0.1:5001"
     number = experiment(copy, "own").experiment_id
-    wanted = f"experiments/{number}/runs?viewStateShareKey=results&workflowType=machine_learning"
-    assert page == wanted
+    assert page == f"experiments/{number}/runs?workflowType=machine_learning", "no view finds it"
     with tracked_stage(Work("train", "cup"), "older", copy):
         pass
     assert f"/experiments/{experiment(copy, 'older').experiment_id}/runs?" in runs_page(copy, 5001)
+
+
+def test_the_first_view_that_finds_a_run_is_opened(copy: Path) -> None:
+    with (
+        tracked_stage(Work("train_analytic", "plane"), "own", copy) as run,
+        run.child("seed 0", {"seed": 0}),
+    ):
+        pass
+    assert "?viewStateShareKey=seeds&" in runs_page(copy, 5001)
+    with (
+        tracked_stage(Work("train_geodesics", "planner-cup"), "own", copy) as run,
+        run.child("seed 0", {"seed": 0}) as seed,
+    ):
+        seed.log(0, {"success": 1.0})
+    assert "?viewStateShareKey=results&" in runs_page(copy, 5001)
 
 
 def test_a_store_without_runs_is_opened_on_its_first_page(tmp_path: Path) -> None:

@@ -42,19 +42,21 @@ def styles_of(planners: Sequence[str], colours: Mapping[str, str]) -> Styles:
     return styles
 
 
-def overview(rows: pd.DataFrame, styles: Styles) -> Figure:
+def overview(rows: pd.DataFrame, styles: Styles, words: Mapping[str, str]) -> Figure:
     """Success, p95 of the length within a time budget, and the spread of lengths; a line of panels
     for each scene.
+
+    words: what is said of each scene.
     """
     scenes = list(dict.fromkeys(rows["scene"]))
-    figure = Figure(figsize=(10.0, 1.6 + 2.7 * len(scenes)), layout="constrained")
+    figure = Figure(figsize=(10.0, 1.0 + 2.7 * len(scenes)), layout="constrained")
     panels = np.atleast_2d(figure.subplots(len(scenes), 3))
     for (success, length, excess), scene in zip(panels, scenes, strict=True):
         case = rows[rows["scene"] == scene]
         _draw_budget(success, case, styles, "success")
         _draw_budget(length, case, styles, "ratio_p95")
         _draw_excess(excess, case, styles)
-        success.set(ylabel=f"{scene}: solved of solvable", xlabel="time budget [s]")
+        success.set(ylabel=f"{words[scene]}:\nsolved of solvable", xlabel="time budget [s]")
         length.set(ylabel="length / best known, p95", xlabel="time budget [s]")
         excess.set(ylabel="share of rows", xlabel="excess over best known")
         for axes in (success, length, excess):

@@ -108,10 +108,10 @@ def _overview_sections(params: Params, overview: pd.DataFrame) -> list[Section]:
 def _budget_section(budgets: pd.DataFrame) -> Section:
     note = "a case is a constraint in a scene; from reports/benchmark/budgets.csv"
     cases = Table("Cases by budget", note, *_parted(verdict_cells(budgets)))
-    behind = Table("Baselines that are ahead", note, *_parted(ahead_cells(budgets)))
+    behind = Table("Baselines and parts that are ahead", note, *_parted(ahead_cells(budgets)))
     told = (
         "How often the planner is first within the same time, over the queries that it and a "
-        "baseline were both asked."
+        "baseline, or a part of it, were both asked."
     )
     return Section("budgets", "Within a time budget", told, tables=[cases], folded=[behind])
 

@@ -13,10 +13,8 @@ from jaxtyping import Float, UInt16
 from constraint_geodesics.benchmark.statistics import CASE
 from constraint_geodesics.palette import planner_family
 from constraint_geodesics.report.page import family_colour
-from constraint_geodesics.report.standing import CHOICE, PLANNER, WHERE, best_of_families
+from constraint_geodesics.report.standing import CHOICE, WHERE, shown_at_first
 
-SHOWN = 4
-"""Planners at first beside ours."""
 TIME_S, EXCESS = (1e-5, 1e3), (1e-6, 1e2)
 """Between what a number of 16 bits stands for times, and for excesses over the best known length;
 what lies beyond is put at the end.
@@ -51,12 +49,12 @@ def chooser(rows: pd.DataFrame, overview: pd.DataFrame, planners: Sequence[str])
     families: dict[str, list[str]] = {}
     for name in names:
         families.setdefault(planner_family(name) or "other", []).append(name)
-    best = [name for name in best_of_families(overview) if name in there][:SHOWN]
+    shown = [name for name in shown_at_first(overview) if name in there]
     scenes = set(rows["scene"])
     return Chooser(
         families,
-        [PLANNER, *best],
-        f"At first the planner and {len(best)} others: {CHOICE[0].lower()}{CHOICE[1:]}",
+        shown,
+        f"At first the planner and {len(shown) - 1} others: {CHOICE[0].lower()}{CHOICE[1:]}",
         list(dict.fromkeys(map(str, rows["constraint"]))),
         {scene: where for scene, where in WHERE.items() if scene in scenes},
         packed(rows, names),

@@ -3,11 +3,12 @@ benchmark beside the best of the rest, and what learning adds to a search and wh
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import pandas as pd
 
+from constraint_geodesics.benchmark.row import read_table
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.cells import fixed, milliseconds, share
@@ -18,6 +19,7 @@ from constraint_geodesics.report.standing import (
     PLANNER,
     WHERE,
     best_of_families,
+    compared,
     planner_result,
 )
 from constraint_geodesics.studies.proposals import POLICY, STILL
@@ -33,6 +35,8 @@ BELOW = (
     "constraints and searches it by policies."
 )
 NOT_RUN = "How it stands beside others is measured by make bench, which has left no rows here."
+SAME = "planner on the same queries"
+SAME_NOTE = "The last row is the planner's on the queries of the row above it. "
 COLUMNS = ("queries × seeds", "solved", "length, p95", "median [ms]")
 FOOTINGS = {"trained on": "constraints it was trained on", "never seen": "constraints never seen"}
 """Groups of constraints in the figures of the policies, in words."""
@@ -55,7 +59,9 @@ def opening(layout: Layout, measured: bool) -> list[str]:
 
 
 def planner_row(layout: Layout) -> Table:
-    """The planner's row of the benchmark in both scenes, and that of the best of the rest."""
+    """The planner's row of the benchmark in both scenes, and that of the best of the rest; where
+    this one was asked fewer queries, the planner's on these too, if the benchmark's rows are there.
+    """
     overview = _overview(layout)
     about = json.loads((layout.root / "reports" / "benchmark" / "about.json").read_text())
     scenes = {scene: words for scene, words in WHERE.items() if scene in set(overview["scene"])}
@@ -65,18 +71,59 @@ def planner_row(layout: Layout) -> Table:
         [name, *(cell for scene in scenes for cell in _row_cells(found[name, scene]))]
         for name in planners
     ]
+    same = _on_the_same(layout, found, scenes, planners[1:])
     note = (
         "All constraints together; solved: of what any planner solved; length: over the best "
-        f"known, failures infinite. The best of the rest is the first by this rule: {CHOICE} Rows "
+        f"known, failures infinite. {SAME_NOTE if same else ''}The best of the rest is the first "
+        f"by this rule: {CHOICE} Rows "
         f"of commit {about['commit'][:12]}, {about['date']}, one thread of {about['processor']}."
     )
     return Table(
         "The planner beside the best of the rest",
         note,
         ("planner", *COLUMNS * len(scenes)),
-        rows,
+        [*rows, *same],
         groups=[(words, len(COLUMNS)) for words in scenes.values()],
-        planners=planners,
+        planners=[*planners, *[PLANNER] * len(same)],
+    )
+
+
+def _on_the_same(
+    layout: Layout,
+    found: Mapping[tuple[str, str], Mapping[Any, Any]],
+    scenes: Iterable[str],
+    others: Sequence[str],
+) -> list[list[str]]:
+    """The planner's row over the queries of another planner, where these are fewer."""
+    fewer = [
+        name
+        for name in others
+        if any(found[name, scene]["queries"] < found[PLANNER, scene]["queries"] for scene in scenes)
+    ]
+    if not fewer or not layout.benchmark_table.is_file():
+        return []
+    pairs = compared(read_table(layout.benchmark_table)[0], fewer)
+    own = {(row["baseline"], row["scene"]): row for row in pairs.to_dict("records")}
+    return [
+        [
+            SAME,
+            *(
+                cell
+                for scene in scenes
+                for cell in _same_cells(own[name, scene], found[PLANNER, scene]["seeds"])
+            ),
+        ]
+        for name in fewer
+        if all((name, scene) in own for scene in scenes)
+    ]
+
+
+def _same_cells(pair: Mapping[Any, Any], seeds: int) -> tuple[str, ...]:
+    return (
+        f"{pair['asked']} × {seeds}",
+        share(pair["success"], 1),
+        fixed(pair["ratio_p95"], 3),
+        milliseconds(pair["time_s"]),
     )
 
 

@@ -98,12 +98,13 @@ def family_colour(planner: str) -> str:
 
 def runs_link(stage: str, item: str) -> str:
     """Address of a stage's runs in the dashboard: by their tags, as a run's own number is another
-    one each time.
+    one each time.  Without the kind of work the page would be of language models.
 
     item: of the stage's matrix.
     """
-    query = f"tags.stage = '{stage}' and tags.item = '{item}'"
-    return f"{DASHBOARD}/#/experiments/{EXPERIMENT}/runs?searchFilter={quote(query, safe='')}"
+    query = quote(f"tags.stage = '{stage}' and tags.item = '{item}'", safe="")
+    asked = f"searchFilter={query}&workflowType=machine_learning"
+    return f"{DASHBOARD}/#/experiments/{EXPERIMENT}/runs?{asked}"
 
 
 class Picture(NamedTuple):

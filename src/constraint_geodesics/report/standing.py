@@ -2,8 +2,8 @@
 for the rest: in sentences, from its tables.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -32,6 +32,23 @@ CHOICE = (
     "more in every scene."
 )
 """Who stands for the rest, and in which order: `best_of_families`."""
+SHOWN = 4
+"""Planners that a chart shows at first beside ours: their curves can be told apart."""
+
+
+class Loss(NamedTuple):
+    """One way to be ahead of the planner: a title, a clause for each budget or scene, and who it
+    is.
+    """
+
+    title: str
+    clauses: Sequence[str]
+    details: Sequence[str] = ()
+
+    @property
+    def sentence(self) -> str:
+        """The clauses as one."""
+        return f"{'; '.join(self.clauses)}."
 
 
 def best_of_families(overview: pd.DataFrame) -> list[str]:
@@ -54,9 +71,17 @@ def best_of_families(overview: pd.DataFrame) -> list[str]:
     return [str(name) for name in ordered.drop_duplicates("family").index]
 
 
+def shown_at_first(overview: pd.DataFrame) -> list[str]:
+    """The planner and the first of `best_of_families`: what a chart of the benchmark begins with.
+
+    overview: the benchmark's summary with all constraints together.
+    """
+    return [PLANNER, *best_of_families(overview)[:SHOWN]]
+
+
 def winner(budgets: pd.DataFrame) -> str:
-    """Who is ahead at equal time: the planner, unless a baseline is ahead of it in more cases of
-    constraint, scene and time than behind; then the one with the largest surplus.
+    """Who is ahead at equal time: the planner, unless a baseline or a part of it is ahead in more
+    cases of constraint, scene and time than behind; then the one with the largest surplus.
 
     budgets: of `ours_against_baselines`.
     """
@@ -96,44 +121,49 @@ def planner_result(overview: pd.DataFrame) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def losses(rows: pd.DataFrame, budgets: pd.DataFrame) -> dict[str, str]:
-    """Where a baseline is ahead of the planner: a title and what it is, for each way to be ahead.
+def losses(rows: pd.DataFrame, budgets: pd.DataFrame) -> list[Loss]:
+    """Where a baseline or a part of the planner is ahead of the whole, for each way to be ahead.
 
     rows: of the benchmark's table.  budgets: of `ours_against_baselines`.
     """
     pairs = compared(rows, list(dict.fromkeys(map(str, budgets["baseline"]))))
-    told = {
-        "Within the same time": _within(budgets),
-        "At the median": _sooner(pairs),
-        "At the 95th percentile of length, whatever time it takes": _shorter(pairs),
-    }
-    found = {title: f"{'; '.join(parts)}." for title, parts in told.items() if parts}
-    nothing = "no baseline is ahead within the same time, sooner at the median, or shorter."
-    return found or {"Nowhere": nothing}
+    told = [
+        Loss("Within the same time", *_within(budgets)),
+        Loss("Sooner at the median", *_sooner(pairs)),
+        Loss("Shorter at the 95th percentile, whatever time it takes", *_shorter(pairs)),
+    ]
+    nothing = (
+        "no baseline and no part of the planner is ahead within the same time, sooner at the "
+        "median, or shorter"
+    )
+    return [loss for loss in told if loss.clauses] or [Loss("Nowhere", [nothing])]
 
 
 def compared(rows: pd.DataFrame, baselines: Sequence[str]) -> pd.DataFrame:
     """The planner and each baseline over the solvable queries that both were asked, all
     constraints together: one row a scene and baseline.
 
-    queries; success, time_s (median) and ratio_p95 (of length over the best known, failures
-    infinite), and the same of the baseline behind `baseline_`.
+    asked: queries that both were asked, solvable or not.  queries: those of them that are solvable;
+    success, time_s (median) and ratio_p95 (of length over the best known, failures infinite), and
+    the same of the baseline behind `baseline_`.
     """
     pooled = all_constraints(rows)
-    pooled = pooled.assign(ratio=ratio_of(pooled))[pooled["best_known_rad"].notna()]
+    pooled = pooled.assign(ratio=ratio_of(pooled), solvable=pooled["best_known_rad"].notna())
     names = [f"{whose}{name}" for whose in ("", "baseline_") for name in _figures(pooled)]
     table: list[dict[str, Any]] = []
     for scene in WHERE:
         case = pooled[pooled["scene"] == scene]
         mine = case[case["planner"] == PLANNER]
         for baseline in baselines:
-            theirs = case[(case["planner"] == baseline) & case["query"].isin(mine["query"])]
+            both = case[(case["planner"] == baseline) & case["query"].isin(mine["query"])]
+            theirs = both[both["solvable"]]
             same = mine[mine["query"].isin(theirs["query"])]
             if len(theirs):
                 figures = (*_figures(same).values(), *_figures(theirs).values())
-                about = {"scene": scene, "baseline": baseline, "queries": same["query"].nunique()}
+                about = {"scene": scene, "baseline": baseline, "asked": both["query"].nunique()}
+                about["queries"] = same["query"].nunique()
                 table.append(about | dict(zip(names, figures, strict=True)))
-    return pd.DataFrame(table, columns=["scene", "baseline", "queries", *names])
+    return pd.DataFrame(table, columns=["scene", "baseline", "asked", "queries", *names])
 
 
 def _figures(own: pd.DataFrame) -> dict[str, float]:
@@ -144,44 +174,81 @@ def _figures(own: pd.DataFrame) -> dict[str, float]:
     }
 
 
-def _within(budgets: pd.DataFrame) -> list[str]:
+Told = tuple[list[str], list[str]]
+"""Clauses and details of a loss."""
+
+
+def _within(budgets: pd.DataFrame) -> Told:
     ahead = budgets[budgets["verdict"] == "ahead"]
     sure = ahead[ahead["queries"] >= FEW]
-    told = []
-    for (_, scene), case in sure.groupby(["budget_s", "scene"]):
-        budget = float(case["budget_s"].iloc[0])
-        names = " and ".join(
-            f"“{baseline}” under {', '.join(own['constraint'])}"
-            for baseline, own in case.groupby("baseline", sort=False)
-        )
-        told.append(f"in {_duration(budget)} {WHERE[str(scene)]}, {names}")
+    clauses, details = [], []
+    for budget, own in sure.groupby("budget_s"):
+        within = f"in {_duration(float(str(budget)))}"
+        counts: list[str] = []
+        for scene, case in _by_scene(own):
+            names = " and ".join(
+                f"“{baseline}” under {', '.join(found['constraint'])}"
+                for baseline, found in case.groupby("baseline", sort=False)
+            )
+            number = case["constraint"].nunique()
+            noun = "" if counts else " constraint" if number == 1 else " constraints"
+            counts.append(f"{number}{noun} {WHERE[scene]}")
+            details.append(f"{within} {WHERE[scene]}, {names}")
+        clauses.append(f"{within} under {' and '.join(counts)}")
     few = len(ahead) - len(sure)
     if few:
-        told.append(f"{few} comparisons over fewer than {FEW} queries stand in a table below")
-    return told
+        said = f"{few} comparisons over fewer than {FEW} queries stand in a table below"
+        (details if clauses else clauses).append(said)
+    return clauses, details
 
 
-def _sooner(pairs: pd.DataFrame) -> list[str]:
+def _sooner(pairs: pd.DataFrame) -> Told:
     sooner = pairs[pairs["baseline_time_s"] < pairs["time_s"]]
     serving = sooner[sooner["baseline_success"] >= SERVES]
-    told = [
-        f"“{row['baseline']}” {WHERE[row['scene']]}, in {milliseconds(row['baseline_time_s'])} ms "
-        f"against {milliseconds(row['time_s'])} (it solves {share(row['baseline_success'], 1)}, "
-        f"the planner {share(row['success'], 1)})"
-        for row in _rows(serving)
-    ]
+    clauses, details = [], []
+    for scene, case in _by_scene(serving):
+        gap = min(_rows(case), key=lambda row: row["baseline_time_s"] / row["time_s"])
+        clauses.append(
+            f"{len(case)} {WHERE[scene]}, the largest gap "
+            f"{milliseconds(gap['baseline_time_s'])} ms against {milliseconds(gap['time_s'])}"
+        )
+        details += [
+            f"“{row['baseline']}” {WHERE[scene]}, in {milliseconds(row['baseline_time_s'])} ms "
+            f"against {milliseconds(row['time_s'])} (it solves {share(row['baseline_success'], 1)},"
+            f" the planner {share(row['success'], 1)})"
+            for row in _rows(case)
+        ]
     rest = len(sooner) - len(serving)
-    return told + ([f"{rest} more that solve less than half"] if rest else [])
+    if rest:
+        said = f"{rest}{' more' if clauses else ''} that solve less than half"
+        (details if clauses else clauses).append(said)
+    return clauses, details
 
 
-def _shorter(pairs: pd.DataFrame) -> list[str]:
+def _shorter(pairs: pd.DataFrame) -> Told:
     shorter = pairs[pairs["baseline_ratio_p95"] * (1.0 + AHEAD) < pairs["ratio_p95"]]
-    return [
-        f"“{row['baseline']}” {WHERE[row['scene']]}, {fixed(row['baseline_ratio_p95'], 3)} times "
-        f"the best known against {fixed(row['ratio_p95'], 3)} on {row['queries']} queries, in "
-        f"{milliseconds(row['baseline_time_s'])} ms against {milliseconds(row['time_s'])}"
-        for row in _rows(shorter)
-    ]
+    clauses, details = [], []
+    for scene, case in _by_scene(shorter):
+        gap = min(_rows(case), key=lambda row: row["baseline_ratio_p95"] / row["ratio_p95"])
+        clauses.append(
+            f"{len(case)} {WHERE[scene]}, the largest gap {fixed(gap['baseline_ratio_p95'], 3)} "
+            f"times the best known against {fixed(gap['ratio_p95'], 3)}"
+        )
+        details += [
+            f"“{row['baseline']}” {WHERE[scene]}, {fixed(row['baseline_ratio_p95'], 3)} times "
+            f"the best known against {fixed(row['ratio_p95'], 3)} on {row['queries']} queries, in "
+            f"{milliseconds(row['baseline_time_s'])} ms against {milliseconds(row['time_s'])}"
+            for row in _rows(case)
+        ]
+    return clauses, details
+
+
+def _by_scene(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """The rows of each scene that has any, in the order of sentences."""
+    for scene in WHERE:
+        case = table[table["scene"] == scene]
+        if len(case):
+            yield scene, case
 
 
 def _rows(pairs: pd.DataFrame) -> list[Mapping[Any, Any]]:

@@ -95,8 +95,9 @@ def ui_command(root: Path, port: int) -> list[str]:
 
 
 def runs_page(root: Path, port: int) -> str:
-    """The address at which that dashboard compares the runs of the experiment that ran last; its
-    first page where nothing ran yet.
+    """The address at which that dashboard compares the runs of the experiment that ran last: in
+    the first view that finds any, as which stages ran decides which views have rows; all runs where
+    none does, and the dashboard's first page where nothing ran yet.
 
     Raises TrackingError if the store can't be read.
     """
@@ -110,9 +111,14 @@ def runs_page(root: Path, port: int) -> str:
         if not last:
             return address
         number = last[0].info.experiment_id
+        view = next((own for own in views.VIEWS if _finds(client, number, own.search)), None)
     with suppress(TrackingError), explained(uri):  # a store that can't be written is shown as it is
         _show(client, known[number])
-    return views.page_of(address, number)
+    return views.page_of(address, number, view)
+
+
+def _finds(client: "MlflowClient", experiment_id: str, search: str) -> bool:
+    return bool(client.search_runs([experiment_id], search, max_results=1))
 
 
 def _shown_store(root: Path) -> str:

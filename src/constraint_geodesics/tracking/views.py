@@ -130,7 +130,7 @@ VIEWS = (
         [("BAR", name) for name in COMPARED],
     ),
 )
-"""In the order of the menu; the first is what `geodesics ui` opens."""
+"""In the order of the menu; `geodesics ui` opens the first whose search finds a run."""
 
 
 def experiment_tags() -> dict[str, str]:
@@ -149,12 +149,12 @@ def outdated(tags: Mapping[str, str]) -> dict[str, str]:
     return {} if tags.get(MADE) == wanted[MADE] else wanted
 
 
-def page_of(address: str, experiment_id: str, view: View = VIEWS[0]) -> str:
-    """The address of a view, below the dashboard's.  Without the kind of work the page would be of
-    language models.
+def page_of(address: str, experiment_id: str, view: View | None = VIEWS[0]) -> str:
+    """The address of a view, or of all runs, below the dashboard's.  Without the kind of work the
+    page would be of language models.
     """
-    asked = f"viewStateShareKey={view.key}&workflowType=machine_learning"
-    return f"{address}/#/experiments/{experiment_id}/runs?{asked}"
+    shown = f"viewStateShareKey={view.key}&" if view else ""
+    return f"{address}/#/experiments/{experiment_id}/runs?{shown}workflowType=machine_learning"
 
 
 def _note() -> str:
