@@ -313,6 +313,7 @@ def test_a_kind_is_known_in_its_own_file_and_among_the_shapes() -> None:
         Sphere: chosen | tried,
         Box: tried | {"studies/thin_shapes.py"},
         Cylinder: {"studies/cup.py"},
+        Mesh: {"studies/changing_scenes.py"},
     }
     for kind in (Box, Sphere, Capsule, Cylinder, Mesh, PointCloud, Body):
         home = kind.__module__.split(".", 1)[1].replace(".", "/") + ".py"

@@ -4,7 +4,6 @@ that is carried, a sphere that comes up while the arm moves.
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import count as counted
 from itertools import product
@@ -198,7 +197,7 @@ def _somewhere(rng: np.random.Generator) -> Placement:
 
 def _changed(planner: Planner, shape: Shape, elsewhere: Placement) -> Iterator[tuple[str, float]]:
     scene, link = planner.scene, planner.robot.tool_link
-    held = replace(shape.placed(Placement((0.0, 0.0, 0.1))), name="held")
+    held = shape.placed(Placement((0.0, 0.0, 0.1)))
     steps: Sequence[tuple[str, Callable[[], object]]] = (
         ("add", lambda: scene.add(shape)),
         ("move", lambda: scene.move(shape.name, elsewhere)),
@@ -288,8 +287,9 @@ def _looked_at(stop: Trajectory, certifier: Certifier) -> str:
     found, looked = "on the path's lines", stop.certificate
     if looked is None:
         found = "drawn anew"
-        timed = {"times": stop.times, "start_velocity": stop.start_velocity}
-        looked = certifier.certify(stop.joints, stop.constraint, **timed)
+        looked = certifier.certify(
+            stop.joints, stop.constraint, times=stop.times, start_velocity=stop.start_velocity
+        )
     return found if looked.valid else f"{found}, not certified"
 
 
@@ -345,15 +345,15 @@ def change_figures(rows: pd.DataFrame) -> dict[str, Any]:
     """Medians [ms] by how many other shapes there are and the kind of change, over all kinds of
     shapes; the 95th percentiles; and the medians of each kind of shape.
     """
-    by_change = rows.groupby(["among", "change"]).ms
-    tables = {"": by_change.median(), "_p95": by_change.quantile(0.95)}
     found: dict[str, Any] = {}
-    for ending, table in tables.items():
-        for (among, change), ms in table.items():
-            found.setdefault(str(among), {})[f"{change}{ending}"] = float(ms)
-    by_shape = rows.groupby(["among", "shape", "change"]).ms.median()
-    for (among, shape, change), ms in by_shape.items():
-        found[str(among)].setdefault("by_shape", {}).setdefault(shape, {})[change] = float(ms)
+    for among, own in rows.groupby("among"):
+        by_change = own.groupby("change").ms
+        by_shape = own.groupby(["shape", "change"]).ms.median().unstack()
+        found[str(among)] = {
+            **by_change.median().to_dict(),
+            **by_change.quantile(0.95).add_suffix("_p95").to_dict(),
+            "by_shape": by_shape.to_dict(orient="index"),
+        }
     return found
 
 
