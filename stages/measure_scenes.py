@@ -4,6 +4,7 @@ cup that is carried, spheres that come up while the arm moves.
 
 import json
 import sys
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +23,17 @@ from constraint_geodesics.text_files import write_text
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "measure_scenes"
-SEED, SPHERES, CUPS, SUDDEN, CHANGES = 0, 100, 200, 100, 20
+SEED, SPHERES, CUPS, SUDDEN, STOPS, CHANGES, MESHES = 0, 100, 200, 100, 100, 20, 5
 LOADED = "level_cup"
+MOVING = ("level_cup", "free", "slide")
+"""Where spheres come up."""
 AMONG = (1, 100)
 
 
 def main(params: Params, layout: Layout) -> None:
     """Write reports/scenes.csv.gz and reports/scenes.json."""
     settings = {"seed": SEED, "spheres": SPHERES, "cups": CUPS, "sudden": SUDDEN}
-    settings |= {"changes": CHANGES}
+    settings |= {"changes": CHANGES, "stops": STOPS, "meshes": MESHES}
     work = Work(STAGE, STAGE, settings, [layout.planner], watched=False)
     with tracked_stage(work, params.tracking.experiment, layout.root) as run:
         file = layout.root / "reports" / "scenes.json"
@@ -45,27 +48,40 @@ def measured(params: Params, layout: Layout, file: Path) -> dict[str, Any]:
             planner.prepare(name)
         tables = {
             "changes": [row for n in AMONG for row in study.changes(planner, n, CHANGES, SEED)],
+            "meshes": list(study.large_meshes(planner, MESHES, SEED)),
             "cup": list(study.loaded(planner, carrying, LOADED, CUPS, SEED)),
-            "sudden": list(study.sudden(planner, LOADED, SUDDEN, SEED)),
-            "sphere": [
-                row
-                for name in params.constraints
-                for row in study.beside_a_sphere(planner, name, SPHERES, SEED)
-            ],
+            "sudden": _each(study.sudden, planner, MOVING, SUDDEN),
+            "stops": _each(study.stops, planner, params.constraints, STOPS),
+            "sphere": _each(study.beside_a_sphere, planner, params.constraints, SPHERES),
+            # last: it leaves another scene
+            "first shape gone": list(
+                study.after_a_first_shape(planner, [*params.constraints], SEED)
+            ),
         }
     frames = {name: pd.DataFrame(rows) for name, rows in tables.items()}
     found = {
         "machine": machine(),
         "changes_ms": study.change_figures(frames["changes"]),
+        "mesh_of_5000_triangles": study.mesh_figures(frames["meshes"]),
+        "first_shape_gone": study.by_constraint(frames["first shape gone"]),
         "cup_carried": study.answer_figures(frames["cup"]),
-        "sudden_spheres": study.answer_figures(frames["sudden"])
-        | {"certified": int(frames["sudden"].certified.fillna(False).sum())},
+        "sudden_spheres": study.by_constraint(frames["sudden"]),
+        "stops": study.by_constraint(frames["stops"]),
         "beside_a_sphere": study.sphere_figures(frames["sphere"]),
     }
     rows = pd.concat([frame.assign(study=name) for name, frame in frames.items()])
     write_table(rows, file.with_name("scenes.csv.gz"), run_header(layout.root))
     write_text(file, json.dumps(found, indent=1) + "\n")
     return found
+
+
+def _each(
+    work: Callable[[Planner, str, int, int], study.Rows],
+    planner: Planner,
+    names: Iterable[str],
+    count: int,
+) -> list[dict[str, Any]]:
+    return [row for name in names for row in work(planner, name, count, SEED)]
 
 
 if __name__ == "__main__":

@@ -473,6 +473,13 @@ def test_a_request_of_moveit_says_it_all(command, query, tmp_path) -> None:
     scene = ("--moveit-scene", str(tmp_path / "scene.yaml"))
     code, out, _ = command("plan", *request, *scene)
     assert (code, out.startswith("solved: ")) == (0, True)
+    saved = tmp_path / "path.csv"
+    assert command("plan", *request, *scene, "--out", str(saved))[0] == 0
+    code, out, _ = command("check", str(saved), *scene)
+    assert (code, out.startswith("valid: ")) == (0, True)
+    code, out, err = command("check", str(saved), "--moveit-scene", str(tmp_path / "none.yaml"))
+    assert (code, out) == (2, "")
+    assert "none.yaml" in error_line(err)
     code, out, err = command("plan", *request)
     assert (code, out) == (2, "")
     assert "start_state: has no value for joint1" in error_line(err)

@@ -68,6 +68,9 @@ AttachFiles = Annotated[
     list[Path] | None,
     typer.Option("--attach", help="YAML with shapes that links carry; repeatable."),
 ]
+MoveitScene = Annotated[
+    Path | None, typer.Option(help="A planning scene of MoveIt to add, as YAML.")
+]
 Limit = Annotated[
     str | None,
     typer.Option(
@@ -201,9 +204,7 @@ def plan(
     srdf: Srdf = None,
     scene: SceneFiles = None,
     attach: AttachFiles = None,
-    moveit_scene: Annotated[
-        Path | None, typer.Option(help="A planning scene of MoveIt to add, as YAML.")
-    ] = None,
+    moveit_scene: MoveitScene = None,
     moveit_request: Annotated[
         Path | None,
         typer.Option(help="A motion request of MoveIt, as YAML: start, goal and constraint."),
@@ -340,7 +341,9 @@ def _told(path: "Trajectory") -> str:
     ]
     name, constraint = path.constraint_name, path.constraint
     proven = _proven(certificate, "" if constraint.is_free else name, constraint.caveat)
-    return f"solved: {', '.join(figures)}; proven: {proven}"
+    others = ", ".join(f"{way.source} {way.length_rad:.2f} rad" for way in path.statistics.ways)
+    line = f"solved: {', '.join(figures)}; proven: {proven}"
+    return f"{line}; other ways: {others}" if others else line
 
 
 def _spent(seconds: float) -> str:
@@ -414,6 +417,7 @@ def check(
     srdf: Srdf = None,
     scene: SceneFiles = None,
     attach: AttachFiles = None,
+    moveit_scene: MoveitScene = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the certificate as one JSON object.")
     ] = False,
@@ -423,6 +427,7 @@ def check(
     """
     from constraint_geodesics.bundle import BundleError
     from constraint_geodesics.constraints.constraint import ConstraintError
+    from constraint_geodesics.moveit import MoveitError, add_moveit_scene
     from constraint_geodesics.planner import PlannerError, SceneError
     from constraint_geodesics.robot.kinematics import RobotError
     from constraint_geodesics.trajectory import read_trajectory
@@ -432,6 +437,8 @@ def check(
         with loading():
             loaded = arm.open()
         with loaded, waiting(f"checking {file}"):
+            if moveit_scene is not None:
+                add_moveit_scene(moveit_scene, loaded.scene)
             own = None if constraint is None else _constraint(constraint, loaded)
             with warnings.catch_warnings(record=True) as told:
                 warnings.simplefilter("ignore")
@@ -444,7 +451,10 @@ def check(
             if broken is not None and broken.kind == "joint_limits" and file.is_file():
                 rows = read_trajectory(file, robot=loaded.robot).joints
                 refuse_degrees_of_table(file, rows, loaded.robot)
-    except (BundleError, ConstraintError, PlannerError, RobotError, SceneError) as error:
+    except (
+        *(BundleError, ConstraintError, MoveitError),
+        *(PlannerError, RobotError, SceneError),
+    ) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
     untimed = (
         " (no times: velocity and acceleration not looked at)"

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rerun
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -259,6 +260,28 @@ def test_a_worker_gets_the_same_shape(kind: str) -> None:
     assert pickle.loads(pickle.dumps(shape)) == shape
 
 
+def test_a_mesh_and_a_cloud_are_drawn_where_they_are() -> None:
+    """To a viewer that takes numbers in single precision."""
+
+    def numbers(batch: Any) -> np.ndarray:
+        flat = batch.as_arrow_array().flatten().to_numpy()
+        return flat.reshape(-1, 3)
+
+    style = {"colors": [(1, 2, 3)]}
+    corners = [(x, y, z) for x in (-0.25, 0.25) for y in (-0.1, 0.1) for z in (-0.15, 0.15)]
+    mesh = SHAPES["mesh"].drawn(rerun, style)
+    places = TURNED.turn @ np.transpose(corners) + np.reshape(TURNED.position_m, (3, 1))
+    np.testing.assert_allclose(
+        np.unique(numbers(mesh.vertex_positions).round(5), axis=0),
+        np.unique(places.T.astype(np.float32).round(5), axis=0),
+        atol=1e-4,
+    )
+    cloud = SHAPES["point cloud"].drawn(rerun, style)
+    places = CLOUD @ TURNED.turn.T + TURNED.position_m
+    np.testing.assert_allclose(numbers(cloud.positions), places, atol=1e-6)
+    assert cloud.radii.as_arrow_array().to_pylist() == pytest.approx([0.05])
+
+
 def test_either_end_of_a_capsule_may_come_first() -> None:
     q = np.random.default_rng(2).uniform(-ROOM, ROOM, (500, 3))
     there = distance("upright capsule", q)
@@ -290,6 +313,7 @@ def test_a_kind_is_known_in_its_own_file_and_among_the_shapes() -> None:
         Sphere: chosen | tried,
         Box: tried | {"studies/thin_shapes.py"},
         Cylinder: {"studies/cup.py"},
+        Mesh: {"studies/changing_scenes.py"},
     }
     for kind in (Box, Sphere, Capsule, Cylinder, Mesh, PointCloud, Body):
         home = kind.__module__.split(".", 1)[1].replace(".", "/") + ".py"

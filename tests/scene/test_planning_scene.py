@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pybullet_data
 import pytest
 from tests.planner_fixtures import nodes_of, pairs_of
 
@@ -17,6 +18,7 @@ from constraint_geodesics.constraints.constraint import Constraint, Pose
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.robot.kinematics import RobotError
 from constraint_geodesics.scene.attached import Attached
+from constraint_geodesics.scene.body import Body
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.capsule import Capsule
 from constraint_geodesics.scene.clearance import clearance_model
@@ -39,6 +41,8 @@ CARRIED = (
     Box("cup", (0.0, 0.0, 0.0), (0.12, 0.05, 0.2)),
     Sphere("cup", (0.0, 0.0, 0.0), 0.08),
     Capsule("cup", (0.0, -0.1, 0.0), (0.0, 0.1, 0.05), 0.03),
+    Mesh("cup", Path(pybullet_data.getDataPath()) / "cube.obj", scale=0.12),
+    Body("cup", "cube_small.urdf"),
     PointCloud("cup", np.random.default_rng(6).uniform(-0.08, 0.08, (40, 3)), 0.02),
 )
 
@@ -261,7 +265,6 @@ def test_a_scene_of_another_robot_is_refused(planner: Planner) -> None:
 
 
 def _missing(folder: Path) -> Shape:
-    from constraint_geodesics.scene.body import Body
 
     return Body("gone", folder / "gone.urdf")
 

@@ -8,6 +8,7 @@ from tests.planner_fixtures import packaged_planner
 from constraint_geodesics.params import Params
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies import changing_scenes as study
+from constraint_geodesics.studies.clutter import MAKERS
 
 NAME = "level_cup"
 
@@ -42,12 +43,33 @@ def test_a_motion_is_answered_when_a_sphere_comes_up() -> None:
     assert planner.scene.now == before
 
 
-def test_changes_of_each_kind_are_timed_and_taken_back() -> None:
+def test_changes_of_shapes_of_each_kind_are_timed_and_taken_back() -> None:
     planner, before = packaged_planner(), packaged_planner().scene.now
-    found = study.change_figures(pd.DataFrame(study.changes(planner, 2, 2, seed=3)))
-    assert set(found["2"]) == {"add", "move", "remove", "attach", "detach"}
-    assert min(found["2"].values()) > 0.0
+    found = study.change_figures(pd.DataFrame(study.changes(planner, 2, 1, seed=3)))["2"]
+    kinds = ("add", "move", "remove", "attach", "detach")
+    assert set(found) == {*kinds, *(f"{kind}_p95" for kind in kinds), "by_shape"}
+    assert set(found["by_shape"]) == set(MAKERS)
+    assert all(set(own) == set(kinds) for own in found["by_shape"].values())
+    assert min(found[f"{kind}_p95"] - found[kind] for kind in kinds) >= 0.0
     assert planner.scene.now == before
+
+
+def test_meshes_of_5000_triangles_are_new_to_the_process_each_time() -> None:
+    planner, before = packaged_planner(), packaged_planner().scene.now
+    rows = pd.DataFrame(study.large_meshes(planner, 2, seed=3))
+    assert rows.triangles.tolist() == [5000] * 4
+    assert planner.scene.now == before
+    once = study.mesh_figures(rows)
+    assert once["ring"]["ms_median"] > once["ball"]["ms_median"] > 0.1  # parts are found anew
+
+
+def test_stops_are_certified_on_the_paths_lines_or_once_they_are_looked_at() -> None:
+    rows = pd.DataFrame(study.stops(packaged_planner(), NAME, 6, seed=3))
+    assert len(rows) == 6
+    found = study.by_constraint(rows)
+    assert found["all"] == found[NAME]
+    assert set(found[NAME]["statuses"]) <= {"on the path's lines", "drawn anew"}
+    assert "ms_median" not in found[NAME]
 
 
 def test_lengths_are_over_the_best_and_what_nobody_solves_is_counted_apart() -> None:

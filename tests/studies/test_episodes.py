@@ -147,6 +147,7 @@ def rows_of(outcomes: dict[tuple[int, str], tuple[bool, str]]) -> pd.DataFrame:
             "outcome": outcome,
             "duration_s": 2.0 + number,
             "joint_speed_rad_s": 1.5 if outcome == "contact" else np.nan,
+            "braking_at_contact": outcome == "contact",
             "tool_speed_m_s": 0.5 if outcome == "contact" else np.nan,
         }
         for (number, controller), (beyond, outcome) in outcomes.items()
@@ -184,6 +185,7 @@ def test_figures_are_of_the_solvable_and_the_page_has_them() -> None:
     assert (first["episodes"], first["unsolvable"]) == (4, 1)
     assert first["beyond"] == {"episodes": 3, "contacts": 0, "solvable": 2, "reached": 1}
     assert first["inside"]["without_contact"] == 0
+    assert first["inside"]["braking_at_contact"] == 1
     assert first["inside"]["tool_speed_m_s_median"] == 0.5
     assert first["answers"]["moving"] == 2
     assert first["answers"]["late"] == 1

@@ -19,7 +19,8 @@ NOTE = (
 )
 BEYOND = (
     *("constraint", "controller", "episodes", "beyond", "contacts", "reached of solvable", "share"),
-    *("inside", "no contact", "joints at contact [rad/s]", "p95", "tool [m/s]", "p95"),
+    *("inside", "no contact", "contacts while braking"),
+    *("joints at contact [rad/s]", "p95", "tool [m/s]", "p95"),
 )
 TIMES = (
     *("constraint", "controller", "answers in motion", "late", "median [ms]", "p95"),
@@ -62,6 +63,7 @@ def _contacts(name: str, controller: str, own: Mapping[str, Any]) -> list[str]:
         *(name, controller, str(own["episodes"]), str(beyond["episodes"])),
         *(str(beyond["contacts"]), f"{beyond['reached']} of {solvable}", share(reached)),
         *(str(inside["episodes"]), str(inside["without_contact"])),
+        str(inside["braking_at_contact"]),
         *(fixed(inside[f"joint_speed_rad_s_{which}"]) for which in ("median", "p95")),
         *(fixed(inside[f"tool_speed_m_s_{which}"]) for which in ("median", "p95")),
     ]

@@ -4,22 +4,31 @@ that is carried, a sphere that comes up while the arm moves.
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import count as counted
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.spatial import ConvexHull
 
-from constraint_geodesics.constraints.constraint import ConstraintManifold, Pose
+from constraint_geodesics.certification.certifier import Certifier
+from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.learning.dataset import draw_queries
 from constraint_geodesics.learning.lift import densify
-from constraint_geodesics.planner import Planner
+from constraint_geodesics.planner import Planner, limits_of
 from constraint_geodesics.scene.box import Box
+from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.sphere import Sphere
-from constraint_geodesics.studies.cup import carried_cup
+from constraint_geodesics.studies.clutter import MAKERS, write_bracket
 from constraint_geodesics.studies.episodes import stop_on
 from constraint_geodesics.studies.problem_runs import DENSE_RAD, quantiles
+from constraint_geodesics.text_files import write_text
 from constraint_geodesics.trajectory import Trajectory
 
 RADII_M, MIDDLE = (0.05, 0.08), (0.3, 0.7)
@@ -33,6 +42,12 @@ BUDGETS_S = (None, 0.03, 0.1, 0.5)
 SUDDEN = 0.25
 """Share of the motion at which a sphere comes up."""
 TRIES = 20
+TRIANGLES = 5000
+"""Of a large mesh."""
+ON_THE_WAY = (0.02, 0.98)
+"""Shares of a motion at which it is to stop."""
+HALF_M = 0.05
+"""About half as large are the shapes that change."""
 DRAWN = 100
 """Pairs of ends at a time."""
 
@@ -159,35 +174,123 @@ def _in_the_way(
 
 
 def changes(planner: Planner, others: int, count: int, seed: int) -> Rows:
-    """Milliseconds of each kind of change among other shapes."""
+    """Milliseconds of each change of a shape of each kind, among other shapes."""
     rng = np.random.default_rng(seed)
     for k in range(others):
         place = tuple((rng.uniform((0.4, -0.9, 0.1), (0.9, 0.9, 1.0))).tolist())
         planner.scene.add(Box(f"other {k}", place, (0.02, 0.02, 0.02)))
     try:
-        for number in range(count):
-            for kind, spent in _changed(planner, rng):
-                yield {"change": kind, "among": others, "query": number, "ms": spent}
+        with TemporaryDirectory() as folder:
+            bracket = write_bracket(Path(folder))
+            for number, (kind, make) in product(range(count), MAKERS.items()):
+                shape = make("crate", _somewhere(rng), HALF_M, rng, bracket)
+                about = {"shape": kind, "among": others, "query": number}
+                for change, spent in _changed(planner, shape, _somewhere(rng)):
+                    yield about | {"change": change, "ms": spent}
     finally:
         planner.scene.remove(*(f"other {k}" for k in range(others)))
 
 
-def _changed(planner: Planner, rng: np.random.Generator) -> Iterator[tuple[str, float]]:
+def _somewhere(rng: np.random.Generator) -> Placement:
+    return Placement(tuple(rng.uniform((0.4, -0.9, 0.1), (0.9, 0.9, 1.0)).tolist()))
+
+
+def _changed(planner: Planner, shape: Shape, elsewhere: Placement) -> Iterator[tuple[str, float]]:
     scene, link = planner.scene, planner.robot.tool_link
-    crate = Box("crate", (0.6, 0.4, 0.2), (0.1, 0.1, 0.1))
-    elsewhere = Pose(rng.uniform((0.4, -0.9, 0.1), (0.9, 0.9, 1.0)), np.eye(3))
-    cup = carried_cup(np.array([0.0, 1.0, 0.0]))
+    held = shape.placed(Placement((0.0, 0.0, 0.1)))
     steps: Sequence[tuple[str, Callable[[], object]]] = (
-        ("add", lambda: scene.add(crate)),
-        ("move", lambda: scene.move("crate", elsewhere)),
-        ("remove", lambda: scene.remove("crate")),
-        ("attach", lambda: scene.attach(cup, link=link)),
-        ("detach", lambda: scene.detach("cup")),
+        ("add", lambda: scene.add(shape)),
+        ("move", lambda: scene.move(shape.name, elsewhere)),
+        ("remove", lambda: scene.remove(shape.name)),
+        ("attach", lambda: scene.attach(held, link=link)),
+        ("detach", lambda: scene.detach(held.name)),
     )
     for kind, change in steps:
-        began = time.perf_counter()
-        change()
-        yield kind, 1e3 * (time.perf_counter() - began)
+        yield kind, _spent_ms(change)
+
+
+def _spent_ms(work: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    work()
+    return 1e3 * (time.perf_counter() - began)
+
+
+def large_meshes(planner: Planner, count: int, seed: int) -> Rows:
+    """Milliseconds of adding meshes of TRIANGLES that no process has seen before: a ball, and a
+    ring, which is divided into convex parts.
+    """
+    rng = np.random.default_rng(seed)
+    with TemporaryDirectory() as folder:
+        for number, (name, make) in product(range(count), (("ball", _ball), ("ring", _ring))):
+            corners, faces = make()
+            corners = corners * rng.uniform(0.9, 1.1)  # another file to every memory
+            lines = [f"v {x} {y} {z}" for x, y, z in corners]
+            lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
+            file = Path(folder) / f"{name}{number}.obj"
+            write_text(file, "\n".join(lines) + "\n")
+            shape = Mesh("mesh", file, Placement((0.7, 0.5, 0.3)))
+            spent = _spent_ms(partial(planner.scene.add, shape))
+            planner.scene.remove("mesh")
+            yield {"mesh": name, "triangles": len(faces), "query": number, "ms": spent}
+
+
+def _ball() -> tuple[np.ndarray, np.ndarray]:
+    """Corners [m] and triangles, the corners of each anticlockwise from outside."""
+    height = np.linspace(-1.0, 1.0, TRIANGLES // 2 + 2)
+    turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(len(height))
+    away = np.sqrt(1.0 - height**2)
+    corners = 0.1 * np.stack([away * np.cos(turn), away * np.sin(turn), height], axis=1)
+    faces = ConvexHull(corners).simplices
+    a, b, c = np.moveaxis(corners[faces], 1, 0)
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a) < 0.0
+    faces[inward] = faces[inward][:, ::-1]
+    return corners, faces
+
+
+def _ring() -> tuple[np.ndarray, np.ndarray]:
+    side = round(np.sqrt(TRIANGLES / 2))
+    k, m = np.divmod(np.arange(side**2), side)
+    round_it, across = 2.0 * np.pi * k / side, 2.0 * np.pi * m / side
+    away = 0.1 + 0.03 * np.cos(across)
+    corners = [away * np.cos(round_it), away * np.sin(round_it), 0.03 * np.sin(across)]
+    next_k, next_m = (k + 1) % side, (m + 1) % side
+    first, on, up = k * side + m, next_k * side + m, k * side + next_m
+    both = next_k * side + next_m
+    faces = np.concatenate([np.stack([first, on, both], 1), np.stack([first, both, up], 1)])
+    return np.stack(corners, axis=1), faces
+
+
+def after_a_first_shape(planner: Planner, names: Sequence[str], seed: int) -> Rows:
+    """Milliseconds of a constraint's first plan once a shape is gone that the planner was loaded
+    with, which makes its roadmap anew; the planner's scene is another one afterwards.
+    """
+    asked = {name: next(_long_paths(planner, name, seed)) for name in names}
+    planner.scene.remove(planner.scene.workcell[-1].name)
+    for name, path in asked.items():
+        yield _row(planner.plan(path.joints[0], path.joints[-1], name), constraint=name)
+
+
+def stops(planner: Planner, name: str, count: int, seed: int) -> Rows:
+    """Whether there is a stop at random moments of motions, and whether it is certified: on the
+    path's own lines, or once it is looked at in the scene.
+    """
+    rng, bundle = np.random.default_rng(seed + 1), planner.bundle
+    limits = limits_of(bundle.planner, bundle.judge, planner.robot)
+    with Certifier(planner.scene.now, limits) as certifier:
+        for number, path in zip(range(count), _long_paths(planner, name, seed), strict=False):
+            stop = stop_on(path, rng.uniform(*ON_THE_WAY) * float(path.times[-1]))
+            found = "none" if stop is None else _looked_at(stop, certifier)
+            yield {"constraint": name, "query": number, "status": found, "touches": False}
+
+
+def _looked_at(stop: Trajectory, certifier: Certifier) -> str:
+    found, looked = "on the path's lines", stop.certificate
+    if looked is None:
+        found = "drawn anew"
+        looked = certifier.certify(
+            stop.joints, stop.constraint, times=stop.times, start_velocity=stop.start_velocity
+        )
+    return found if looked.valid else f"{found}, not certified"
 
 
 def sphere_figures(rows: pd.DataFrame) -> dict[str, Any]:
@@ -217,16 +320,46 @@ def _by_budget(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def answer_figures(rows: pd.DataFrame) -> dict[str, Any]:
-    """How many of each status, times of all, and how many touch something."""
-    return {
+    """How many of each status, times of all, and how many touch something; of the certified, where
+    a row says whether it is.
+    """
+    found = {
         "queries": len(rows),
         "statuses": {str(k): int(n) for k, n in rows.status.value_counts().items()},
         "touching": int(rows.touches.sum()),
-        **quantiles("ms", rows.ms),
     }
+    if "ms" in rows:
+        found |= quantiles("ms", rows.ms)
+    if "certified" in rows:
+        found["certified"] = int(rows.certified.fillna(False).sum())
+    return found
+
+
+def by_constraint(rows: pd.DataFrame) -> dict[str, Any]:
+    """As `answer_figures`, of all rows and of each constraint's."""
+    groups = [("all", rows), *rows.groupby("constraint", sort=False)]
+    return {str(name): answer_figures(own) for name, own in groups}
 
 
 def change_figures(rows: pd.DataFrame) -> dict[str, Any]:
-    """Medians [ms] by how many other shapes there are, and the kind of change."""
-    medians = rows.groupby(["among", "change"]).ms.median().unstack()
-    return {str(among): row.to_dict() for among, row in medians.iterrows()}
+    """Medians [ms] by how many other shapes there are and the kind of change, over all kinds of
+    shapes; the 95th percentiles; and the medians of each kind of shape.
+    """
+    found: dict[str, Any] = {}
+    for among, own in rows.groupby("among"):
+        by_change = own.groupby("change").ms
+        by_shape = own.groupby(["shape", "change"]).ms.median().unstack()
+        found[str(among)] = {
+            **by_change.median().to_dict(),
+            **by_change.quantile(0.95).add_suffix("_p95").to_dict(),
+            "by_shape": by_shape.to_dict(orient="index"),
+        }
+    return found
+
+
+def mesh_figures(rows: pd.DataFrame) -> dict[str, Any]:
+    """Triangles, and how long adding one took, of a ball and of a ring."""
+    return {
+        str(name): {"triangles": int(own.triangles.iloc[0]), **quantiles("ms", own.ms)}
+        for name, own in rows.groupby("mesh", sort=False)
+    }

@@ -205,14 +205,18 @@ def _reports(planner: Planner, episode: Episode, seed: int) -> Iterator[tuple[st
 
 
 def run_row(episode: Episode, report: Report) -> dict[str, Any]:
-    """An episode with one controller; of the contact nan where there was none."""
+    """An episode with one controller; of the contact nan where there was none, and whether the arm
+    was braking or at rest then.
+    """
     contact = report.contact
+    braking = contact is not None and report.leg(contact.at_s).path.source in ("stop", "rest")
     return {
         "obstacles": len(episode.obstacles),
         "sensing_m": episode.sensing_m,
         "seen": len(report.seen),
         "beyond": report.beyond,
         "outcome": report.outcome,
+        "braking_at_contact": braking,
         "duration_s": report.duration_s,
         "first_duration_s": float(episode.first.times[-1]),
         "joint_speed_rad_s": np.nan if contact is None else contact.joint_speed_rad_s,
@@ -305,6 +309,7 @@ def _of_runs(runs: pd.DataFrame, answers: pd.DataFrame) -> dict[str, Any]:
         "inside": {
             "episodes": len(inside),
             "without_contact": len(inside) - len(hit),
+            "braking_at_contact": int(hit.braking_at_contact.sum()),
             "reached": int((inside.outcome == "reached").sum()),
             **quantiles("joint_speed_rad_s", hit.joint_speed_rad_s),
             **quantiles("tool_speed_m_s", hit.tool_speed_m_s),

@@ -354,9 +354,13 @@ class Report:
         """Whether every obstacle appeared beyond the braking distance."""
         return all(answer.can_stop for answer in self.answers)
 
+    def leg(self, at_s: float) -> Leg:
+        """The motion that is executed at a time [s]."""
+        return next(one for one in reversed(self.legs) if one.begins_s <= at_s or one.begins_s == 0)
+
     def state(self, at_s: float) -> State:
         """Of the arm at a time [s]."""
-        leg = next(one for one in reversed(self.legs) if one.begins_s <= at_s or one.begins_s == 0)
+        leg = self.leg(at_s)
         return leg.path.state(min(max(at_s - leg.begins_s, 0.0), float(leg.path.times[-1])))
 
 
