@@ -116,12 +116,13 @@ def batches_of(run: Run) -> list[QueryBatch]:
     learned = {name: LearnedManifold.load(run.layout.manifold(name)) for name in run.measured_on}
     build = BaselineBuilder(params, run.layout.root)
     shared, found = _shared_parts(run), list[tuple[int, QueryBatch]]()
+    made_of = {name: _made_of(run, name) for name in run.settings}
     for (constraint, name), own in _by_case(run.queries).items():
         described, scene = params.all_constraints[constraint], Scene.from_params(params, constraint)
         ends = [[q.number, *q.start.tolist(), *q.goal.tolist(), repr(q.obstacle)] for q in own]
         parts = [*shared, described.model_dump(), repr(scene.attached), ends]
         for first in range(0, min(settings.queries, len(own)), settings.batch):
-            baselines = _baselines(run, constraint, first, parts)
+            baselines = _baselines(run, constraint, first, made_of, parts)
             if not baselines:
                 continue
             batch = QueryBatch(
@@ -146,9 +147,21 @@ def _by_case(queries: Sequence[Query]) -> dict[tuple[str, str], list[Query]]:
     return cases
 
 
-def _baselines(run: Run, constraint: str, first: int, parts: Sequence[Any]) -> tuple[Baseline, ...]:
-    """The planners that answer a constraint's queries from the one at `first` on.  parts: of all
-    fingerprints.
+def _made_of(run: Run, name: str) -> list[str]:
+    """Digests of a planner's code and of its files."""
+    kind = run.params.benchmark.planners[name].kind
+    return [code_digest(f"peers.{kind}", "peers.making"), _data_of(run, run.settings[name])]
+
+
+def _baselines(
+    run: Run,
+    constraint: str,
+    first: int,
+    made_of: Mapping[str, Sequence[str]],
+    parts: Sequence[Any],
+) -> tuple[Baseline, ...]:
+    """The planners that answer a constraint's queries from the one at `first` on.  made_of: digests
+    of each; parts: of all fingerprints.
     """
     bench, found = run.params.benchmark, []
     for name, own in run.settings.items():
@@ -159,12 +172,11 @@ def _baselines(run: Run, constraint: str, first: int, parts: Sequence[Any]) -> t
         if first >= count:
             continue
         about = [entry.kind, own.model_dump(mode="json")]
-        made_of = [_code_of(entry.kind), _data_of(run, own)]
         found.append(
             Baseline(
                 name=name,
                 seeds=tuple(range(seeds_of(entry, own, bench.seeds))),
-                fingerprint=fingerprint(*about, *made_of, *parts),
+                fingerprint=fingerprint(*about, *made_of[name], *parts),
                 kind=entry.kind,
                 settings=fingerprint(*about)[:8],
                 queries=count - first,
@@ -201,10 +213,6 @@ def _shared_parts(run: Run) -> list[Any]:
         machine(),
         data_digest(*(layout.manifold(name) for name in run.measured_on)),
     ]
-
-
-def _code_of(kind: str) -> str:
-    return code_digest(f"peers.{kind}", "peers.making")
 
 
 def _data_of(run: Run, settings: BaselineSettings) -> str:
