@@ -3,7 +3,7 @@ with `replan` and beside BiRRT from scratch; goes on where an earlier run of it 
 """
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine, run_header
 from constraint_geodesics.pipeline.stage import run_stage
+from constraint_geodesics.progress import progress
 from constraint_geodesics.recording.episode_recording import EpisodeRecord, Stretch, record_episode
 from constraint_geodesics.report.episodes_page import episodes_markdown
 from constraint_geodesics.studies import episode_runs as runs
@@ -29,8 +30,8 @@ CONSTRAINTS = ("level_cup", "free", "slide")
 
 
 def main(params: Params, layout: Layout) -> None:
-    """Write data/episode_rows/ as episodes end, then reports/episodes.csv.gz, .json and .md, and
-    recordings of the first ones.
+    """Write data/episode_rows/ as episodes end, then reports/episodes.csv.gz, .json and .md, and a
+    recording of each.
     """
     code = f"{code_digest('studies.episode_runs')} {data_digest(layout.planner)} {machine()} {SEED}"
     folder = layout.root / "data" / "episode_rows"
@@ -51,22 +52,21 @@ def main(params: Params, layout: Layout) -> None:
         write_table(pd.concat(both), reports / "episodes.csv.gz", run_header(layout.root))
         run.report({"machine": machine(), "figures": found}, reports / "episodes.json")
         write_text(reports / "episodes.md", episodes_markdown(found))
-        _record(layout, tasks, rows)
+        with progress("recordings", len(tasks)) as advance:
+            for task, row in zip(tasks, rows, strict=True):
+                _record(task, layout, row)
+                advance()
 
 
-def _record(layout: Layout, tasks: Sequence[runs.Task], rows: Sequence[Mapping[str, Any]]) -> None:
-    planner = runs.opened(layout.planner)
-    for task, row in zip(tasks, rows, strict=True):
-        if not row["motions"]:
-            continue
-        constraint = task.constraint
-        with study.carrying(planner, constraint):
-            ends = runs.ends(planner, constraint, task.seed)
-            episode = study.drawn(planner, constraint, task.number, task.seed, ends)
-        for controller, own in row["motions"].items():
-            name = f"episode{task.number}-{controller.split()[0].lower()}.rrd"
-            file = layout.recordings(STAGE, constraint) / name
-            record_episode(file, _record_of(controller, constraint, episode, own), meshes=False)
+def _record(task: runs.Task, layout: Layout, row: Mapping[str, Any]) -> None:
+    planner, constraint = runs.opened(task.planner), task.constraint
+    with study.carrying(planner, constraint):
+        ends = runs.ends(planner, constraint, task.seed)
+        episode = study.drawn(planner, constraint, task.number, task.seed, ends)
+    for controller, own in row["motions"].items():
+        name = f"episode{task.number}-{controller.split()[0].lower()}.rrd"
+        file = layout.recordings(STAGE, constraint) / name
+        record_episode(file, _record_of(controller, constraint, episode, own), meshes=False)
 
 
 def _record_of(

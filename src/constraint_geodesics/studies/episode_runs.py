@@ -41,8 +41,6 @@ SOUND_S = 5.0
 """BiRRT is asked again for so long until its path is certified."""
 ENDS = 200
 """Pairs of ends that a constraint's episodes are drawn from."""
-RECORDED = 2
-"""Episodes of each constraint whose motions are kept for recordings."""
 
 
 @dataclass(frozen=True)
@@ -141,8 +139,8 @@ def opened(folder: Path) -> Planner:
 
 
 def ran(planner: Planner, constraint: str, number: int, seed: int) -> dict[str, Any]:
-    """One episode with each controller: `runs`, a row each, their `answers`, and of the first
-    RECORDED episodes `motions`, to be recorded.
+    """One episode with each controller: `runs`, a row each, their `answers`, and the `motions`, to
+    be recorded.
     """
     found = dict[str, Any](runs=[], answers=[], motions={})
     with study.carrying(planner, constraint):
@@ -159,8 +157,7 @@ def ran(planner: Planner, constraint: str, number: int, seed: int) -> dict[str, 
             found["runs"].append(row | run_row(episode, report))
             rows = answer_rows(report)
             found["answers"] += [about | {"controller": name} | one for one in rows]
-            if number < RECORDED:
-                found["motions"][name] = motions(report)
+            found["motions"][name] = motions(report)
     return found
 
 

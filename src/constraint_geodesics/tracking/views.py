@@ -20,7 +20,7 @@ NOTE, MADE = "mlflow.note.content", "geodesics.views"
 differs, and what somebody changed in the dashboard stays until then."""
 FIRST_MS = 1_700_000_000_000
 """When the last view in the menu was made, as the menu understands it: the youngest is on top."""
-NAME_PX, CREATED_PX, TEXT_PX, FIGURE_PX = 285, 100, 120, 96
+NAME_PX, CREATED_PX, TEXT_PX, FIGURE_PX = 285, 100, 150, 96
 """Widths of columns.  The first holds the longest name of a run; all of COMPARED is seen in a
 window of 1400."""
 
