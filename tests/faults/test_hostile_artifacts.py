@@ -55,6 +55,7 @@ from constraint_geodesics.pipeline.stage import complain
 from constraint_geodesics.recording.recording import PathRecord, read_recording, record_path
 from constraint_geodesics.report.chooser import Chooser
 from constraint_geodesics.report.page import Section, Table, write_page
+from constraint_geodesics.report.standing import Loss
 from constraint_geodesics.robot.description import read_description
 from constraint_geodesics.robot.kinematics import load_robot
 from constraint_geodesics.scene.allowed_collisions import allowed_by_srdf
@@ -906,7 +907,7 @@ def test_a_page_shows_names_and_runs_none(tmp_path: Path) -> None:
         winner=hostile,
         standing=hostile,
         result=hostile,
-        losses={hostile: hostile},
+        losses=[Loss(hostile, [hostile], [hostile])],
         chooser=Chooser(
             {"other": [hostile]}, [hostile], hostile, [hostile], {hostile: hostile}, content
         ),
