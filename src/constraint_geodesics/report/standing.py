@@ -2,7 +2,7 @@
 for the rest: in sentences, from its tables.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -205,19 +205,18 @@ def _within(budgets: pd.DataFrame) -> Told:
 def _sooner(pairs: pd.DataFrame) -> Told:
     sooner = pairs[pairs["baseline_time_s"] < pairs["time_s"]]
     serving = sooner[sooner["baseline_success"] >= SERVES]
-    clauses, details = [], []
-    for scene, case in _by_scene(serving):
-        gap = min(_rows(case), key=lambda row: row["baseline_time_s"] / row["time_s"])
-        clauses.append(
-            f"{len(case)} {WHERE[scene]}, the largest gap "
-            f"{milliseconds(gap['baseline_time_s'])} ms against {milliseconds(gap['time_s'])}"
-        )
-        details += [
-            f"“{row['baseline']}” {WHERE[scene]}, in {milliseconds(row['baseline_time_s'])} ms "
-            f"against {milliseconds(row['time_s'])} (it solves {share(row['baseline_success'], 1)},"
-            f" the planner {share(row['success'], 1)})"
-            for row in _rows(case)
-        ]
+    clauses, details = _by_largest_gap(
+        serving,
+        "time_s",
+        lambda row: (
+            f"{milliseconds(row['baseline_time_s'])} ms against {milliseconds(row['time_s'])}"
+        ),
+        lambda row: (
+            f"in {milliseconds(row['baseline_time_s'])} ms against {milliseconds(row['time_s'])} "
+            f"(it solves {share(row['baseline_success'], 1)}, the planner "
+            f"{share(row['success'], 1)})"
+        ),
+    )
     rest = len(sooner) - len(serving)
     if rest:
         said = f"{rest}{' more' if clauses else ''} that solve less than half"
@@ -227,19 +226,34 @@ def _sooner(pairs: pd.DataFrame) -> Told:
 
 def _shorter(pairs: pd.DataFrame) -> Told:
     shorter = pairs[pairs["baseline_ratio_p95"] * (1.0 + AHEAD) < pairs["ratio_p95"]]
-    clauses, details = [], []
-    for scene, case in _by_scene(shorter):
-        gap = min(_rows(case), key=lambda row: row["baseline_ratio_p95"] / row["ratio_p95"])
-        clauses.append(
-            f"{len(case)} {WHERE[scene]}, the largest gap {fixed(gap['baseline_ratio_p95'], 3)} "
-            f"times the best known against {fixed(gap['ratio_p95'], 3)}"
-        )
-        details += [
-            f"“{row['baseline']}” {WHERE[scene]}, {fixed(row['baseline_ratio_p95'], 3)} times "
-            f"the best known against {fixed(row['ratio_p95'], 3)} on {row['queries']} queries, in "
+    return _by_largest_gap(
+        shorter,
+        "ratio_p95",
+        lambda row: (
+            f"{fixed(row['baseline_ratio_p95'], 3)} times the best known against "
+            f"{fixed(row['ratio_p95'], 3)}"
+        ),
+        lambda row: (
+            f"{fixed(row['baseline_ratio_p95'], 3)} times the best known against "
+            f"{fixed(row['ratio_p95'], 3)} on {row['queries']} queries, in "
             f"{milliseconds(row['baseline_time_s'])} ms against {milliseconds(row['time_s'])}"
-            for row in _rows(case)
-        ]
+        ),
+    )
+
+
+def _by_largest_gap(
+    ahead: pd.DataFrame,
+    figure: str,
+    gap: Callable[[Mapping[Any, Any]], str],
+    detail: Callable[[Mapping[Any, Any]], str],
+) -> Told:
+    """Of each scene how many are ahead in a figure, and the largest gap; each of them in detail."""
+    clauses, details = [], []
+    for scene, case in _by_scene(ahead):
+        rows = _rows(case)
+        widest = min(rows, key=lambda row: row[f"baseline_{figure}"] / row[figure])
+        clauses.append(f"{len(rows)} {WHERE[scene]}, the largest gap {gap(widest)}")
+        details += [f"“{row['baseline']}” {WHERE[scene]}, {detail(row)}" for row in rows]
     return clauses, details
 
 

@@ -100,9 +100,8 @@ class BiRRT:
     def ask(self, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]) -> Found:
         """The shorter of both paths, where one is certified; the time is without the band's.
 
-        A path that is not certified, with a band or without (it jumped from one part of the
-        constraint to another), is followed by another attempt with half the steps, until BIRRT_S
-        have passed.
+        A path that is not certified before its band (it jumped from one part of the constraint to
+        another) is followed by another attempt with half the steps, until BIRRT_S have passed.
         """
         spacing = self.planner.bundle.judge.row_spacing_rad
         known = problem_of(start, goal, self.manifold, self.certifier, self.clearance)

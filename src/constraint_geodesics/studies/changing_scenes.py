@@ -177,8 +177,7 @@ def changes(planner: Planner, others: int, count: int, seed: int) -> Rows:
     """Milliseconds of each change of a shape of each kind, among other shapes."""
     rng = np.random.default_rng(seed)
     for k in range(others):
-        place = tuple((rng.uniform((0.4, -0.9, 0.1), (0.9, 0.9, 1.0))).tolist())
-        planner.scene.add(Box(f"other {k}", place, (0.02, 0.02, 0.02)))
+        planner.scene.add(Box(f"other {k}", _somewhere(rng).position_m, (0.02, 0.02, 0.02)))
     try:
         with TemporaryDirectory() as folder:
             bracket = write_bracket(Path(folder))
