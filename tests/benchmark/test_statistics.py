@@ -226,14 +226,15 @@ def test_a_second_run_is_compared_row_by_row() -> None:
         time_s=first["time_s"].where(first["planner"] == "same", 7.0),
     )
     told = repeated(first, again).set_index("planner")
-    assert told.loc["same", ["rows", "same_validity", "length_difference", "overlap"]].tolist() == [
-        5,
-        True,
-        0.0,
-        True,
-    ]
+    figures = ["rows", "same_validity", "length_difference", "ratio", "ratio_low", "ratio_high"]
+    assert told.loc["same", figures].tolist() == [5, True, 0.0, 1.0, 1.0, 1.0]
     assert told.loc["other", "length_difference"] == pytest.approx(0.5)
-    assert not told.loc["other", "overlap"]
+    assert told.loc["other", "ratio"] == pytest.approx(70.0)
+    paired = table_of([row("same", q, 0, 1.0, t) for q, t in enumerate((1.0, 10.0, 100.0))])
+    slower = repeated(paired, paired.assign(time_s=[5.0, 20.0, 1.0])).iloc[0]
+    assert slower["ratio"] == 2.0  # that of the medians is 0.5
+    slower = repeated(paired.assign(time_s=[0.0, 10.0, 100.0]), paired.assign(time_s=20.0)).iloc[0]
+    assert slower["ratio"] == pytest.approx(1.1)
     refused = repeated(first, again.assign(valid=False)).set_index("planner")
     assert not refused["same_validity"].any()
 

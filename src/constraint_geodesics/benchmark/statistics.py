@@ -276,8 +276,9 @@ def repeated(first: pd.DataFrame, again: pd.DataFrame) -> pd.DataFrame:
     """Two runs of the same rows compared: one row a planner.
 
     rows: that both have.  same_validity; length_difference: the largest relative one of rows valid
-    in both.  time_*: median of the first and of the second run [s] with 95 % bootstrap intervals,
-    and whether these overlap.
+    in both.  time_s, time_again_s: medians of the first and of the second run.  ratio_*: the median
+    over queries of the second time over the first of the same row, of a query's seeds the median,
+    with its 95 % bootstrap interval; rows that took no time or do not apply have no part in it.
     """
     keys, table = [*CASE, "planner", "query", "seed"], []
     both = first.merge(again, on=keys, suffixes=("", "_again"))
@@ -290,13 +291,13 @@ def repeated(first: pd.DataFrame, again: pd.DataFrame) -> pd.DataFrame:
             "same_validity": bool((own["valid"] == own["valid_again"]).all()),
             "length_difference": float(relative.max()) if len(relative) else 0.0,
         }
-        for run in ("time", "time_again"):
-            column = "time_s" if run == "time" else "time_s_again"
-            low, middle, high = _interval(own[column].to_numpy(), np.median)
-            row |= {f"{run}_s": middle, f"{run}_low_s": low, f"{run}_high_s": high}
-        overlap = row["time_low_s"] <= row["time_again_high_s"]
-        row["overlap"] = bool(overlap and row["time_again_low_s"] <= row["time_high_s"])
-        table.append(row)
+        times = {"time_s": own["time_s"].median(), "time_again_s": own["time_s_again"].median()}
+        timed = own[(own["time_s"] > 0.0) & (own["status"] != "not_applicable")]
+        ratios = (timed["time_s_again"] / timed["time_s"]).groupby(
+            [timed[k] for k in (*CASE, "query")]
+        )
+        low, middle, high = _interval(ratios.median().to_numpy(), np.median)
+        table.append(row | times | {"ratio": middle, "ratio_low": low, "ratio_high": high})
     return pd.DataFrame(table)
 
 

@@ -32,7 +32,7 @@ OVERVIEW = (
 )
 REPEAT = (
     *("planner", "rows", "same validity", "largest relative difference of a length"),
-    *("median time [ms], 95 % interval", "second run", "overlap"),
+    *("median time [ms]", "second run [ms]", "second time over first, 95 % interval"),
 )
 BREAK_EVEN = (
     *("planner", "made beforehand [s]", "mean time of a query [ms]", "the planner's [ms]", "valid"),
@@ -238,15 +238,14 @@ def repeated_cells(table: pd.DataFrame) -> Cells:
     """Two runs of the same rows, planner by planner."""
     rows: Cells = [REPEAT]
     for row in table.to_dict("records"):
-        times = [
-            "{} [{}, {}]".format(
-                *(milliseconds(row[f"{run}_{end}s"]) for end in ("", "low_", "high_"))
-            )
-            for run in ("time", "time_again")
-        ]
-        same, overlap = ("yes" if row[name] else "no" for name in ("same_validity", "overlap"))
-        difference = f"{row['length_difference']:.1e}"
-        rows.append((str(row["planner"]), str(row["rows"]), same, difference, *times, overlap))
+        times = (milliseconds(row["time_s"]), milliseconds(row["time_again_s"]))
+        low, ratio, high = (fixed(row[name], 2) for name in ("ratio_low", "ratio", "ratio_high"))
+        same, difference = (
+            "yes" if row["same_validity"] else "no",
+            f"{row['length_difference']:.1e}",
+        )
+        about = str(row["planner"]), str(row["rows"]), same, difference
+        rows.append((*about, *times, f"{ratio} [{low}, {high}]"))
     return rows
 
 
