@@ -56,7 +56,6 @@ def write(params: Params, layout: Layout, run: StageRun) -> None:
     """
     folder, settings = layout.root / "reports" / "benchmark", all_settings(params)
     rows, about = read_table(layout.benchmark_table)
-    rows = rows[rows["planner"].isin(list(settings))]  # others are asked no more
     orders = {
         "planner": list(settings),
         "constraint": list(params.all_constraints),

@@ -26,6 +26,7 @@ from mlflow import MlflowClient
 from safetensors.numpy import load_file
 
 from constraint_geodesics import doctor
+from constraint_geodesics.benchmark.row import KEY, read_table
 from constraint_geodesics.geodesics.policy_search import save_policy, train_policy
 from constraint_geodesics.params import load_params
 from constraint_geodesics.pipeline.lock_files import is_whole, keep_locks, recover_locks
@@ -246,6 +247,9 @@ def test_a_lock_file_that_is_cut_short_is_put_back(
 # The whole pipeline on small parameters
 
 
+BENCHMARK = "stages/dvc.yaml:run_benchmark"
+UNTIMED = ("planner", "BiRRT")
+"""Planners that no clock stops: asked again they give the same path."""
 LATEST = 100
 """Times that a stage may be done before it is killed: no kill that did not hit it is counted."""
 
@@ -323,9 +327,7 @@ def process_of(stage: str, dvc: subprocess.Popen[str]) -> psutil.Process | None:
 
 
 def kill_once(pair: Pair, stage: str, number: int) -> bool:
-    """Kill a stage at a random moment, its process alone or with all of its group, DVC too; returns
-    whether it was at work then.
-    """
+    """Kill a stage at a random moment; returns whether it was at work then."""
     rng = random.Random(f"{stage} {number}")
     script, *items = lock_of(pair.whole)[stage]["cmd"].split()[1:]
     times = pd.read_csv(pair.whole / "reports/stage_times.csv").set_index("stage")["seconds"]
@@ -336,6 +338,12 @@ def kill_once(pair: Pair, stage: str, number: int) -> bool:
     if process is None:
         raise AssertionError(f"{stage} did not begin: {dvc.communicate()[1]}")
     time.sleep(rng.uniform(0.0, lasts + 1.0))  # it also imports
+    kill_now(process, dvc, number)
+    return dvc.returncode != 0
+
+
+def kill_now(process: psutil.Process, dvc: subprocess.Popen[str], number: int) -> None:
+    """Kill a stage's process alone, or with all of its group, DVC too."""
     with suppress(psutil.Error):
         if number % 2:
             process.kill()
@@ -344,7 +352,6 @@ def kill_once(pair: Pair, stage: str, number: int) -> bool:
                 one.kill()
             os.killpg(dvc.pid, signal.SIGKILL)
     dvc.communicate()
-    return dvc.returncode != 0
 
 
 def lock_of(folder: Path) -> dict[str, Any]:
@@ -436,6 +443,64 @@ def _recover(pair: Pair) -> None:
         text=True,
     )
     assert recovered.returncode == 0, recovered.stderr
+
+
+def benchmark_rows(folder: Path) -> dict[str, dict[str, Any]]:
+    """The rows that are there, by the text of their lines."""
+    found = {}
+    for file in (folder / "data/benchmark_rows").glob("*.jsonl"):
+        for line in file.read_text().splitlines():
+            with suppress(json.JSONDecodeError):  # killed while it was written
+                row = json.loads(line)
+                if "status" in row:
+                    found[line] = row
+    return found
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3600)
+def test_a_benchmark_that_is_killed_keeps_its_rows_and_makes_the_others(
+    pair: Pair, effort: Effort
+) -> None:
+    with counting("benchmark_kills", effort) as row:
+        whole = smoke.dvc(pair.whole, "repro", BENCHMARK)
+        assert whole.returncode == 0, whole.stderr
+        wanted = len(benchmark_rows(pair.whole))
+        made = len(benchmark_rows(pair.hurt))
+        # by what is done, not by time: each kill hits the run, and another row
+        moments = sorted(random.Random(2).sample(range(made, wanted), effort.kills))
+        kept = dict[str, dict[str, Any]]()
+        for number, moment in enumerate(moments):
+            dvc = repro(pair.hurt, BENCHMARK)
+            process = process_of(BENCHMARK, dvc)
+            assert process is not None, dvc.communicate()[1]
+            while len(benchmark_rows(pair.hurt)) < moment:
+                assert dvc.poll() is None, dvc.communicate()[1]
+                time.sleep(0.05)
+            kill_now(process, dvc, number)
+            assert dvc.returncode != 0
+            recover_locks(pair.hurt)  # DVC itself may have been killed while it wrote
+            kept |= benchmark_rows(pair.hurt)
+        last = smoke.dvc(pair.hurt, "repro", BENCHMARK)
+        assert last.returncode == 0, last.stderr
+        lost = kept.keys() - benchmark_rows(pair.hurt)
+        tables = [
+            read_table(folder / "reports/benchmark.csv")[0].set_index(KEY).sort_index()
+            for folder in (pair.whole, pair.hurt)
+        ]
+        same = [table.loc[list(UNTIMED), ["valid", "length_rad"]] for table in tables]
+        row |= {
+            "injected": len(moments),
+            "survived": len(moments) if not lost else 0,
+            "rows": len(tables[1]),
+            "rows_kept": len(kept),
+            "rows_lost": len(lost),
+        }
+        assert not lost
+        assert tables[0].index.equals(tables[1].index)
+        pd.testing.assert_frame_equal(*same)
+        assert "Running stage" not in smoke.dvc(pair.hurt, "repro", BENCHMARK).stdout
+        assert not any("RUNNING" in own for own in statuses(pair.hurt).values())
 
 
 @pytest.mark.long
