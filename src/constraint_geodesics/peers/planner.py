@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import ClassVar, Literal, get_args
 
 from constraint_geodesics.bundle import read_bundle
+from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.fields import Positive
 from constraint_geodesics.methods import open_method
 from constraint_geodesics.peers.baseline import GRAPH, BaselineSettings, Context
@@ -16,6 +17,8 @@ from constraint_geodesics.search.candidates import ALL_PARTS, Parts
 
 Part = Literal["straight", "graph", "refinement", "tree"]
 """What an entry may switch off."""
+_PAIRS = 20
+"""Of a roadmap's nodes, one of which will be free and joined."""
 
 
 class PlannerSettings(BaselineSettings):
@@ -126,7 +129,19 @@ def _opened(context: Context, method: str) -> Planner:
             own.planner.plan(nodes[0], nodes[-1], constraint, parts=trees)
         own.prepared.add(constraint.key)
     own.planner.scene.become(replace(context.scene, robot=own.planner.robot))
+    if method != "planner":
+        _answer_once(own.planner, constraint)
     return own.planner
+
+
+def _answer_once(planner: Planner, constraint: Constraint) -> None:
+    """Let a method make what it keeps for a scene: configurations that are free in it, for curves
+    to bend towards.
+    """
+    nodes = planner.nodes(constraint)
+    for first, last in zip(nodes[:_PAIRS], nodes[-_PAIRS:], strict=True):
+        if planner.plan(first, last, constraint).status not in ("in_collision", "not_connected"):
+            return
 
 
 BASELINE = PlannerSettings
