@@ -485,7 +485,7 @@ def test_a_benchmark_that_is_killed_keeps_its_rows_and_makes_the_others(
         assert last.returncode == 0, last.stderr
         lost = kept.keys() - benchmark_rows(pair.hurt)
         tables = [
-            read_table(folder / "reports/benchmark.csv")[0].set_index(KEY).sort_index()
+            read_table(folder / "reports/benchmark.csv")[0].set_index(list(KEY)).sort_index()
             for folder in (pair.whole, pair.hurt)
         ]
         same = [table.loc[list(UNTIMED), ["valid", "length_rad"]] for table in tables]
