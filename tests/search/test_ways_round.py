@@ -95,7 +95,7 @@ def test_ways_round_a_sphere_are_clear_and_those_seldom_sound_come_last(name: st
 
 def test_an_answer_names_the_other_ways_and_a_recording_draws_them(tmp_path: Path) -> None:
     planner, named = packaged_planner(), 0
-    for start, goal, ball, _ in queries("level_cup", 12):
+    for start, goal, ball, _ in queries("level_cup", 24):
         path = planner.plan(start, goal, "level_cup", scene=[ball])
         if path.status != "solved":
             continue

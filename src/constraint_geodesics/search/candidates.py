@@ -40,7 +40,12 @@ Source = Literal["straight", "policy", "graph", "tree", "bend"]
 ROW_SAFETY = 0.95
 """Share of the allowed violation between two rows that their distance is chosen for."""
 ALMOST = 1.1
-"""A way that is no longer than so many times the straight distance is short enough."""
+"""A way that is no longer than so many times what it would be were nothing there is short enough.
+"""
+FEW = 2
+"""Nodes of a way that is pushed clear of something, as a multiple of a band's: more are relaxed
+more slowly, and no further.
+"""
 WIDER, AGAIN = (2.0, 4.0), 10
 """Margins of a band that still clips something, as multiples of the first; iterations with each."""
 FIRST, SHALLOW_M = 10, 0.01
@@ -165,15 +170,16 @@ def candidates(
     yield None
     answer, known = Answer("not_found"), list[Candidate]()
     if blocked is not None and parts.refinement:
-        enough = ALMOST * float(np.linalg.norm(goal - start))
+        straight = float(np.linalg.norm(goal - start))
         ways = round_it(task, blocked.source, blocked.nodes)
         for one in ways:
             if one is None:
                 break
             known.append(one)
-            if one.length <= enough:
+            if one.length <= ALMOST * straight:
                 break
-        if not parts.graph or (known and known[-1].length <= enough):
+        shortest = min((one.length for one in known), default=np.inf)
+        if not parts.graph or shortest <= ALMOST * blocked.length:
             yield from _shortest_first(known)
             known = []
     if parts.graph:
@@ -225,10 +231,9 @@ def round_it(
                 yield pushed
             else:
                 near.append(pushed or band)
-    settings = replace(task.settings, iterations=WITH_FINER)
     for band in sorted(near, key=lambda one: one.length):
-        finer = _relaxed(task, source, _halved(band.nodes), settings, clear=True, wider=FINER)
-        if finer is not None and _is_clear(task, finer.points):
+        finer = _finer(task, band)
+        if finer is not None:
             yield finer
     yield None
     for band in sorted(far, key=lambda one: one.length):
@@ -247,6 +252,24 @@ def _relaxed_on(task: Task, band: Candidate, direct: float) -> Candidate:
     settings = replace(task.settings, iterations=left)
     further = _relaxed(task, band.source, band.nodes, settings, clear=True)
     return further if further is not None and _is_clear(task, further.points) else band
+
+
+def _pushed_finer(task: Task, source: Source, nodes: Float[np.ndarray, "n D"]) -> Candidate | None:
+    """The curve through a band that is pushed clear of what may meet, with more nodes where it
+    clips something.
+    """
+    band = _relaxed(task, source, nodes, task.settings, clear=True)
+    if band is None or _is_clear(task, band.points):
+        return band
+    return _finer(task, band)
+
+
+def _finer(task: Task, clipping: Candidate) -> Candidate | None:
+    """A band that clips something pushed on with twice the nodes; None where it still does."""
+    settings = replace(task.settings, iterations=WITH_FINER)
+    nodes = _halved(clipping.nodes)
+    finer = _relaxed(task, clipping.source, nodes, settings, clear=True, wider=FINER)
+    return finer if finer is not None and _is_clear(task, finer.points) else None
 
 
 def _depth(task: Task, points: Float[np.ndarray, "n D"]) -> float:
@@ -362,8 +385,8 @@ def along(
     task: Task, source: Source, corners: Float[np.ndarray, "k D"], refine: bool, clear: bool
 ) -> Iterator[Candidate]:
     """The relaxed way over a graph or tree, with more nodes where fewer jump; where there is
-    something on the way from the points that its edges were looked at, pushed clear of it, then
-    with no line moved into anything, and then less and less relaxed.
+    something on the way pushed clear of it, from few points, then from all at which its edges were
+    looked at, then with no line moved into anything, and then less and less relaxed.
     """
     segments = task.settings.segments
     if refine and not clear:
@@ -376,6 +399,10 @@ def along(
             yield found
     if refine:
         points = points_along(task.clear, corners)
+        if len(points) > FEW * segments:
+            few = _pushed_finer(task, source, resample(points, FEW * segments))
+            if few is not None:
+                yield few
         found = _pushed(task, source, points, task.settings)
         if found is None:
             found = _relaxed(task, source, points, task.settings, clear=True, guarded=True)

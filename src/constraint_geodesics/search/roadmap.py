@@ -110,15 +110,16 @@ def shortest_way(
     """Corners of the shortest way over the graph, both ends included; None where the graph does not
     join them.
 
-    space: the edges of a way that was found are looked at in it, those to its ends as well, since
-    nothing may be known of them, and the graph may be of a workcell with less in it.  Those that
-    fail are left out, and the search is begun again [lazy shortest paths, Dellin and Srinivasa
-    2016].  most: so often at most.
+    space: the nodes and edges of a way that was found are looked at in it, the edges to its ends as
+    well, since nothing may be known of them, and the graph may be of a workcell with less in it.
+    The first that fails is left out, and the search is begun again [lazy shortest paths, Dellin and
+    Srinivasa 2016].  most: so often at most.
     """
     if not len(at_start.nodes) or not len(at_goal.nodes):
         return None
     begins, leads, lengths = roadmap.neighbours
     own, looked_at = lengths.copy(), np.zeros(len(lengths), bool)
+    known_free = np.zeros(len(roadmap.joints), bool)
     ends = _End(start, at_start), _End(goal, at_goal)
     for _ in count() if most is None else range(most):
         nodes = _a_star(
@@ -137,7 +138,7 @@ def shortest_way(
         if space is None or (
             ends[0].holds(space, roadmap, nodes[0])
             and ends[1].holds(space, roadmap, nodes[-1])
-            and _holds(space, roadmap.joints, begins, leads, own, looked_at, nodes)
+            and _holds(space, roadmap.joints, begins, leads, own, known_free, looked_at, nodes)
         ):
             return np.concatenate([start[None], roadmap.joints[nodes], goal[None]])
     return None
@@ -270,33 +271,45 @@ def edge_lengths(space, nodes, edges, lengths):
 
 
 @njit(**COMPILE)
-def _holds(space, joints, begins, leads, lengths, looked_at, way):
-    """Whether all edges of a way hold in the space; those that do not become infinitely long, in
-    either direction.
+def _holds(space, joints, begins, leads, lengths, known_free, looked_at, way):
+    """Whether all nodes and edges of a way hold in the space; its first and last node are known to.
+    Nodes that do not, which cost least to look at, lose all their edges; else the first edge that
+    does not becomes infinitely long, in either direction.
     """
     work = workspace(space)
     sound = True
-    for k in range(way.shape[0] - 1):
+    for k in range(1, way.shape[0] - 1):
+        here = way[k]
+        if not known_free[here]:
+            known_free[here] = is_free(space, joints[here], joints[here], work)
+            if not known_free[here]:
+                sound = False
+                for e in range(begins[here], begins[here + 1]):
+                    _leave_out(begins, leads, lengths, here, leads[e])
+    for k in range(way.shape[0] - 1 if sound else 0):
         here, there = way[k], way[k + 1]
         for e in range(begins[here], begins[here + 1]):
             if leads[e] != there or looked_at[e]:
                 continue
-            point = joints[there].copy()  # a node may lie in what the graph does not know
-            holds = (
-                project_node(space, point, space.projection, work) <= 1e-6
-                and distance(point, joints[there]) < EDGE_STEP
-                and edge_length(space, joints[here], joints[there], work) < np.inf
-            )
+            if edge_length(space, joints[here], joints[there], work) == np.inf:
+                _leave_out(begins, leads, lengths, here, there)
+                return False
             looked_at[e] = True
-            if not holds:
-                sound = False
-                lengths[e] = np.inf
             for back in range(begins[there], begins[there + 1]):
                 if leads[back] == here:
                     looked_at[back] = True
-                    if not holds:
-                        lengths[back] = np.inf
     return sound
+
+
+@njit(**LEAF)
+def _leave_out(begins, leads, lengths, first, second):
+    """Make the edge between two nodes infinitely long, in either direction."""
+    for e in range(begins[first], begins[first + 1]):
+        if leads[e] == second:
+            lengths[e] = np.inf
+    for e in range(begins[second], begins[second + 1]):
+        if leads[e] == first:
+            lengths[e] = np.inf
 
 
 @njit(**COMPILE)
