@@ -23,10 +23,11 @@ from constraint_geodesics.benchmark.runner import (
     QueryBatch,
     batch_rows,
     fingerprint,
+    make_rows,
     rows_to_do,
     run_batch,
 )
-from constraint_geodesics.params import load_params
+from constraint_geodesics.params import ComputeParams, load_params
 from constraint_geodesics.peers.straight_band import StraightBand
 from constraint_geodesics.problem import Solution
 from constraint_geodesics.scene.scene import Scene
@@ -142,6 +143,23 @@ def test_a_row_that_killed_its_process_twice_is_a_failure(batch) -> None:
         )
         assert band["valid"] == (kills == 1)
         assert band["reason"] == reason
+
+
+def test_rows_that_were_interrupted_are_made(batch, monkeypatch) -> None:
+    """However often: that is the user's doing, not theirs."""
+
+    def interrupted(planner, problem, seed):
+        raise KeyboardInterrupt
+
+    one = replace(batch, queries=batch.queries[:1], baselines=ASKED[:1])
+    with monkeypatch.context() as patch:
+        patch.setattr(runner, "_planned", interrupted)
+        for _ in range(3):
+            with pytest.raises(KeyboardInterrupt):
+                make_rows([one], ComputeParams(backend="loky", workers=1), "rows")
+    assert len(batch_rows(one)) == 0
+    make_rows([one], ComputeParams(backend="loky", workers=1), "rows")
+    assert [row["reason"] for row in batch_rows(one)] == [""]
 
 
 def test_a_planner_that_kills_its_process_before_it_is_timed_is_given_up_too(batch) -> None:

@@ -14,6 +14,7 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold, cons
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.geometry.graph import components, nearest_neighbour_edges
 from constraint_geodesics.params import Params
+from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.clearance import ClearanceModel, clearance_model
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.sphere import Sphere
@@ -293,9 +294,10 @@ def measured(space: Space, nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return lengths
 
 
-def test_edges_that_something_new_stands_on_are_left_out(made) -> None:
+@pytest.mark.parametrize("shape", ["ball", "thin plate"])
+def test_edges_that_something_new_stands_on_are_left_out(made, shape: str) -> None:
     """The shortest way over a graph of another workcell is that over the edges which hold in this
-    one: Dijkstra's, of all edges measured again in it.
+    one: Dijkstra's, of all edges measured again in it.  Few nodes touch the plate.
     """
     roadmap, robot = made.roadmap, made.manifold.robot
     rng, changed, found = np.random.default_rng(9), 0, 0
@@ -307,8 +309,13 @@ def test_edges_that_something_new_stands_on_are_left_out(made) -> None:
         before = shortest_way(roadmap, start, goal, at_start, at_goal, made.space)
         assert before is not None
         np.testing.assert_array_equal(before, shortest_way(roadmap, start, goal, at_start, at_goal))
-        ball = Sphere("ball", tuple(map(float, robot.forward(before[len(before) // 2])[0])), 0.1)
-        model = clearance_model(Scene(robot, (ball,)))
+        half = len(before) // 2
+        # on a node, and between two
+        on = before[half] if shape == "ball" else 0.5 * (before[half - 1] + before[half])
+        place = tuple(map(float, robot.forward(on)[0]))
+        plate = Box("plate", place, (0.004, 0.3, 0.3))
+        new = Sphere("ball", place, 0.1) if shape == "ball" else plate
+        model = clearance_model(Scene(robot, (new,)))
         if model.clearance(robot, np.stack([start, goal])).min() < 0.01:
             continue
         space = space_of(made.manifold, model, MARGIN)

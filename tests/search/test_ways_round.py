@@ -1,6 +1,8 @@
 """Lines bent round a sphere, and answers that name the ways that were found round it."""
 
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,17 @@ from tests.recording.files import column
 
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.search.band import PROJECTION, project
-from constraint_geodesics.search.candidates import Task, round_it
+from constraint_geodesics.search.candidates import (
+    ALMOST,
+    FEW,
+    Candidate,
+    Task,
+    _relaxed,
+    along,
+    candidates,
+    round_it,
+)
+from constraint_geodesics.search.roadmap import Roadmap, nearest, points_along, shortest_way
 from constraint_geodesics.search.ways_round import SIDES, bent_round
 from constraint_geodesics.trajectory import Trajectory
 
@@ -93,8 +105,65 @@ def test_ways_round_a_sphere_are_clear_and_those_seldom_sound_come_last(name: st
     assert found >= 12
 
 
+def test_the_roadmap_is_asked_only_where_the_ways_round_are_long() -> None:
+    planner, without, asked = packaged_planner(), 0, 0
+    for start, goal, ball, _ in queries("level_cup", 12):
+        with planner.scene.including([ball]):
+            task, calls = planner._preparation.task(planner.constraints["level_cup"]), list[int]()
+            share = np.linspace(0.0, 1.0, task.settings.segments + 1)[:, None]
+            line = _relaxed(task, "straight", (1.0 - share) * start + share * goal, task.settings)
+            assert line is not None
+            around = takewhile(lambda way: way is not None, round_it(task, "straight", line.nodes))
+            shortest = min((way.length for way in around if way is not None), default=np.inf)
+
+            def counted(task: Task = task, calls: list[int] = calls) -> Roadmap | None:
+                calls.append(1)
+                return task.roadmap()
+
+            first = next(
+                one
+                for one in candidates(replace(task, roadmap=counted), start, goal)
+                if one is not None
+            )
+        if shortest <= ALMOST * line.length:
+            assert isinstance(first, Candidate)
+            assert first.length <= ALMOST * line.length
+            assert not calls
+            without += 1
+        else:
+            assert calls
+            asked += 1
+    assert without >= 6
+    assert asked >= 1
+
+
+def test_ways_over_a_graph_come_from_few_points_first() -> None:
+    """Then, should that one be refused, from all at which the edges were looked at."""
+    planner, found = packaged_planner(), 0
+    for start, goal, ball, _ in queries("level_cup", 12):
+        with planner.scene.including([ball]):
+            task = planner._preparation.task(planner.constraints["level_cup"])
+            roadmap = task.roadmap()
+            assert roadmap is not None
+            ends = nearest(roadmap, start), nearest(roadmap, goal)
+            corners = shortest_way(roadmap, start, goal, *ends, task.clear)
+            if corners is None:
+                continue
+            ways = list(along(task, "graph", corners, refine=True, clear=True))
+            every = len(points_along(task.clear, corners))
+            for way in ways:
+                assert task.clearance.clearance(planner.robot, way.points).min() > 0.0
+            counts = [len(way.nodes) for way in ways]
+        if every > FEW * task.settings.segments and counts[0] < every:
+            assert counts[0] < 2 * FEW * task.settings.segments
+            assert any(count >= every for count in counts[1:])
+            found += 1
+    assert found >= 6
+
+
 def test_an_answer_names_the_other_ways_and_a_recording_draws_them(tmp_path: Path) -> None:
     planner, named = packaged_planner(), 0
+    # where the first way is short no other is looked for
     for start, goal, ball, _ in queries("level_cup", 24):
         path = planner.plan(start, goal, "level_cup", scene=[ball])
         if path.status != "solved":

@@ -20,8 +20,7 @@ from constraint_geodesics.benchmark.runner import (
     Recorder,
     batch_rows,
     fingerprint,
-    rows_to_do,
-    run_batch,
+    make_rows,
 )
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
@@ -29,7 +28,6 @@ from constraint_geodesics.params import BaselineParams, Params
 from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings
 from constraint_geodesics.peers.registry import BaselineBuilder, after, all_settings
 from constraint_geodesics.pipeline.code import code_digest, data_digest
-from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.scene.arm import mesh_digests
@@ -101,8 +99,7 @@ def committed_run(params: Params, layout: Layout, rows: Path, recordings: Path) 
 def answered(run: Run) -> pd.DataFrame:
     """The table of all rows, after those that are not there yet have been made."""
     batches = batches_of(run)
-    left = [batch for batch in batches if rows_to_do(batch)]
-    parallel_map(run_batch, left, run.params.compute, description="benchmark")
+    make_rows(batches, run.params.compute, "benchmark")
     return table_of([row for batch in batches for row in batch_rows(batch)])
 
 

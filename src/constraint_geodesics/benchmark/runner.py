@@ -31,7 +31,8 @@ from constraint_geodesics.benchmark.queries import Query
 from constraint_geodesics.benchmark.row import KEY, key_of, read_rows, row_line
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.params import JudgeParams
+from constraint_geodesics.params import ComputeParams, JudgeParams
+from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
@@ -39,6 +40,7 @@ from constraint_geodesics.scene.scene import Scene
 if TYPE_CHECKING:
     from constraint_geodesics.learning.learned_manifold import LearnedManifold
 
+_INTERRUPTED = json.dumps({"interrupted": True})
 _WARM: set[tuple[str, str]] = set()  # planners and scenes that this process has asked before
 
 
@@ -134,6 +136,23 @@ class _Job:
         query, name = self.query, self.baseline.name
         values = (name, query.constraint, query.scene, query.number, self.seed)
         return dict(zip(KEY, values, strict=True))
+
+
+def make_rows(batches: Sequence[QueryBatch], compute: ComputeParams, description: str) -> None:
+    """Make the rows that are not there yet, several batches side by side.  description: names the
+    work where its progress is shown.
+
+    An interrupt is noted, so that the rows that were begun are not taken for such as end their
+    process.
+    """
+    left = [batch for batch in batches if rows_to_do(batch)]
+    try:
+        parallel_map(run_batch, left, compute, description=description)
+    except KeyboardInterrupt:
+        for batch in left:
+            if batch.file.is_file():
+                _append(batch.file, f"\n{_INTERRUPTED}")
+        raise
 
 
 def run_batch(batch: QueryBatch) -> int:
@@ -269,13 +288,13 @@ def _asked(
 
 
 def _started(batch: QueryBatch, job: _Job) -> int:
-    """Note that a row is begun; how often it was before without an end: once a kill, twice a crash
-    of its own.
+    """Note that a row is begun; how often it was before without an end, since the last interrupt:
+    once a kill, twice a crash of its own.
     """
     mark = json.dumps({"started": job.key, "fingerprint": job.baseline.fingerprint})
-    before = batch.file.read_text().splitlines().count(mark) if batch.file.is_file() else 0
+    text = batch.file.read_text() if batch.file.is_file() else ""
     _append(batch.file, mark)
-    return before
+    return text.rpartition(_INTERRUPTED)[2].splitlines().count(mark)
 
 
 def _planned(planner: PathPlanner, problem: PlanningProblem, seed: int) -> Solution:

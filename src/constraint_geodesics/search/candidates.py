@@ -1,12 +1,12 @@
 """The project's own planner: proposals of a curve, the shortest of which is refined by an elastic
 band.
 
-Proposals are tried in the order of what they cost: the straight joint line, the way over the
-constraint's graph, two trees grown towards each other.  Each is relaxed by Newton's method on the
-exact constraint; one that is continuous, within the limits and clear of the workcell's shapes and
-of the arm itself is drawn as rows so close together that the straight lines between them keep the
-constraint, and goes to the caller, who has it certified.  Curves of another kind come from a method
-of their own (methods.py), through `refined` or not.
+Proposals are tried in the order of what they cost: the straight joint line, bends of it round what
+it leads through, the way over the constraint's graph, two trees grown towards each other.  Each is
+relaxed by Newton's method on the exact constraint; one that is continuous, within the limits and
+clear of the workcell's shapes and of the arm itself is drawn as rows so close together that the
+straight lines between them keep the constraint, and goes to the caller, who has it certified.
+Curves of another kind come from a method of their own (methods.py), through `refined` or not.
 """
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -40,11 +40,12 @@ Source = Literal["straight", "policy", "graph", "tree", "bend"]
 ROW_SAFETY = 0.95
 """Share of the allowed violation between two rows that their distance is chosen for."""
 ALMOST = 1.1
-"""A way that is no longer than so many times what it would be were nothing there is short enough.
+"""A way that is no longer than so many times the straight distance, or the line relaxed as if
+nothing were there, is short enough.
 """
 FEW = 2
-"""Nodes of a way that is pushed clear of something, as a multiple of a band's: more are relaxed
-more slowly, and no further.
+"""Nodes of a way that is pushed clear of something, as a multiple of a band's: with more an
+iteration costs more, and the path gets no shorter.
 """
 WIDER, AGAIN = (2.0, 4.0), 10
 """Margins of a band that still clips something, as multiples of the first; iterations with each."""
@@ -154,8 +155,8 @@ def candidates(
     """Sound curves from the cheapest proposals to the dearest, of one kind the shortest first; None
     where dearer ones begin, and an Answer at the end.
 
-    Where the straight line touches something it is bent round that to either side, and the graph is
-    asked for a way.  Trees come last.
+    Where the straight line touches something it is bent round that to either side, and where these
+    ways are long the graph is asked for one.  Trees come last.
     """
     blocked = None
     ways: Iterator[Candidate | None] = iter(())

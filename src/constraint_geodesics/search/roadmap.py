@@ -110,10 +110,10 @@ def shortest_way(
     """Corners of the shortest way over the graph, both ends included; None where the graph does not
     join them.
 
-    space: the nodes and edges of a way that was found are looked at in it, the edges to its ends as
-    well, since nothing may be known of them, and the graph may be of a workcell with less in it.
-    The first that fails is left out, and the search is begun again [lazy shortest paths, Dellin and
-    Srinivasa 2016].  most: so often at most.
+    space: the edges to the ends of a way that was found are looked at in it, then its nodes, then
+    its edges, since the graph may be of a workcell with less in it.  Nodes that touch something are
+    left out, else the first edge that fails, and the search is begun again [lazy shortest paths,
+    Dellin and Srinivasa 2016].  most: so often at most.
     """
     if not len(at_start.nodes) or not len(at_goal.nodes):
         return None

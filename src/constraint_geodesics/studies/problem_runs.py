@@ -34,8 +34,7 @@ from constraint_geodesics.benchmark.runner import (
     QueryBatch,
     batch_rows,
     fingerprint,
-    rows_to_do,
-    run_batch,
+    make_rows,
 )
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.learning.lift import densify
@@ -44,7 +43,6 @@ from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings,
 from constraint_geodesics.peers.making import made_together
 from constraint_geodesics.peers.ompl_settings import OmplSettings
 from constraint_geodesics.peers.registry import after, kind_of, settings_of
-from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.problem import PathPlanner
@@ -233,8 +231,7 @@ def answered(problems: Sequence[Problem], asked: Asked, description: str) -> pd.
     the work where its progress is shown.  Raises BaselineError and ProblemFileError as `batches`.
     """
     own = batches(problems, asked)
-    left = [batch for batch in own if rows_to_do(batch)]
-    parallel_map(run_batch, left, asked.params.compute, description=description)
+    make_rows(own, asked.params.compute, description)
     return table_of([row for batch in own for row in batch_rows(batch)], asked.limit)
 
 
