@@ -26,5 +26,7 @@ def is_unchanged(one: Shape | Attached, before: Shape | Attached) -> bool:
     """Whether a shape, attached or not, is what it was.  One that reads files is if it is the very
     same object: an equal one may have been made since its file was written anew.
     """
+    if one is before:
+        return True
     own, known = (x.shape if isinstance(x, Attached) else x for x in (one, before))
-    return one is before or (one == before and (own is known or not own.reads_files))
+    return one == before and (own is known or not own.reads_files)

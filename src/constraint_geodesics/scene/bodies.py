@@ -7,6 +7,7 @@ import contextlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -399,12 +400,13 @@ def _with_neighbours(
             hull = ConvexHull(points)
             corners, faces = np.unique(hull.simplices, return_inverse=True)
             faces = faces.reshape(hull.simplices.shape)
-            edges = np.concatenate([faces[:, [i, k]] for i in range(3) for k in range(3) if i != k])
-            edges = np.unique(edges, axis=0)
-            starts = np.searchsorted(edges[:, 0], range(len(corners)))
+            count = len(corners)
+            ways = [faces[:, i] * count + faces[:, k] for i, k in permutations(range(3), 2)]
+            first, second = np.divmod(np.unique(np.concatenate(ways)), count)  # each edge once
+            starts = np.searchsorted(first, range(count))
             own = points[corners]
-            if _leads_furthest(own, edges[:, 1], starts, hull.equations[:, :3]):
-                return own, edges[:, 1], np.diff(starts, append=len(edges))
+            if _leads_furthest(own, second, starts, hull.equations[:, :3]):
+                return own, second, np.diff(starts, append=len(second))
     first, second = np.nonzero(~np.eye(len(points), dtype=bool))
     return points, second, np.bincount(first, minlength=len(points))
 
