@@ -8,9 +8,11 @@ import json
 import os
 import re
 import shutil
+import signal
 import sqlite3
 import subprocess
 import sys
+import time
 import venv
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -707,6 +709,22 @@ def test_dvc_at_work_or_too_slow_is_noted(ran) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX)
         (found,) = look("pipeline", ran)
     assert found.status == "note"
+    assert found.message == "DVC is at work here: the stages were not looked at"
+
+
+def test_a_stage_that_runs_is_no_trouble(ran) -> None:
+    (ran / "dvc.yaml").write_text(PIPELINE.replace("cp params.yaml", "sleep 60 && cp params.yaml"))
+    command = [sys.executable, "-m", "dvc", "repro", "--quiet"]
+    with subprocess.Popen(command, cwd=ran, env=ENVIRON, start_new_session=True) as working:
+        try:
+            locked, until = ran / ".dvc" / "tmp" / "rwlock", time.monotonic() + 60.0
+            while not (locked.is_file() and json.loads(locked.read_text() or "{}").get("write")):
+                assert working.poll() is None
+                assert time.monotonic() < until
+                time.sleep(0.05)
+            found = only(look("pipeline", ran), "note")
+        finally:
+            os.killpg(working.pid, signal.SIGKILL)
     assert found.message == "DVC is at work here: the stages were not looked at"
 
 

@@ -734,7 +734,7 @@ def check_pipeline(root: Path, here: Surroundings, longest_s: float = LONGEST_ST
         yield from _of_stages(json.loads(answer.stdout))
         return "all stages are up to date"
     line = " ".join(answer.stderr.split()).replace("ERROR: ", "", 1)
-    if "Unable to acquire lock" in line:
+    if "Unable to acquire lock" in line or "is busy, it is being blocked by" in line:
         yield _note(f"DVC is at work here: {unseen}", "look again when it has ended")
     elif "is not a git repository" in line:
         yield _note(f"DVC refuses to run outside of a git repository: {unseen}")
