@@ -275,6 +275,7 @@ def write_recording(
     with stream:
         if blueprint is not None:
             stream.send_blueprint(blueprint, make_active=False)
+            stream.flush()  # the viewer keeps its own layout of what comes before
         if name:
             stream.send_recording_name(name)
         rr.send_chunks(chunks, recording=stream)
