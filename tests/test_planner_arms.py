@@ -290,8 +290,12 @@ def test_the_certificate_names_the_pairs_that_are_not_looked_at() -> None:
     (start, goal), *_ = free_pairs(planner, 1, seed=1)
     rests_on = planner.plan(start, goal, "free").certificate.rests_on
     assert planner.robot.allowed
-    for first, second in planner.robot.allowed:
-        assert f"{first} with {second}" in rests_on
+    for pair in planner.robot.allowed:
+        assert " with ".join(sorted(pair)) in rests_on
+    assert "panda_link0 with the shapes around the arm" not in rests_on
+    planner.scene.add(Sphere("far", (2.0, 0.0, 1.0), 0.1))
+    rests_on = planner.plan(start, goal, "free").certificate.rests_on
+    assert "panda_link0 with the shapes around the arm" in rests_on
 
 
 def test_a_closed_planner_answers_nothing() -> None:

@@ -187,12 +187,27 @@ def test_what_touches_the_carrier_is_said_to(planner: Planner) -> None:
     assert path.status == "solved", path.explanation
     said = planner._certifier.collisions.rests_on
     assert "wide on link6" in said
-    assert "wide with link5" in said
+    assert "link5 with wide" in said
     planner.scene.detach("wide")
     planner.scene.attach(wide, "link6")
     refused = planner.plan(start, goal, "free")
     assert refused.status == "in_collision"
     assert "wide with link5" in refused.explanation
+
+
+def test_the_certificate_names_what_never_counts(planner: Planner) -> None:
+    """Exempt links of a shape, and what is no contact by definition."""
+    bolted = Box("bolted", (0.0, 0.0, 2.0), (0.1, 0.1, 0.1), exempt_links=("link3",))
+    planner.scene.add(bolted)
+    planner.scene.attach(Sphere("ball", (0.0, 0.0, 0.2), 0.02), "link6")
+    looked_at, never = planner._certifier.collisions.rests_on.split("; never a contact: ")
+    assert "bolted with link3" in looked_at
+    assert never == "a link with the one it hangs on, ball with link6"
+    planner.scene.remove("bolted")
+    planner.scene.detach("ball")
+    said = planner._certifier.collisions.rests_on
+    assert "bolted" not in said
+    assert "ball" not in said
 
 
 def test_a_change_that_fails_changes_nothing(planner: Planner, tmp_path: Path) -> None:

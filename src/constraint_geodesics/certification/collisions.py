@@ -2,7 +2,7 @@
 distances where two bodies come closer than the proof's margin.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from constraint_geodesics.certification.certificate import Violation, malformed
 from constraint_geodesics.certification.chain import Chain
 from constraint_geodesics.certification.collider import Collider
 from constraint_geodesics.scene import convex_kernels as convex
-from constraint_geodesics.scene.bodies import Body, Pair
+from constraint_geodesics.scene.bodies import Body, Pair, touching
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
 
@@ -72,8 +72,7 @@ class CollisionCheck:
         self._follow(scene)
 
     def _follow(self, scene: Scene) -> None:
-        touching = ((one.name, other) for one in scene.attached for other in one.touching)
-        self._allowed = sorted({*scene.robot.allowed, *scene.allowed, *touching})
+        self._allowed = sorted(tuple(sorted(pair)) for pair in touching(scene.robot, scene))
         self._standing = self._rigid_contact(scene.robot.dof)
         self._rests_on = ""
 
@@ -97,8 +96,13 @@ class CollisionCheck:
         if apart := len(self.collider.apart):
             line += f"; {apart} pairs that never meet within the joint limits"
         if self._allowed:
-            pairs = ", ".join(f"{first} with {second}" for first, second in self._allowed)
-            line += f"; not looked at, since they may touch: {pairs}"
+            line += f"; not looked at, since they may touch: {_listed(self._allowed)}"
+        never = ["a link with the one it hangs on"] if links > 1 else []
+        bases = [b.name for b in bodies if b.shape is None and b.parent is None]
+        never += [f"{base} with the shapes around the arm" for base in bases if shapes]
+        never += [f"{body.name} with {body.carrier}" for body in carried]
+        if never:
+            line += f"; never a contact: {', '.join(never)}"
         if self._world is None:
             line += "; no PyBullet, with which nothing was compared"
         return line
@@ -284,6 +288,10 @@ class CollisionCheck:
             f"of the way to the next, that no proof keeps them apart"
         )
         return malformed("clearance", row, text)
+
+
+def _listed(pairs: Iterable[tuple[str, ...]]) -> str:
+    return ", ".join(" with ".join(pair) for pair in pairs)
 
 
 def _in_base(points: Float[np.ndarray, "n 3"], frame: np.ndarray) -> Float[np.ndarray, "n 3"]:
