@@ -13,6 +13,7 @@ from tests.benchmark.problem_fixtures import problem, shape, small_file, written
 
 from constraint_geodesics import bundle
 from constraint_geodesics.benchmark.arm_source import PipelineArm, UrdfArm, opened
+from constraint_geodesics.benchmark.dense_check import watched
 from constraint_geodesics.benchmark.problem_files import Problem, ProblemFileError, read_problems
 from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.benchmark.runner import batch_rows, rows_to_do, run_batch
@@ -32,7 +33,6 @@ from constraint_geodesics.studies.problem_runs import (
     figures,
     limited,
     table_of,
-    watched,
 )
 from constraint_geodesics.studies.problems import (
     ENDS_RAD,

@@ -11,6 +11,7 @@ from typing import Any
 
 import pandas as pd
 
+from constraint_geodesics.benchmark.dense_check import watched
 from constraint_geodesics.benchmark.queries import Query, read_queries
 from constraint_geodesics.benchmark.recorder import PathRecorder, first_queries
 from constraint_geodesics.benchmark.row import table_of
@@ -132,6 +133,7 @@ def batches_of(run: Run) -> list[QueryBatch]:
                 file=run.rows / f"{constraint}-{name}-{first}.jsonl",
                 learned=learned,
                 record=run.record,
+                watch=watched,
             )
             found.append((first // settings.batch, batch))
     return spread(found)

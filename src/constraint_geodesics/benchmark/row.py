@@ -24,12 +24,14 @@ COLUMNS = (
     *("planner", "kind", "settings", "constraint", "scene", "query", "seed"),
     *("status", "valid", "reason", "time_s", "iterations", "length_rad", "best_known_rad"),
     *("tool_length_m", "max_violation_rad", "max_violation_m", "max_step_rad"),
+    *("touches", "looked_at"),
     *("peak_memory_mb", "scene_s", "core_share", "recording"),
 )
 """Of the table, before the latent lengths.  planner: its name in params.yaml; kind: its file in
 peers/; settings: a digest of all its settings, so that two rows with the same one are of the same
 planner.  time_s: from the problem to the path; scene_s: its preparation for the scene;
-core_share: of a core, that its process had meanwhile.
+core_share: of a core, that its process had meanwhile.  touches: 1 where PyBullet finds a contact on
+the path, of looked_at configurations; blank in tables of before it was asked.
 """
 NUMBERS = COLUMNS[COLUMNS.index("time_s") : -1]
 _OLD_NAMES = {"latent_length": f"{LATENT}planner"}

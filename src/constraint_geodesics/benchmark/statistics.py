@@ -41,39 +41,57 @@ def benchmark_summary(rows: pd.DataFrame, reference: str) -> pd.DataFrame:
     queries, rows; solvable: queries that any planner solved.  success: valid rows of all;
     success_of_solvable: of those whose query any planner solved, with its 95 % interval of Clopper
     and Pearson over queries.  claimed_but_invalid: rows called solved that the certifier refuses.
+    wrongly_certified: rows that the certifier takes and PyBullet does not, nan where it was not
+    asked.
     not_applicable: rows of problems that the planner cannot work on.
     ratio_*: length over best known of valid rows: median, 95th percentile, and the interquartile
     mean over queries (of each query's mean over its seeds) with its 95 % bootstrap interval;
     ratio_p95_all: the 95th percentile with every row that is not valid counted as infinite, of the
-    solvable queries.
+    solvable queries, with its 95 % bootstrap interval over queries.
     time_*: of the rows of solvable queries [s], or a planner's own limit would be its time where
     there is no path.  within_1, _5, _10: median time [s] to a valid path within so many per
     cent of the best known, infinite where fewer than half of the rows get there.
     reference_iqm: the interquartile mean of `reference` over the queries that the planner has a
-    valid path of.
+    valid path of.  reference_queries, _success, _ratio_p95_all, _time_median_s: its figures over
+    the queries that the planner was asked.
     beaten: the probability that a run of `reference` is shorter than one of the planner on a query,
     ties counted half, failures as infinitely long.
     """
     rows = rows.assign(ratio=ratio_of(rows))
     table = []
     for (constraint, scene), case in rows.groupby(CASE, sort=False):
-        wanted = _lengths_by_query(case[case["planner"] == reference])
-        mine = case[(case["planner"] == reference) & case["valid"]].groupby("query")["ratio"].mean()
+        theirs = case[case["planner"] == reference]
+        wanted = _lengths_by_query(theirs)
+        mine = theirs[theirs["valid"]].groupby("query")["ratio"].mean()
         for planner, own in case.groupby("planner", sort=False):
             about = {"constraint": constraint, "scene": scene, "planner": planner}
             same = mine[mine.index.isin(own[own["valid"]]["query"])].to_numpy()
             compared = {
                 "reference_iqm": interquartile_mean(same)[1],
                 "beaten": _beaten(wanted, _lengths_by_query(own)),
+                **_reference(theirs[theirs["query"].isin(own["query"])]),
             }
             table.append(about | _figures(own) | compared)
     return pd.DataFrame(table)
+
+
+def _reference(same: pd.DataFrame) -> dict[str, Any]:
+    solvable = same[same["best_known_rad"].notna()]
+    return {
+        "reference_queries": same["query"].nunique(),
+        "reference_success": float(solvable["valid"].mean()),
+        "reference_ratio_p95_all": quantile_with_failures(solvable["ratio"].to_numpy(), 0.95),
+        "reference_time_median_s": solvable["time_s"].quantile(0.5),
+    }
 
 
 def _figures(own: pd.DataFrame) -> dict[str, Any]:
     solvable = own[own["best_known_rad"].notna()]
     ratio, time = own["ratio"].dropna(), solvable["time_s"]
     low, middle, high = interquartile_mean(own.groupby("query")["ratio"].mean().dropna().to_numpy())
+    p95_low, p95_high = _p95_interval(
+        [each.to_numpy() for _, each in solvable.groupby("query")["ratio"]]
+    )
     success_low, success_high = _of_a_share(solvable.groupby("query")["valid"].mean())
     reached = {
         f"within_{100 * share:.0f}_s": _median_time(solvable, 1.0 + share) for share in WITHIN
@@ -88,6 +106,7 @@ def _figures(own: pd.DataFrame) -> dict[str, Any]:
         "success_low": success_low,
         "success_high": success_high,
         "claimed_but_invalid": int(((own["status"] == "solved") & ~own["valid"]).sum()),
+        "wrongly_certified": _wrongly_certified(own),
         "not_applicable": int((own["status"] == "not_applicable").sum()),
         "ratio_median": ratio.quantile(0.5),
         "ratio_p95": ratio.quantile(0.95),
@@ -95,11 +114,19 @@ def _figures(own: pd.DataFrame) -> dict[str, Any]:
         "ratio_iqm_low": low,
         "ratio_iqm_high": high,
         "ratio_p95_all": quantile_with_failures(solvable["ratio"].to_numpy(), 0.95),
+        "ratio_p95_all_low": p95_low,
+        "ratio_p95_all_high": p95_high,
         "time_median_s": time.quantile(0.5),
         "time_p95_s": time.quantile(0.95),
         **reached,
         "peak_memory_median_mb": own["peak_memory_mb"].quantile(0.5),
     }
+
+
+def _wrongly_certified(own: pd.DataFrame) -> float:
+    certified = own[own["valid"]]
+    asked = certified["touches"].notna().all()
+    return float((certified["touches"] == 1.0).sum()) if asked else float("nan")
 
 
 def _of_a_share(solved: "pd.Series[float]") -> tuple[float, float]:
@@ -150,6 +177,21 @@ def quantile_with_failures(ratio: Float[np.ndarray, "n"], share: float) -> float
         return float("nan")
     filled = np.sort(np.where(np.isnan(ratio), np.inf, ratio))
     return float(filled[min(int(np.ceil(share * len(filled))) - 1, len(filled) - 1)])
+
+
+def _p95_interval(by_query: Sequence[Float[np.ndarray, "seeds"]]) -> tuple[float, float]:
+    """The 95 % percentile bootstrap interval of `quantile_with_failures` over queries, each with
+    all of its runs; nan without queries.
+    """
+    if not by_query:
+        return float("nan"), float("nan")
+    rng = np.random.default_rng(0)
+    drawn = [
+        quantile_with_failures(np.concatenate([by_query[k] for k in chosen]), 0.95)
+        for chosen in rng.integers(len(by_query), size=(RESAMPLES, len(by_query)))
+    ]
+    ordered = np.sort(drawn)  # no mean of a number and infinity
+    return float(ordered[int(0.025 * RESAMPLES)]), float(ordered[int(0.975 * RESAMPLES) - 1])
 
 
 def over_budget(rows: pd.DataFrame, budgets: Sequence[float]) -> pd.DataFrame:

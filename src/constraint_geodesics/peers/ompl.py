@@ -33,7 +33,10 @@ _STALL = 0.2
 """A step along the constraint that advances by less than this share of itself leads nowhere."""
 _WANDER = 2.0
 """OMPL's λ: a step along the constraint is at most this many times as long as the straight one."""
-_MILESTONES_BETWEEN_LOOKS = 5
+_EXPANDED, _EXPANDED_SHARE = 2, 0.05
+"""Milestones of a roadmap that come by random walks between two looks, and as a share of all."""
+_WALK = 5
+"""Milestones that one of these walks leaves at most: OMPL's own number."""
 _SHORTCUTS = 50
 
 Sampler = Callable[[], Float[np.ndarray, "D"]]
@@ -384,42 +387,50 @@ def _shorten(space: _Space, path: Any) -> None:
 
 
 def _grow_roadmap(
-    kind: type, every: int | None, space: _Space, settings: OmplSettings, deadline: float
+    kind: type, takes_first: bool, space: _Space, settings: OmplSettings, deadline: float
 ) -> tuple[Any, int]:
-    """Grow a roadmap of at most `iterations` samples around both ends; returns its first path.
+    """Grow a roadmap of at most `iterations` milestones around both ends.
 
-    every: samples after which a path is looked for; None: after all of them, so that it is the
-    shortest.
-    OMPL's own loop lets a second thread look while the first one samples for 0.2 s at a time, so
-    that a path depends on the machine.  Here `solve` may not run at all: it only enters the ends
-    and answers with the path that comes nearest to the goal, found by A*.
+    takes_first: a path is looked for again and again, and the first one taken; else after all
+    milestones, so that it is the shortest.
+    As OMPL's own loop does, it draws milestones all over the space, and half as many by random
+    walks from where few connect.  That loop lets a second thread look meanwhile, for 0.2 s at a
+    time, so that a path depends on the machine.  Here `solve` may not run at all: it only enters
+    the ends and answers with the path that comes nearest to the goal, found by A*.
     """
-    most = settings.iterations
-    between_looks, planner = every or most, kind(space.information)
+    planner = kind(space.information)
     planner.setProblemDefinition(space.definition)
     planner.setup()
-    tries, wanted = 0, 0
+    most, most_tries, wanted, tries = settings.iterations, 100 * settings.iterations, 0, 0
+
+    def is_over() -> bool:
+        late = time.perf_counter() > deadline
+        return late or tries > most_tries or planner.milestoneCount() >= most
 
     def enough() -> bool:
         nonlocal tries
         tries += 1
-        return (
-            planner.milestoneCount() >= wanted
-            or tries > most_tries
-            or time.perf_counter() > deadline
-        )
+        return planner.milestoneCount() >= wanted or is_over()
 
-    most_tries = 100 * most
+    condition = base.PlannerTerminationCondition(enough)
+    begun = False
     while True:
-        planner.solve(base.plannerAlwaysTerminatingCondition())
-        looked = wanted > 0 or between_looks < most
-        wanted = planner.milestoneCount() + between_looks
-        if looked and space.definition.getSolutionDifference() == 0.0:
-            return space.definition.getSolutionPath(), planner.milestoneCount()
-        space.definition.clearSolutionPaths()
-        if (looked and wanted > most) or tries > most_tries or time.perf_counter() > deadline:
+        over = begun and is_over()
+        if takes_first or over or not begun:
+            space.definition.clearSolutionPaths()
+            planner.solve(base.plannerAlwaysTerminatingCondition())
+            if (takes_first or over) and space.definition.getSolutionDifference() == 0.0:
+                return space.definition.getSolutionPath(), planner.milestoneCount()
+        if over:
             return None, planner.milestoneCount()
-        planner.growRoadmapPtc(base.PlannerTerminationCondition(enough))
+        begun = True
+        count = planner.milestoneCount()
+        few = max(_EXPANDED, int(_EXPANDED_SHARE * count))
+        wanted = min(count + 2 * few, most)
+        planner.growRoadmapPtc(condition)
+        if wanted + few + _WALK <= most:
+            wanted += few
+            planner.expandRoadmapPtc(condition)
 
 
 def _informed_rrt_star(space: _Space) -> Any:
@@ -459,8 +470,8 @@ def _grow_tree(
 
 
 _SEARCHES: dict[Search, Callable[[_Space, OmplSettings, float], tuple[Any, int]]] = {
-    "prm": partial(_grow_roadmap, geometric.PRM, _MILESTONES_BETWEEN_LOOKS),
-    "prm_star": partial(_grow_roadmap, geometric.PRMstar, None),
+    "prm": partial(_grow_roadmap, geometric.PRM, True),
+    "prm_star": partial(_grow_roadmap, geometric.PRMstar, False),
     "rrt_star": partial(_grow_tree, lambda space: geometric.RRTstar(space.information)),
     "informed_rrt_star": partial(_grow_tree, _informed_rrt_star),
     "birrt": partial(_grow_tree, lambda space: geometric.RRTConnect(space.information)),

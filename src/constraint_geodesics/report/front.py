@@ -3,12 +3,11 @@ benchmark beside the best of the rest, and what learning adds to a search and wh
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import pandas as pd
 
-from constraint_geodesics.benchmark.row import read_table
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.cells import fixed, milliseconds, share
@@ -19,7 +18,6 @@ from constraint_geodesics.report.standing import (
     PLANNER,
     WHERE,
     best_of_families,
-    compared,
     planner_result,
 )
 from constraint_geodesics.studies.proposals import POLICY, STILL
@@ -71,7 +69,22 @@ def planner_row(layout: Layout) -> Table:
         [name, *(cell for scene in scenes for cell in _row_cells(found[name, scene]))]
         for name in planners
     ]
-    same = _on_the_same(layout, found, scenes, planners[1:])
+    fewer = [
+        name
+        for name in planners[1:]
+        if any(found[name, scene]["queries"] < found[PLANNER, scene]["queries"] for scene in scenes)
+    ]
+    same = [
+        [
+            SAME,
+            *(
+                cell
+                for scene in scenes
+                for cell in _on_the_same(found[name, scene], found[PLANNER, scene]["seeds"])
+            ),
+        ]
+        for name in fewer
+    ]
     note = (
         "All constraints together; solved: of what any planner solved; length: over the best "
         f"known, failures infinite. {SAME_NOTE if same else ''}The best of the rest is the first "
@@ -88,42 +101,12 @@ def planner_row(layout: Layout) -> Table:
     )
 
 
-def _on_the_same(
-    layout: Layout,
-    found: Mapping[tuple[str, str], Mapping[Any, Any]],
-    scenes: Iterable[str],
-    others: Sequence[str],
-) -> list[list[str]]:
-    """The planner's row over the queries of another planner, where these are fewer."""
-    fewer = [
-        name
-        for name in others
-        if any(found[name, scene]["queries"] < found[PLANNER, scene]["queries"] for scene in scenes)
-    ]
-    if not fewer or not layout.benchmark_table.is_file():
-        return []
-    pairs = compared(read_table(layout.benchmark_table)[0], fewer)
-    own = {(row["baseline"], row["scene"]): row for row in pairs.to_dict("records")}
-    return [
-        [
-            SAME,
-            *(
-                cell
-                for scene in scenes
-                for cell in _same_cells(own[name, scene], found[PLANNER, scene]["seeds"])
-            ),
-        ]
-        for name in fewer
-        if all((name, scene) in own for scene in scenes)
-    ]
-
-
-def _same_cells(pair: Mapping[Any, Any], seeds: int) -> tuple[str, ...]:
+def _on_the_same(row: Mapping[Any, Any], seeds: int) -> tuple[str, ...]:
     return (
-        f"{pair['asked']} × {seeds}",
-        share(pair["success"], 1),
-        fixed(pair["ratio_p95"], 3),
-        milliseconds(pair["time_s"]),
+        f"{row['reference_queries']} × {seeds}",
+        share(row["reference_success"], 1),
+        fixed(row["reference_ratio_p95_all"], 3),
+        milliseconds(row["reference_time_median_s"]),
     )
 
 

@@ -26,6 +26,7 @@ Figures = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]
 HEADER = (
     *("scene", "planner", "asked", "solved of what any solves", "time [ms], median", "p95"),
     *("failures too, p95", "length / best known, median", "p95", "wrongly certified"),
+    "ready for the scene [ms]",
 )
 NOTE = (
     "asked: problems whose ends are free and within limits. Solved: a certified path that PyBullet "
@@ -33,7 +34,11 @@ NOTE = (
     "planner here solves: where one is asked alone, of its own. Times end with the first "
     "certified path, projection, simplification, band and failed attempts in them; for the limit "
     'where there is none in "failures too". Best known: the shortest such path that any planner '
-    "here found. Wrongly certified: paths that the certificate takes and PyBullet does not"
+    "here found. Wrongly certified: paths that the certificate takes and PyBullet does not. Ready "
+    "for the scene: what comes once a scene and is in no time of a query, in the median: the "
+    "planner follows a change with its certifier, search and PyBullet's world; the others are lent "
+    "the judge's certifier, whose making is not counted. OMPL's planners ask through Python for "
+    "every state, and PRM makes its roadmap anew for each query"
 )
 
 
@@ -70,7 +75,9 @@ def write_problem_report(
     """
     found = figures(table)
     write_table(table, folder / f"{name}.csv.gz", run)
-    told = {"about": list(about), "figures": found}
+    commit = f"commit {run['commit'][:12]}, " if run["commit"] else ""
+    about = [*about, f"rows of {commit}{run['date']}, one thread of {run['processor']}"]
+    told = {"about": about, "figures": found}
     write_text(folder / f"{name}.json", json.dumps(told, indent=1) + "\n")
     write_text(folder / f"{name}.md", problems_markdown(title, about, found))
     return found
@@ -118,6 +125,7 @@ def _rows(first: str, planners: Mapping[str, Mapping[str, Any]]) -> list[list[st
             fixed(own["ratio_median"], 3),
             fixed(own["ratio_p95"], 3),
             str(own["wrongly_certified"]),
+            fixed(own["ready_ms"], 1),
         ]
         for name, own in planners.items()
     ]

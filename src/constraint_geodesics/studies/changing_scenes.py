@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import ConvexHull
 
+from constraint_geodesics.benchmark.dense_check import DENSE_RAD
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.learning.dataset import draw_queries
@@ -27,7 +28,7 @@ from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.studies.clutter import MAKERS, write_bracket
 from constraint_geodesics.studies.episodes import stop_on
-from constraint_geodesics.studies.problem_runs import DENSE_RAD, quantiles
+from constraint_geodesics.studies.problem_runs import quantiles
 from constraint_geodesics.text_files import write_text
 from constraint_geodesics.trajectory import Trajectory
 

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 
 from constraint_geodesics.benchmark.arm_source import ArmSource, opened
+from constraint_geodesics.benchmark.dense_check import watched
 from constraint_geodesics.benchmark.problem_files import (
     Problem,
     require_different,
@@ -28,16 +29,13 @@ from constraint_geodesics.benchmark.problem_files import (
 from constraint_geodesics.benchmark.queries import Query
 from constraint_geodesics.benchmark.row import KEY
 from constraint_geodesics.benchmark.runner import (
-    Answer,
     Baseline,
-    Look,
     QueryBatch,
     batch_rows,
     fingerprint,
     make_rows,
 )
 from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.params import BaselineParams, Params
 from constraint_geodesics.peers.baseline import BaselineError, BaselineSettings, Context
 from constraint_geodesics.peers.making import made_together
@@ -50,8 +48,6 @@ from constraint_geodesics.scene.scene import Scene
 
 MEASURED_BY = ("studies.problem_runs", "studies.problems", "studies.clutter")
 """The modules that draw, ask and judge: every row depends on what they import."""
-DENSE_RAD = 0.005
-"""Distance of the configurations of an answered path at which PyBullet is asked."""
 COLUMNS = (
     *("scene", "constraint", "query", "planner", "settings", "status", "valid", "touches"),
     *("ends", "limit_s", "time_s", "scene_s", "length_rad", "best_known_rad", "looked_at"),
@@ -115,28 +111,6 @@ class ProblemBuilder:
         made, took = made_together(settings, context, self.limit_s)
         changed = {name: s + changed_s * settings[name].uses_bundle for name, s in took.items()}
         yield made, changed
-
-
-@contextmanager
-def watched(query: Query, scene: Scene) -> Iterator[Look]:
-    """What PyBullet says of the ends, and of every path, in a world of its own."""
-    with scene.world() as world:
-        ends = []
-        for name, q in (("start", query.start), ("goal", query.goal)):
-            if scene.robot.limit_distance(q) < 0.0:
-                ends.append(f"{name} is out of limits")
-            elif not world.is_free(q):
-                ends.append(f"{name} touches")
-
-        def look(answer: Answer) -> Mapping[str, Any]:
-            found = {"ends": ", ".join(ends), "touches": False, "looked_at": 0}
-            if len(answer.joints) < 2 or not np.isfinite(answer.joints).all():
-                return found
-            dense = densify(answer.joints, DENSE_RAD)
-            touches = world.first_collision(dense) is not None
-            return found | {"touches": touches, "looked_at": len(dense)}
-
-        yield look
 
 
 def limited(entry: BaselineParams, limit_s: float) -> BaselineParams:
