@@ -1,11 +1,17 @@
 """Requests at random against the planner: no exception but a typed one, and no path that an oracle
-of its own calls wrong: PyBullet's shapes every 0.005 rad (0.02 in `make test`), and limits,
-constraint, ends, velocities and accelerations by other formulas than the planner's.
+of its own calls wrong: PyBullet's shapes and its poses of the tool every 0.005 rad (0.02 in `make
+test`), and limits, constraint, ends, velocities and accelerations by other formulas than the
+planner's.
 """
 
 import json
 import math
+import multiprocessing
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
@@ -50,11 +56,20 @@ class Figures:
     statuses: dict[str, int] = field(default_factory=dict)
     wrong: list[str] = field(default_factory=list)
 
+    def add(self, other: "Figures") -> None:
+        """Count what another has, too."""
+        for name, own in asdict(other).items():
+            if isinstance(own, dict):
+                for status, count in own.items():
+                    self.statuses[status] = self.statuses.get(status, 0) + count
+            else:
+                setattr(self, name, getattr(self, name) + own)
+
 
 @pytest.mark.timeout(24 * 3600)  # `make soak` takes hours
 def test_random_requests(effort: Effort) -> None:
     with counting("random_requests", effort) as row:
-        figures = _asked(packaged_planner(), effort)
+        figures = _asked(effort)
         row |= {name: own for name, own in asdict(figures).items() if isinstance(own, int)}
         row["solved"] = figures.statuses["solved"]
         assert not figures.wrong, "\n".join(figures.wrong[:20])
@@ -64,23 +79,35 @@ def test_random_requests(effort: Effort) -> None:
         assert figures.configurations > 10 * figures.requests
 
 
-def _asked(planner: Planner, effort: Effort) -> Figures:
-    """All requests, in their scenes."""
-    figures, first = _begun(effort), planner.scene.now
-    try:
-        while figures.requests < effort.requests:
-            block = figures.requests // A_SCENE
-            planner.scene.become(first)
-            planner.scene.become(scene_of(planner, first, block))
-            with Judge(planner.scene.now, {}) as judge:
-                for number in range(block * A_SCENE, (block + 1) * A_SCENE):
-                    step = STEP_RAD[effort.name]
-                    _ask(planner, request(planner, number), judge, figures, step)
+def _asked(effort: Effort) -> Figures:
+    """All requests: their scenes are answered side by side where they are many."""
+    figures = _begun(effort)
+    blocks = range(figures.requests // A_SCENE, effort.requests // A_SCENE)
+    block = partial(_block, STEP_RAD[effort.name])
+    with ExitStack() as opened:
+        found: Iterable[Figures] = map(block, blocks)
+        if effort.name != "quick":
+            spawned = multiprocessing.get_context("spawn")
+            found = opened.enter_context(ProcessPoolExecutor(mp_context=spawned)).map(block, blocks)
+        for own in found:
+            figures.add(own)
             if figures.requests % KEPT_EVERY == 0:
                 _keep(effort, figures)
+    _keep(effort, figures)
+    return figures
+
+
+def _block(step: float, block: int) -> Figures:
+    """The requests of one scene."""
+    planner, figures = packaged_planner(), Figures()
+    first = planner.scene.now
+    try:
+        planner.scene.become(scene_of(planner, first, block))
+        with Judge(planner.scene.now, {}) as judge:
+            for number in range(block * A_SCENE, (block + 1) * A_SCENE):
+                _ask(planner, request(planner, number), judge, figures, step)
     finally:
         planner.scene.become(first)
-    _keep(effort, figures)
     return figures
 
 
@@ -110,24 +137,26 @@ def test_the_oracle_sees_what_is_wrong(spoil: str) -> None:
 def test_the_oracle_sees_an_end_that_is_no_goal(kind: type) -> None:
     """A path that stops before a pose, a region, or all of a list."""
     planner, seen = packaged_planner(), 0
-    for number in range(2000):
-        asked = request(planner, number)
-        if asked.kind != "poses" or not isinstance(asked.words["goal"], kind):
-            continue
-        path = planner.plan(**asked.words)
-        if path.status != "solved" or "scene" in asked.words:
-            continue
-        assert not _end_faults(planner, asked, path.joints)
-        at_start = _end_faults(planner, asked, path.joints[:1])
-        if kind is GoalRegion:  # where it ends a little off it may be in it still
-            seen += any("the goal is off" in said for said in at_start)
-        elif at_start:
-            back = path.joints[-2] - path.joints[-1]
-            short = path.joints.copy()
-            short[-1] += 2e-3 * back / np.linalg.norm(back)
-            seen += any("the goal is off" in said for said in _end_faults(planner, asked, short))
-        if seen == 3:
-            return
+    with Judge(planner.scene.now, {}) as judge:
+        faults = partial(_end_faults, judge, planner.robot.tool_link)
+        for number in range(2000):
+            asked = request(planner, number)
+            if asked.kind != "poses" or not isinstance(asked.words["goal"], kind):
+                continue
+            path = planner.plan(**asked.words)
+            if path.status != "solved" or "scene" in asked.words:
+                continue
+            assert not faults(asked, path.joints)
+            at_start = faults(asked, path.joints[:1])
+            if kind is GoalRegion:  # where it ends a little off it may be in it still
+                seen += any("the goal is off" in said for said in at_start)
+            elif at_start:
+                back = path.joints[-2] - path.joints[-1]
+                short = path.joints.copy()
+                short[-1] += 2e-3 * back / np.linalg.norm(back)
+                seen += any("the goal is off" in said for said in faults(asked, short))
+            if seen == 3:
+                return
     raise AssertionError(f"seen {seen} times")
 
 
@@ -200,10 +229,10 @@ def _faults(
     beyond = float(np.maximum(robot.lower - rows, rows - robot.upper).max())
     if beyond > SLACK:
         found.append(f"limits: beyond by {beyond:.3g}")
-    off = _off(planner, path.constraint, rows)
+    off = _off(judge, robot.tool_link, path.constraint, rows)
     if off > OFF:
         found.append(f"constraint: off by {off:.3g}")
-    found += _end_faults(planner, asked, joints)
+    found += _end_faults(judge, robot.tool_link, asked, joints)
     found += _motion_faults(planner, asked, joints, times)
     return found, len(rows)
 
@@ -216,13 +245,15 @@ def _dense(joints: np.ndarray, step: float) -> np.ndarray:
     return np.concatenate(found)
 
 
-def _off(planner: Planner, constraint: Any, rows: np.ndarray) -> float:
-    """By how much rows are off a constraint at most, by SciPy's rotations."""
+def _off(judge: Judge, tool: str, constraint: Any, rows: np.ndarray) -> float:
+    """By how much rows are off a constraint at most, by PyBullet's poses of the tool and SciPy's
+    rotations.
+    """
     axes = np.array(constraint.axes, bool)
     if not axes.any():
         return 0.0
     tolerance, reference = np.array(constraint.tolerance), constraint.reference
-    places, turns = planner.robot.forward(rows)
+    places, turns = judge.poses(rows, tool)
     worst = float(
         np.max(
             np.abs(places - reference.position)[:, axes[:3]] - tolerance[:3][axes[:3]], initial=0.0
@@ -254,24 +285,24 @@ def _off(planner: Planner, constraint: Any, rows: np.ndarray) -> float:
     return max(worst, float(beyond.max()))
 
 
-def _end_faults(planner: Planner, asked: Request, joints: np.ndarray) -> list[str]:
+def _end_faults(judge: Judge, tool: str, asked: Request, joints: np.ndarray) -> list[str]:
     found, words = [], asked.words
     moved = float(np.abs(joints[0] - words["start"]).max())
     if moved > (0.01 if words.get("snap") else SLACK):
         found.append(f"end: the start is off by {moved:.3g}")
     goals = words["goal"] if isinstance(words["goal"], list) else [words["goal"]]
-    share, missed = min(_missed(planner, goal, joints[-1]) for goal in goals)
+    share, missed = min(_missed(judge, tool, goal, joints[-1]) for goal in goals)
     if share > 1.0:
         found.append(f"end: the goal is off by {missed:.3g}")
     return found
 
 
-def _missed(planner: Planner, goal: Any, q: np.ndarray) -> tuple[float, float]:
+def _missed(judge: Judge, tool: str, goal: Any, q: np.ndarray) -> tuple[float, float]:
     """By how much a configuration misses a goal: as a share of what it may, and itself."""
     if isinstance(goal, GoalRegion):
-        missed, most = _off(planner, goal.region, q[None]), OFF
+        missed, most = _off(judge, tool, goal.region, q[None]), OFF
     elif isinstance(goal, Pose):
-        place, turn = planner.robot.forward(q)
+        (place,), (turn,) = judge.poses(q[None], tool)
         away = Rotation.from_matrix(turn @ goal.rotation.T).magnitude()
         missed, most = max(float(np.abs(place - goal.position).max()), float(away)), OFF
     else:

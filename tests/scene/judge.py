@@ -37,6 +37,7 @@ class Judge:
         index = {row[12].decode(): row[0] for row in info}
         base = self._call("getBodyInfo", self._arm)[0].decode()
         index[base] = -1
+        self._index = index
         joints = {row[1].decode(): row[0] for row in info}
         self._joints = [joints[name] for name in scene.robot.joint_names]
         names = {k: name for name, k in index.items()}
@@ -74,17 +75,32 @@ class Judge:
         """The least distance of what must not touch at a configuration [m], below 0 where it does,
         and what that is; inf where nothing touches.
         """
-        for joint, value in zip(self._joints, q.tolist(), strict=True):
-            self._call("resetJointState", self._arm, joint, value)
+        self._put(q)
         for body, link, at in self._held:
-            there = HERE
-            if link >= 0:
-                state = self._call("getLinkState", self._arm, link, computeForwardKinematics=1)
-                there = state[4:6]
-            place = pybullet.multiplyTransforms(*there, *at)
+            place = pybullet.multiplyTransforms(*self._link(link), *at)
             self._call("resetBasePositionAndOrientation", body, *place)
         self._call("performCollisionDetection")
         return min(self._distances(), default=(np.inf, ()))
+
+    def poses(self, rows: np.ndarray, link: str) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (n, 3) [m] and rotations (n, 3, 3) of a link, at configurations (n, D)."""
+        places, turns = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3))
+        for k, q in enumerate(rows):
+            self._put(q)
+            places[k], turn = self._link(self._index[link])
+            turns[k] = np.reshape(pybullet.getMatrixFromQuaternion(turn), (3, 3))
+        return places, turns
+
+    def _put(self, q: np.ndarray) -> None:
+        for joint, value in zip(self._joints, q.tolist(), strict=True):
+            self._call("resetJointState", self._arm, joint, value)
+
+    def _link(self, link: int) -> Pose:
+        """Where a link's frame is now."""
+        if link < 0:
+            return HERE
+        state = self._call("getLinkState", self._arm, link, computeForwardKinematics=1)
+        return state[4], state[5]
 
     def _distances(self) -> Iterator[tuple[float, tuple[str, ...]]]:
         for names, first, second in self._pairs:

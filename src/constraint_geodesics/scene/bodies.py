@@ -25,7 +25,7 @@ from constraint_geodesics.scene.world import BodyKey
 
 _MIXED = 9
 """Pieces with fewer corners are no hulls to be computed: any two corners count as neighbours."""
-_TRIED, _ROUNDING_M = 200, 1e-9
+_ROUNDING_M = 1e-9
 
 
 @dataclass(frozen=True)
@@ -392,8 +392,8 @@ def _with_neighbours(
     points: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "m 3"], Int[np.ndarray, "E"], Int[np.ndarray, "m"]]:
     """Corners of a convex hull, those beside each, one corner's after the other's, and how many
-    they are: that share a face, or all others where a way along edges might end before the corner
-    that lies furthest out.
+    they are: that share a face, or all others where it is not proven that a way along edges ends at
+    the corner that lies furthest out.
     """
     if len(points) >= _MIXED:
         with contextlib.suppress(QhullError):  # flat
@@ -401,27 +401,12 @@ def _with_neighbours(
             corners, faces = np.unique(hull.simplices, return_inverse=True)
             faces = faces.reshape(hull.simplices.shape)
             count = len(corners)
-            ways = [faces[:, i] * count + faces[:, k] for i, k in permutations(range(3), 2)]
-            first, second = np.divmod(np.unique(np.concatenate(ways)), count)  # each edge once
-            starts = np.searchsorted(first, range(count))
             own = points[corners]
-            if _leads_furthest(own, second, starts, hull.equations[:, :3]):
-                return own, second, np.diff(starts, append=len(second))
+            around, begins = np.argsort(faces.ravel(), kind="stable") // 3, np.zeros(count + 1, int)
+            begins[1:] = np.cumsum(np.bincount(faces.ravel(), minlength=count))
+            if kernels.leads_furthest(own, faces, begins, around, _ROUNDING_M):
+                ways = [faces[:, i] * count + faces[:, k] for i, k in permutations(range(3), 2)]
+                first, second = np.divmod(np.unique(np.concatenate(ways)), count)  # each edge once
+                return own, second, np.bincount(first, minlength=count)
     first, second = np.nonzero(~np.eye(len(points), dtype=bool))
     return points, second, np.bincount(first, minlength=len(points))
-
-
-def _leads_furthest(
-    corners: Float[np.ndarray, "m 3"],
-    beside: Int[np.ndarray, "E"],
-    starts: Int[np.ndarray, "m"],
-    normals: Float[np.ndarray, "f 3"],
-) -> bool:
-    """Whether no corner lies further out than all beside it without being the furthest, in the
-    directions of the faces, near them, and in others.
-    """
-    rng = np.random.default_rng(0)
-    near = normals + 1e-3 * rng.normal(size=normals.shape)
-    directions = np.concatenate([normals, near, rng.normal(size=(_TRIED, 3))])
-    ends = np.append(starts, len(beside))
-    return bool(kernels.leads_furthest(corners, beside, ends, directions, _ROUNDING_M))

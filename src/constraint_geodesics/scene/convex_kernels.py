@@ -38,6 +38,8 @@ CORNERS = 7
 PAIR = 9
 """How many columns a pair has."""
 
+_CLEARLY = -1e-3
+"""A vector that takes less than that of an edge lies outside their cone."""
 _ITERATIONS = 48
 _CONVERGED = 1e-7
 # rows of what a distance writes into: four corners, the point nearest to the origin, another
@@ -307,26 +309,81 @@ def pair_table(ends, begins, counts, nodes):
 
 
 @njit(**COMPILE)
-def leads_furthest(corners, beside, ends, directions, tolerance):
-    """Whether no corner (m, 3) lies further out than all beside it, but for the tolerance [m] less
-    far than another, in any direction (n, 3).  beside: of corner k those from ends[k] on.
+def leads_furthest(corners, faces, begins, around, tolerance):
+    """Whether the way from neighbour to neighbour ends at a corner that is furthest out but for the
+    tolerance [m], in every direction.
+
+    corners (m, 3); faces (f, 3) of the surface; around: the faces of corner v are those from
+    begins[v] to begins[v + 1].  Proven for each corner v and each other w: w - v is a sum of
+    vectors from v to its neighbours, none taken a negative number of times, and of a rest no longer
+    than the tolerance; so a direction along which no neighbour lies further than v leads to w no
+    further than by that rest.  The cones over v's faces and its first neighbour are tried.
     """
-    out = np.empty(corners.shape[0])
-    for d in range(directions.shape[0]):
-        most = -np.inf
-        for k in range(corners.shape[0]):
-            out[k] = 0.0
+    most = 0
+    for v in range(corners.shape[0]):
+        most = max(most, begins[v + 1] - begins[v])
+    edges, duals, w = np.empty((most, 3, 3)), np.empty((most, 3, 3)), np.empty(3)
+    for v in range(corners.shape[0]):
+        count = _cones(corners, faces, around[begins[v] : begins[v + 1]], v, edges, duals)
+        last = 0
+        for other in range(corners.shape[0]):
             for i in range(3):
-                out[k] += corners[k, i] * directions[d, i]
-            most = max(most, out[k])
-        for k in range(corners.shape[0]):
-            if out[k] >= most - tolerance:
-                continue
-            is_end = True
-            for e in range(ends[k], ends[k + 1]):
-                if out[beside[e]] > out[k]:
-                    is_end = False
+                w[i] = corners[other, i] - corners[v, i]
+            is_held = other == v
+            for turn in range(count):
+                if is_held:
                     break
-            if is_end:
+                # the cone that held the corner before comes first
+                k = last if turn == 0 else turn - 1 if turn <= last else turn
+                if _rest(edges[k], duals[k], w) <= tolerance:
+                    is_held, last = True, k
+            if not is_held:
                 return False
     return True
+
+
+@njit(**LEAF)
+def _cones(corners, faces, own, v, edges, duals):
+    """The three edges of each cone of a corner, and what of a vector each of them takes (3, 3).
+    Returns how many cones there are: flat ones are none.
+    """
+    apex = faces[own[0], 1] if faces[own[0], 0] == v else faces[own[0], 0]
+    count = 0
+    for face in own:
+        a = faces[face, 2] if faces[face, 0] == v else faces[face, 0]
+        b = faces[face, 2] if faces[face, 1] == v else faces[face, 1]
+        for i in range(3):
+            edges[count, 0, i] = corners[a, i] - corners[v, i]
+            edges[count, 1, i] = corners[b, i] - corners[v, i]
+            edges[count, 2, i] = corners[apex, i] - corners[v, i]
+        for k in range(3):
+            u, x = edges[count, (k + 1) % 3], edges[count, (k + 2) % 3]
+            duals[count, k, 0] = u[1] * x[2] - u[2] * x[1]
+            duals[count, k, 1] = u[2] * x[0] - u[0] * x[2]
+            duals[count, k, 2] = u[0] * x[1] - u[1] * x[0]
+        volume = 0.0
+        for i in range(3):
+            volume += edges[count, 0, i] * duals[count, 0, i]
+        if volume != 0.0:
+            for k in range(3):
+                for i in range(3):
+                    duals[count, k, i] /= volume
+            count += 1
+    return count
+
+
+@njit(**LEAF)
+def _rest(edges, duals, w):
+    """How much of a vector a cone leaves [m]: computed from what its edges take, however well that
+    was found.
+    """
+    x, y, z = w[0], w[1], w[2]
+    for k in range(3):
+        share = duals[k, 0] * w[0] + duals[k, 1] * w[1] + duals[k, 2] * w[2]
+        if share < _CLEARLY:
+            return np.inf
+        share = max(share, 0.0)
+        x -= share * edges[k, 0]
+        y -= share * edges[k, 1]
+        z -= share * edges[k, 2]
+    return np.sqrt(x * x + y * y + z * z)
