@@ -42,7 +42,7 @@ def with_planners(text: str) -> str:
     """README's text with its table of planners, from the benchmark's overview, and its numbers."""
     with (ROOT / "reports" / "benchmark" / "overview.csv").open() as file:
         found = {(row["planner"], row["scene"]): row for row in csv.DictReader(file)}
-    columns = ("solved", "length, p95 (planner's)", "median [ms] (planner's)")
+    columns = ("solved", "length, p95", "median [ms]")
     head = ("planner", "queries × seeds", *columns, *(f"sphere: {column}" for column in columns))
     lines = [f"| {' | '.join(head)} |", f"|---|{'---:|' * 7}"]
     slow = asks_in_python(all_settings(load_params(ROOT / "params.yaml")))
