@@ -181,7 +181,7 @@ def test_it_shares_with_the_search_the_bodies_and_their_distance_alone() -> None
     allowed = {
         "constraint_geodesics.compiled": {"COMPILE", "LEAF"},
         "constraint_geodesics.scene": {"convex_kernels"},
-        "constraint_geodesics.scene.bodies": {"Body", "BodyTable", "Pair"},
+        "constraint_geodesics.scene.bodies": {"Body", "BodyTable", "Pair", "touching"},
         "constraint_geodesics.scene.scene": {"Scene"},
         "constraint_geodesics.constraints.constraint": {"Constraint", "Pose"},
         "constraint_geodesics.scene.world": {"BodyKey", "LoadedChain", "LoadedLink", "World"},
