@@ -11,7 +11,8 @@ from urllib.parse import unquote
 
 from constraint_geodesics.params import load_params
 from constraint_geodesics.peers.registry import all_settings
-from constraint_geodesics.report.benchmark_tables import asked, asks_in_python
+from constraint_geodesics.report.benchmark_tables import FEW, asked, asks_in_python
+from constraint_geodesics.report.cells import fixed, milliseconds
 
 ROOT = Path(__file__).resolve().parents[1]
 README, RESULTS, EXPERIMENTS = (
@@ -58,20 +59,13 @@ def _cells(row: dict[str, str]) -> tuple[str, str, str]:
     infinite, and the median time of one figure of the benchmark's overview; behind the last two
     those of the planner on the same queries.
     """
-    cells = []
-    for figure, told in (("ratio_p95_all", _length), ("time_median_s", _time)):
-        own, planners = float(row[figure]), float(row[f"reference_{figure}"])
-        is_own = row["planner"] == SHOWN[0]
-        cells.append(told(own) if is_own else f"{told(own)} ({told(planners)})")
-    return f"{float(row['success_of_solvable']):.0%}", cells[0], cells[1]
-
-
-def _length(ratio: float) -> str:
-    return "∞" if ratio == float("inf") else f"{ratio:.3f}"
-
-
-def _time(seconds: float) -> str:
-    return f"{1e3 * seconds:,.0f}" if seconds >= 0.1 else f"{1e3 * seconds:.3g}"
+    few, whose = int(row["queries"]) < FEW, ("", "reference_")
+    lengths = ["–" if few else fixed(float(row[f"{of}ratio_p95_all"]), 3) for of in whose]
+    times = [milliseconds(float(row[f"{of}time_median_s"])) for of in whose]
+    own, beside = zip(lengths, times, strict=True)
+    if row["planner"] != SHOWN[0]:
+        own = tuple(f"{first} ({second})" for first, second in zip(own, beside, strict=True))
+    return f"{float(row['success_of_solvable']):.0%}", own[0], own[1]
 
 
 def replaced(text: str, name: str, content: str) -> str:

@@ -6,11 +6,8 @@ planner's.
 
 import json
 import math
-import multiprocessing
-from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field, replace
+from collections import Counter
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +15,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+from joblib import Parallel, delayed
 from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.constraints.constraint import Pose
@@ -53,24 +51,20 @@ class Figures:
     exceptions: int = 0
     wrongly_certified: int = 0
     configurations: int = 0
-    statuses: dict[str, int] = field(default_factory=dict)
+    statuses: Counter[str] = field(default_factory=Counter)
     wrong: list[str] = field(default_factory=list)
 
     def add(self, other: "Figures") -> None:
         """Count what another has, too."""
-        for name, own in asdict(other).items():
-            if isinstance(own, dict):
-                for status, count in own.items():
-                    self.statuses[status] = self.statuses.get(status, 0) + count
-            else:
-                setattr(self, name, getattr(self, name) + own)
+        for name, own in vars(other).items():
+            setattr(self, name, getattr(self, name) + own)
 
 
 @pytest.mark.timeout(24 * 3600)  # `make soak` takes hours
 def test_random_requests(effort: Effort) -> None:
     with counting("random_requests", effort) as row:
         figures = _asked(effort)
-        row |= {name: own for name, own in asdict(figures).items() if isinstance(own, int)}
+        row |= {name: own for name, own in vars(figures).items() if isinstance(own, int)}
         row["solved"] = figures.statuses["solved"]
         assert not figures.wrong, "\n".join(figures.wrong[:20])
         assert figures.answered > 0.3 * figures.requests
@@ -83,16 +77,12 @@ def _asked(effort: Effort) -> Figures:
     """All requests: their scenes are answered side by side where they are many."""
     figures = _begun(effort)
     blocks = range(figures.requests // A_SCENE, effort.requests // A_SCENE)
-    block = partial(_block, STEP_RAD[effort.name])
-    with ExitStack() as opened:
-        found: Iterable[Figures] = map(block, blocks)
-        if effort.name != "quick":
-            spawned = multiprocessing.get_context("spawn")
-            found = opened.enter_context(ProcessPoolExecutor(mp_context=spawned)).map(block, blocks)
-        for own in found:
-            figures.add(own)
-            if figures.requests % KEPT_EVERY == 0:
-                _keep(effort, figures)
+    workers = 1 if effort.name == "quick" else -1
+    answered = Parallel(workers, return_as="generator")
+    for own in answered(delayed(_block)(STEP_RAD[effort.name], block) for block in blocks):
+        figures.add(own)
+        if figures.requests % KEPT_EVERY == 0:
+            _keep(effort, figures)
     _keep(effort, figures)
     return figures
 
@@ -184,7 +174,7 @@ def _ask(planner: Planner, asked: Request, judge: Judge, figures: Figures, step:
             figures.wrong.append(f"{where}: {type(error).__name__}: {str(error)[:300]}")
         return
     figures.answered += 1
-    figures.statuses[path.status] = figures.statuses.get(path.status, 0) + 1
+    figures.statuses[path.status] += 1
     faults = _answer_faults(path)
     if asked.kind == "corrupt":
         faults.append(f"a corrupt request is answered: {path.status}")
@@ -341,6 +331,7 @@ def _begun(effort: Effort) -> Figures:
         return Figures()
     about: dict[str, Any] = json.loads(KEPT.read_text())
     of = about.pop("of")
+    about["statuses"] = Counter(about["statuses"])
     return Figures(**about) if of == _of() else Figures()
 
 
@@ -348,7 +339,7 @@ def _keep(effort: Effort, figures: Figures) -> None:
     if effort.name == "soak":
         KEPT.parent.mkdir(parents=True, exist_ok=True)
         part = KEPT.with_suffix(".part")
-        part.write_text(json.dumps({"of": _of(), **asdict(figures)}))
+        part.write_text(json.dumps({"of": _of(), **vars(figures)}))
         part.replace(KEPT)
 
 

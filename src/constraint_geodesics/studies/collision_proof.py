@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from constraint_geodesics.benchmark.dense_check import DENSE_RAD
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.scene.box import Box
@@ -23,8 +24,6 @@ Kind = Literal["table", "spheres", "boxes", "plates"]
 KINDS: tuple[Kind, ...] = ("table", "spheres", "boxes", "plates")
 SHAPES = 3
 """Shapes added to a scene."""
-DENSE_RAD = 0.005
-"""Distance of the configurations at which PyBullet is asked."""
 ROW_RAD = 0.05
 """Distance of the rows of a straight joint line."""
 AWAY_M, HIGH_M = (0.35, 0.75), (0.1, 0.8)

@@ -23,6 +23,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Float
 
+from constraint_geodesics.benchmark.dense_check import DENSE_RAD
 from constraint_geodesics.geometry.braking import State
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.planner import Planner
@@ -44,8 +45,6 @@ TRIES = 3
 """Plans from rest, one after another, before the arm gives up."""
 SENSING_M = (0.2, 0.3, 0.45)
 """Sensing radii, by turns."""
-DENSE_RAD = 0.005
-"""Distance of the configurations at which PyBullet judges an executed motion."""
 ANSWER_S = 0.5 * LATENCY_S
 """After which a replan begins no other path."""
 SHORTEST_RAD = 1.0
