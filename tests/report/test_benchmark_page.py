@@ -61,11 +61,11 @@ def test_every_figure_of_the_benchmark_is_on_the_page(page):
 
 def test_the_page_opens_with_who_is_ahead_and_where_the_planner_loses(layout, page):
     text, budgets = text_of(layout), table_of(layout, "budgets")
-    rows, _ = read_table(layout.benchmark_table)
+    overview = table_of(layout, "overview")
     first = text.index(f"<strong>Ahead at equal time: {winner(budgets)}.</strong>")
     assert first < text.index(equal_time(budgets))
-    assert first < text.index(planner_result(table_of(layout, "overview")))
-    for loss in losses(rows, budgets):
+    assert first < text.index(planner_result(overview))
+    for loss in losses(overview, budgets):
         place = text.index(f"<strong>{loss.title}</strong>: {loss.sentence}")
         assert first < text.index('id="chooser"') < place, "narrow screens show the chart before"
         for detail in loss.details:

@@ -4,11 +4,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from constraint_geodesics.benchmark.statistics import all_constraints, benchmark_summary
 from constraint_geodesics.report.benchmark_tables import FEW
 from constraint_geodesics.report.standing import (
     ASKED,
     best_of_families,
-    compared,
     equal_time,
     losses,
     planner_result,
@@ -29,6 +29,10 @@ def verdicts(**by_baseline):
     )
 
 
+def overview_of(*rows):
+    return benchmark_summary(all_constraints(pd.DataFrame(rows)), "planner")
+
+
 def answers(planner, time_s, length, *, scene="table", queries=4, constraint="level_cup"):
     """A planner's rows; the best known length is 2 rad, and a length of nan is a failure."""
     return [
@@ -43,6 +47,8 @@ def answers(planner, time_s, length, *, scene="table", queries=4, constraint="le
             "time_s": time_s,
             "length_rad": length,
             "best_known_rad": 2.0,
+            "touches": 0.0,
+            "peak_memory_mb": 1.0,
         }
         for query in range(queries)
     ]
@@ -74,23 +80,21 @@ def test_the_winner_is_who_is_ahead_in_more_cases_than_behind():
 
 
 def test_a_planner_that_nobody_beats_loses_nowhere():
-    rows = pd.DataFrame(answers("planner", 0.001, 2.0) + answers("BiRRT", 0.1, 2.1))
-    (loss,) = losses(rows, verdicts(BiRRT=["behind"]))
+    overview = overview_of(*answers("planner", 0.001, 2.0), *answers("BiRRT", 0.1, 2.1))
+    (loss,) = losses(overview, verdicts(BiRRT=["behind"]))
     assert loss.title == "Nowhere"
 
 
 def test_what_is_sooner_or_shorter_is_named_with_both_figures():
-    rows = pd.DataFrame(
-        [
-            *answers("planner", 0.010, 2.1),
-            *answers("BiRRT", 0.005, 2.4),
-            *answers("PRM", 0.001, np.nan),
-            *answers("SLSQP", 2.0, 2.0),
-            *answers("planner", 0.020, 2.2, scene="keep_out"),
-            *answers("SLSQP", 2.0, 2.3, scene="keep_out"),
-        ]
+    overview = overview_of(
+        *answers("planner", 0.010, 2.1),
+        *answers("BiRRT", 0.005, 2.4),
+        *answers("PRM", 0.001, np.nan),
+        *answers("SLSQP", 2.0, 2.0),
+        *answers("planner", 0.020, 2.2, scene="keep_out"),
+        *answers("SLSQP", 2.0, 2.3, scene="keep_out"),
     )
-    sooner, shorter = losses(rows, verdicts(BiRRT=["behind"], PRM=["behind"], SLSQP=["behind"]))
+    sooner, shorter = losses(overview, verdicts(BiRRT=["behind"], PRM=["behind"], SLSQP=["behind"]))
     assert sooner.title == "Sooner at the median"
     assert sooner.sentence == "1 in the workcell, the largest gap 5 ms against 10."
     assert sooner.details == [
@@ -108,9 +112,9 @@ def test_what_is_sooner_or_shorter_is_named_with_both_figures():
 
 
 def test_within_the_same_time_few_queries_are_only_counted():
-    rows = pd.DataFrame(answers("planner", 0.001, 2.0) + answers("BiRRT", 0.1, 2.1))
+    overview = overview_of(*answers("planner", 0.001, 2.0), *answers("BiRRT", 0.1, 2.1))
     budgets = verdicts(BiRRT=["ahead", "behind", "ahead"], PRM=["ahead"])
-    (loss,) = losses(rows, budgets)
+    (loss,) = losses(overview, budgets)
     assert loss.sentence == (
         "in 10 ms under 1 constraint in the workcell; in 1 s under 1 constraint in the workcell."
     )
@@ -118,23 +122,22 @@ def test_within_the_same_time_few_queries_are_only_counted():
         "in 10 ms in the workcell, “BiRRT” under level_cup and “PRM” under level_cup",
         "in 1 s in the workcell, “BiRRT” under level_cup",
     ]
-    (loss,) = losses(rows, budgets.assign(queries=FEW - 1))
+    (loss,) = losses(overview, budgets.assign(queries=FEW - 1))
     assert loss.sentence == f"3 comparisons over fewer than {FEW} queries stand in a table below."
 
 
-def test_both_are_compared_over_the_queries_that_both_were_asked():
-    rows = pd.DataFrame(
-        [
-            *answers("planner", 0.001, 2.0, queries=2),
-            *answers("planner", 0.009, 2.0, constraint="slide"),
-            *answers("PRM", 0.005, 2.0, queries=3),
-        ]
-    )
-    (pair,) = compared(rows, ["PRM", "BiRRT"]).to_dict("records")
-    assert (pair["queries"], pair["time_s"], pair["baseline_time_s"]) == (2, 0.001, 0.005)
-    rows.loc[rows["query"] == 0, "best_known_rad"] = np.nan
-    (pair,) = compared(rows, ["PRM"]).to_dict("records")
-    assert (pair["asked"], pair["queries"]) == (2, 1), "nobody has solved the first"
+def test_the_planner_is_compared_over_the_queries_that_the_other_was_asked():
+    rows = [
+        *answers("planner", 0.001, 2.0, queries=2),
+        *answers("planner", 0.009, 2.0, constraint="slide"),
+        *answers("PRM", 0.005, 2.0, queries=2),
+    ]
+    assert [loss.title for loss in losses(overview_of(*rows), verdicts(PRM=["behind"]))] == [
+        "Nowhere"
+    ]
+    rows += answers("PRM", 0.005, 2.0, constraint="slide")
+    (loss,) = losses(overview_of(*rows), verdicts(PRM=["behind"]))
+    assert loss.sentence == "1 in the workcell, the largest gap 5 ms against 9."
 
 
 def test_each_family_is_represented_by_the_best_in_its_worse_scene():
@@ -163,5 +166,5 @@ def test_the_planners_result_is_said_of_both_scenes():
 
 @pytest.mark.parametrize("verdict", ["tied", "neither"])
 def test_a_tie_is_no_loss(verdict):
-    rows = pd.DataFrame(answers("planner", 0.001, 2.0) + answers("BiRRT", 0.001, 2.0))
-    assert [loss.title for loss in losses(rows, verdicts(BiRRT=[verdict]))] == ["Nowhere"]
+    overview = overview_of(*answers("planner", 0.001, 2.0), *answers("BiRRT", 0.001, 2.0))
+    assert [loss.title for loss in losses(overview, verdicts(BiRRT=[verdict]))] == ["Nowhere"]

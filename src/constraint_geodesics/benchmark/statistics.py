@@ -52,8 +52,8 @@ def benchmark_summary(rows: pd.DataFrame, reference: str) -> pd.DataFrame:
     there is no path.  within_1, _5, _10: median time [s] to a valid path within so many per
     cent of the best known, infinite where fewer than half of the rows get there.
     reference_iqm: the interquartile mean of `reference` over the queries that the planner has a
-    valid path of.  reference_queries, _success, _ratio_p95_all, _time_median_s: its figures over
-    the queries that the planner was asked.
+    valid path of.  reference_queries, _seeds, _success_of_solvable, _ratio_p95_all,
+    _time_median_s: its figures over the queries that the planner was asked.
     beaten: the probability that a run of `reference` is shorter than one of the planner on a query,
     ties counted half, failures as infinitely long.
     """
@@ -66,22 +66,25 @@ def benchmark_summary(rows: pd.DataFrame, reference: str) -> pd.DataFrame:
         for planner, own in case.groupby("planner", sort=False):
             about = {"constraint": constraint, "scene": scene, "planner": planner}
             same = mine[mine.index.isin(own[own["valid"]]["query"])].to_numpy()
+            theirs_on_these = _chief(theirs[theirs["query"].isin(own["query"])])
             compared = {
                 "reference_iqm": interquartile_mean(same)[1],
                 "beaten": _beaten(wanted, _lengths_by_query(own)),
-                **_reference(theirs[theirs["query"].isin(own["query"])]),
+                **{f"reference_{name}": figure for name, figure in theirs_on_these.items()},
             }
             table.append(about | _figures(own) | compared)
     return pd.DataFrame(table)
 
 
-def _reference(same: pd.DataFrame) -> dict[str, Any]:
-    solvable = same[same["best_known_rad"].notna()]
+def _chief(own: pd.DataFrame) -> dict[str, Any]:
+    """The figures that are also given of the reference on a planner's queries."""
+    solvable = own[own["best_known_rad"].notna()]
     return {
-        "reference_queries": same["query"].nunique(),
-        "reference_success": float(solvable["valid"].mean()),
-        "reference_ratio_p95_all": quantile_with_failures(solvable["ratio"].to_numpy(), 0.95),
-        "reference_time_median_s": solvable["time_s"].quantile(0.5),
+        "queries": own["query"].nunique(),
+        "seeds": own["seed"].nunique(),
+        "success_of_solvable": float(solvable["valid"].mean()),
+        "ratio_p95_all": quantile_with_failures(solvable["ratio"].to_numpy(), 0.95),
+        "time_median_s": solvable["time_s"].quantile(0.5),
     }
 
 
@@ -98,11 +101,9 @@ def _figures(own: pd.DataFrame) -> dict[str, Any]:
     }
     return {
         "rows": len(own),
-        "queries": own["query"].nunique(),
-        "seeds": own["seed"].nunique(),
+        **_chief(own),
         "solvable": solvable["query"].nunique(),
         "success": float(own["valid"].mean()),
-        "success_of_solvable": float(solvable["valid"].mean()) if len(solvable) else np.nan,
         "success_low": success_low,
         "success_high": success_high,
         "claimed_but_invalid": int(((own["status"] == "solved") & ~own["valid"]).sum()),
@@ -113,10 +114,8 @@ def _figures(own: pd.DataFrame) -> dict[str, Any]:
         "ratio_iqm": middle,
         "ratio_iqm_low": low,
         "ratio_iqm_high": high,
-        "ratio_p95_all": quantile_with_failures(solvable["ratio"].to_numpy(), 0.95),
         "ratio_p95_all_low": p95_low,
         "ratio_p95_all_high": p95_high,
-        "time_median_s": time.quantile(0.5),
         "time_p95_s": time.quantile(0.95),
         **reached,
         "peak_memory_median_mb": own["peak_memory_mb"].quantile(0.5),

@@ -52,7 +52,7 @@ def write_benchmark_page(params: Params, layout: Layout) -> None:
         winner=winner(budgets),
         standing=equal_time(budgets),
         result=planner_result(overview),
-        losses=losses(rows, budgets),
+        losses=losses(overview, budgets),
         chooser=chooser(rows, overview, list(params.benchmark.planners)),
         about=about,
         planners=rows["planner"].nunique(),

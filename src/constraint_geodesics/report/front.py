@@ -75,14 +75,7 @@ def planner_row(layout: Layout) -> Table:
         if any(found[name, scene]["queries"] < found[PLANNER, scene]["queries"] for scene in scenes)
     ]
     same = [
-        [
-            SAME,
-            *(
-                cell
-                for scene in scenes
-                for cell in _on_the_same(found[name, scene], found[PLANNER, scene]["seeds"])
-            ),
-        ]
+        [SAME, *(cell for scene in scenes for cell in _row_cells(found[name, scene], "reference_"))]
         for name in fewer
     ]
     note = (
@@ -101,21 +94,13 @@ def planner_row(layout: Layout) -> Table:
     )
 
 
-def _on_the_same(row: Mapping[Any, Any], seeds: int) -> tuple[str, ...]:
+def _row_cells(row: Mapping[Any, Any], whose: str = "") -> tuple[str, ...]:
+    """whose: "reference_" for the planner's figures on the queries that another was asked."""
     return (
-        f"{row['reference_queries']} × {seeds}",
-        share(row["reference_success"], 1),
-        fixed(row["reference_ratio_p95_all"], 3),
-        milliseconds(row["reference_time_median_s"]),
-    )
-
-
-def _row_cells(row: Mapping[Any, Any]) -> tuple[str, ...]:
-    return (
-        f"{row['queries']} × {row['seeds']}",
-        share(row["success_of_solvable"], 1),
-        fixed(row["ratio_p95_all"], 3),
-        milliseconds(row["time_median_s"]),
+        f"{row[f'{whose}queries']} × {row[f'{whose}seeds']}",
+        share(row[f"{whose}success_of_solvable"], 1),
+        fixed(row[f"{whose}ratio_p95_all"], 3),
+        milliseconds(row[f"{whose}time_median_s"]),
     )
 
 

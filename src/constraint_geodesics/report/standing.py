@@ -8,12 +8,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from constraint_geodesics.benchmark.queries import KEEP_OUT, TABLE
-from constraint_geodesics.benchmark.statistics import (
-    AHEAD,
-    all_constraints,
-    quantile_with_failures,
-    ratio_of,
-)
+from constraint_geodesics.benchmark.statistics import AHEAD
 from constraint_geodesics.palette import planner_family
 from constraint_geodesics.report.benchmark_tables import FEW, ahead_text
 from constraint_geodesics.report.cells import fixed, milliseconds, share
@@ -121,57 +116,24 @@ def planner_result(overview: pd.DataFrame) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def losses(rows: pd.DataFrame, budgets: pd.DataFrame) -> list[Loss]:
-    """Where a baseline or a part of the planner is ahead of the whole, for each way to be ahead.
+def losses(overview: pd.DataFrame, budgets: pd.DataFrame) -> list[Loss]:
+    """Where a baseline or a part of the planner is ahead of the whole, for each way to be ahead:
+    the planner's figures are of the queries that the other was asked.
 
-    rows: of the benchmark's table.  budgets: of `ours_against_baselines`.
+    overview: the benchmark's summary with all constraints together.  budgets: of
+    `ours_against_baselines`.
     """
-    pairs = compared(rows, list(dict.fromkeys(map(str, budgets["baseline"]))))
+    others = overview[overview["planner"].isin(budgets["baseline"])]
     told = [
         Loss("Within the same time", *_within(budgets)),
-        Loss("Sooner at the median", *_sooner(pairs)),
-        Loss("Shorter at the 95th percentile, whatever time it takes", *_shorter(pairs)),
+        Loss("Sooner at the median", *_sooner(others)),
+        Loss("Shorter at the 95th percentile, whatever time it takes", *_shorter(others)),
     ]
     nothing = (
         "no baseline and no part of the planner is ahead within the same time, sooner at the "
         "median, or shorter"
     )
     return [loss for loss in told if loss.clauses] or [Loss("Nowhere", [nothing])]
-
-
-def compared(rows: pd.DataFrame, baselines: Sequence[str]) -> pd.DataFrame:
-    """The planner and each baseline over the solvable queries that both were asked, all
-    constraints together: one row a scene and baseline.
-
-    asked: queries that both were asked, solvable or not.  queries: those of them that are solvable;
-    success, time_s (median) and ratio_p95 (of length over the best known, failures infinite), and
-    the same of the baseline behind `baseline_`.
-    """
-    pooled = all_constraints(rows)
-    pooled = pooled.assign(ratio=ratio_of(pooled), solvable=pooled["best_known_rad"].notna())
-    names = [f"{whose}{name}" for whose in ("", "baseline_") for name in _figures(pooled)]
-    table: list[dict[str, Any]] = []
-    for scene in WHERE:
-        case = pooled[pooled["scene"] == scene]
-        mine = case[case["planner"] == PLANNER]
-        for baseline in baselines:
-            both = case[(case["planner"] == baseline) & case["query"].isin(mine["query"])]
-            theirs = both[both["solvable"]]
-            same = mine[mine["query"].isin(theirs["query"])]
-            if len(theirs):
-                figures = (*_figures(same).values(), *_figures(theirs).values())
-                about = {"scene": scene, "baseline": baseline, "asked": both["query"].nunique()}
-                about["queries"] = same["query"].nunique()
-                table.append(about | dict(zip(names, figures, strict=True)))
-    return pd.DataFrame(table, columns=["scene", "baseline", "asked", "queries", *names])
-
-
-def _figures(own: pd.DataFrame) -> dict[str, float]:
-    return {
-        "success": float(own["valid"].mean()),
-        "time_s": float(own["time_s"].median()),
-        "ratio_p95": quantile_with_failures(own["ratio"].to_numpy(), 0.95),
-    }
 
 
 Told = tuple[list[str], list[str]]
@@ -202,19 +164,16 @@ def _within(budgets: pd.DataFrame) -> Told:
     return clauses, details
 
 
-def _sooner(pairs: pd.DataFrame) -> Told:
-    sooner = pairs[pairs["baseline_time_s"] < pairs["time_s"]]
-    serving = sooner[sooner["baseline_success"] >= SERVES]
+def _sooner(others: pd.DataFrame) -> Told:
+    sooner = others[others["time_median_s"] < others["reference_time_median_s"]]
+    serving = sooner[sooner["success_of_solvable"] >= SERVES]
     clauses, details = _by_largest_gap(
         serving,
-        "time_s",
+        "time_median_s",
+        _times,
         lambda row: (
-            f"{milliseconds(row['baseline_time_s'])} ms against {milliseconds(row['time_s'])}"
-        ),
-        lambda row: (
-            f"in {milliseconds(row['baseline_time_s'])} ms against {milliseconds(row['time_s'])} "
-            f"(it solves {share(row['baseline_success'], 1)}, the planner "
-            f"{share(row['success'], 1)})"
+            f"in {_times(row)} (it solves {share(row['success_of_solvable'], 1)}, the planner "
+            f"{share(row['reference_success_of_solvable'], 1)})"
         ),
     )
     rest = len(sooner) - len(serving)
@@ -224,21 +183,24 @@ def _sooner(pairs: pd.DataFrame) -> Told:
     return clauses, details
 
 
-def _shorter(pairs: pd.DataFrame) -> Told:
-    shorter = pairs[pairs["baseline_ratio_p95"] * (1.0 + AHEAD) < pairs["ratio_p95"]]
+def _shorter(others: pd.DataFrame) -> Told:
+    shorter = others[others["ratio_p95_all"] * (1.0 + AHEAD) < others["reference_ratio_p95_all"]]
     return _by_largest_gap(
         shorter,
-        "ratio_p95",
-        lambda row: (
-            f"{fixed(row['baseline_ratio_p95'], 3)} times the best known against "
-            f"{fixed(row['ratio_p95'], 3)}"
-        ),
-        lambda row: (
-            f"{fixed(row['baseline_ratio_p95'], 3)} times the best known against "
-            f"{fixed(row['ratio_p95'], 3)} on {row['queries']} queries, in "
-            f"{milliseconds(row['baseline_time_s'])} ms against {milliseconds(row['time_s'])}"
-        ),
+        "ratio_p95_all",
+        _lengths,
+        lambda row: f"{_lengths(row)} on {row['solvable']} queries, in {_times(row)}",
     )
+
+
+def _times(row: Mapping[Any, Any]) -> str:
+    theirs, ours = (milliseconds(row[f"{whose}time_median_s"]) for whose in ("", "reference_"))
+    return f"{theirs} ms against {ours}"
+
+
+def _lengths(row: Mapping[Any, Any]) -> str:
+    theirs, ours = (fixed(row[f"{whose}ratio_p95_all"], 3) for whose in ("", "reference_"))
+    return f"{theirs} times the best known against {ours}"
 
 
 def _by_largest_gap(
@@ -250,10 +212,10 @@ def _by_largest_gap(
     """Of each scene how many are ahead in a figure, and the largest gap; each of them in detail."""
     clauses, details = [], []
     for scene, case in _by_scene(ahead):
-        rows = _rows(case)
-        widest = min(rows, key=lambda row: row[f"baseline_{figure}"] / row[figure])
+        rows = list(case.to_dict("records"))
+        widest = min(rows, key=lambda row: row[figure] / row[f"reference_{figure}"])
         clauses.append(f"{len(rows)} {WHERE[scene]}, the largest gap {gap(widest)}")
-        details += [f"“{row['baseline']}” {WHERE[scene]}, {detail(row)}" for row in rows]
+        details += [f"“{row['planner']}” {WHERE[scene]}, {detail(row)}" for row in rows]
     return clauses, details
 
 
@@ -263,10 +225,6 @@ def _by_scene(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         case = table[table["scene"] == scene]
         if len(case):
             yield scene, case
-
-
-def _rows(pairs: pd.DataFrame) -> list[Mapping[Any, Any]]:
-    return list(pairs.to_dict("records"))
 
 
 def _duration(seconds: float) -> str:
