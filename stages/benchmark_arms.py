@@ -46,8 +46,10 @@ def main(params: Params, layout: Layout) -> None:
         parallel_map(measure, left, params.compute, description="arms and goals")
         rows = table_of([row for part in parts for row in kept(part) or ()])
         reports, found = layout.root / "reports", figures(rows)
-        write_table(rows, reports / "arms.csv", run_header(layout.root))
-        write_text(reports / "arms.json", json.dumps(found, indent=1) + "\n")
+        about = run_header(layout.root)
+        write_table(rows, reports / "arms.csv", about)
+        told = found | {"machine": about}
+        write_text(reports / "arms.json", json.dumps(told, indent=1) + "\n")
         run.mirror({table: own["all"] for table, own in found.items()}, reports / "arms.json")
         run.cells(cells_of(compared(found), ("table", "arm", "constraint", "planner"), ARMS))
 

@@ -11,7 +11,7 @@ import pandas as pd
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.machine import machine
+from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.demonstrations_figure import demonstrations_figure
 from constraint_geodesics.studies.demonstrations import (
@@ -45,7 +45,7 @@ def main(params: Params, layout: Layout) -> None:
             "cells": summary(table, own.peer_pairs),
             "ranks": ranks(table),
             "free_motion": free_motion(free_arms(), own.seeds),
-            "machine": machine(),
+            "machine": run_header(layout.root),
         }
         picture = demonstrations_figure(example(params, layout))
         with written(reports / "demonstrations.png") as part:

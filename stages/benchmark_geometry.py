@@ -11,6 +11,7 @@ from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import robot_from
 from constraint_geodesics.studies.geodesic_search import geodesic_problem, write_rows
@@ -48,7 +49,12 @@ def main(params: Params, layout: Layout, manifold: str, constraint: str) -> None
         figures["policy_search"] = policy_search_figures(trained)
         write_rows(benchmark.quadrature_rows(), layout.report(STAGE, "quadrature", "csv"))
         run.report(
-            {"manifold": manifold, "constraint": constraint, **figures},
+            {
+                "machine": run_header(layout.root),
+                "manifold": manifold,
+                "constraint": constraint,
+                **figures,
+            },
             layout.root / "reports/geometry.json",
         )
 

@@ -11,6 +11,7 @@ from constraint_geodesics.learning.learned_manifold import chart_named
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.scene.scene import robot_from
 from constraint_geodesics.studies.proposals import PolicyTask, grouped_figures, run_policies
@@ -41,7 +42,8 @@ def main(params: Params, layout: Layout) -> None:
             with written(file) as part:
                 rows.round(6).to_csv(part, index=False, compression={"method": "gzip", "mtime": 0})
         every = pd.concat(tables, ignore_index=True)
-        run.report(grouped_figures(every, params), layout.report(STAGE, "policies"))
+        told = grouped_figures(every, params) | {"machine": run_header(layout.root)}
+        run.report(told, layout.report(STAGE, "policies"))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import sys
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.machine import machine
+from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.studies.charts import measure, summary, table_of, tasks_of
 from constraint_geodesics.text_files import written
@@ -30,7 +30,9 @@ def main(params: Params, layout: Layout) -> None:
         kept = {"method": "gzip", "mtime": 0}
         with written(reports / f"{STAGE}.csv.gz") as part:
             table.to_csv(part, index=False, compression=kept, float_format="%.6g")
-        run.report({**summary(table), "machine": machine()}, reports / f"{STAGE}.json")
+        run.report(
+            {**summary(table), "machine": run_header(layout.root)}, reports / f"{STAGE}.json"
+        )
         for task in tasks:  # finished: the next run of this stage starts from nothing
             shutil.rmtree(task.scratch, ignore_errors=True)
 

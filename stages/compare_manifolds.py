@@ -9,7 +9,7 @@ from constraint_geodesics.learning.dataset import read_joints
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.machine import machine, run_header
+from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.studies.manifolds import measure, summary, table_of, tasks_of
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
@@ -29,9 +29,10 @@ def main(params: Params, layout: Layout) -> None:
         tasks = tasks_of(params, joints, layout.scratch(STAGE, "vae"))
         found = parallel_map(measure, tasks, params.compute, description="learners")
         table = table_of([row for rows in found for row in rows])
-        write_table(table, reports / f"{STAGE}.csv", run_header(layout.root))
+        about = run_header(layout.root)
+        write_table(table, reports / f"{STAGE}.csv", about)
         counts = {"rows": len(tasks[0].rows), "held_out": len(tasks[0].held_out)}
-        figures = {**summary(table), **counts, "machine": machine()}
+        figures = {**summary(table), **counts, "machine": about}
         run.report(figures, reports / f"{STAGE}.json")
 
 

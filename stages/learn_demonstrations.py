@@ -10,7 +10,7 @@ import pandas as pd
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.machine import machine
+from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.studies.demonstrations import by_cell, cells_of, summary
 from constraint_geodesics.studies.learned_demonstrations import measure
@@ -31,7 +31,7 @@ def main(params: Params, layout: Layout) -> None:
         packed = {"method": "gzip", "mtime": 0}
         with written(reports / "learned_demonstrations.csv.gz") as part:
             table.to_csv(part, index=False, compression=packed, float_format="%.6g")
-        figures = {"cells": summary(table, own.peer_pairs), "machine": machine()}
+        figures = {"cells": summary(table, own.peer_pairs), "machine": run_header(layout.root)}
         run.cells(by_cell(figures["cells"]))
         run.report(figures, reports / "learned_demonstrations.json")
         for cell in cells:  # finished: the next run of this stage starts from nothing

@@ -14,7 +14,7 @@ from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.bundle import read_bundle
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.machine import machine, run_header
+from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.scene import Scene
@@ -59,8 +59,9 @@ def measured(params: Params, layout: Layout, file: Path) -> dict[str, Any]:
             ),
         }
     frames = {name: pd.DataFrame(rows) for name, rows in tables.items()}
+    about = run_header(layout.root)
     found = {
-        "machine": machine(),
+        "machine": about,
         "changes_ms": study.change_figures(frames["changes"]),
         "mesh_of_5000_triangles": study.mesh_figures(frames["meshes"]),
         "first_shape_gone": study.by_constraint(frames["first shape gone"]),
@@ -70,7 +71,7 @@ def measured(params: Params, layout: Layout, file: Path) -> dict[str, Any]:
         "beside_a_sphere": study.sphere_figures(frames["sphere"]),
     }
     rows = pd.concat([frame.assign(study=name) for name, frame in frames.items()])
-    write_table(rows, file.with_name("scenes.csv.gz"), run_header(layout.root))
+    write_table(rows, file.with_name("scenes.csv.gz"), about)
     write_text(file, json.dumps(found, indent=1) + "\n")
     return found
 

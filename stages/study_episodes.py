@@ -49,9 +49,10 @@ def main(params: Params, layout: Layout) -> None:
         table, answers = runs.tables(rows)
         found = runs.figures(table, answers)
         both = [table.assign(table="run"), answers.assign(table="answer")]
-        write_table(pd.concat(both), reports / "episodes.csv.gz", run_header(layout.root))
-        run.report({"machine": machine(), "figures": found}, reports / "episodes.json")
-        write_text(reports / "episodes.md", episodes_markdown(found))
+        about = run_header(layout.root)
+        write_table(pd.concat(both), reports / "episodes.csv.gz", about)
+        run.report({"machine": about, "figures": found}, reports / "episodes.json")
+        write_text(reports / "episodes.md", episodes_markdown(found, about))
         with progress("recordings", len(tasks)) as advance:
             for task, row in zip(tasks, rows, strict=True):
                 _record(task, layout, row)

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.methods import SearchMethod
 from constraint_geodesics.planner import PlannerError
 from constraint_geodesics.problem import SATISFIED
+from constraint_geodesics.progress import LINE_AFTER_S
 from constraint_geodesics.recording.recording import read_recording
 from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.sphere import Sphere
@@ -299,6 +301,24 @@ def test_a_batch_is_planned_like_its_queries(planner) -> None:
         assert path.joints.tobytes() == alone.joints.tobytes()
         assert path.times.tobytes() == alone.times.tobytes()
     assert planner.plan_batch(starts[:0], goals[:0], "slide") == []
+
+
+def test_long_calls_say_so_on_the_main_thread_alone(planner, monkeypatch, capfd) -> None:
+    (start, goal), *_ = pairs_of("slide", 1, seed=8)
+    planner.plan(start, goal, "slide", budget_s=0.1)
+    planner.plan_batch([start], [goal], "slide")
+    assert capfd.readouterr().err == ""
+    planner.plan(start, goal, "slide", budget_s=LINE_AFTER_S + 0.5)
+    assert capfd.readouterr().err == "planning for 2.5 s …\n"
+    monkeypatch.setattr("constraint_geodesics.planner.LINE_AFTER_S", 0.0)
+    asked = [start] * 3, [goal] * 3, "slide"
+    planner.plan_batch(*asked)
+    assert "planned, after the first 1: 2/2, took 0 s\n" in capfd.readouterr().err
+    thread = Thread(target=planner.plan_batch, args=asked)
+    thread.start()
+    thread.join()
+    planner.plan_batch(*asked, progress=lambda done: None)
+    assert capfd.readouterr().err == ""
 
 
 def test_a_batch_of_unequal_shapes_is_refused(planner) -> None:

@@ -19,7 +19,7 @@ from constraint_geodesics.cli_degrees import (
 )
 from constraint_geodesics.extras import require
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
-from constraint_geodesics.progress import waiting
+from constraint_geodesics.progress import LINE_AFTER_S, waiting
 
 if TYPE_CHECKING:
     from constraint_geodesics.certification.certifier import Certificate
@@ -282,7 +282,8 @@ def plan(
                 first, wanted = asked[0], [asked[1]]
                 refuse_degrees({"--start": first, "--goal": asked[1]}, loaded.robot)
                 kept = _constraint(asked[2], loaded)
-            with waiting("planning" if budget is None else f"planning for {budget:g} s"):
+            says_so = budget is not None and budget > LINE_AFTER_S  # the planner itself
+            with waiting("" if says_so else "planning"):
                 path = loaded.plan(
                     first,
                     wanted,

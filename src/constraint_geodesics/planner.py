@@ -5,9 +5,12 @@ planner = Planner.load()
 trajectory = planner.plan(start, goal, "level_cup")
 """
 
+import multiprocessing
+import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
@@ -42,6 +45,8 @@ from constraint_geodesics.params import (
 )
 from constraint_geodesics.problem import PlannerError as PlannerError
 from constraint_geodesics.problem import end_refused
+from constraint_geodesics.progress import LINE_AFTER_S, waiting
+from constraint_geodesics.progress import progress as bar
 from constraint_geodesics.replanning import Replanning
 from constraint_geodesics.robot.inverse_kinematics import Search, solutions, spread
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot, rpy_of
@@ -86,6 +91,33 @@ def _in_turn(
             return method(planner, *args, **kwargs)
 
     return alone
+
+
+def _waiting(description: str, expected_s: float) -> AbstractContextManager[None]:
+    """Say so where a call takes long; one that is soon over does not even start a clock."""
+    return waiting(description) if expected_s > LINE_AFTER_S and _may_show() else nullcontext()
+
+
+def _may_show() -> bool:
+    """Workers, threads as processes, leave it to who started them."""
+    alone = multiprocessing.current_process().name == "MainProcess"
+    return alone and threading.current_thread() is threading.main_thread()
+
+
+def _late_bar(opened: ExitStack, total: int) -> Callable[[int], None]:
+    """What is told how many queries are done, and shows a bar of the rest once two seconds have
+    passed.
+    """
+    began, advance = time.monotonic(), None
+
+    def tell(done: int) -> None:
+        nonlocal advance
+        if advance is not None:
+            advance()
+        elif done < total and time.monotonic() - began > LINE_AFTER_S and _may_show():
+            advance = opened.enter_context(bar(f"planned, after the first {done}", total - done))
+
+    return tell
 
 
 class Planner:
@@ -225,9 +257,10 @@ class Planner:
         Raises PlannerError if it holds an axis but has no reference: its roadmap would be another
         for every start.
         """
-        nodes = self.nodes(constraint)
-        if len(nodes):
-            self.plan(nodes[0], nodes[-1], constraint)
+        with _waiting("making the roadmap", np.inf):
+            nodes = self.nodes(constraint)
+            if len(nodes):
+                self.plan(nodes[0], nodes[-1], constraint)
 
     @_in_turn
     def nodes(self, constraint: str | Constraint) -> Float[np.ndarray, "n D"]:
@@ -339,7 +372,8 @@ class Planner:
         if start_velocity is not None:
             moving = checked_configuration(start_velocity, dof, "start_velocity")
             moving = moving if np.linalg.norm(moving) > AT_REST else None
-        with self.scene.including(scene):
+        long = budget_s or 0.0
+        with _waiting(f"planning for {long:g} s", long), self.scene.including(scene):
             task, moved = self._preparation.task(self._held_at(given, q_start)), 0.0
             if snap:
                 q_start, moved = self._snapped(q_start, task.manifold)
@@ -379,8 +413,10 @@ class Planner:
         progress: Callable[[int], None] | None = None,
     ) -> list[Trajectory]:
         """The paths of B queries of one constraint, one for each, in their order; progress is
-        called with the number done; other threads have their turn between queries.  Raises
-        PlannerError, before anything is planned, if starts and goals have not the same shape
+        called with the number done, and without it a bar is shown where it takes more than two
+        seconds; other threads have their turn between queries.
+
+        Raises PlannerError, before anything is planned, if starts and goals have not the same shape
         (B, D), a row is not finite, or the constraint is unknown.
         """
         self._require_open()
@@ -388,11 +424,12 @@ class Planner:
         if not (progress is None or callable(progress)):
             raise PlannerError(f"progress = {shown(progress)}: must be a function")
         first, last = _batch(starts, goals, self.scene.robot.dof)
-        answers = []
-        for row, (start, goal) in enumerate(zip(first, last, strict=True)):
-            answers.append(self.plan(start, goal, constraint))
-            if progress is not None:
-                progress(row + 1)
+        answers: list[Trajectory] = []
+        with ExitStack() as shown_bar:
+            done = progress if progress is not None else _late_bar(shown_bar, len(first))
+            for start, goal in zip(first, last, strict=True):
+                answers.append(self.plan(start, goal, constraint))
+                done(len(answers))
         return answers
 
     @_in_turn

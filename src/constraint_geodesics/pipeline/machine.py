@@ -1,4 +1,4 @@
-"""What timings were taken on."""
+"""Where figures are from: what they were taken on, of which commit, and when."""
 
 import hashlib
 import platform
@@ -23,8 +23,8 @@ def machine() -> dict[str, str]:
 
 
 def run_header(root: Path) -> dict[str, str]:
-    """Where a table is from: commit, digest of dvc.lock, processor and date; blank where there is
-    none.
+    """Where a report is from: commit and digest of dvc.lock, blank where there is none, date, and
+    `machine`.
     """
     commit = subprocess.run(
         ["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=False
@@ -33,6 +33,6 @@ def run_header(root: Path) -> dict[str, str]:
     return {
         "commit": commit.stdout.strip(),
         "dvc.lock": hashlib.sha256(lock.read_bytes()).hexdigest() if lock.is_file() else "",
-        "processor": machine()["processor"],
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        **machine(),
     }

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.report.cells import fixed, markdown_table, share
+from constraint_geodesics.report.cells import fixed, markdown_table, origin, share
 from constraint_geodesics.report.page import Table
 from constraint_geodesics.report.results import read_metrics
 
@@ -166,9 +166,11 @@ def _table(described: _Described, figures: Mapping[str, Figures]) -> Table:
 
 def arms_markdown(layout: Layout) -> str:
     """The tables as Markdown."""
+    about = read_metrics(layout.root / "reports" / "arms.json").get("machine")
     told = "\n\n".join(
         f"## {own.title}\n\n{own.note[0].upper()}{own.note[1:]}.\n\n"
         f"{markdown_table([own.header, *own.rows])}"
         for own in arm_tables(layout)
     )
-    return f"# Arms and goals\n\nOne thread, next to another process.\n\n{told}\n"
+    said = f"{origin(about) if about else 'One thread'}, next to another process."
+    return f"# Arms and goals\n\n{said}\n\n{told}\n"

@@ -1,6 +1,6 @@
 """How the report writes numbers, and tables of them as Markdown; and the paper's own table."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,15 @@ geodesic stands next to the benchmark's `learned`.
 """
 Cells = list[Sequence[str]]
 """A table's header and its rows."""
+
+
+def origin(run: Mapping[str, str]) -> str:
+    """Where a report's rows are from, as a sentence without its stop.  run: of `run_header`; older
+    files have less.
+    """
+    commit = f" of commit {run['commit'][:12]}" if run.get("commit") else ""
+    date = f", {run['date']}" if run.get("date") else ""
+    return f"Rows{commit}{date}, one thread of {run['processor']}"
 
 
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:

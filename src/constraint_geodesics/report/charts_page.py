@@ -7,7 +7,7 @@ from typing import Any
 
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.report.cells import fixed, markdown_table, share
+from constraint_geodesics.report.cells import fixed, markdown_table, origin, share
 from constraint_geodesics.report.results import read_metrics
 from constraint_geodesics.studies.charts import CHART, HOLE, JOINTS, TASK, WORKCELL
 from constraint_geodesics.studies.proposals import DESCENT, POLICY
@@ -40,7 +40,7 @@ def charts_markdown(params: Params, layout: Layout) -> str:
         f"seeds, the least and largest in brackets. Charts are VAEs of N latent dimensions, "
         f"{own.epochs} epochs, learned from all free configurations of the workcell or from those "
         f"of the task alone; the straight line, random curves and the descent are the chart's. "
-        f"Length is over the shortest answer of all."
+        f"Length is over the shortest answer of all. {origin(found['machine'])}."
     )
     hole = own.hole
     held = (

@@ -7,7 +7,7 @@ from typing import Any
 
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.report.cells import Cells, fixed, markdown_table, share, short
+from constraint_geodesics.report.cells import Cells, fixed, markdown_table, origin, share, short
 from constraint_geodesics.report.results import read_metrics
 from constraint_geodesics.studies.demonstrations import (
     AS_NETWORKS,
@@ -49,7 +49,7 @@ def demonstrations_markdown(params: Params, layout: Layout) -> str:
         f"leave it. The worst violation of the formula along each path is taken: "
         f"medians over the paths, 95th percentiles behind them. Length is over the path of the "
         f"formula's planner. Times include the projection of the ends and the certificate, not the "
-        f"graph of a new constraint, which is drawn once."
+        f"graph of a new constraint, which is drawn once. {origin(found['machine'])}."
     )
     peers = (
         f"*{TANGENTS}* are planes or quadrics through the nearest rows; they are told the rank, "

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from constraint_geodesics.report.cells import fixed, markdown_table, share
+from constraint_geodesics.report.cells import fixed, markdown_table, origin, share
 
 NOTE = (
     "An arm follows a certified path among one to three spheres and boxes that it does not know, "
@@ -32,8 +32,11 @@ Figures = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """By controller, and by "all", constraint, or sensing radius."""
 
 
-def episodes_markdown(found: Figures) -> str:
-    """Contacts and goals, times, and what the sensing radius does, a table each."""
+def episodes_markdown(found: Figures, run: Mapping[str, str]) -> str:
+    """Contacts and goals, times, and what the sensing radius does, a table each.
+
+    run: where the rows are from, of `run_header`.
+    """
     constraints = [name for name in next(iter(found.values())) if not name.endswith(" m")]
     radii = [name for name in next(iter(found.values())) if name.endswith(" m")]
     cases = [(name, who, own[name]) for name in constraints for who, own in found.items()]
@@ -42,7 +45,7 @@ def episodes_markdown(found: Figures) -> str:
         "\n\n".join(
             [
                 "# Episodes among obstacles that are not known",
-                f"{NOTE}.",
+                f"{NOTE}. {origin(run)}.",
                 "## Contacts and goals",
                 markdown_table([BEYOND, *(_contacts(*case) for case in cases)]),
                 "## Times",

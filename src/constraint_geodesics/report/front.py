@@ -10,7 +10,7 @@ import pandas as pd
 
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.report.cells import fixed, milliseconds, share
+from constraint_geodesics.report.cells import fixed, milliseconds, origin, share
 from constraint_geodesics.report.page import Links, Table, runs_link
 from constraint_geodesics.report.results import read_metrics
 from constraint_geodesics.report.standing import (
@@ -81,8 +81,7 @@ def planner_row(layout: Layout) -> Table:
     note = (
         "All constraints together; solved: of what any planner solved; length: over the best "
         f"known, failures infinite. {SAME_NOTE if same else ''}The best of the rest is the first "
-        f"by this rule: {CHOICE} Rows "
-        f"of commit {about['commit'][:12]}, {about['date']}, one thread of {about['processor']}."
+        f"by this rule: {CHOICE} {origin(about)}."
     )
     return Table(
         "The planner beside the best of the rest",

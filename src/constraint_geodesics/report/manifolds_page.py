@@ -9,7 +9,7 @@ import numpy as np
 
 from constraint_geodesics.params import CompareManifoldsParams, Params
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.report.cells import fixed, markdown_table, plus_minus, share
+from constraint_geodesics.report.cells import fixed, markdown_table, origin, plus_minus, share
 from constraint_geodesics.report.results import read_metrics
 from constraint_geodesics.studies.manifolds import LEARNERS, UNIFORM
 
@@ -59,7 +59,8 @@ def _given(settings: CompareManifoldsParams, params: Params, found: Mapping[str,
         f"{gplvm.inducing} inducing points; the GAN {gan.steps:,} steps of its generator with "
         f"{gan.critic_steps} of its critic each, of {gan.batch_size} rows. A GAN has no encoder: "
         f"Gauss-Newton looks for the latent point. {settings.samples:,} samples a seed, "
-        f"{settings.checked:,} of them checked; {settings.pairs} geodesics."
+        f"{settings.checked:,} of them checked; {settings.pairs} geodesics. "
+        f"{origin(found['machine'])}."
     )
 
 

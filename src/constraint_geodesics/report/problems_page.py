@@ -13,7 +13,7 @@ from constraint_geodesics.benchmark.problem_files import Problem
 from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import run_header
-from constraint_geodesics.report.cells import fixed, markdown_table
+from constraint_geodesics.report.cells import fixed, markdown_table, origin
 from constraint_geodesics.studies.problem_runs import Asked, answered, figures
 from constraint_geodesics.text_files import write_text
 from constraint_geodesics.tracking.comparison import problem_cells
@@ -75,8 +75,7 @@ def write_problem_report(
     """
     found = figures(table)
     write_table(table, folder / f"{name}.csv.gz", run)
-    commit = f"commit {run['commit'][:12]}, " if run["commit"] else ""
-    about = [*about, f"rows of {commit}{run['date']}, one thread of {run['processor']}"]
+    about = [*about, origin(run)]
     told = {"about": about, "figures": found}
     write_text(folder / f"{name}.json", json.dumps(told, indent=1) + "\n")
     write_text(folder / f"{name}.md", problems_markdown(title, about, found))

@@ -10,7 +10,7 @@ import pandas as pd
 
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout, in_checkout
-from constraint_geodesics.report.cells import fixed, markdown_table, share, short
+from constraint_geodesics.report.cells import fixed, markdown_table, origin, share, short
 from constraint_geodesics.report.page import Links, Recorded, Table, runs_link
 from constraint_geodesics.report.results import read_metrics
 from constraint_geodesics.studies.proposals import (
@@ -115,9 +115,13 @@ def execution_markdown(params: Params, layout: Layout) -> str:
 def policies_markdown(params: Params, layout: Layout) -> str:
     """What learning adds, and all tables of it, as Markdown."""
     added = what_learning_adds(params, layout)
-    said = "\n".join(f"- **{footing}.** {sentence}" for footing, sentence in added.items())
-    blocks = "\n\n".join(map(_markdown, policy_blocks(params, layout)))
-    return f"{said}\n\n{blocks}\n"
+    about = read_metrics(layout.report("benchmark_policies", "policies")).get("machine")
+    parts = [
+        "\n".join(f"- **{footing}.** {sentence}" for footing, sentence in added.items()),
+        *([f"{origin(about)}."] if about else []),
+        *map(_markdown, policy_blocks(params, layout)),
+    ]
+    return "\n\n".join(parts) + "\n"
 
 
 def what_learning_adds(params: Params, layout: Layout) -> dict[str, str]:

@@ -42,7 +42,6 @@ from constraint_geodesics.geometry.manifold import EmbeddedManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
 from constraint_geodesics.learning.lift import corrected, retracted
 from constraint_geodesics.params import GeodesicParams, GeometryParams
-from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.progress import progress
 from constraint_geodesics.studies.geodesic_search import (
     MANIFOLDS,
@@ -105,7 +104,7 @@ class GeometryBenchmark:
                 found[name] = measure()
                 advance()
         solvers = {name.split("/")[1]: found.pop(name) for name in list(found) if "/" in name}
-        return found | {"machine": machine(), "solvers": solvers}
+        return found | {"solvers": solvers}
 
     def curve_length(self) -> dict[str, Any]:
         """Lengths a second at the default accuracy, ratio to the naive way, and the error."""
