@@ -93,16 +93,21 @@ def arm_rows() -> list[dict]:
     return rows
 
 
+RUN = {"commit": "0123456789abcdef", "date": "2026-01-01 00:00 UTC", "processor": "a processor"}
+ORIGIN = "Rows of commit 0123456789ab, 2026-01-01 00:00 UTC, one thread of a processor"
+"""Where rows are from, as reports have it and as pages say it."""
+
+
 def write_arm_report(layout: Layout) -> None:
     """reports/arms.json of this layout."""
     file = layout.root / "reports" / "arms.json"
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps(figures(table_of(arm_rows()))))
+    file.write_text(json.dumps(figures(table_of(arm_rows())) | {"machine": RUN}))
 
 
 def write_study_reports(params: Params, layout: Layout) -> None:
     """reports/benchmark_policies and execute_paths of this layout."""
-    policies = grouped_figures(policy_rows(params), params)
+    policies = grouped_figures(policy_rows(params), params) | {"machine": RUN}
     for file, content in (
         (layout.report("benchmark_policies", "policies"), policies),
         (layout.report("execute_paths", params.studies.constraint), execution_figures()),

@@ -1,7 +1,7 @@
 """Tables of the study of arms and goals: cells and targets from figures that are known."""
 
 import pytest
-from tests.report.study_fixtures import write_arm_report
+from tests.report.study_fixtures import ORIGIN, write_arm_report
 
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.arms_page import TABLES, arm_tables, arms_markdown
@@ -41,6 +41,7 @@ def test_the_cells_are_the_figures(layout) -> None:
 
 def test_markdown_names_every_table_and_target(layout) -> None:
     text = arms_markdown(layout)
+    assert f"{ORIGIN}, next to another process." in text
     for own in TABLES.values():
         assert f"## {own.title}\n" in text
         assert all(column.target in text for column in own.columns)

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from tests.report.study_fixtures import ORIGIN, RUN
 
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.charts_page import METRICS, charts_markdown
@@ -34,12 +35,13 @@ def layout(tmp_path) -> Layout:
     }
     file = tmp_path / "reports" / "compare_charts.json"
     file.parent.mkdir()
-    file.write_text(json.dumps({"charts": charts, "queries": 50, "solvable": 49}))
+    file.write_text(json.dumps({"charts": charts, "queries": 50, "solvable": 49, "machine": RUN}))
     return Layout(tmp_path)
 
 
 def test_the_page_says_what_the_figures_say(params, layout) -> None:
     text = charts_markdown(params, layout)
+    assert ORIGIN in text
     assert "In joint space itself the policy solves 99.0% with a p95 of 1.010" in text
     assert "best learned chart, of 6 dimensions and task data, 100.0%, 1.015" in text
     assert "With fewer dimensions than joints it solves 40.0% to 50.0%." in text

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from tests.report.study_fixtures import ORIGIN, RUN
 
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.demonstrations_page import demonstrations_markdown
@@ -61,12 +62,15 @@ def layout(tmp_path) -> Layout:
     ]
     file = tmp_path / "reports" / "demonstrations.json"
     file.parent.mkdir()
-    file.write_text(json.dumps({"cells": cells, "ranks": ranks, "free_motion": free}))
+    file.write_text(
+        json.dumps({"cells": cells, "ranks": ranks, "free_motion": free, "machine": RUN})
+    )
     return Layout(tmp_path)
 
 
 def test_the_page_says_what_the_figures_say(params, layout) -> None:
     text = demonstrations_markdown(params, layout)
+    assert text.count(ORIGIN) == 1
     assert "Of 15 draws the rank, how many relations and not which, is right in 80.0%" in text
     assert "in 90.0%; more than the formula holds was found in 1." in text
     assert "nothing is found in 2 of 3 draws" in text
@@ -86,10 +90,11 @@ def test_there_is_a_row_for_each_cell(params, layout) -> None:
 def test_what_is_learned_stands_beside_it_where_it_was_run(params, layout) -> None:
     learned = {LEVEL_SET: method(0.05, 0.9, trained_s=6.0), DESCENT: method(7.0, 0.9)}
     file = layout.root / "reports" / "learned_demonstrations.json"
-    file.write_text(json.dumps({"cells": {"door": {"noisy": learned}}}))
+    file.write_text(json.dumps({"cells": {"door": {"noisy": learned}}, "machine": RUN}))
     text = demonstrations_markdown(params, layout)
     lines = [line for line in text.splitlines() if "| door " in line]
     assert len(lines) == 3
+    assert text.count(ORIGIN) == 2
     assert "0.03 / 0.04" in lines[0]
     assert "0.05 / 0.9" in lines[2]
     assert "7 / 0.9" in lines[2]

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from tests.report.study_fixtures import ORIGIN, RUN
 
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.manifolds_page import COLUMNS, SHARES, manifolds_markdown
@@ -38,6 +39,7 @@ def report() -> dict:
         "constraints": {"level": kept, "slide": kept},
         "rows": 43000,
         "held_out": 2000,
+        "machine": RUN,
     }
 
 
@@ -51,6 +53,7 @@ def layout(tmp_path) -> Layout:
 
 def test_the_page_says_what_the_figures_say(params, layout) -> None:
     text = manifolds_markdown(params, layout)
+    assert ORIGIN in text
     assert "best by the GPLVM, to 0.0100 rad" in text
     assert "worst by the GAN, to 0.3000 rad" in text
     assert "The GAN draws the most samples within the limits and free of collision, 90.0%" in text

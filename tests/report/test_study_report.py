@@ -1,7 +1,7 @@
 """Tables of the planner that users call: exact figures from rows that are known."""
 
 import pytest
-from tests.report.study_fixtures import write_study_reports
+from tests.report.study_fixtures import ORIGIN, write_study_reports
 
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.study_report import (
@@ -55,7 +55,9 @@ def test_markdown_holds_every_row(reported):
     text = execution_markdown(*reported)
     assert "| straight joint line" in text
     assert "| planned path" in text
-    assert "| random curves, same time" in policies_markdown(*reported)
+    text = policies_markdown(*reported)
+    assert "| random curves, same time" in text
+    assert ORIGIN in text
 
 
 def test_what_learning_adds_is_said_of_every_footing(reported):

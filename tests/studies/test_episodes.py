@@ -191,7 +191,8 @@ def test_figures_are_of_the_solvable_and_the_page_has_them() -> None:
     assert first["answers"]["late"] == 1
     assert first["both_reach"] == {"episodes": 1, "duration_s_median": 2.0, "duration_s_p95": 2.0}
     assert found["a"]["free"] == found["a"]["0.2 m"] == first
-    page = episodes_markdown(found)
+    page = episodes_markdown(found, {"processor": "a processor"})
+    assert "Rows, one thread of a processor." in page
     (line,) = [own for own in page.splitlines() if own.startswith("| all") and "1 of 2" in own]
     assert "50%" in line
     assert "0.2" in page.split("## By the sensing radius")[1]

@@ -35,7 +35,8 @@ def demonstrations_markdown(params: Params, layout: Layout) -> str:
     reports, own = layout.root / "reports", params.demonstrations
     found = read_metrics(reports / "demonstrations.json")
     learned = reports / "learned_demonstrations.json"
-    known = read_metrics(learned)["cells"] if learned.is_file() else {}
+    networks = read_metrics(learned) if learned.is_file() else {"cells": {}, "machine": {}}
+    known = networks["cells"]
     for task, case, methods in _cells(known):
         found["cells"][task][case] |= methods
     given = (
@@ -80,7 +81,8 @@ def demonstrations_markdown(params: Params, layout: Layout) -> str:
     ]
     if known:
         shown = (LEVEL_SET, RESIDUAL, DESCENT, POLICY)
-        parts += [trained, markdown_table(_peer_rows(found["cells"], shown))]
+        parts.append(f"{trained} {origin(networks['machine'])}.")
+        parts.append(markdown_table(_peer_rows(found["cells"], shown)))
         parts.append(markdown_table(_training_rows(found["cells"])))
     parts += [HOLES, markdown_table(_hole_rows(found["cells"]))]
     return "\n\n".join(parts) + "\n"
