@@ -13,11 +13,14 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
+from io import StringIO
 from pathlib import Path
 from threading import Thread
 
 import numpy as np
 import pytest
+from rich.console import Console
+from rich.live import Live
 
 from constraint_geodesics import Constraint, Planner, Pose, Trajectory, bundle
 from constraint_geodesics.certification.certifier import Certifier, Limits
@@ -318,6 +321,8 @@ def test_long_calls_say_so_on_the_main_thread_alone(planner, monkeypatch, capfd)
     thread.start()
     thread.join()
     planner.plan_batch(*asked, progress=lambda done: None)
+    with Live(console=Console(file=StringIO(), force_terminal=True)):
+        planner.plan_batch(*asked)
     assert capfd.readouterr().err == ""
 
 

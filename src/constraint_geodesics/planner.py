@@ -6,6 +6,7 @@ trajectory = planner.plan(start, goal, "level_cup")
 """
 
 import multiprocessing
+import sys
 import threading
 import time
 import warnings
@@ -99,9 +100,12 @@ def _waiting(description: str, expected_s: float) -> AbstractContextManager[None
 
 
 def _may_show() -> bool:
-    """Workers, threads as processes, leave it to who started them."""
+    """Workers, threads as processes, leave it to who started them; where Rich has taken stderr, a
+    bar is there already.
+    """
     alone = multiprocessing.current_process().name == "MainProcess"
-    return alone and threading.current_thread() is threading.main_thread()
+    has_bar = type(sys.stderr).__module__ == "rich.file_proxy"
+    return alone and threading.current_thread() is threading.main_thread() and not has_bar
 
 
 def _late_bar(opened: ExitStack, total: int) -> Callable[[int], None]:
