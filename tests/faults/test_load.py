@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -319,6 +319,35 @@ def test_what_is_no_request_is_said(
         response = connection.getresponse()
         assert response.status == status
         assert words in json.loads(response.read())["message"]
+
+
+def test_a_request_without_end_is_not_read(served: str) -> None:
+    """One that also says how long it is would be read in pieces, for as long as they come."""
+    with connected(served) as connection:
+        connection.putrequest("POST", "/invocations")
+        connection.putheader("Content-Length", "5")
+        connection.putheader("Transfer-Encoding", "chunked")
+        connection.endheaders()
+        assert connection.getresponse().status == 411
+
+
+def test_who_sends_nothing_holds_no_place(asked: Asked, served: str) -> None:
+    with ExitStack() as idle:
+        waiting = [idle.enter_context(connected(served)) for _ in range(2 * WAITING)]
+        for connection in waiting:
+            connection.putrequest("POST", "/invocations")
+            connection.putheader("Content-Length", "500")
+            connection.endheaders()
+        load = Load()
+        with connected(served) as connection:
+            for place in range(3):
+                ask(connection, asked, place, load)
+        assert (len(load.seconds), load.wrong, load.refused, load.lost) == (3, 0, 0, 0)
+        response = waiting[0].getresponse()
+        assert response.status == 408
+        assert "not there within 5 s" in json.loads(response.read())["message"]
+        waiting.pop(1).close()  # others are not hurt by one that leaves
+        assert waiting[-1].getresponse().status == 408
 
 
 @pytest.mark.long

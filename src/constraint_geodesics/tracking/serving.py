@@ -5,19 +5,20 @@ MLflow's own command has no such door: what is too much waits in the queue of a 
 no model sees, until its client has given up.
 """
 
+import asyncio
 import math
 import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 
 import uvicorn
 from starlette.responses import JSONResponse
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from constraint_geodesics.bundle import read_bundle
 from constraint_geodesics.tracking.store import (
@@ -29,7 +30,9 @@ from constraint_geodesics.tracking.store import (
 
 RETRY_AFTER_S = 1
 MOST_BYTES = 1_000_000
-"""Of one request: some 3,000 queries."""
+"""Of one request: some 3,000 queries, more than are answered in the minute that MLflow gives."""
+SENT_WITHIN_S = 5.0
+"""A request that comes more slowly is not waited for."""
 WANTED_UNTIL = ContextVar("WANTED_UNTIL", default=math.inf)
 """When the client of the request that is answered here gets 504 from MLflow (`time.monotonic`):
 what is answered later nobody reads."""
@@ -49,10 +52,12 @@ class Served:
 
 
 class Door:
-    """Lets `waiting` requests into an application; those beyond are answered 503 at once, unread.
+    """Lets `waiting` requests into an application; those beyond are answered 503 at once.
 
-    A request must say how long it is, and be no longer than MOST_BYTES: 411 and 413 otherwise.
-    Those that only look, as /ping, always get in.  timeout_s: for how long a client waits.
+    A request must say how long it is, be no longer than MOST_BYTES, and be there SENT_WITHIN_S
+    after its first line: 411, 413 and 408 otherwise.  It takes a place when it is there, so that
+    nobody holds one by sending nothing.  Those that only look, as /ping, always get in.  timeout_s:
+    for how long a client waits.
     """
 
     def __init__(self, app: ASGIApp, waiting: int, timeout_s: float) -> None:
@@ -63,26 +68,65 @@ class Door:
         if scope["type"] != "http" or scope["method"] != "POST":
             await self._app(scope, receive, send)
             return
-        refused = self._refusal(dict(scope["headers"]).get(b"content-length"))
-        if refused is not None:
-            await refused(scope, receive, send)
+        found = await self._asked(scope, receive)
+        if isinstance(found, JSONResponse):
+            await found(scope, receive, send)
             return
         WANTED_UNTIL.set(time.monotonic() + self._timeout_s)
         self._inside += 1
         try:
-            await self._app(scope, receive, send)
+            await self._app(scope, _after(found, receive), send)
         finally:
             self._inside -= 1
 
-    def _refusal(self, length: bytes | None) -> JSONResponse | None:
-        if length is None:
-            return _refused(411, "the request must have a Content-Length")
-        if int(length) > MOST_BYTES:
-            return _refused(413, f"the request has {int(length)} bytes: at most {MOST_BYTES}")
-        if self._inside >= self._waiting:
-            busy = f"{self._inside} requests wait already: ask again in {RETRY_AFTER_S} s"
-            return _refused(503, busy, {"Retry-After": str(RETRY_AFTER_S)})
-        return None
+    async def _asked(self, scope: Scope, receive: Receive) -> Message | JSONResponse:
+        """The whole request as one message, or why it is not let in."""
+        refused = _unfit(dict(scope["headers"])) or self._busy()
+        if refused is not None:
+            return refused
+        whole = await _whole(receive)
+        if whole is None:
+            return _refused(408, f"the request was not there within {SENT_WITHIN_S:g} s")
+        return self._busy() or whole  # others may have come in since
+
+    def _busy(self) -> JSONResponse | None:
+        if self._inside < self._waiting:
+            return None
+        busy = f"{self._inside} requests wait already: ask again in {RETRY_AFTER_S} s"
+        return _refused(503, busy, {"Retry-After": str(RETRY_AFTER_S)})
+
+
+def _unfit(headers: Mapping[bytes, bytes]) -> JSONResponse | None:
+    length = headers.get(b"content-length")
+    if length is None or b"transfer-encoding" in headers:  # which would say another length
+        return _refused(411, "the request must have a Content-Length, and no Transfer-Encoding")
+    if int(length) > MOST_BYTES:
+        return _refused(413, f"the request has {int(length)} bytes: at most {MOST_BYTES}")
+    return None
+
+
+async def _whole(receive: Receive) -> Message | None:
+    """A request as one message; None where it does not come in time, or its client left."""
+    body = bytearray()
+    try:
+        async with asyncio.timeout(SENT_WITHIN_S):
+            while (message := await receive())["type"] == "http.request":
+                body += message.get("body", b"")
+                if not message.get("more_body", False):
+                    return {"type": "http.request", "body": bytes(body), "more_body": False}
+    except TimeoutError:
+        pass
+    return None
+
+
+def _after(whole: Message, receive: Receive) -> Receive:
+    """What gives a whole request first."""
+    left = [whole]
+
+    async def next_message() -> Message:
+        return left.pop() if left else await receive()
+
+    return next_message
 
 
 def _refused(status: int, message: str, headers: dict[str, str] | None = None) -> JSONResponse:
