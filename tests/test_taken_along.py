@@ -17,6 +17,7 @@ from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.taken_along import FILES, as_taken
 from tests.planner_fixtures import packaged_bundle
+from tests.scene.mesh_files import Brick, write_bricks
 
 ROBOTS = Path(__file__).resolve().parent / "robots"
 FREE = Constraint((0,) * 6)
@@ -79,6 +80,42 @@ def test_the_files_lie_in_the_folder_under_their_contents(folder) -> None:
     assert str(folder) not in (folder / CARD).read_text()
 
 
+def a_robot(folder: Path, visual: str, drawn: Path) -> Path:
+    """A copy of the tests' robots; one's URDF shows a mesh besides."""
+    shutil.copytree(ROBOTS, folder / "robots")
+    urdf = folder / "robots" / "six_axis.urdf"
+    shown = f'<visual><geometry><mesh filename="{visual}"/></geometry></visual>'
+    head, mark, rest = urdf.read_text().partition("<collision>")
+    urdf.write_text(head + shown + mark + rest)
+    assert drawn.is_file()
+    return urdf
+
+
+@pytest.mark.parametrize("name", ["link.stl", "link.obj", "link.dae"])
+def test_a_file_that_is_no_mesh_is_not_handed_on(name, tmp_path) -> None:
+    """A robot's folder may come from somebody to whom the planner goes back.  PyBullet loads no
+    robot that shows a file of another name.
+    """
+    secret = tmp_path / "secret"
+    secret.write_text("v 1 2\nhunter2\n")
+    os.symlink(secret, tmp_path / name)
+    urdf = a_robot(tmp_path, str(tmp_path / name), tmp_path / name)
+    os.symlink(secret, tmp_path / "robots" / "wrist.mtl")
+    with Planner.from_urdf(urdf, "tool") as planner:
+        planner.bundle.write(tmp_path / "planner")
+    written = [file for file in (tmp_path / "planner").rglob("*") if file.is_file()]
+    assert {"six_axis", "wrist.obj"} <= {file.name.split("-")[0] for file in written}
+    assert not [file for file in written if b"hunter2" in file.read_bytes()]
+
+
+def test_what_is_shown_is_handed_on(tmp_path) -> None:
+    write_bricks(tmp_path / "cover.stl", [Brick((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))])
+    urdf = a_robot(tmp_path, str(tmp_path / "cover.stl"), tmp_path / "cover.stl")
+    with Planner.from_urdf(urdf, "tool") as planner:
+        planner.bundle.write(tmp_path / "planner")
+    assert [file.name for file in (tmp_path / "planner").rglob("cover.*")] == ["cover.stl"]
+
+
 def test_written_again_it_is_the_same(folder, tmp_path) -> None:
     open_bundle(folder)[0].write(tmp_path / "again")
     assert (tmp_path / "again" / CARD).read_bytes() == (folder / CARD).read_bytes()
@@ -125,7 +162,9 @@ def test_a_file_without_a_checksum_is_refused(folder) -> None:
         open_bundle(sealed(folder, card))
 
 
-def test_mlflow_s_folder_may_go_away(handed_on, monkeypatch, tmp_path) -> None:
+@pytest.fixture
+def cached(handed_on, monkeypatch, tmp_path) -> Path:
+    """Where files that MLflow takes away again are kept; MLflow's are those of `handed_on`."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
     @contextmanager
@@ -135,9 +174,26 @@ def test_mlflow_s_folder_may_go_away(handed_on, monkeypatch, tmp_path) -> None:
         shutil.rmtree(place)
 
     monkeypatch.setattr(bundle, "plug", lambda _: fetched)
+    return tmp_path / "cache"
+
+
+def test_mlflow_s_folder_may_go_away(cached) -> None:
     for _ in range(2):
         found, where = open_bundle("models:/arm/1")
         assert isinstance(found, Bundle)
-        assert Path(found.robot.urdf).is_relative_to(tmp_path / "cache")
+        assert Path(found.robot.urdf).is_relative_to(cached)
         with Planner(found, where) as planner:
             assert planner.plan([0.0] * 6, GOAL, FREE).status == "solved"
+
+
+@pytest.mark.parametrize("damage", ["cut", "gone"])
+def test_a_damaged_copy_is_made_again(cached, damage) -> None:
+    open_bundle("models:/arm/1")
+    (mesh,) = cached.rglob("wrist.obj")
+    whole = mesh.read_bytes()
+    mesh.unlink()
+    if damage == "cut":
+        mesh.write_bytes(whole[:10])
+    for _ in range(2):
+        assert isinstance(open_bundle("models:/arm/1")[0], Bundle)
+        assert mesh.read_bytes() == whole

@@ -206,11 +206,19 @@ def _lasting(folder: Path) -> Path:
         return folder
     digest = hashlib.sha256(read_content(folder / CARD, piped=False)).hexdigest()[:16]
     place = user_cache_path("constraint_geodesics") / "planners" / digest
-    if not place.is_dir():
-        place.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=place.parent) as part, suppress(FileExistsError):
-            # links stay links, so that they are seen; another process may be first
-            shutil.copytree(folder, Path(part) / digest, symlinks=True).rename(place)
+    with suppress(BundleError):
+        read_bundle(place)
+        return place
+    shutil.rmtree(place, ignore_errors=True)  # cut short, altered, or never what its card says
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=place.parent) as part:
+        # links stay links, so that they are seen
+        whole = Path(shutil.copytree(folder, Path(part) / digest, symlinks=True))
+        try:
+            whole.rename(place)
+        except OSError:  # another process may be first
+            if not place.is_dir():
+                raise
     return place
 
 

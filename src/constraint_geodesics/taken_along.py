@@ -15,12 +15,17 @@ from typing import Any
 from constraint_geodesics.params import RobotParams
 from constraint_geodesics.robot.arm_file import digest_of
 from constraint_geodesics.robot.description import find_mesh
+from constraint_geodesics.robot.kinematics import RobotError
+from constraint_geodesics.scene.collada import as_obj
+from constraint_geodesics.scene.pieces import read_mesh
 from constraint_geodesics.text_files import read_content
 from constraint_geodesics.xml_files import read_xml
 
 FILES = "files"
 _WORDS = ("adjacent", "found")
 """What `may_touch` says where it names no file."""
+_COLOUR = b"newmtl"
+"""What begins each one in a file of colours."""
 
 
 class MissingFileError(ValueError):
@@ -86,7 +91,7 @@ def _urdf(file: Path, contents: dict[str, bytes]) -> str:
     tree = read_xml(file)
     for mesh in tree.iter("mesh"):
         found = find_mesh(mesh.get("filename", ""), file)
-        if found is not None:
+        if found is not None and _is_mesh(found):
             mesh.set("filename", _plain(found, contents).removeprefix(f"{FILES}/"))
     content = ElementTree.tostring(tree)
     digest = digest_of(content)
@@ -95,13 +100,24 @@ def _urdf(file: Path, contents: dict[str, bytes]) -> str:
     return name
 
 
+def _is_mesh(file: Path) -> bool:
+    """Whether a URDF's mesh is one that can be read: it may name any file of this machine, and what
+    lies in the folder is handed on.
+    """
+    try:
+        (as_obj if file.suffix.lower() == ".dae" else read_mesh)(file)
+    except (OSError, ValueError, RobotError):
+        return False
+    return True
+
+
 def _plain(file: Path, contents: dict[str, bytes]) -> str:
     """A file as it is, and the colours beside an OBJ."""
     content, colours = read_content(file), file.with_suffix(".mtl")
     folder = f"{FILES}/{digest_of(content)}"
     contents[f"{folder}/{file.name}"] = content
-    if colours.is_file():
-        contents[f"{folder}/{colours.name}"] = read_content(colours)
+    if colours.is_file() and _COLOUR in (drawn := read_content(colours)):
+        contents[f"{folder}/{colours.name}"] = drawn
     return f"{folder}/{file.name}"
 
 
