@@ -132,15 +132,16 @@ def with_numbers(text: str) -> str:
 
 
 def with_efforts(text: str) -> str:
-    """A page's text with the effort and the commit of each row of reports/reliability.json, and its
-    numbers.
+    """A page's text with the effort, the commit and the processor of each row of
+    reports/reliability.json, and its numbers.
     """
     rows = json.loads((ROOT / "reports" / "reliability.json").read_text())
-    alike: dict[tuple[str, str], list[str]] = defaultdict(list)
+    alike: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name, row in sorted(rows.items()):
         commit = f"`{row['commit']}`" if row.get("commit") else "not kept"
-        alike[f"`make {COMMANDS[row['effort']]}`", commit].append(name)
-    head = "| effort | commit | took [s] | rows |\n|---|---|---:|---|"
+        own = f"`make {COMMANDS[row['effort']]}`", commit, row.get("processor", "not kept")
+        alike[own].append(name)
+    head = "| effort | commit | processor | took [s] | rows |\n|---|---|---|---:|---|"
     lines = [f"| {' | '.join((*own, _together(rows, alike[own])))} |" for own in sorted(alike)]
     return with_numbers(replaced(text, "efforts", "\n".join([head, *lines])))
 
@@ -150,7 +151,7 @@ COMMANDS = {"quick": "test", "faults": "test-faults", "soak": "soak"}
 
 
 def _together(rows: dict[str, dict[str, float]], names: list[str]) -> str:
-    """Cells of rows of one effort and commit: for how long their tests ran, and their names."""
+    """Cells of rows of one effort, commit and processor: how long their tests ran, their names."""
     seconds = [rows[name]["seconds"] for name in names if "seconds" in rows[name]]
     took = f"{sum(seconds):.0f}" if len(seconds) == len(names) else "–"
     return f"{took} | {', '.join(f'`{name}`' for name in names)}"

@@ -209,6 +209,32 @@ def test_the_gate_refuses_what_a_stage_would_fail_on(
         assert part in message, message
 
 
+@pytest.mark.parametrize(
+    ("host", "store", "good"),
+    [
+        ("127.0.0.1", None, True),
+        ("[::1]", None, True),
+        ("node7", None, False),
+        ("node7", "sqlite:///runs.db", False),
+        ("node7", "http://node7:5000", True),
+    ],
+)
+def test_workers_on_other_machines_need_a_server_of_mlflow(
+    tmp_path: Path, host: str, store: str | None, good: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each seed's worker reports; SQLite on a shared disk is no place for several machines."""
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    if store is not None:
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", store)
+    dask = {"backend": "dask", "dask_address": f"tcp://{host}:8786"}
+    params = load_params(changed(tmp_path, lambda p: p["compute"].update(dask)))
+    if good:
+        check_params(params)
+        return
+    with pytest.raises(ParamsError, match=r"dask_address='tcp://node7:8786'.*MLFLOW_TRACKING_URI"):
+        check_params(params)
+
+
 def test_an_experiment_changes_one_line(tmp_path: Path) -> None:
     """DVC writes the file anew; it must be as DVC writes it."""
     file = tmp_path / "params.yaml"

@@ -6,6 +6,8 @@ what the stages ask of each other's parameters.
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -18,9 +20,11 @@ from constraint_geodesics.peers.baseline import BaselineError
 from constraint_geodesics.scene.pieces import read_pieces
 from constraint_geodesics.scene.scene import Scene, robot_from
 from constraint_geodesics.studies.hidden_tasks import TASKS
+from constraint_geodesics.tracking.store import tracking_uri
 
 TABLE_I = ("prm", "rrt_star", "birrt")
 """Kinds of baselines that the result table has rows of."""
+THIS_MACHINE = ("127.0.0.1", "::1", "localhost")
 
 
 def check_params(params: Params) -> None:
@@ -75,7 +79,15 @@ def _check_constraints(params: Params) -> None:
 
 
 def _problems(params: Params) -> Iterator[str]:
-    joints, execution = robot_from(params.robot).dof, params.execution
+    joints, execution, compute = robot_from(params.robot).dof, params.execution, params.compute
+    if compute.backend == "dask" and tracking_uri(Path()).startswith("sqlite:"):
+        address = str(compute.dask_address)
+        if urlsplit(address).hostname not in THIS_MACHINE:
+            yield (
+                f"compute.dask_address={address!r}: workers on other machines tell MLflow of their "
+                f"seeds, and must not write to one file of SQLite: set MLFLOW_TRACKING_URI to the "
+                f"address of an MLflow server"
+            )
     for name, manifold in params.manifolds.items():
         if manifold.latent_dim > joints:
             yield (

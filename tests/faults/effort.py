@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from filelock import FileLock
 
+from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.text_files import write_text
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -67,7 +68,11 @@ def counting(part: str, effort: Effort) -> Iterator[Row]:
     if before and _order(before["effort"]) > _order(effort.name):
         _exchanged(part, before)
         return
-    about = {"commit": _commit(), "seconds": round(time.monotonic() - began, 1)}
+    about = {
+        "commit": _commit(),
+        "seconds": round(time.monotonic() - began, 1),
+        "processor": machine()["processor"],
+    }
     _exchanged(part, {"effort": effort.name, **about, **row})
 
 

@@ -23,7 +23,7 @@ def test_a_row_says_what_was_measured_on_which_commit_and_for_how_long(file: Pat
     measure("kills", FAULTS, 0)
     measure("load", QUICK, 3)
     rows = json.loads(file.read_text())
-    assert list(rows["kills"]) == ["effort", "commit", "seconds", "lost"]
+    assert list(rows["kills"]) == ["effort", "commit", "seconds", "processor", "lost"]
     assert rows["kills"]["effort"] == "faults"
     assert rows["kills"]["seconds"] >= 0.0
     assert rows["load"]["lost"] == 3

@@ -45,7 +45,7 @@ pytestmark = [pytest.mark.timeout(900), pytest.mark.long]
 ROOT = Path(__file__).resolve().parents[2]
 CONSTRAINT = "level_cup"
 SHARDS, SEEDS, QUERIES = 12, 4, 6
-PLANNERS = ("straight + band", "BiRRT")
+PLANNERS = ("planner", "straight + band", "BiRRT")
 MEASURED = ["time_s", "scene_s", "peak_memory_mb"]
 """Columns of the benchmark that tell of the machine."""
 ONE = ComputeParams(backend="loky", workers=1)

@@ -20,13 +20,15 @@ from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.constraints.constraint import Pose
 from constraint_geodesics.goals.region import GoalRegion
-from constraint_geodesics.pipeline.code import code_digest
+from constraint_geodesics.pipeline.code import code_digest, digest
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import Status
 from constraint_geodesics.trajectory import Trajectory
+from tests.faults import requests
 from tests.faults.effort import Effort, counting
 from tests.faults.requests import A_SCENE, SEED, Request, request, scene_of
 from tests.planner_fixtures import packaged_planner
+from tests.scene import judge as oracle
 from tests.scene.judge import Judge
 
 STEP_RAD = {"quick": 0.02, "faults": 0.005, "soak": 0.005}
@@ -344,4 +346,6 @@ def _keep(effort: Effort, figures: Figures) -> None:
 
 
 def _of() -> list[Any]:
-    return [SEED, code_digest("planner")]
+    """What the figures hang on: requests and oracle as well as the planner."""
+    asked = [digest(Path(file)) for file in (__file__, requests.__file__, oracle.__file__)]
+    return [SEED, *asked, code_digest("planner")]

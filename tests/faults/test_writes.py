@@ -342,6 +342,7 @@ def test_a_write_that_fails_leaves_the_previous_file_whole(
             else:  # of several files some are new: it is refused
                 assert len(own.files) > 1
                 assert is_one_line(now, folder)
+                TRIED["to_be_written_again"] += 1
             own.write(folder, 0)
         assert ended or effort == QUICK, f"{effort.faults} faults do not reach the end of the write"
     TRIED["survived"] += TRIED["injected"] - began
