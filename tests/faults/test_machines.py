@@ -46,7 +46,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CONSTRAINT = "level_cup"
 SHARDS, SEEDS, QUERIES = 12, 4, 6
 PLANNERS = ("planner", "straight + band", "BiRRT")
-MEASURED = ["time_s", "scene_s", "peak_memory_mb"]
+MEASURED = ["time_s", "core_share", "scene_s", "peak_memory_mb"]
 """Columns of the benchmark that tell of the machine."""
 ONE = ComputeParams(backend="loky", workers=1)
 LOST = "lost the Dask scheduler at tcp://127.0.0.1"
