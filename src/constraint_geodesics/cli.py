@@ -427,7 +427,8 @@ def _chosen(listed: "list[Listed]", wanted: "Filter") -> list[Path]:
     if wanted.one_problem:
         chosen = one_of_each(listed, wanted)
         names = ", ".join(f"{entry.number} ({entry.planner})" for entry in chosen)
-        print(f"opening {names} of the {len(listed)} that fit", file=sys.stderr)
+        more = f" of the {len(listed)} that fit" if len(listed) > len(chosen) else ""
+        print(f"opening recordings {names}{more}", file=sys.stderr)
         return [Path(entry.file) for entry in chosen]
     print(as_table(listed))
     if not (sys.stdin.isatty() and sys.stdout.isatty()):

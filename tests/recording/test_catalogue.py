@@ -353,7 +353,7 @@ def test_one_command_opens_the_learned_path_over_the_sampled_one(
     )
     code, out, err = geodesics("replay", *asked, "--save", "both.rrd")
     assert code == 0
-    assert "opening 1 (learned_geodesic), 3 (birrt)" in err
+    assert "opening recordings 1 (learned_geodesic), 3 (birrt)" in err
     assert Path("both.rrd").stat().st_size > 2.5e6, "two robots"
     assert out.startswith("both.rrd: ")
 
