@@ -138,9 +138,8 @@ def with_efforts(text: str) -> str:
     rows = json.loads((ROOT / "reports" / "reliability.json").read_text())
     alike: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name, row in sorted(rows.items()):
-        commit = f"`{row['commit']}`" if row.get("commit") else "not kept"
-        own = f"`make {COMMANDS[row['effort']]}`", commit, row.get("processor", "not kept")
-        alike[own].append(name)
+        effort, processor = f"`make {COMMANDS[row['effort']]}`", row.get("processor", "not kept")
+        alike[effort, f"`{row['commit']}`", processor].append(name)
     head = "| effort | commit | processor | took [s] | rows |\n|---|---|---|---:|---|"
     lines = [f"| {' | '.join((*own, _together(rows, alike[own])))} |" for own in sorted(alike)]
     return with_numbers(replaced(text, "efforts", "\n".join([head, *lines])))
@@ -152,9 +151,8 @@ COMMANDS = {"quick": "test", "faults": "test-faults", "soak": "soak"}
 
 def _together(rows: dict[str, dict[str, float]], names: list[str]) -> str:
     """Cells of rows of one effort, commit and processor: how long their tests ran, their names."""
-    seconds = [rows[name]["seconds"] for name in names if "seconds" in rows[name]]
-    took = f"{sum(seconds):.0f}" if len(seconds) == len(names) else "–"
-    return f"{took} | {', '.join(f'`{name}`' for name in names)}"
+    took = sum(rows[name]["seconds"] for name in names)
+    return f"{took:.0f} | {', '.join(f'`{name}`' for name in names)}"
 
 
 PAGES = {
