@@ -4,6 +4,7 @@ the same seed gives the same results wherever the work runs, and whoever dies in
 
 import hashlib
 import math
+import shutil
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -25,6 +26,7 @@ from constraint_geodesics.benchmark.runner import (
     rows_to_do,
     run_batch,
 )
+from constraint_geodesics.bundle import PACKAGED
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.learning.dataset import Shard, ShardTask, draw_shard, shard_tasks
 from constraint_geodesics.params import ComputeParams, Params
@@ -102,7 +104,10 @@ def seeds(params: Params, folder: Path, number: int) -> list[Job]:
 
 
 def batches(scene: Scene, params: Params, folder: Path, number: int) -> list[QueryBatch]:
-    """The benchmark's own planners on its own queries, one a batch."""
+    """The benchmark's own planners on its own queries, one a batch.  folder: of their rows, and of
+    the planner's files, where the pipeline would have them.
+    """
+    shutil.copytree(PACKAGED, folder / "data" / "planner", dirs_exist_ok=True)
     manifold = constraint_manifold(scene.robot, params.constraints[CONSTRAINT])
     asked = [
         query
@@ -116,7 +121,7 @@ def batches(scene: Scene, params: Params, folder: Path, number: int) -> list[Que
             manifold=manifold,
             queries=(query,),
             baselines=planners,
-            build=BaselineBuilder(params, ROOT),
+            build=BaselineBuilder(params, folder),
             judge=params.judge,
             file=folder / f"{place}.jsonl",
         )
