@@ -80,14 +80,14 @@ def test_the_files_lie_in_the_folder_under_their_contents(folder) -> None:
     assert str(folder) not in (folder / CARD).read_text()
 
 
-def a_robot(folder: Path, visual: str, drawn: Path) -> Path:
+def a_robot(folder: Path, drawn: Path) -> Path:
     """A copy of the tests' robots; one's URDF shows a mesh besides."""
+    assert drawn.is_file()
     shutil.copytree(ROBOTS, folder / "robots")
     urdf = folder / "robots" / "six_axis.urdf"
-    shown = f'<visual><geometry><mesh filename="{visual}"/></geometry></visual>'
+    shown = f'<visual><geometry><mesh filename="{drawn}"/></geometry></visual>'
     head, mark, rest = urdf.read_text().partition("<collision>")
     urdf.write_text(head + shown + mark + rest)
-    assert drawn.is_file()
     return urdf
 
 
@@ -99,7 +99,7 @@ def test_a_file_that_is_no_mesh_is_not_handed_on(name, tmp_path) -> None:
     secret = tmp_path / "secret"
     secret.write_text("v 1 2\nhunter2\n")
     os.symlink(secret, tmp_path / name)
-    urdf = a_robot(tmp_path, str(tmp_path / name), tmp_path / name)
+    urdf = a_robot(tmp_path, tmp_path / name)
     os.symlink(secret, tmp_path / "robots" / "wrist.mtl")
     with Planner.from_urdf(urdf, "tool") as planner:
         planner.bundle.write(tmp_path / "planner")
@@ -110,7 +110,7 @@ def test_a_file_that_is_no_mesh_is_not_handed_on(name, tmp_path) -> None:
 
 def test_what_is_shown_is_handed_on(tmp_path) -> None:
     write_bricks(tmp_path / "cover.stl", [Brick((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))])
-    urdf = a_robot(tmp_path, str(tmp_path / "cover.stl"), tmp_path / "cover.stl")
+    urdf = a_robot(tmp_path, tmp_path / "cover.stl")
     with Planner.from_urdf(urdf, "tool") as planner:
         planner.bundle.write(tmp_path / "planner")
     assert [file.name for file in (tmp_path / "planner").rglob("cover.*")] == ["cover.stl"]

@@ -15,9 +15,7 @@ from typing import Any
 from constraint_geodesics.params import RobotParams
 from constraint_geodesics.robot.arm_file import digest_of
 from constraint_geodesics.robot.description import find_mesh
-from constraint_geodesics.robot.kinematics import RobotError
-from constraint_geodesics.scene.collada import as_obj
-from constraint_geodesics.scene.pieces import read_mesh
+from constraint_geodesics.scene.triangles import read_triangles
 from constraint_geodesics.text_files import read_content
 from constraint_geodesics.xml_files import read_xml
 
@@ -105,8 +103,8 @@ def _is_mesh(file: Path) -> bool:
     lies in the folder is handed on.
     """
     try:
-        (as_obj if file.suffix.lower() == ".dae" else read_mesh)(file)
-    except (OSError, ValueError, RobotError):
+        read_triangles(file, digest_of(read_content(file)))
+    except (OSError, ValueError):
         return False
     return True
 
