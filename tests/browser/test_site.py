@@ -69,7 +69,7 @@ def test_the_night_can_be_chosen_and_is_kept(browser: "Browser", site: Path) -> 
     [
         ("plan_batch", "api_planner.html#constraint_geodesics.Planner.plan_batch"),
         ("PointCloud", "api_scene.html#constraint_geodesics.PointCloud"),
-        ("braking distance", "scenes.html"),
+        ("braking distance", "scenes.html#obstacles-that-appear"),
     ],
 )
 def test_the_search_finds_a_word_without_a_server(
@@ -81,10 +81,10 @@ def test_the_search_finds_a_word_without_a_server(
         page.wait_for_load_state("networkidle")
         page.locator("input[name=query]").click()
         page.locator("input[name=query]").press_sequentially(words)  # the theme listens to keys
-        found = page.locator("a.md-search-result__link")
-        until(lambda: found.count() > 0, f"{words} is found")
-        leads = [link.get_attribute("href") or "" for link in found.all()]
-        assert any(where in link for link in leads), leads
+        file, place = where.split("#")  # the words to be marked stand between them
+        link = f'a.md-search-result__link[href*="{file}"][href$="#{place}"]'
+        found = page.locator(link)
+        until(lambda: found.count() > 0, f"{words} is found in {where}")
         found.first.click()
         page.wait_for_load_state("networkidle")
         assert not traffic.outside

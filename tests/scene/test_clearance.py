@@ -22,8 +22,10 @@ from constraint_geodesics.scene.clearance import (
     clearance_batch,
     clearance_model,
     contact_row,
+    near_again,
     near_contacts,
     new_contacts,
+    new_nearby,
     path_stays_clear,
 )
 from constraint_geodesics.scene.convex_kernels import REACH
@@ -137,6 +139,31 @@ def distance_of(
     count = near_contacts(robot.chain, model, q, 0.11, room)
     own = room.found[:count, PAIR] == contact[PAIR]
     return float(room.found[:count][own, DISTANCE][0]) if own.any() else np.nan
+
+
+@SCENES
+def test_contacts_that_are_asked_for_again_are_all_that_there_are(
+    request: pytest.FixtureRequest, name: str, shapes: tuple
+) -> None:
+    """Along walks of small steps and great ones."""
+    robot: SerialRobot = request.getfixturevalue(name)
+    model, rng, found = clearance_model(Scene(robot, shapes)).arrays, np.random.default_rng(3), 0
+    room, kept = new_contacts(model, robot.dof), new_contacts(model, robot.dof)
+    nearby = new_nearby(model, 4, robot.dof)
+    places = robot.sample(4, rng)
+    for step in (*rng.uniform(0.0, 0.1, 60), 1.0, *rng.uniform(0.0, 0.02, 60)):
+        places = places + step * rng.uniform(-1.0, 1.0, places.shape)
+        for k, q in enumerate(places):
+            count = near_contacts(robot.chain, model, q, 0.05, room)
+            again = near_again(robot.chain, model, q, 0.05, kept, nearby, k)
+            told = [room.found[:count], kept.found[:again]]
+            apart = [own[own[:, DISTANCE] > 1e-6, DISTANCE] for own in told]
+            np.testing.assert_allclose(*apart, rtol=0.0, atol=1e-6)
+            # how deep pieces overlap hangs on the direction that was looked along before
+            pairs = [set(model.pairs[own[:, PAIR].astype(int), 0]) for own in told]
+            assert pairs[0] == pairs[1]
+            found += count
+    assert found > 100
 
 
 @SCENES

@@ -38,7 +38,7 @@ from constraint_geodesics.search.curve_kernels import (
     rows_along,
     spline_through,
 )
-from constraint_geodesics.search.push_kernels import new_push, penalise
+from constraint_geodesics.search.push_kernels import new_push, new_samples, penalise
 from constraint_geodesics.search.space import Space, space_of
 
 MARGIN = 0.006
@@ -569,7 +569,14 @@ def test_the_penalty_is_none_of_what_is_far_and_its_slopes_are_those_of_differen
         if apart.min() < 0.005:  # of what overlaps the direction is one of a few
             continue
         push = new_push(line)
-        value = penalise(walled, margin, line, push, room)
+        samples_seen = new_samples(walled, line)
+        value = penalise(walled, margin, line, push, room, samples_seen, 0.0, np.inf)
+        if value > 0.0:  # no more is told of what is too much
+            enough = penalise(
+                walled, margin, line, push, room, samples_seen, 1.0, 1.0 + 0.5 * value
+            )
+            assert 1.0 + 0.5 * value <= enough <= 1.0 + value
+            penalise(walled, margin, line, push, room, samples_seen, 0.0, np.inf)
         assert (value > 0.0) == (apart.min() < margin)
         far += value == 0.0
         slopes = push.slopes[1:-1].copy()
@@ -580,7 +587,10 @@ def test_the_penalty_is_none_of_what_is_far_and_its_slopes_are_those_of_differen
             there, back = line.copy(), line.copy()
             there[node, joint] += 1e-4
             back[node, joint] -= 1e-4
-            values = [penalise(walled, margin, nodes, push, room) for nodes in (there, back)]
+            values = [
+                penalise(walled, margin, nodes, push, room, samples_seen, 0.0, np.inf)
+                for nodes in (there, back)
+            ]
             ahead, behind = (values[0] - value) / 1e-4, (value - values[1]) / 1e-4
             # where other corners come nearest there are two slopes
             assert min(ahead, behind) - allowed <= slopes[node - 1, joint]
@@ -592,7 +602,7 @@ def test_what_pushes_a_band_curves_it_upwards(spaces, walled) -> None:
     room, seen = new_contacts(walled.clearance, HOME.size), 0
     for line, _ in blocked_lines(spaces, walled, 6):
         push, dof = new_push(line), HOME.size
-        penalise(walled, 0.02, line, push, room)
+        penalise(walled, 0.02, line, push, room, new_samples(walled, line), 0.0, np.inf)
         whole = np.zeros((len(line), dof, len(line), dof))
         for i in range(len(line)):
             whole[i, :, i] = push.curvatures[i]

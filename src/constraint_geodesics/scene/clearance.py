@@ -34,6 +34,8 @@ _CONTACT = 8
 _OVERLAPPING = 1e-7
 FINEST_M = 0.001
 """Motion over which a line is looked at no closer: the certificate does."""
+SLACK_M = 0.1
+"""How much further away pairs are kept in mind, at configurations that are asked about again."""
 _DEEPEST = 32
 _SIGNS = [(x, y, z) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) for z in (-1.0, 0.0, 1.0)]
 _TRIED = np.array([np.divide(s, np.linalg.norm(s)) for s in _SIGNS if any(s)])
@@ -54,7 +56,8 @@ class ClearanceArrays(NamedTuple):
 class Contacts(NamedTuple):
     """What the kernels write into: nodes and pairs of their own, frames (D + 1, 12), joint
     origins and axes (D, 3), and `found` (P, 8), the contacts by the columns above; a point (D,) of
-    a line, and its parts that are still looked at.
+    a line, and its parts that are still looked at.  all_pairs (P,): of bodies, in their order;
+    reach (D,): how far anything gets from each axis at most [m], 1 for a prismatic joint.
     """
 
     nodes: np.ndarray
@@ -66,6 +69,8 @@ class Contacts(NamedTuple):
     found: np.ndarray
     point: np.ndarray
     parts: np.ndarray
+    all_pairs: np.ndarray
+    reach: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -155,6 +160,10 @@ def _reach(robot: SerialRobot, piece: Piece, frame: int) -> Float[np.ndarray, "D
 @njit(**COMPILE)
 def new_contacts(model, dof):
     """What the kernels write into."""
+    reach = np.zeros(dof)
+    for node in model.nodes:
+        for j in range(dof):
+            reach[j] = max(reach[j], node[convex.REACH + j])
     return Contacts(
         model.nodes.copy(),
         model.pairs.copy(),
@@ -165,6 +174,28 @@ def new_contacts(model, dof):
         np.empty((max(model.pairs.shape[0], 1), _CONTACT)),
         np.empty(dof),
         np.empty((_DEEPEST, 2)),
+        np.arange(model.top),
+        reach,
+    )
+
+
+class Nearby(NamedTuple):
+    """Pairs of bodies that may be near at K configurations: where these were when the pairs were
+    sought, seen (K, D), nan for never; how many there are, counts (K,), and which, listed (K, P).
+    """
+
+    seen: np.ndarray
+    counts: np.ndarray
+    listed: np.ndarray
+
+
+@njit(**COMPILE)
+def new_nearby(model, count, dof):
+    """Of so many configurations, for `near_again`."""
+    return Nearby(
+        np.full((count, dof), np.nan),
+        np.zeros(count, np.int64),
+        np.empty((count, model.top), np.int64),
     )
 
 
@@ -202,7 +233,7 @@ def _place(chain, q, room):
 def _shallowest(bodies, frames, p, simplex):
     """How deep a pair of pieces overlaps, as a distance below 0, in the direction in which it is
     least of those that are tried, which becomes the pair's; the second's deepest point into
-    `simplex`.
+    `simplex`.  Directions along which the middle of the second alone is deeper are not tried.
     """
     hulls, nodes, pairs = bodies
     a, b = int(pairs[p, 0]), int(pairs[p, 1])
@@ -227,6 +258,14 @@ def _shallowest(bodies, frames, p, simplex):
         else:
             at, sign = convex.BOX + 3 + (k - count) // 2, 1.0 if k % 2 == 0 else -1.0
             n = (sign * nodes[a, at], sign * nodes[a, at + 3], sign * nodes[a, at + 6])
+        beyond = n[0] * x + n[1] * y + n[2] * z
+        if box:
+            for i in range(3):
+                at = convex.BOX + 3 + i
+                along = n[0] * nodes[a, at] + n[1] * nodes[a, at + 3] + n[2] * nodes[a, at + 6]
+                beyond -= nodes[a, convex.BOX + i] * abs(along)
+        if beyond <= most:
+            continue
         value = convex.gap_along(bodies, frames, p, n)
         if value > most:
             best, most = n, value
@@ -270,11 +309,41 @@ def near_contacts(chain, model, q, far, room):
     """The contacts of one configuration that are nearer than `far` [m] into `room`, the nearest
     first, one for each pair of bodies; returns how many.
     """
+    _place(chain, q, room)
+    return _near_of(model, far, room, room.all_pairs)
+
+
+@njit(**LEAF)
+def near_again(chain, model, q, far, room, nearby, k):
+    """The same for the k-th of configurations that are asked about again and again, a little moved,
+    with the same `far`: only pairs are looked at that were within SLACK_M of it where they were
+    sought last, until a body may have moved by as much.
+    """
+    seen, moved = nearby.seen[k], 0.0
+    for d in range(q.shape[0]):
+        moved += abs(q[d] - seen[d]) * room.reach[d]
+    _place(chain, q, room)
+    listed = nearby.listed[k]
+    if not moved < SLACK_M:  # nan where they never were
+        nodes, pairs, count = room.nodes, room.pairs, 0
+        for d in range(q.shape[0]):
+            seen[d] = q[d]
+        for body in range(model.top):
+            a, b = int(pairs[body, 0]), int(pairs[body, 1])
+            if convex.roughly_apart(nodes, a, b) < far + SLACK_M:
+                listed[count] = body
+                count += 1
+        nearby.counts[k] = count
+    return _near_of(model, far, room, listed[: nearby.counts[k]])
+
+
+@njit(**LEAF)
+def _near_of(model, far, room, listed):
+    """The contacts of those pairs of bodies (k,) at the place that `room` has."""
     nodes, pairs, frames, found = room.nodes, room.pairs, room.frames, room.found
     simplex, bodies = room.simplex, (model.hulls, room.nodes, room.pairs)
-    _place(chain, q, room)
     count = 0
-    for body in range(model.top):
+    for body in listed:
         if convex.roughly_apart(nodes, int(pairs[body, 0]), int(pairs[body, 1])) >= far:
             continue
         least = far
@@ -354,7 +423,9 @@ def stays_clear(chain, model, first, second, room):
             middle, moves = 0.5 * (start + end), motion * (end - start)
             for d in range(dof):
                 q[d] = first[d] + middle * (second[d] - first[d])
-            _place(chain, q, room)
+            _place_frames(chain, q, frames, room.origins, room.axes)
+            for side in range(2):
+                convex.place_ball(nodes, frames, int(pairs[p, side]))
             apart = _apart(bodies, frames, simplex, p, moves)
             if apart < 0:
                 return False
@@ -409,8 +480,10 @@ def clearance_batch(chain, model, far, q, smallest):
 @njit(**COMPILE)
 def path_stays_clear(chain, model, q):
     """Whether nothing overlaps on the straight joint lines between configurations (T, D)."""
-    room = new_contacts(model, q.shape[1])
+    room, lines = new_contacts(model, q.shape[1]), q.shape[0] - 1
     clear = True
-    for b in range(q.shape[0] - 1):
+    for b in range(lines // 2, lines):  # what meets something mostly does in the middle
+        clear = clear and stays_clear(chain, model, q[b], q[b + 1], room)
+    for b in range(lines // 2 - 1, -1, -1):
         clear = clear and stays_clear(chain, model, q[b], q[b + 1], room)
     return clear

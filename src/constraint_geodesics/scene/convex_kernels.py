@@ -251,15 +251,21 @@ def pieces_of(pairs, body):
     return (first, last) if first < last else (body, body + 1)
 
 
+@njit(inline="always", **LEAF)
+def place_ball(nodes, frames, i):
+    """The centre of a node's ball into `nodes`."""
+    f = int(nodes[i, FRAME])
+    x, y, z = turned(frames, f, nodes[i, BALL], nodes[i, BALL + 1], nodes[i, BALL + 2])
+    nodes[i, PLACE] = frames[f, 0] + x
+    nodes[i, PLACE + 1] = frames[f, 1] + y
+    nodes[i, PLACE + 2] = frames[f, 2] + z
+
+
 @njit(**LEAF)
 def place_balls(nodes, frames):
     """The balls' centres into `nodes`."""
     for i in range(nodes.shape[0]):
-        f = int(nodes[i, FRAME])
-        x, y, z = turned(frames, f, nodes[i, BALL], nodes[i, BALL + 1], nodes[i, BALL + 2])
-        nodes[i, PLACE] = frames[f, 0] + x
-        nodes[i, PLACE + 1] = frames[f, 1] + y
-        nodes[i, PLACE + 2] = frames[f, 2] + z
+        place_ball(nodes, frames, i)
 
 
 @njit(inline="always", **COMPILE)

@@ -30,8 +30,8 @@ from constraint_geodesics.constraints.kernels import (
 )
 from constraint_geodesics.constraints.projection import normal_matrix
 from constraint_geodesics.robot.kernels import LANES
-from constraint_geodesics.scene.clearance import Contacts, new_contacts
-from constraint_geodesics.search.push_kernels import Push, new_push, penalise
+from constraint_geodesics.scene.clearance import Contacts, Nearby, new_contacts
+from constraint_geodesics.search.push_kernels import Push, new_push, new_samples, penalise
 from constraint_geodesics.search.space import (
     NEAR,
     Workspace,
@@ -365,18 +365,25 @@ def reduced(space, q, which, gradient, basis, hessian, onto, work):
 
 
 @njit(**LEAF)
-def _coupling(band, i, a, b):
-    """An entry of the block between node i and the one before: −N_iᵀ N_{i−1}, and what pushes their
-    line.
+def _couple(band, i):
+    """The block between node i and the one before, N_iᵀ (X − 1) N_{i−1} with what pushes their line
+    in X, into `band.couplings`.
     """
-    dof, push, value = band.gradients.shape[1], band.push, 0.0
+    bases, cross, size, before = band.bases, band.cross, band.counts[i], band.counts[i - 1]
+    dof, touched, crosses = bases.shape[1], band.push.touched[i], band.push.crosses[i]
     for d in range(dof):
-        value -= band.bases[i, d, a] * band.bases[i - 1, d, b]
-    if push.touched[i]:
-        for d in range(dof):
+        for b in range(before):
+            cross[d, b] = -bases[i - 1, d, b]
+        if touched:
             for e in range(dof):
-                value += band.bases[i, d, a] * push.crosses[i, d, e] * band.bases[i - 1, e, b]
-    return value
+                for b in range(before):
+                    cross[d, b] += crosses[d, e] * bases[i - 1, e, b]
+    for a in range(size):
+        for b in range(before):
+            band.couplings[i, a, b] = 0.0
+        for d in range(dof):
+            for b in range(before):
+                band.couplings[i, a, b] += bases[i, d, a] * cross[d, b]
 
 
 @njit(**LEAF)
@@ -397,9 +404,8 @@ def _newton(band, m, shift):
         if i > 0:
             # couplings[i]: L_{i,i−1}, of node i to node i − 1
             before = counts[i - 1]
+            _couple(band, i)
             for a in range(size):
-                for b in range(before):
-                    couplings[i, a, b] = _coupling(band, i, a, b)
                 forward(factors[i - 1], before, couplings[i, a])
             for a in range(size):
                 for b in range(size):
@@ -447,7 +453,7 @@ class _Band(NamedTuple):
     """What the m inner nodes of a band have: bases, hessians, factors, couplings (m, D, D), counts
     (m,), gradients, right, steps, onto (m, D); shares, left (m,) of `project_all`; trial (m + 2, D)
     with what pushes it, and what pushes the band; held (m + 2,); blocked, still (m + 1,): the lines
-    that touch something, and those of the trial.
+    that touch something, and those of the trial; samples: of what pushes; cross (D, D).
     """
 
     bases: np.ndarray
@@ -468,6 +474,8 @@ class _Band(NamedTuple):
     blocked: np.ndarray
     still: np.ndarray
     contacts: Contacts
+    samples: Nearby
+    cross: np.ndarray
 
 
 @njit(**COMPILE)
@@ -493,6 +501,8 @@ def _new_band(around, nodes):
         np.zeros(m + 1, dtype=np.bool_),
         np.zeros(m + 1, dtype=np.bool_),
         new_contacts(around.clearance, dof),
+        new_samples(around, nodes),
+        np.empty((dof, dof)),
     )
 
 
@@ -581,18 +591,20 @@ def _promise(nodes, band):
 
 
 @njit(**LEAF)
-def _valued(around, margin, nodes, push, contacts):
-    """Energy and penalty of a band, whose derivatives are written into `push`."""
+def _valued(around, margin, nodes, push, band, most):
+    """Energy and penalty of a band, whose derivatives are written into `push`; any value from
+    `most` on where it is no less.
+    """
     energy = band_energy(nodes)
-    if around.clearance.top > 0:
-        energy += penalise(around, margin, nodes, push, contacts)
-    return energy
+    if around.clearance.top == 0:
+        return energy
+    return penalise(around, margin, nodes, push, band.contacts, band.samples, energy, most)
 
 
 @njit(inline="always", **COMPILE)
-def _moved(space, around, nodes, scale, settings, band, work):
+def _moved(space, around, nodes, scale, settings, band, work, most):
     """The nodes after a share of the steps, projected, into `band.trial`; returns what remains of
-    the violation, and the value.
+    the violation, and the value, or any from `most` on.
     """
     trial, n = band.trial, nodes.shape[0] - 1
     _, projection, _, _, margin, guarded = settings
@@ -602,7 +614,7 @@ def _moved(space, around, nodes, scale, settings, band, work):
     left = project_all(space, trial[1:n], band.shares, projection, band.left, work)
     if guarded:
         _hold_back(around, nodes, band)
-    return left, _valued(around, margin, trial, band.pushed, band.contacts)
+    return left, _valued(around, margin, trial, band.pushed, band, most)
 
 
 @njit(inline="always", **COMPILE)
@@ -631,7 +643,7 @@ def relax_band(space, around, nodes, settings):
     work, band = new_work(space), _new_band(around, nodes)
     used, converged, reach = 0, False, largest
     worst = project_all(space, nodes[1:n], band.shares, projection, band.left, work.node)
-    value = _valued(around, margin, nodes, band.push, band.contacts)
+    value = _valued(around, margin, nodes, band.push, band, np.inf)
     if guarded:
         for i in range(n):
             band.blocked[i] = not is_free(around, nodes[i], nodes[i + 1], band)
@@ -651,7 +663,7 @@ def relax_band(space, around, nodes, settings):
         scale, improved, at_once = min(1.0, reach / longest) if longest > 0.0 else 1.0, False, True
         enough = max(worst, 1e-6)
         for _ in range(6):
-            left, after = _moved(space, around, nodes, scale, settings, band, work.node)
+            left, after = _moved(space, around, nodes, scale, settings, band, work.node, value)
             if after < value and left <= enough:
                 improved = True
                 break

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
-from constraint_geodesics.scene.clearance import DISTANCE, contact_row, near_contacts
+from constraint_geodesics.scene.clearance import DISTANCE, contact_row, near_again, new_nearby
 from constraint_geodesics.search.space import STILL
 
 SAMPLES = 2
@@ -52,6 +52,12 @@ def new_push(nodes):
     )
 
 
+@njit(**COMPILE)
+def new_samples(around, nodes):
+    """What is kept in mind of the samples of a band of these nodes."""
+    return new_nearby(around.clearance, (nodes.shape[0] - 1) * SAMPLES, nodes.shape[1])
+
+
 @njit(**LEAF)
 def _share_out(push, i, share, slope, stiffness):
     """Add a sample's slope along `push.row` and its stiffness to the nodes of line i."""
@@ -71,10 +77,11 @@ def _share_out(push, i, share, slope, stiffness):
 
 
 @njit(**LEAF)
-def penalise(around, margin, nodes, push, contacts):
-    """P of a band's nodes (n + 1, D), with its derivatives into `push`.
+def penalise(around, margin, nodes, push, contacts, samples, energy, most):
+    """Energy and P of a band's nodes (n + 1, D), with the derivatives of P into `push`; any value
+    from `most` on, and no derivatives, where it is no less.
 
-    around: a Space with what may meet.
+    around: a Space with what may meet.  samples: of `new_samples`.  energy: of the nodes.
     """
     n, sample, total = nodes.shape[0] - 1, push.sample, 0.0
     push.slopes[:] = 0.0
@@ -86,11 +93,13 @@ def penalise(around, margin, nodes, push, contacts):
         i, share = k // SAMPLES, (k % SAMPLES) / SAMPLES
         for d in range(nodes.shape[1]):
             sample[d] = (1.0 - share) * nodes[i, d] + share * nodes[i + 1, d]
-        near = near_contacts(around.chain, around.clearance, sample, margin, contacts)
+        near = near_again(around.chain, around.clearance, sample, margin, contacts, samples, k)
         for c in range(near):
             short = margin - contacts.found[c, DISTANCE]
             if contact_row(around.chain.prismatic, contacts, c, push.row) < STILL:
                 continue
             total += 0.5 * weight * short * short
             _share_out(push, i, share, -weight * short, weight)
-    return total
+        if energy + total >= most:
+            break
+    return energy + total
