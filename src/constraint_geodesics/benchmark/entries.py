@@ -78,8 +78,8 @@ def committed_run(params: Params, layout: Layout, rows: Path, recordings: Path) 
     """
     if not (layout.planner / "planner.json").is_file():
         raise BaselineError(
-            "data/planner is missing, which the benchmark's planners are made of: run `make "
-            "repro` first"
+            "data/planner is missing, which the benchmark's planners are made of: `dvc repro "
+            "build_planner` makes it, `make repro` what is learned too"
         )
     queries = [
         query
