@@ -43,7 +43,9 @@ def test_projection_pushes_what_is_drawn_out_of_a_pillar(blank_diffusion: PathDi
         known = world.is_free, clearance, certifier.collisions.is_clear
         asked = PlanningProblem(start, goal, free, *known)
         assert not asked.keeps_clear(np.linspace(start, goal, 50))
-        found = DiffusionPlanner(blank_diffusion, PathDiffusionSettings(proposals=64)).plan(asked, 0)
+        found = DiffusionPlanner(blank_diffusion, PathDiffusionSettings(proposals=64)).plan(
+            asked, 0
+        )
         assert_sound(found, asked, certifier)
 
 
