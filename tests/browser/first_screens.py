@@ -37,8 +37,8 @@ SIZES: dict[str, dict[str, Any]] = {
 }
 STYLE = """
 :root { color-scheme: light dark }
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 56rem; margin: 2rem auto; padding: 0 1rem }
-body { overflow-wrap: anywhere }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 56rem; margin: 2rem auto; padding: 0 1rem;
+  overflow-wrap: anywhere }
 img { max-width: 100% } table { border-collapse: collapse; display: block; overflow-x: auto }
 td, th { border: 1px solid #8888; padding: .3rem .8rem }
 pre, code { background: #8882; border-radius: 6px } pre { padding: 1rem; overflow: auto }

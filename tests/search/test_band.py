@@ -569,14 +569,12 @@ def test_the_penalty_is_none_of_what_is_far_and_its_slopes_are_those_of_differen
         if apart.min() < 0.005:  # of what overlaps the direction is one of a few
             continue
         push = new_push(line)
-        samples_seen = new_samples(walled, line)
-        value = penalise(walled, margin, line, push, room, samples_seen, 0.0, np.inf)
+        asked = push, room, new_samples(walled, line)
+        value = penalise(walled, margin, line, *asked, 0.0, np.inf)
         if value > 0.0:  # no more is told of what is too much
-            enough = penalise(
-                walled, margin, line, push, room, samples_seen, 1.0, 1.0 + 0.5 * value
-            )
+            enough = penalise(walled, margin, line, *asked, 1.0, 1.0 + 0.5 * value)
             assert 1.0 + 0.5 * value <= enough <= 1.0 + value
-            penalise(walled, margin, line, push, room, samples_seen, 0.0, np.inf)
+            penalise(walled, margin, line, *asked, 0.0, np.inf)
         assert (value > 0.0) == (apart.min() < margin)
         far += value == 0.0
         slopes = push.slopes[1:-1].copy()
@@ -587,10 +585,7 @@ def test_the_penalty_is_none_of_what_is_far_and_its_slopes_are_those_of_differen
             there, back = line.copy(), line.copy()
             there[node, joint] += 1e-4
             back[node, joint] -= 1e-4
-            values = [
-                penalise(walled, margin, nodes, push, room, samples_seen, 0.0, np.inf)
-                for nodes in (there, back)
-            ]
+            values = [penalise(walled, margin, at, *asked, 0.0, np.inf) for at in (there, back)]
             ahead, behind = (values[0] - value) / 1e-4, (value - values[1]) / 1e-4
             # where other corners come nearest there are two slopes
             assert min(ahead, behind) - allowed <= slopes[node - 1, joint]
