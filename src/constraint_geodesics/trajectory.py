@@ -107,10 +107,10 @@ class Trajectory:
     the end, and at the start unless there is a `start_velocity` [rad/s, or m/s of prismatic
     joints].  explanation: one line for people.  certificate: None without a path.
 
-    Of a motion under way an answer that is not "solved" has waypoints too: those of a stop, of
-    which nothing is known that it breaks where the status is "stopped" (its certificate is valid,
-    or None where `stop` drew waypoints anew); else the explanation says what, and so does
-    `certificate.violation` where there is a certificate.
+    Of a motion under way `replan`'s answer that is not "solved" has waypoints too where the arm can
+    stop on its path at all: those of the stop, of which nothing is known that it breaks where the
+    status is "stopped" (its certificate is valid, or None where `stop` drew waypoints anew); else
+    the explanation says what, and so does `certificate.violation` where there is a certificate.
     """
 
     status: Status
@@ -330,9 +330,14 @@ class Trajectory:
         if self.certificate is None:
             return None
         steps, start = step_lengths(motion.joints), motion.start_velocity
+        broken = self.certificate.violation
+        if broken is None:
+            broken = _broken_times(motion, self.asked.pace)
+        else:  # its row is one of the path's
+            broken = replace(broken, row=None, message=f"of the path: {broken.message}")
         return replace(
             self.certificate,
-            violation=self.certificate.violation or _broken_times(motion, self.asked.pace),
+            violation=broken,
             length_rad=float(steps.sum()),
             max_step_rad=float(steps.max()),
             goal_violation=np.nan,

@@ -24,6 +24,7 @@ from constraint_geodesics.learning.lift import as_executed, densify
 from constraint_geodesics.params import Params
 from constraint_geodesics.robot.kinematics import load_robot, rotation_from_rpy
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.scene.world import World
 
 LIMITS = Limits(acceleration_rad_s2=(20.0,) * 6)
@@ -193,6 +194,7 @@ def test_it_shares_with_the_search_the_bodies_and_their_distance_alone() -> None
         "REACH",
         "ROUNDING",
         "FRAME",
+        "MARGIN",
         "SIMPLEX",
         "VECTOR",
         "distance",
@@ -724,6 +726,61 @@ def test_a_velocity_at_the_start_must_not_lead_off_the_constraint(certifier, goo
         assert found.valid == valid, found.violation
         if not valid:
             assert "leads off the constraint" in found.violation.message
+
+
+def test_a_velocity_at_the_start_must_not_lead_out_of_a_tolerance(scene, certifier, good) -> None:
+    """Where nothing is broken yet, a little inside of it, and the line follows its edge."""
+    tilting = Constraint((0, 0, 0, 1, 1, 0), (0, 0, 0, 0.1, 0.1, 0), good.constraint.reference)
+    manifold = ConstraintManifold(scene.robot, tilting)
+    drawn = scene.robot.sample(2000, np.random.default_rng(0))
+    on_edge = retract(manifold, drawn)
+    starts = on_edge.joints[scene.robot.limit_distance(on_edge.joints) > 0.3]
+    turn, found = np.eye(6)[4], []
+    for q in starts:  # the fifth joint tilts the tool; the first turns all about the upright
+        rate = (manifold.violation(q + 1e-4 * turn) - manifold.violation(q)) / 1e-4
+        if rate > 0.5 and manifold.violation(q) < 1e-9:
+            found.append(q - 5e-4 * turn)
+    assert len(found) > 20
+    spin, seconds = np.eye(6)[0], 0.04
+    for q in found[:20]:
+        rows = q + 0.012 * np.arange(9)[:, None] * spin
+        times = seconds * np.arange(9)
+        for outward, valid in ((0.0, True), (0.35, False)):
+            velocity = 0.3 * spin + outward * turn
+            answer = certifier.certify(
+                rows, tilting, times=times, collisions=False, start_velocity=velocity
+            )
+            if valid:
+                assert answer.valid, answer.violation
+            else:
+                assert answer.violation.kind == "start_velocity"
+                assert "leads off the constraint" in answer.violation.message
+
+
+def test_an_arm_that_turns_into_its_path_is_looked_at_beside_it(scene, good) -> None:
+    """A ball where it goes while it turns, and the line alone does not."""
+    q, spin, aside = good.joints[0], np.eye(6)[5], np.eye(6)[0]
+    rows, times = q + 0.05 * np.arange(9)[:, None] * spin, 0.1 * np.arange(9)
+    velocity = 0.5 * spin + 0.19 * aside
+    beside = q + 0.025 * spin + 0.25 * 0.19 * 0.1 * aside
+    with Certifier(scene, LIMITS) as certifier:
+        places, there = certifier.tool_poses(np.stack([q, beside]))[:, :3]
+        way = (there - places) / np.linalg.norm(there - places)
+        alone = certifier.certify(rows, FREE, times=times, start_velocity=velocity)
+        assert alone.valid, alone.violation
+    near, far = 0.0, 0.3
+    while far - near > 3e-4:  # until it stands hardly beside the line
+        away = 0.5 * (near + far)
+        ball = Sphere("ball", tuple(places + away * way), 0.02)
+        with Certifier(replace(scene, workcell=(*scene.workcell, ball)), LIMITS) as certifier:
+            if certifier.certify(rows, FREE, times=times).valid:
+                far = away
+                answer = certifier.certify(rows, FREE, times=times, start_velocity=velocity)
+            else:
+                near = away
+    assert answer.violation.kind == "workcell_collision"
+    assert answer.violation.row == 0
+    assert answer.violation.message.startswith("as the arm turns into the line from row 0: ")
 
 
 def test_a_joint_that_moves_must_stop_before_its_limit(certifier, good) -> None:

@@ -116,6 +116,17 @@ def test_distances_are_pybullets(any_scene: Scene) -> None:
     assert seen > 300
 
 
+def test_limits_that_are_no_numbers_prove_nothing(scene: Scene) -> None:
+    with Certifier(scene) as certifier:
+        arrays = certifier.collisions.collider.arrays
+        for low, high in ((-np.inf, np.inf), (np.nan, 1.0)):
+            limits = np.array([[low] * 6, [high] * 6])
+            assert not any(
+                kernels.never_meets(arrays, body, limits, MARGIN_M, 1000)
+                for body in range(arrays.top)
+            )
+
+
 def test_pairs_that_are_left_out_never_meet(any_scene: Scene) -> None:
     with Certifier(any_scene) as certifier, any_scene.world() as world:
         named = certifier.collisions.collider.apart
@@ -446,6 +457,47 @@ def test_boxes_are_as_sharp_as_they_are(scene: Scene) -> None:
         other = Box("other", (0.0, 0.0, 0.0), (edge, edge, edge))
         around = other.placed(Placement.of_matrix(link @ there))
         own = replace(scene, workcell=(*scene.workcell, around), attached=(carried,))
+        with Certifier(own) as certifier:
+            assert certifier.collisions.is_free(q) == free
+            assert (certifier.collisions.along(np.stack([q, q])).violation is None) == free
+
+
+@pytest.mark.parametrize(
+    ("turned", "overlap", "free"),
+    [(True, 3e-4, False), (True, -3e-4, True), (False, 3e-4, False), (False, 0.0, True)],
+)
+def test_boxes_that_never_move_against_each_other_are_as_sharp(
+    scene: Scene, turned: bool, overlap: float, free: bool
+) -> None:
+    """Two that one link carries: edge across edge, or face on face, which is no contact."""
+    edge, quarter = 0.1, 0.25 * np.pi
+    away = edge * np.sqrt(2.0) if turned else edge
+    rpy = ((0.0, 0.0, quarter), (0.0, quarter, 0.0)) if turned else ((0.0, 0.0, 0.0),) * 2
+    held = [
+        Attached(Box("one", (0.0, 0.0, 0.2), (edge,) * 3, rpy_rad=rpy[0]), "link6", ("other",)),
+        Attached(Box("another", (away - overlap, 0.0, 0.2), (edge,) * 3, rpy_rad=rpy[1]), "link6"),
+    ]
+    others = tuple(f"link{i}" for i in range(1, 6))
+    own = replace(scene, attached=tuple(replace(one, touching=others) for one in held))
+    q = np.array([0.3, -0.5, -1.2, 0.2, 0.5, 0.1])
+    with Certifier(own) as certifier:
+        found = certifier.collisions.along(np.stack([q, q])).violation
+        assert certifier.collisions.is_free(q) == free
+    assert (found is None) == free
+    assert free or found.message == "another and one touch at every configuration"
+
+
+def test_a_ball_that_grazes_the_corner_of_a_box_touches_it(scene: Scene) -> None:
+    """PyBullet rounds the corner off, and a ball's rounding is all of it matter."""
+    q, radius = np.array([0.3, -0.5, -1.2, 0.2, 0.5, 0.1]), 0.05
+    ball = Attached(Sphere("ball", (0.0, 0.0, 0.25), radius), "link6", ("link4", "link5"))
+    with scene.world() as world:
+        (link,) = world.link_poses(q, ["link6"])
+    centre = (link @ np.array([0.0, 0.0, 0.25, 1.0]))[:3]
+    for overlap, free in ((9e-5, False), (-9e-5, True)):
+        corner = centre + (radius - overlap) / np.sqrt(3.0)
+        around = Box("other", tuple(corner + 0.05), (0.1, 0.1, 0.1))
+        own = replace(scene, workcell=(around,), attached=(ball,))
         with Certifier(own) as certifier:
             assert certifier.collisions.is_free(q) == free
             assert (certifier.collisions.along(np.stack([q, q])).violation is None) == free

@@ -48,6 +48,20 @@ def test_it_is_the_chain_that_pybullet_loads(robot: SerialRobot) -> None:
     np.testing.assert_allclose(same, theirs[:, 3:], atol=1e-6)
 
 
+def test_an_axis_that_hardly_differs_from_minus_z_is_kept(tmp_path) -> None:
+    hinge = SLIDE.format(axis="4e-05 0 -0.9999999992").replace("prismatic", "revolute")
+    (tmp_path / "hinge.urdf").write_text(hinge.replace("0.5", "3"))
+    robot = load_robot(tmp_path / "hinge.urdf", "tool")
+    chain = read_chain(chain_of_urdf(robot.urdf, robot.tool_link, robot.joint_names), 1)
+    q = np.array([[2.0]])
+    position, rotation = robot.forward(q[0])
+    turned = poses(chain, q)[0]
+    np.testing.assert_allclose(turned[:3], position, atol=1e-12)
+    x, y, z, w = turned[3:]
+    axis = 2.0 * np.array([x * z + w * y, y * z - w * x, 0.5 - x * x - y * y])
+    np.testing.assert_allclose(axis, rotation[:, 2], atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("axis", "message"),
     [("0 0 0.5", "of length 0.5"), ("0 0 0", "of length 0"), ("0 1", "must be three numbers")],

@@ -22,6 +22,9 @@ from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.urdf import data_path
 
 ROBOTS = ["scene", "kuka_scene"]
+SLIDE = """<robot name="slide"><link name="base"/><link name="tool"/><joint name="slide"
+type="prismatic"><parent link="base"/><child link="tool"/><axis xyz="0 0 1"/>
+<origin xyz="0 0.1 0.2"/><limit lower="-0.5" upper="0.5" velocity="1"/></joint></robot>"""
 
 
 @pytest.mark.parametrize("place", range(3))
@@ -154,6 +157,23 @@ def test_rpy_turns_about_the_fixed_axes() -> None:
 def test_a_bad_description_is_named(urdf: str, link: str, limits: dict, message: str) -> None:
     with pytest.raises(RobotError, match=message):
         load_robot(data_path() / Path(urdf), link, limits)
+
+
+@pytest.mark.parametrize(
+    ("sound", "bad", "message"),
+    [
+        (
+            'lower="-0.5"',
+            'lower="-inf"',
+            "limits of joint 'slide' are -inf and 0.5: must be finite",
+        ),
+        ('xyz="0 0.1 0.2"', 'xyz="0 nan 0.2"', "the origin of a <joint> has numbers that are not"),
+    ],
+)
+def test_numbers_that_are_none_are_refused(tmp_path, sound: str, bad: str, message: str) -> None:
+    (tmp_path / "slide.urdf").write_text(SLIDE.replace(sound, bad))
+    with pytest.raises(RobotError, match=message):
+        load_robot(tmp_path / "slide.urdf", "tool")
 
 
 def test_wrong_number_of_joints(xarm) -> None:

@@ -13,6 +13,7 @@ by collision_kernels.py; joint limits hold between rows because they hold at bot
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import chain
 from typing import Any, NamedTuple, Self
 
@@ -39,8 +40,10 @@ from constraint_geodesics.scene.scene import Scene
 
 __all__ = ["Certificate", "CertificationError", "Certifier", "Limits", "Violation"]
 
-_SOON_S = (1e-4, 1e-3)
-"""After which a velocity at the start is looked at for where it leads."""
+_TURNED = np.array([0.25, 0.5, 0.75, 1.0])[:, None]
+"""Shares of the time in which an arm turns from its velocity into the first line, at which it is
+looked at.
+"""
 _LEFT = 1e-3
 """By how much the arm may leave the constraint [rad or m] while it turns into the first line."""
 _POSES = 24
@@ -192,6 +195,8 @@ class Certifier:
         asked, apart = time.perf_counter(), Separation(violation)
         if violation is None and collisions:
             apart = self.collisions.along(rows)
+            if apart.violation is None and moving.any():
+                apart = self._as_it_turns(apart, rows, moving, times)
         now = time.perf_counter()
         return Certificate(
             apart.violation,
@@ -280,17 +285,26 @@ class Certifier:
                 )
                 yield Violation("joint_limits", 0, float(beyond[joint]), allowed, text)
         with np.errstate(over="ignore", invalid="ignore"):
-            off = [self._off(q + soon * velocity, constraint, first) for soon in (0.0, *_SOON_S)]
-        for soon, found in zip(_SOON_S, off[1:], strict=True):
-            bent = 0.5 * (soon * float(np.abs(velocity).sum())) ** 2  # what curvature may add
-            rate = (found - off[0] - bent) / soon
-            left = 0.25 * rate * float(times[1] - times[0])  # it turns until the line's middle
-            if not left <= _LEFT:
-                text = (
-                    f"the velocity at row 0 leads off the constraint at {rate:.3g} rad/s or m/s: "
-                    f"it is left by {left:.3g} before the line is followed, {_LEFT:.3g} is allowed"
-                )
-                yield Violation("start_velocity", 0, left, _LEFT, text)
+            turned = _turned(path.rows, velocity, times)
+            left = float(np.max([self._off(q, constraint, first) for q in turned]))
+        if not left <= _LEFT:
+            text = (
+                f"the velocity at row 0 leads off the constraint: it is left by {left:.3g} rad or "
+                f"m before the line is followed, {_LEFT:.3g} is allowed"
+            )
+            yield Violation("start_velocity", 0, left, _LEFT, text)
+
+    def _as_it_turns(
+        self, apart: Separation, rows: np.ndarray, velocity: np.ndarray, times: Any
+    ) -> Separation:
+        """What was found on the lines, and beside the first one, where the arm turns into it."""
+        turn = np.concatenate([rows[:1], _turned(rows, velocity, times), rows[1:2]])
+        beside = self.collisions.along(turn)
+        if (found := beside.violation) is not None:
+            text = f"as the arm turns into the line from row 0: {found.message}"
+            return Separation(replace(found, row=0, message=text))
+        least = min(apart.clearance_m, beside.clearance_m)
+        return Separation(None, least, apart.asked + beside.asked)
 
     def _off(self, q: np.ndarray, constraint: Constraint, first: np.ndarray) -> float:
         """How far a configuration is off a constraint [rad or m]."""
@@ -362,6 +376,17 @@ class Certifier:
             f"limits, {allowed:.3g} is allowed"
         )
         return value, Violation("pose", None, value, allowed, text)
+
+
+def _turned(
+    rows: Float[np.ndarray, "T D"], velocity: Float[np.ndarray, "D"], times: Any
+) -> Float[np.ndarray, "n D"]:
+    """Where an arm is while its velocity changes, evenly, from that at the first row to the first
+    line's own in its middle.
+    """
+    half = 0.5 * float(times[1] - times[0])
+    line, passed = 0.5 * (rows[1] - rows[0]) / half, half * _TURNED
+    return rows[0] + passed * velocity + 0.5 * passed**2 / half * (line - velocity)
 
 
 def _largest(own: Float[np.ndarray, "n 7"], theirs: Float[np.ndarray, "n 7"]) -> float:

@@ -92,9 +92,12 @@ def _across(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _from_z_to(axis: np.ndarray) -> np.ndarray:
     """A unit quaternion that turns e_z to the direction of `axis`."""
     x, y, z = axis / np.sqrt((axis * axis).sum())
-    if z < -1.0 + 1e-9:
+    if z > 0.0:
+        q = np.array([1.0 + z, -y, x, 0.0])
+    elif x == 0.0 and y == 0.0:
         return np.array([0.0, 1.0, 0.0, 0.0])
-    q = np.array([1.0 + z, -y, x, 0.0])
+    else:  # the same, without what cancels
+        q = np.array([(x * x + y * y) / (1.0 - z), -y, x, 0.0])
     return q / np.sqrt((q * q).sum())
 
 

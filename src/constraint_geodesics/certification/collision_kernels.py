@@ -371,7 +371,7 @@ def never_meets(bodies, body, limits, margin, cells):
             lower, upper = convex.distance(own, frames, p, wanted, simplex)
             if upper - rounding <= margin:
                 return False
-            if lower <= margin + rounding + motion:
+            if not lower > margin + rounding + motion:  # nor where it is no number
                 free = False
                 break
         if free:

@@ -4,10 +4,12 @@ distances where two bodies come closer than the proof's margin.
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial import ConvexHull, QhullError
 
 from constraint_geodesics.certification import collision_kernels as kernels
 from constraint_geodesics.certification.certificate import Violation, malformed
@@ -232,11 +234,11 @@ class CollisionCheck:
 
     def _overlap(self, row: int) -> float:
         """How far a row of the table of pairs may overlap until it is a contact whatever PyBullet
-        says [m]: by the margin, where their roundings leave room for that.
+        says [m]: by the margin of the proof, where that is no more than those around the bodies.
         """
         arrays = self.collider.arrays
         ends = arrays.pairs[row, :2].astype(int)
-        return min(MARGIN_M, float(arrays.nodes[ends, convex.ROUNDING].sum()))
+        return min(MARGIN_M, float(arrays.nodes[ends, convex.MARGIN].sum()))
 
     def _reach(self, pair: float) -> Float[np.ndarray, "D"]:
         """How far the second body's points get from the axes of the joints that move the two."""
@@ -267,9 +269,10 @@ class CollisionCheck:
         if self._world is None:
             text = f"{second.name} and {first.name} are too close at every configuration"
             return _kind(first, second), None, text
-        # PyBullet knows meshes by their surfaces, and none of two of them
+        # PyBullet knows meshes by their surfaces, none of two of them, and rounds edges of boxes
         apart = self._world.distance(zeros, first.key, second.key, MARGIN_M)
-        if apart < 0.0 or near < -MARGIN_M:
+        beyond = near + self._overlap(row) - _depth_of_sharp(first, second)
+        if apart < 0.0 or beyond < -_ROUNDING_M:
             text = f"{second.name} and {first.name} touch at every configuration"
             return _kind(first, second), None, text
         return None
@@ -288,6 +291,22 @@ class CollisionCheck:
             f"of the way to the next, that no proof keeps them apart"
         )
         return malformed("clearance", row, text)
+
+
+def _depth_of_sharp(first: Body, second: Body) -> float:
+    """How deep pieces of two bodies overlap that have no rounding at all, and so no distance below
+    0 [m]: how far the origin is inside the hull of their differences.  0 where faces lie on each
+    other.
+    """
+    sharp = [[piece for piece in body.pieces if piece.rounding == 0.0] for body in (first, second)]
+    deepest = 0.0
+    for one, other in product(*sharp):
+        apart = (other.corners[None] - one.corners[:, None]).reshape(-1, 3)
+        try:
+            deepest = max(deepest, -float(ConvexHull(apart).equations[:, 3].max()))
+        except QhullError:
+            continue  # both flat, in one plane
+    return deepest
 
 
 def _listed(pairs: Iterable[tuple[str, ...]]) -> str:

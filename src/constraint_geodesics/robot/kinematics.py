@@ -236,7 +236,9 @@ def _attribute(joint: ElementTree.Element, child: str, name: str, urdf: Path) ->
 
 
 def origin_of(element: ElementTree.Element) -> Float[np.ndarray, "4 4"]:
-    """The transform that a URDF's joint, or a link's shape, gives as its origin."""
+    """The transform that a URDF's joint, or a link's shape, gives as its origin.  Raises RobotError
+    where that is no number.
+    """
     origin = element.find("origin")
     transform = np.eye(4)
     if origin is not None:
@@ -244,6 +246,8 @@ def origin_of(element: ElementTree.Element) -> Float[np.ndarray, "4 4"]:
             np.array([float(x) for x in origin.get("rpy", "0 0 0").split()])
         )
         transform[:3, 3] = [float(x) for x in origin.get("xyz", "0 0 0").split()]
+    if not np.isfinite(transform).all():
+        raise RobotError(f"the origin of a <{element.tag}> has numbers that are not finite")
     return transform
 
 
@@ -261,11 +265,11 @@ def _limits(joint: ElementTree.Element, urdf: Path) -> tuple[float, float, float
         return -np.pi, np.pi, float(limit.get("velocity", "inf")) if limit is not None else np.inf
     if limit is None or limit.get("lower") is None or limit.get("upper") is None:
         raise RobotError(f"{urdf}: joint {joint.get('name')!r} has no limits")
-    return (
-        float(limit.get("lower", "")),
-        float(limit.get("upper", "")),
-        float(limit.get("velocity", "inf")),
-    )
+    lower, upper = float(limit.get("lower", "")), float(limit.get("upper", ""))
+    if not np.isfinite([lower, upper]).all():
+        what = f"limits of joint {joint.get('name')!r} are {lower:g} and {upper:g}"
+        raise RobotError(f"{urdf}: {what}: must be finite, or the joint continuous")
+    return lower, upper, float(limit.get("velocity", "inf"))
 
 
 def _tightened(

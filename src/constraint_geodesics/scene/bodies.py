@@ -145,7 +145,8 @@ def block_of(pieces: Sequence[Piece], dof: int) -> _Block:
         corners = hull[own_places[:, None] + np.arange(3)]
         centre = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
         radius = np.linalg.norm(corners - centre, axis=1).max() + piece.rounding
-        row[kernels.ROUNDING], row[kernels.CORNER] = piece.rounding, size
+        row[kernels.ROUNDING], row[kernels.MARGIN] = piece.rounding, piece.margin
+        row[kernels.CORNER] = size
         hulls.append(hull)
         places.append(own_places + size)
         size += len(hull)
@@ -157,7 +158,9 @@ def block_of(pieces: Sequence[Piece], dof: int) -> _Block:
         rows.append(row)
     if len(pieces) > 1:
         own, whole = np.array(rows), rows[0].copy()
-        whole[kernels.ROUNDING], whole[kernels.BOX : kernels.PLACE] = own[:, 1].max(), -1.0
+        whole[kernels.ROUNDING] = own[:, kernels.ROUNDING].max()
+        whole[kernels.MARGIN] = own[:, kernels.MARGIN].min()
+        whole[kernels.BOX : kernels.PLACE] = -1.0
         all_corners = np.concatenate([piece.corners for piece in pieces])
         ball, size = slice(kernels.BALL, kernels.BALL + 3), kernels.BALL + 3
         whole[ball] = 0.5 * (all_corners.min(axis=0) + all_corners.max(axis=0))

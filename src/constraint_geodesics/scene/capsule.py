@@ -1,5 +1,6 @@
 """A capsule: a cylinder in any direction with a half sphere on either end, as a pipe or a post."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -28,21 +29,21 @@ class Capsule(Shape):
     exempt_links: tuple[str, ...] = ()
     kind: Literal["capsule"] = "capsule"
 
-    @property
+    @cached_property
     def length_m(self) -> float:
         """Of the line between its ends, without the half spheres."""
-        return float(np.linalg.norm(np.subtract(self.to_m, self.from_m)))
+        return math.dist(self.to_m, self.from_m)
 
     @cached_property
     def at(self) -> Placement:
         """Its middle, with the z axis along its line."""
         x, y, z = (0.5 * (a + b) for a, b in zip(self.from_m, self.to_m, strict=True))
-        return Placement((x, y, z), rpy_of(self._turn()))
+        return Placement((x, y, z), rpy_of(self._turn))
 
     def pieces(self) -> tuple[Piece, ...]:
         """A box with one edge, along the line, rounded by the radius."""
         half_edges = (0.0, 0.0, 0.5 * self.length_m)
-        return (RoundedBox(self.at.position_m, half_edges, self.radius_m, self._turn()).piece(),)
+        return (RoundedBox(self.at.position_m, half_edges, self.radius_m, self._turn).piece(),)
 
     def placed(self, at: Placement) -> "Capsule":
         """With its middle elsewhere, and its line along the z axis there."""
@@ -68,11 +69,18 @@ class Capsule(Shape):
         size = {"lengths": [self.length_m], "radii": [self.radius_m]}
         return rerun.Capsules3D(translations=[self.from_m], quaternions=[turn], **size, **style)
 
+    @cached_property
     def _turn(self) -> Float[np.ndarray, "3 3"]:
         """Turns the z axis into the direction of the line."""
         if not self.length_m > 0.0:
             return np.eye(3)
         axis = np.subtract(self.to_m, self.from_m) / self.length_m
-        across = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
+        across = _cross(np.eye(3)[np.abs(axis).argmin()], axis)
         across /= np.linalg.norm(across)
-        return np.column_stack([across, np.cross(axis, across), axis])
+        return np.column_stack([across, _cross(axis, across), axis])
+
+
+def _cross(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """`np.cross`, at a tenth of its cost."""
+    (x, y, z), (u, v, w) = a.tolist(), b.tolist()
+    return np.array([y * w - z * v, z * u - x * w, x * v - y * u])

@@ -56,8 +56,7 @@ class ClearanceArrays(NamedTuple):
 class Contacts(NamedTuple):
     """What the kernels write into: nodes and pairs of their own, frames (D + 1, 12), joint
     origins and axes (D, 3), and `found` (P, 8), the contacts by the columns above; a point (D,) of
-    a line, and its parts that are still looked at.  all_pairs (P,): of bodies, in their order;
-    reach (D,): how far anything gets from each axis at most [m], 1 for a prismatic joint.
+    a line, and its parts that are still looked at.  all_pairs (P,): of bodies, in their order.
     """
 
     nodes: np.ndarray
@@ -70,7 +69,6 @@ class Contacts(NamedTuple):
     point: np.ndarray
     parts: np.ndarray
     all_pairs: np.ndarray
-    reach: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -160,10 +158,6 @@ def _reach(robot: SerialRobot, piece: Piece, frame: int) -> Float[np.ndarray, "D
 @njit(**COMPILE)
 def new_contacts(model, dof):
     """What the kernels write into."""
-    reach = np.zeros(dof)
-    for node in model.nodes:
-        for j in range(dof):
-            reach[j] = max(reach[j], node[convex.REACH + j])
     return Contacts(
         model.nodes.copy(),
         model.pairs.copy(),
@@ -175,27 +169,33 @@ def new_contacts(model, dof):
         np.empty(dof),
         np.empty((_DEEPEST, 2)),
         np.arange(model.top),
-        reach,
     )
 
 
 class Nearby(NamedTuple):
     """Pairs of bodies that may be near at K configurations: where these were when the pairs were
     sought, seen (K, D), nan for never; how many there are, counts (K,), and which, listed (K, P).
+    reach (D,): how far anything gets from each axis at most [m], 1 for a prismatic joint.
     """
 
     seen: np.ndarray
     counts: np.ndarray
     listed: np.ndarray
+    reach: np.ndarray
 
 
 @njit(**COMPILE)
 def new_nearby(model, count, dof):
     """Of so many configurations, for `near_again`."""
+    reach = np.zeros(dof)
+    for node in model.nodes:
+        for j in range(dof):
+            reach[j] = max(reach[j], node[convex.REACH + j])
     return Nearby(
         np.full((count, dof), np.nan),
         np.zeros(count, np.int64),
         np.empty((count, model.top), np.int64),
+        reach,
     )
 
 
@@ -321,7 +321,7 @@ def near_again(chain, model, q, far, room, nearby, k):
     """
     seen, moved = nearby.seen[k], 0.0
     for d in range(q.shape[0]):
-        moved += abs(q[d] - seen[d]) * room.reach[d]
+        moved += abs(q[d] - seen[d]) * nearby.reach[d]
     _place(chain, q, room)
     listed = nearby.listed[k]
     if not moved < SLACK_M:  # nan where they never were

@@ -20,6 +20,8 @@ from constraint_geodesics.compiled import COMPILE, LEAF
 FRAME, ROUNDING = 0, 1
 CORNER = 2
 """Where a piece's first corner is among the hulls."""
+MARGIN = 3
+"""How much of the rounding is no matter [m]."""
 BALL = 4
 """Centre (3) and radius of a ball around it."""
 BOX = 8

@@ -37,7 +37,8 @@ class Cylinder(Shape):
     def pieces(self) -> tuple[Piece, ...]:
         """The prism around it, and PyBullet's margin, since that takes a hull within it."""
         half = 0.5 * self.length_m
-        return (Piece(prism(SIDES, self.radius_m, -half, half), HULL_MARGIN).at(self.pose.matrix),)
+        around = Piece(prism(SIDES, self.radius_m, -half, half), HULL_MARGIN, margin=HULL_MARGIN)
+        return (around.at(self.pose.matrix),)
 
     def placed(self, at: Placement) -> "Cylinder":
         """With its frame elsewhere."""

@@ -93,4 +93,4 @@ def _pieces(file: Path, digest: str, scale: float) -> tuple[Piece, ...]:
         found = convex_pieces(mesh)
     except RobotError as error:
         raise RobotError(f"{file}: {error}") from None
-    return tuple(piece._replace(rounding=HULL_MARGIN) for piece in found)
+    return tuple(piece._replace(rounding=HULL_MARGIN, margin=HULL_MARGIN) for piece in found)

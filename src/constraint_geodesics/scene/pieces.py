@@ -38,7 +38,8 @@ class Piece(NamedTuple):
     """All points within `rounding` [m] of the convex hull of its corners (n, 3) [m].
 
     hollow_m: how far corners of its mesh lie inside that hull at most, which covers more than the
-    mesh, as PyBullet does.  box: centre (3,), half edges (3,) and turn (9,) of the box that the
+    mesh, as PyBullet does.  margin: how much of the rounding [m] is no matter, but what PyBullet
+    keeps around it.  box: centre (3,), half edges (3,) and turn (9,) of the box that the
     hull is, where it is known to be one.
     """
 
@@ -46,6 +47,7 @@ class Piece(NamedTuple):
     rounding: float = 0.0
     hollow_m: float = 0.0
     box: Float[np.ndarray, "15"] | None = None
+    margin: float = 0.0
 
     def at(self, pose: Float[np.ndarray, "4 4"]) -> "Piece":
         """The same piece elsewhere."""
@@ -161,7 +163,7 @@ def _capsule(shape: ElementTree.Element, _: Path) -> Iterator[Piece]:
 def _cylinder(shape: ElementTree.Element, _: Path) -> Iterator[Piece]:
     """The prism around it, where PyBullet takes one within it."""
     half, radius = 0.5 * float(_size(shape, "length")[0]), float(_size(shape, "radius")[0])
-    yield Piece(prism(_SIDES, radius, -half, half), HULL_MARGIN)
+    yield Piece(prism(_SIDES, radius, -half, half), HULL_MARGIN, margin=HULL_MARGIN)
 
 
 def _mesh(shape: ElementTree.Element, urdf: Path) -> Iterator[Piece]:
@@ -187,7 +189,7 @@ def mesh_piece(points: Float[np.ndarray, "n 3"]) -> Piece:
     corners = np.unique(points.round(_SAME), axis=0)
     hull = ConvexHull(corners)
     hollow = _deepest(corners, hull.equations)
-    return Piece(corners[hull.vertices], HULL_MARGIN + 10.0**-_SAME, hollow)
+    return Piece(corners[hull.vertices], HULL_MARGIN + 10.0**-_SAME, hollow, margin=HULL_MARGIN)
 
 
 def _deepest(corners: Float[np.ndarray, "n 3"], faces: Float[np.ndarray, "f 4"]) -> float:

@@ -104,8 +104,8 @@ class PointCloud(Shape):
             low, high = own.min(axis=0), own.max(axis=0)
             x, y, z = (0.5 * (low + high) @ turn.T + place).tolist()
             a, b, c = (0.5 * (high - low)).tolist()
-            rounding = self.radius_m + HULL_MARGIN
-            found.append(RoundedBox((x, y, z), (a, b, c), rounding, turn).piece())
+            around = RoundedBox((x, y, z), (a, b, c), self.radius_m + HULL_MARGIN, turn).piece()
+            found.append(around._replace(margin=HULL_MARGIN))
         return tuple(found)
 
     def placed(self, at: Placement) -> "PointCloud":

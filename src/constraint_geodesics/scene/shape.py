@@ -207,8 +207,13 @@ class Shape(ABC):
 
 def add_body(bullet: Any, position: Triple, turn: Any = (0, 0, 0, 1), **geometry: Any) -> int:
     """A fixed body of PyBullet with one collision shape, turned by a quaternion x, y, z, w."""
-    shape = bullet.createCollisionShape(**geometry)
-    return int(bullet.createMultiBody(0, shape, basePosition=position, baseOrientation=turn))
+    return _as_body(bullet, bullet.createCollisionShape(**geometry), position, turn)
+
+
+def _as_body(bullet: Any, shape: int, position: Triple, turn: Any) -> int:
+    # with a look of its own, since PyBullet makes one of hundreds of triangles for what is round
+    place = {"basePosition": position, "baseOrientation": turn}
+    return int(bullet.createMultiBody(0, shape, bullet.speck, **place))
 
 
 def add_mesh(bullet: Any, at: Placement, key: str, mesh: Callable[[], Any]) -> int:
@@ -223,5 +228,4 @@ def add_mesh(bullet: Any, at: Placement, key: str, mesh: Callable[[], Any]) -> i
             indices=faces.reshape(-1).tolist(),
             flags=bullet.GEOM_FORCE_CONCAVE_TRIMESH,
         )
-    shape, turn = bullet.meshes[key], at.quaternion
-    return int(bullet.createMultiBody(0, shape, basePosition=at.position_m, baseOrientation=turn))
+    return _as_body(bullet, bullet.meshes[key], at.position_m, at.quaternion)

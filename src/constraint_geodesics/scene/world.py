@@ -5,7 +5,7 @@ The only importer of pybullet.  Every world is a client of its own; nothing is s
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from itertools import combinations
 from typing import Any, NamedTuple, Self
 
@@ -83,6 +83,12 @@ class _Client:
         self._module = pybullet
         self._id = pybullet.connect(pybullet.DIRECT)
         self.meshes = dict[str, int]()  # shapes of meshes that were made here, by what is in them
+
+    @cached_property
+    def speck(self) -> int:
+        """What every shape looks like, which nobody sees."""
+        size = {"shapeType": self.GEOM_BOX, "halfExtents": [1e-3] * 3}
+        return int(self.createVisualShape(**size))
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(self._module, name)
