@@ -18,7 +18,7 @@ from constraint_geodesics.answering import NO_MORE, TIMES, Answering, End, Refus
 from constraint_geodesics.geometry.braking import Motion, State, ahead, going_on
 from constraint_geodesics.goals.goal import ConfigurationGoal
 from constraint_geodesics.problem import PlannerError, Status
-from constraint_geodesics.search.candidates import rows_of
+from constraint_geodesics.search.candidates import Candidate, rows_of
 from constraint_geodesics.search.explanations import refused_end
 from constraint_geodesics.search.preparation import Preparation, Query
 from constraint_geodesics.search.repair import onward, over_graph, repaired
@@ -114,17 +114,15 @@ class Replanning:
     def _others(
         self, query: Query, rest: "_Rest", stop: Motion | None
     ) -> Iterator[Trajectory | None]:
-        """Other paths to the goal, from those that take the least time to find."""
+        """Other paths to the goal, from those that take the least time to find; None for a try that
+        came to nothing.
+        """
         end, moving = End(query.goal), query.start_velocity is not None
         joints = np.concatenate([query.start[None], rest.trajectory.joints[rest.state.row :]])
         if len(joints) > 1 and np.array_equal(joints[-1], query.goal):
             for candidate in repaired(query.task, joints):
-                found = self.answering.begun(query, candidate, end)
-                yield found if isinstance(found, Trajectory) else None
-        way = over_graph(query.task, query.start, query.goal)
-        if way is not None:
-            found = self.answering.begun(query, way, end)
-            yield found if isinstance(found, Trajectory) else None
+                yield self._begun(query, candidate, end)
+        yield self._begun(query, over_graph(query.task, query.start, query.goal), end)
         stops = stop is not None and self._is_clear(stop)
         if moving and stop is not None and stops:
             yield from self._after(query, stop)
@@ -134,9 +132,16 @@ class Replanning:
             goal = ConfigurationGoal(query.goal, exactly=True)
             yield self.answering.answer(own, (goal,), None)
 
+    def _begun(self, query: Query, candidate: Candidate | None, end: End) -> Trajectory | None:
+        found = None if candidate is None else self.answering.begun(query, candidate, end)
+        return found if isinstance(found, Trajectory) else None
+
     def _after(self, query: Query, stop: Motion) -> Iterator[Trajectory | None]:
         """The stop, and other paths from there, as one trajectory."""
         for candidate in onward(query.task, stop.joints[-1], query.goal):
+            if candidate is None:
+                yield None
+                continue
             for share in _TIGHTENED:
                 rows = rows_of(
                     candidate, share * self.answering.certifier.limits.violation_tolerance
@@ -169,6 +174,7 @@ class Replanning:
             joints=stop.joints,
             times=stop.times,
             certificate=found.certificate,
+            statistics=replace(nothing.statistics, source="stop"),
             start_velocity=query.start_velocity,
         )
 

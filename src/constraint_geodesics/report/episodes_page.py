@@ -11,20 +11,40 @@ NOTE = (
     "radius. Beyond the braking distance: wherever something was seen the arm could still have "
     "stopped without touching it; inside it: it could not. Reached: of the episodes that can be "
     "solved at all, by a plan that knows every obstacle or by either controller. Contacts are "
-    "PyBullet's, every 5 mrad of the executed motion. Answers are those asked for by a moving arm "
-    "that can still stop; one is late where it takes longer than "
-    "the 60 ms that it is given: the arm then stops on its path. Waited: from the sight of "
-    "something that blocks the motion to a path to the goal. Duration: of the episodes in which "
-    "both reach the goal"
+    "PyBullet's, every 5 mrad of the executed motion. Which obstacles appear beyond the distance "
+    "depends on how the arm moves meanwhile, so that the two are sorted by their own motions; "
+    "what became of all episodes compares them. Answers are those asked for by a moving arm "
+    "that can still stop, and, apart, by one that no stop would save; one is late where it takes "
+    "longer than the 60 ms that it is given: the arm then stops on its path. Waited: from the "
+    "sight of something that blocks the motion to a path to the goal, 60 ms at least since no "
+    "answer begins sooner; an arm that stops plans while it brakes; those that are never on a "
+    "path again are counted. Duration: of the episodes in which both reach the goal"
 )
 BEYOND = (
-    *("constraint", "controller", "episodes", "beyond", "contacts", "reached of solvable", "share"),
-    *("inside", "no contact", "contacts while braking"),
+    *("constraint", "controller", "episodes", "reached", "contacts"),
+    *(
+        "beyond",
+        "contacts there",
+        "reached of solvable",
+        "share",
+        "inside",
+        "no contact",
+        "contacts while braking",
+    ),
     *("joints at contact [rad/s]", "p95", "tool [m/s]", "p95"),
 )
 TIMES = (
     *("constraint", "controller", "answers in motion", "late", "median [ms]", "p95"),
-    *("blocked", "waited, median [s]", "p95", "both reach", "duration, median [s]", "p95"),
+    *("no stop saves", "late there", "median [ms]", "p95"),
+    *(
+        "blocked",
+        "never on",
+        "waited, median [s]",
+        "p95",
+        "both reach",
+        "duration, median [s]",
+        "p95",
+    ),
 )
 SENSING = ("sensing radius [m]", "controller", "episodes", "beyond", "inside", "no contact")
 
@@ -63,7 +83,8 @@ def _contacts(name: str, controller: str, own: Mapping[str, Any]) -> list[str]:
     solvable = beyond["solvable"]
     reached = beyond["reached"] / solvable if solvable else None
     return [
-        *(name, controller, str(own["episodes"]), str(beyond["episodes"])),
+        *(name, controller, str(own["episodes"]), str(own["reached"]), str(own["contacts"])),
+        str(beyond["episodes"]),
         *(str(beyond["contacts"]), f"{beyond['reached']} of {solvable}", share(reached)),
         *(str(inside["episodes"]), str(inside["without_contact"])),
         str(inside["braking_at_contact"]),
@@ -73,11 +94,14 @@ def _contacts(name: str, controller: str, own: Mapping[str, Any]) -> list[str]:
 
 
 def _times(name: str, controller: str, own: Mapping[str, Any]) -> list[str]:
-    asked, both = own["answers"], own["both_reach"]
+    asked, inside, both = own["answers"], own["inside"], own["both_reach"]
     return [
         *(name, controller, str(asked["moving"]), str(asked["late"])),
         *(fixed(asked[f"ms_{which}"], 1) for which in ("median", "p95")),
-        *(str(asked["blocked"]), fixed(asked["waited_s_median"]), fixed(asked["waited_s_p95"])),
+        *(str(inside["answers"]), str(inside["late"])),
+        *(fixed(inside[f"answer_ms_{which}"], 1) for which in ("median", "p95")),
+        *(str(asked["blocked"]), str(asked["never_on"])),
+        *(fixed(asked["waited_s_median"]), fixed(asked["waited_s_p95"])),
         *(str(both["episodes"]), fixed(both["duration_s_median"]), fixed(both["duration_s_p95"])),
     ]
 

@@ -21,13 +21,13 @@ def pushed(task: Task, nodes: Float[np.ndarray, "n D"]) -> Candidate | None:
     return refined(task, "bend", nodes, clear=True)
 
 
-def repaired(task: Task, rows: Float[np.ndarray, "T D"]) -> Iterator[Candidate]:
-    """Sound curves near a path: pushed clear from where it is; then from either side."""
+def repaired(task: Task, rows: Float[np.ndarray, "T D"]) -> Iterator[Candidate | None]:
+    """Sound curves near a path: pushed clear from where it is; then from either side.  None for a
+    try that came to nothing, so that whoever waits can look at the clock.
+    """
     nodes = resample(rows, task.settings.segments + 1)
-    found = pushed(task, nodes)
-    if found is not None:
-        yield found
-    yield from (way for way in round_it(task, "bend", nodes) if way is not None)
+    yield pushed(task, nodes)
+    yield from round_it(task, "bend", nodes)
 
 
 def over_graph(
@@ -46,13 +46,9 @@ def over_graph(
 
 def onward(
     task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]
-) -> Iterator[Candidate]:
+) -> Iterator[Candidate | None]:
     """Curves from where an arm rests that take little time to find: the straight line pushed clear,
-    and the way over the graph.
+    and the way over the graph; None for one that is not sound.
     """
-    line = pushed(task, resample(np.stack([start, goal]), task.settings.segments + 1))
-    if line is not None:
-        yield line
-    way = over_graph(task, start, goal)
-    if way is not None:
-        yield way
+    yield pushed(task, resample(np.stack([start, goal]), task.settings.segments + 1))
+    yield over_graph(task, start, goal)

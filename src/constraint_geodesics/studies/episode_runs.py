@@ -62,8 +62,8 @@ class Task:
 
 class FromScratch(AbstractContextManager["FromScratch"]):
     """The classical answer: where the rest of the path touches what was seen the arm stops on it,
-    and BiRRT with a band after it plans from rest, until its path is certified, from the second
-    attempt on with half its steps.
+    and BiRRT with a band after it plans from where it will rest, until its path is certified, from
+    the second attempt on with half its steps.
 
     It asks compiled distances, what is left of a path is looked at by the planner's own proof, and
     the scene's changes are as incremental as the planner's; limits: what paths are certified for.
@@ -79,7 +79,7 @@ class FromScratch(AbstractContextManager["FromScratch"]):
         def banded(own: BirrtSettings) -> PathPlanner:
             return BandAfter(SamplingPlanner(own.search, own, row_spacing_rad))
 
-        self._planner = until_sound(banded, BirrtSettings(), SOUND_S)
+        self._planner = until_sound(banded, BirrtSettings(band=True).bare, SOUND_S)
 
     def __exit__(self, *_: object) -> None:
         self._opened.close()
@@ -206,7 +206,9 @@ def run_row(episode: Episode, report: Report) -> dict[str, Any]:
     was braking or at rest then.
     """
     contact = report.contact
-    braking = contact is not None and report.leg(contact.at_s).path.source in ("stop", "rest")
+    braking = contact is not None and (
+        report.leg(contact.at_s).path.source == "stop" or contact.joint_speed_rad_s == 0.0
+    )
     return {
         "obstacles": len(episode.obstacles),
         "sensing_m": episode.sensing_m,
@@ -263,13 +265,14 @@ def motions(report: Report) -> dict[str, Any]:
 
 
 def figures(runs: pd.DataFrame, answers: pd.DataFrame) -> dict[str, Any]:
-    """By controller, of all episodes, of each constraint and sensing radius: what became of the
-    episodes whose obstacles appear beyond the braking distance, of the others, the times of the
+    """By controller, of all episodes, of each constraint and sensing radius: what became of them,
+    of those whose obstacles appear beyond the braking distance, of the others, the times of the
     answers, and the durations of episodes in which both controllers reach the goal.
 
     The goal counts as reached or not where the episode can be solved at all: by a plan in the scene
-    of all obstacles, or by one of the controllers.  Answers are those that an arm asks for which
-    can stop.
+    of all obstacles, or by one of the controllers.  Which obstacles appear beyond the distance
+    depends on the motion, so that those episodes are not the same for both.  Answers are those that
+    an arm asks for which can stop; of the others, `inside` has the times.
     """
     each = ["constraint", "episode"]
     runs = runs.assign(
@@ -293,10 +296,12 @@ def _of_runs(runs: pd.DataFrame, answers: pd.DataFrame) -> dict[str, Any]:
     beyond, inside = runs[runs.beyond], runs[~runs.beyond]
     hit = inside[inside.outcome == "contact"]
     moving, both = answers[answers.moving & answers.can_stop], runs[runs.both]
-    blocked, too_near = moving[moving.blocked], answers[~answers.can_stop]
+    blocked, too_near = moving[moving.blocked], answers[answers.moving & ~answers.can_stop]
     return {
         "episodes": len(runs),
         "unsolvable": int((~runs.solvable).sum()),
+        "reached": int((runs.outcome == "reached").sum()),
+        "contacts": int((runs.outcome == "contact").sum()),
         "beyond": {
             "episodes": len(beyond),
             "contacts": int((beyond.outcome == "contact").sum()),
@@ -310,6 +315,8 @@ def _of_runs(runs: pd.DataFrame, answers: pd.DataFrame) -> dict[str, Any]:
             "reached": int((inside.outcome == "reached").sum()),
             **quantiles("joint_speed_rad_s", hit.joint_speed_rad_s),
             **quantiles("tool_speed_m_s", hit.tool_speed_m_s),
+            "answers": len(too_near),
+            "late": int(too_near.late.sum()),
             **quantiles("answer_ms", too_near.ms),
         },
         "answers": {
@@ -317,6 +324,7 @@ def _of_runs(runs: pd.DataFrame, answers: pd.DataFrame) -> dict[str, Any]:
             "late": int(moving.late.sum()),
             **quantiles("ms", moving.ms),
             "blocked": len(blocked),
+            "never_on": int(blocked.waited_s.isna().sum()),
             **quantiles("waited_s", blocked.waited_s.dropna()),
         },
         "both_reach": {"episodes": len(both), **quantiles("duration_s", both.duration_s)},

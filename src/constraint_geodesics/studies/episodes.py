@@ -6,12 +6,13 @@ of the arm or of what it carries.  The answer is asked for from the state of the
 later, and the arm goes on along its old path until then.  The time that the answer takes is
 measured: where it comes later than LATENCY_S, the arm takes the stop on its path from that state
 instead, and the late answer is dropped.  What comes near meanwhile is seen at the next tick after
-the answer.  An arm that rests plans from there, and the clock goes on while it does.
+the answer.  An arm that stops plans from where it will rest, and the clock goes on while it does:
+from its last answer on, since where it comes to rest is known by then.
 
 An obstacle appears beyond the braking distance where the arm, had it only braked from the state
 that the answer begins in, would have touched nothing that it knows, by PyBullet: no contact is
-excused there.  Inside it no stop avoids the obstacle, and what counts is how slow the arm is at the
-contact.
+excused there, and a motion that can't brake is no excuse.  Inside it no stop avoids the obstacle,
+and what counts is how slow the arm is at the contact.
 """
 
 import time
@@ -125,7 +126,7 @@ class Answered(NamedTuple):
         """For people."""
         took = f"in {1e3 * self.spent_s:.0f} ms"
         if self.late:
-            return f"stops, as the answer came {took}"
+            return f"{'goes on' if self.path is None else 'stops'}, as the answer came {took}"
         if self.path is None:
             return f"goes on, decided {took}"
         if self.path.status != "solved":
@@ -213,12 +214,14 @@ class _Eyes:
 
 
 class _Simulation:
-    """The clock, the motion that is followed, and what is known."""
+    """The clock, the motion that is followed, what is known, and since when the control has had
+    nothing to answer [s].
+    """
 
     def __init__(self, episode: Episode, controller: Controller, eyes: _Eyes) -> None:
         self.controller, self.eyes, self.goal = controller, eyes, episode.goal
         self.leg, self.tick, self.failed = Leg(0.0, episode.first), 0, 0
-        self.known = episode.first.scene
+        self.known, self.idle_s = episode.first.scene, 0.0
 
     @property
     def now_s(self) -> float:
@@ -263,6 +266,7 @@ class _Simulation:
         late = moving and spent > LATENCY_S
         if late:
             found = stop_on(path, at_s)
+        self.idle_s = asked_s + spent
         yield from self._waiting(begins_s)
         self.failed = 0
         answer = Answered(asked_s, self.now_s, spent, found, late, moving, can_stop)
@@ -272,7 +276,8 @@ class _Simulation:
         asked_s, began = self.now_s, time.perf_counter()
         found = self.controller.resting(self.leg.path)
         spent = time.perf_counter() - began
-        yield from self._waiting(asked_s + spent)
+        self.idle_s = max(self.idle_s + spent, asked_s)
+        yield from self._waiting(self.idle_s)
         self.failed += found.status != "solved"
         yield self._followed(Answered(asked_s, self.now_s, spent, found, False, False, True))
 
@@ -293,7 +298,7 @@ class _Simulation:
         """Whether going on until `at_s` and braking then touches nothing that is known."""
         stop, path = stop_on(self.leg.path, at_s), self.leg.path
         if stop is None:
-            return False
+            return True
         rows = _between(path, from_s, at_s)[1]
         with self.known.world() as world:
             return world.first_collision(densify(np.vstack([rows, stop.joints]), DENSE_RAD)) is None
