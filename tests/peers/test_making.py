@@ -1,9 +1,10 @@
 """What randomised baselines are made of: the second attempt of OMPL's has half the step."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
-from tests.planner_fixtures import manifold_of, packaged_planner
+from tests.planner_fixtures import manifold_of, packaged_planner, problem
 
 from constraint_geodesics.params import BaselineParams, load_params
 from constraint_geodesics.peers.baseline import Context
@@ -11,6 +12,7 @@ from constraint_geodesics.peers.making import made_together
 from constraint_geodesics.peers.registry import kinds, settings_of
 from constraint_geodesics.peers.wrappers import BandAfter, Remembered, Restarted, UntilSound
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.problem import PlanningProblem
 
 PARAMS = load_params(Path(__file__).parents[2] / "params.yaml")
 
@@ -35,11 +37,30 @@ def test_a_second_attempt_has_half_the_step_with_a_band_or_without() -> None:
             assert isinstance(first, BandAfter)
             assert isinstance(second, BandAfter)
             first, second = first.inner, second.inner
-        assert isinstance(first, Remembered)
-        assert isinstance(second, Remembered)
-        assert first.inner.settings.delta_rad == 2.0 * second.inner.settings.delta_rad
-    assert found["plain"].inner is found["band"].inner.inner
-    assert found["plain"].second is found["band"].second.inner
+            assert isinstance(first, Remembered)
+            assert isinstance(second, Remembered)
+            first, second = first.inner, second.inner
+        assert first.settings.delta_rad == 2.0 * second.settings.delta_rad
+
+
+def test_a_band_takes_the_path_as_it_was_found_and_no_search_is_done_twice() -> None:
+    found = made(plain={}, band={"band": True}, raw={"simplify": False})
+    plain, band, raw = found["plain"].inner, found["band"].inner.inner, found["raw"].inner
+    assert plain.settings.simplify
+    assert not band.inner.settings.simplify
+    assert band is raw
+    assert plain.searches is band.inner.searches
+    with packaged_planner().scene.world() as world:
+        asked = problem(world, "free", 0)
+        assert_same_search(asked, plain, raw)
+
+
+def assert_same_search(asked: PlanningProblem, plain: Any, raw: Any) -> None:
+    first, second = plain.plan(asked, 0), raw.plan(asked, 0)
+    assert plain.plan(asked, 0).time_s > 0.5 * first.time_s  # a search holds its time
+    assert second.iterations == first.iterations
+    (searched,) = plain.searches._found.values()
+    assert min(first.time_s, second.time_s) > searched.time_s
 
 
 def test_restarts_keep_their_step_and_their_own_limit() -> None:

@@ -63,12 +63,16 @@ def problem_of(
     clearance: ClearanceModel | None,
 ) -> PlanningProblem:
     """A problem in the certifier's scene: its compiled checks are asked of configurations and
-    lines, its certificate of whole paths.
+    lines, its certificate of whole paths, once where the same one is asked about again.
     """
     checks = certifier.collisions
+    last = list[tuple[Float[np.ndarray, "T D"], bool]]()
 
     def is_sound(joints: Float[np.ndarray, "T D"]) -> bool:
-        return certifier.certify(joints, manifold.constraint, start, goal).valid
+        if not (last and last[0][0] is joints):
+            valid = certifier.certify(joints, manifold.constraint, start, goal).valid
+            last[:] = [(joints, valid)]
+        return last[0][1]
 
     known = checks.is_free, clearance, checks.is_clear, is_sound
     return PlanningProblem(start, goal, manifold, *known)

@@ -80,6 +80,8 @@ class DecoderSampling:
             problem, self.settings, partial(next, samples), seed, deadline
         )
         rows = None if joints is None else rows_along(manifold, joints)
+        if rows is not None and not problem.keeps_clear(rows):  # they lie a little beside the path
+            rows = None
         return answer(rows, problem, began, iterations)
 
     def _misfit(self, manifold: ConstraintManifold) -> str:

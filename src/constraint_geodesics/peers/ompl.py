@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -38,9 +38,48 @@ _EXPANDED, _EXPANDED_SHARE = 2, 0.05
 _WALK = 5
 """Milestones that one of these walks leaves at most: OMPL's own number."""
 _SHORTCUTS = 50
+_FINER = (1, 2, 4)
+"""Into how many parts the step between two looks is divided where a shortened path touches
+something.
+"""
 
 Sampler = Callable[[], Float[np.ndarray, "D"]]
 """Draws one configuration [rad], which is projected onto the constraint afterwards."""
+
+
+class _Found(NamedTuple):
+    """What a search came to: its space, OMPL's path if there is one, iterations and time [s]."""
+
+    space: "_Space"
+    path: Any
+    iterations: int
+    time_s: float
+
+
+class Searches:
+    """The searches of the last problem: who takes a path as it was found, and who shortens it,
+    share one.  A search holds the time it took, whoever asks for it again.
+    """
+
+    def __init__(self) -> None:
+        self._problem: PlanningProblem | None = None
+        self._found: dict[tuple[Search, OmplSettings, int], _Found] = {}
+
+    def found(
+        self,
+        problem: PlanningProblem,
+        asked: tuple[Search, OmplSettings, int],
+        search: Callable[[], _Found],
+    ) -> _Found:
+        """Of a planner with a seed; for the same problem, as an object, nothing is searched
+        again.
+        """
+        if self._problem is not problem:
+            self._problem = problem
+            self._found.clear()
+        if asked not in self._found:
+            self._found[asked] = search()
+        return self._found[asked]
 
 
 @dataclass(frozen=True)
@@ -48,12 +87,13 @@ class SamplingPlanner:
     """One of OMPL's planners with its settings.
 
     row_spacing_rad: distance of the path's rows at most, the constraint kept between them; None for
-    OMPL's own rows.
+    OMPL's own rows.  searches: those that it shares with others.
     """
 
     name: Search
     settings: OmplSettings
     row_spacing_rad: float | None = None
+    searches: Searches = field(default_factory=Searches)
 
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """Look for a path until one is found (PRM, BiRRT) or the iterations are used up (RRT*
@@ -71,17 +111,25 @@ class SamplingPlanner:
         misfit = self._misfit(problem.manifold)
         if misfit:
             return without_path(problem, "not_applicable", began, misfit)
-        _start_random_numbers(seed)
-        space = _Space(problem, self.settings)
-        found, iterations = _SEARCHES[self.name](
-            space, self.settings, began + self.settings.budget_s
+        search = self.settings.search_alone
+        space, path, iterations, spent_s = self.searches.found(
+            problem, (self.name, search, seed), lambda: self._found(problem, search, seed)
         )
-        if found is None:
+        began = time.perf_counter() - spent_s
+        if path is None:
             return answer(None, problem, began, iterations)
-        joints = (_simplified(space, found) if self.settings.simplify else space.dense(found))[0]
+        shortened = self.settings.simplify
+        joints = (_simplified(space, path, seed) if shortened else space.dense(path))[0]
         if self.row_spacing_rad is not None:
             joints = as_executed(problem.manifold, joints, self.row_spacing_rad)
         return answer(joints, problem, began, iterations)
+
+    def _found(self, problem: PlanningProblem, settings: OmplSettings, seed: int) -> _Found:
+        began = time.perf_counter()
+        _start_random_numbers(seed)
+        space = _Space(problem, settings)
+        path, iterations = _SEARCHES[self.name](space, settings, began + settings.budget_s)
+        return _Found(space, path, iterations, time.perf_counter() - began)
 
     def _misfit(self, manifold: ConstraintManifold) -> str:
         """Why OMPL has no space of this kind for the constraint; empty where it has one."""
@@ -101,7 +149,7 @@ class SamplingPlanner:
 def birrt_with_sampler(
     problem: PlanningProblem, settings: OmplSettings, sampler: Sampler, seed: int, deadline: float
 ) -> tuple[Float[np.ndarray, "T D"] | None, int]:
-    """RRTConnect in the projected space with samples from elsewhere, simplified as
+    """RRTConnect in the projected space with samples from elsewhere, shortened or not as
     `SamplingPlanner`'s paths are.
 
     Both ends must be sound.  deadline: of time.perf_counter().  Returns the rows, None without a
@@ -112,7 +160,7 @@ def birrt_with_sampler(
     found, iterations = _SEARCHES["birrt"](space, settings, deadline)
     if found is None:
         return None, iterations
-    joints, sound = _simplified(space, found)
+    joints, sound = _simplified(space, found, seed) if settings.simplify else space.dense(found)
     return (joints if sound else None), iterations
 
 
@@ -125,7 +173,7 @@ class _Single:
         count, dof = len(manifold.rows.held), manifold.robot.dof
         self._manifold, self._q = manifold.arrays, np.empty((1, dof))
         self._residual, self._jacobian = np.empty((1, count)), np.empty((1, count, dof))
-        self._worst, self._all = np.empty(1), np.ones(1)
+        self._worst, self._share = np.empty(1), np.ones(1)
         self._settings = Retraction()
         self._room = new_room(self._manifold.constraint, dof)
 
@@ -141,10 +189,12 @@ class _Single:
         kernels.violation_batch(self._manifold, self._q, self._worst)
         return float(self._worst[0])
 
-    def retract(self, x: np.ndarray) -> Float[np.ndarray, "D"] | None:
-        """The configuration on the constraint, or None; as `projection.retract`."""
-        joints = np.array(x, np.float64)[None]
-        retract_all(self._manifold, self._all, joints, self._settings, self._worst, self._room)
+    def retract(self, x: np.ndarray, share: float) -> Float[np.ndarray, "D"] | None:
+        """The configuration on the constraint, or None; as `projection.retract`.  share: of the
+        tolerance that it may use.
+        """
+        joints, self._share[0] = np.array(x, np.float64)[None], share
+        retract_all(self._manifold, self._share, joints, self._settings, self._worst, self._room)
         return joints[0] if self._worst[0] <= self._settings.accuracy else None
 
 
@@ -156,16 +206,18 @@ class _HeldAxes(base.Constraint):
 
     OMPL's Python bindings let nobody replace the sampler of a projected space.  But a tree's
     iteration first asks whether to go on, then projects its sample: the first projection after
-    `expect_sample` is given another one.
+    `expect_sample` is given another one.  Where there is a tolerance a sample is projected into it,
+    as deep as the planner's roadmap spreads its own, and not onto its edge.
     """
 
     def __init__(self, manifold: ConstraintManifold, step: float, sampler: Sampler | None) -> None:
         super().__init__(manifold.robot.dof, manifold.codim, SATISFIED)
         self._single = _Single(manifold)
         self._sampler = sampler
-        self._samples = False
+        self._samples, self._shares = False, np.random.default_rng(0)
+        self._within = 1.0 / int(manifold.rows.held.sum()) if manifold.rows.tolerance.any() else 0.0
         self._exact = manifold.rows.exact
-        self._step = step
+        self.step = step  # along the constraint, that which OMPL has now
         self._last = np.full(manifold.robot.dof, np.inf)
 
     def function(self, x: np.ndarray, out: np.ndarray) -> None:
@@ -176,13 +228,17 @@ class _HeldAxes(base.Constraint):
 
     def expect_sample(self) -> None:
         """What is projected next is a tree's sample."""
-        self._samples = self._sampler is not None
+        self._samples = True
 
     def project(self, x: np.ndarray) -> bool:
-        if self._samples and self._sampler is not None:
+        share = 1.0
+        if self._samples:
             self._samples = False
-            x[:] = self._sampler()
-        joints = self._single.retract(x)
+            if self._sampler is None:
+                share = self._shares.uniform() ** self._within
+            else:
+                x[:] = self._sampler()
+        joints = self._single.retract(x, share)
         if joints is None or self._stalls(x, joints):
             return False
         self._last = joints
@@ -196,9 +252,9 @@ class _HeldAxes(base.Constraint):
         # OMPL walks along the manifold as long as the goal comes nearer, by however little:
         # thousands of steps into a dead end.  It steps from the point projected last, which is how
         # such a step is told from a sample.
-        if abs(_distance(wanted, self._last) - self._step) > 1e-6 * self._step:
+        if abs(_distance(wanted, self._last) - self.step) > 1e-6 * self.step:
             return False
-        return _distance(reached, self._last) < _STALL * self._step
+        return _distance(reached, self._last) < _STALL * self.step
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> float:
@@ -240,25 +296,31 @@ class _Space:
             kind = "projected"
         joints = _joint_space(manifold.robot)
         axes = _HeldAxes(manifold, self.settings.delta_rad, self.sampler)
-        self.expect_sample = axes.expect_sample
+        self._axes, self.expect_sample = axes, axes.expect_sample
         if self.is_plain:
             self.information = base.SpaceInformation(joints)
-            self.information.setStateValidityCheckingResolution(
-                self.settings.delta_rad / joints.getMaximumExtent()
-            )
         else:
             self.information = _constrained(joints, kind, axes, self.settings)
-            self.information.getStateSpace().setDelta(self.settings.delta_rad)
             self.information.getStateSpace().setLambda(_WANDER)
             self.information.setMotionValidator(_Motions(self.information, _validity(self.problem)))
         self.information.setStateValidityChecker(_validity(self.problem))
-        self.information.setup()
+        self.look_closer(1)
         ends = [self._state(q) for q in (self.problem.start, self.problem.goal)]
         if not self.is_plain and kind != "projected":
             for end in ends:
                 self.information.getStateSpace().anchorChart(end)
         self.definition = base.ProblemDefinition(self.information)
         self.definition.setStartAndGoalStates(*ends)
+
+    def look_closer(self, parts: int) -> None:
+        """Divide the step between two looks into so many parts."""
+        step, space = self.settings.delta_rad / parts, self.information.getStateSpace()
+        if self.is_plain:
+            self.information.setStateValidityCheckingResolution(step / space.getMaximumExtent())
+        else:
+            space.setDelta(step)
+            self._axes.step = step
+        self.information.setup()
 
     def dense(self, path: Any) -> tuple[Float[np.ndarray, "T D"], bool]:
         """The configurations along a path's edges, its ends exact, and whether all of them are
@@ -268,14 +330,14 @@ class _Space:
         rows, sound = [_read(states[0], self._dof)[None]], True
         for first, second in itertools.pairwise(states):
             walk = self._walk(first, second)
-            if not self._is_sound(walk):
+            here = self._is_sound(walk)
+            if not (here or self.is_plain):
                 # a roadmap's edge may have been checked from its other end, and OMPL's walk is not
                 # symmetric; the pieces that a shortcut leaves of an edge are not checked at all
                 backward = self._walk(second, first)[::-1]
                 if self._is_sound(backward):
-                    walk = backward
-                else:
-                    sound = False
+                    walk, here = backward, True
+            sound = sound and here
             rows.append(walk[1:])
         return np.concatenate(rows), sound
 
@@ -368,14 +430,22 @@ def _start_random_numbers(seed: int) -> None:
     util.RNG.setSeed(seed + 1)  # OMPL refuses the seed 0
 
 
-def _simplified(space: _Space, found: Any) -> tuple[Float[np.ndarray, "T D"], bool]:
-    """The rows of the shortened path, of the path itself where that is not sound, and whether they
-    are.
+def _simplified(space: _Space, found: Any, seed: int) -> tuple[Float[np.ndarray, "T D"], bool]:
+    """The rows of the shortened path, and whether they are sound: looked at more closely where they
+    are not, and of the path itself where that does not help.
     """
-    shorter = geometric.PathGeometric(found)
-    _shorten(space, shorter)
-    joints, sound = space.dense(shorter)
-    return (joints, True) if sound else space.dense(found)
+    try:
+        for finer in _FINER:
+            space.look_closer(finer)
+            _start_random_numbers(seed)
+            shorter = geometric.PathGeometric(found)
+            _shorten(space, shorter)
+            joints, sound = space.dense(shorter)
+            if sound:
+                return joints, True
+    finally:
+        space.look_closer(1)
+    return space.dense(found)
 
 
 def _shorten(space: _Space, path: Any) -> None:
@@ -410,6 +480,7 @@ def _grow_roadmap(
     def enough() -> bool:
         nonlocal tries
         tries += 1
+        space.expect_sample()
         return planner.milestoneCount() >= wanted or is_over()
 
     condition = base.PlannerTerminationCondition(enough)

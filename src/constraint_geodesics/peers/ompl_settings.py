@@ -41,9 +41,20 @@ class OmplSettings(BaselineSettings):
 
     def make(self, context: Context) -> PathPlanner:
         """Rows as far apart as the judge wants them."""
-        from constraint_geodesics.peers.ompl import SamplingPlanner
+        from constraint_geodesics.peers.ompl import SamplingPlanner, Searches
 
-        return SamplingPlanner(self.search, self, context.params.judge.row_spacing_rad)
+        searches = context.shared.setdefault("OMPL's searches", Searches())
+        return SamplingPlanner(self.search, self, context.params.judge.row_spacing_rad, searches)
+
+    @property
+    def bare(self) -> Self:
+        """The path as it is found: a band shortens it sooner than OMPL does, and as much."""
+        return self.model_copy(update={"band": False, "simplify": self.simplify and not self.band})
+
+    @property
+    def search_alone(self) -> Self:
+        """What the search depends on, and not what is done with its path."""
+        return self.model_copy(update={"simplify": True, "band": False, "restarts_s": None})
 
     @property
     def given_s(self) -> float:

@@ -104,9 +104,11 @@ class UntilSound:
 
 
 def _is_unsound(problem: PlanningProblem, answer: Solution) -> bool:
-    if problem.is_sound is None or answer.status != "solved":
-        return False
-    return not problem.is_sound(answer.joints)
+    return answer.status == "solved" and not _is_kept(problem, answer.joints)
+
+
+def _is_kept(problem: PlanningProblem, joints: Float[np.ndarray, "T D"]) -> bool:
+    return problem.is_sound is None or problem.is_sound(joints)
 
 
 def _length(answer: Solution) -> float:
@@ -133,8 +135,9 @@ class BandAfter:
 
 
 def band_after(problem: PlanningProblem, planned: Solution, settings: BandSettings) -> Solution:
-    """A planned path shortened by a band, time and iterations added to its own; without a path,
-    what it was.
+    """A planned path shortened by a band, time and iterations added to its own; without a path, or
+    where no band is sound that is shorter, what it was, on rows that keep the constraint between
+    them if those are sound.
     """
     began = time.perf_counter()
     if (
@@ -145,15 +148,17 @@ def band_after(problem: PlanningProblem, planned: Solution, settings: BandSettin
         return planned
     own = rows_along(problem.manifold, planned.joints)
     longest = float(step_lengths(own).sum())
-    rows, iterations = own, 0
+    rows, iterations = None, 0
     task = task_of(problem, settings)
     for candidate in _bands_along(task, planned.joints):
         iterations += candidate.iterations
         if candidate.length < longest:
             relaxed = free_rows(problem, candidate)
-            if relaxed is not None:
+            if relaxed is not None and _is_kept(problem, relaxed):
                 rows = relaxed
                 break
+    if rows is None:
+        rows = own if _is_kept(problem, own) else planned.joints
     spent = time.perf_counter() - began
     return Solution("solved", rows, planned.time_s + spent, planned.iterations + iterations)
 
