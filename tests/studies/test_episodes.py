@@ -42,6 +42,18 @@ class Blind:
         return path.stop(float(path.times[-1]))
 
 
+@dataclass(frozen=True)
+class Stopping(Blind):
+    """Stops whenever it sees something, and never gets on."""
+
+    def moving(self, path: Trajectory, at_s: float) -> Trajectory | None:
+        return study.stop_on(path, at_s)
+
+    def resting(self, path: Trajectory) -> Trajectory:
+        time.sleep(self.thinks_s)
+        return path.stop(float(path.times[-1]))
+
+
 @cache
 def episodes(count: int) -> tuple[Episode, ...]:
     planner = packaged_planner()
@@ -116,6 +128,26 @@ def test_an_arm_whose_answer_is_late_stops() -> None:
     assert sights[0].at_s == first.asked_s
 
 
+def test_an_arm_that_stops_plans_while_it_brakes_and_brakes_where_it_touches_something() -> None:
+    thinks_s, contacts, rests = 0.03, 0, 0
+    for episode in episodes(5):
+        happenings = list(study.run(episode, Stopping(thinks_s)))
+        report = study.report(episode, happenings)
+        row = runs.run_row(episode, report)
+        assert row["braking_at_contact"] == (report.contact is not None)
+        contacts += report.contact is not None
+        answers = [one for one in happenings if isinstance(one, Answered)]
+        resting = [one for one in answers if not one.moving]
+        if report.contact is None and len(resting) == study.TRIES:
+            first, second = resting[:2]
+            assert first.spent_s > thinks_s
+            assert first.begins_s == first.asked_s  # it has braked for longer
+            assert second.begins_s >= first.begins_s + thinks_s
+            rests += 1
+    assert contacts > 0
+    assert rests > 0
+
+
 def test_a_constraint_without_queries_is_refused() -> None:
     with pytest.raises(PlannerError, match="no constraint 'level'"):
         study.drawn(packaged_planner(), "level", 0, 0)
@@ -185,7 +217,10 @@ def test_figures_are_of_the_solvable_and_the_page_has_them() -> None:
     assert (first["episodes"], first["unsolvable"]) == (4, 1)
     assert first["beyond"] == {"episodes": 3, "contacts": 0, "solvable": 2, "reached": 1}
     assert first["inside"]["without_contact"] == 0
+    assert (first["reached"], first["contacts"]) == (1, 1)
     assert first["inside"]["braking_at_contact"] == 1
+    assert (first["inside"]["answers"], first["inside"]["late"]) == (1, 1)
+    assert first["answers"]["never_on"] == 1
     assert first["inside"]["tool_speed_m_s_median"] == 0.5
     assert first["answers"]["moving"] == 2
     assert first["answers"]["late"] == 1
