@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.planner_fixtures import (
@@ -44,6 +46,14 @@ def test_many_starts_are_no_longer_than_one_and_the_band_no_longer_than_its_path
             1 + 1e-3
         )  # lines between far rows cut corners
         assert after.time_s > given.time_s
+
+
+def test_a_sound_path_is_not_given_away_for_a_band_that_is_not(world: World) -> None:
+    (asked,) = problems(world, "level_cup", 1)
+    given = BIRRT.plan(asked, 0)
+    picky = replace(asked, is_sound=lambda rows: rows is given.joints)
+    assert band_after(picky, given, BandSettings()).joints is given.joints
+    assert band_after(asked, given, BandSettings()).joints is not given.joints
 
 
 def test_many_starts_depend_on_the_seed_where_the_straight_one_fails(world: World) -> None:
