@@ -7,6 +7,7 @@ import json
 import re
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 from constraint_geodesics.params import load_params
@@ -36,7 +37,8 @@ SHOWN = (
 )
 """Rows of README's table."""
 QUOTED = re.compile(r"([\d.]+)([^\d<]{0,12})<!-- from (\S+) (\S+) ([\d.e-]+) (\d) -->")
-"""A number with its source behind it: file, key (a blank is written %20), scale, digits."""
+"""A number with its source behind it: file, key (a blank is written %20, a sum over a list +),
+scale, digits."""
 
 
 def with_planners(text: str) -> str:
@@ -85,11 +87,18 @@ def filled(text: str) -> str:
 
 def _requoted(found: re.Match[str]) -> str:
     _, between, file, key, scale, digits = found.groups()
-    value = json.loads((ROOT / file).read_text())
-    for part in unquote(key).split("/"):
-        value = value[int(part) if isinstance(value, list) else part]
+    value = _at(json.loads((ROOT / file).read_text()), unquote(key).split("/"))
     shown = f"{value * float(scale):.{digits}f}"
     return f"{shown}{between}<!-- from {file} {key} {scale} {digits} -->"
+
+
+def _at(value: Any, parts: list[str]) -> float:
+    """A report's number; of a list the place in it, or the sum over all of it (+)."""
+    for place, part in enumerate(parts):
+        if part == "+":
+            return sum(_at(own, parts[place + 1 :]) for own in value)
+        value = value[int(part) if isinstance(value, list) else part]
+    return value
 
 
 TIMES = re.compile(r"<!-- stage_times -->.*?<!-- /stage_times -->", re.S)
@@ -145,6 +154,12 @@ def with_efforts(text: str) -> str:
     return with_numbers(replaced(text, "efforts", "\n".join([head, *lines])))
 
 
+def with_outcome(text: str) -> str:
+    """A page's text with the sentences that open the report on demonstrations, and its numbers."""
+    said = (ROOT / "reports" / "demonstrations.md").read_text().split("\n\n")[1]
+    return with_numbers(replaced(text, "outcome", said))
+
+
 COMMANDS = {"quick": "test", "faults": "test-faults", "soak": "soak"}
 """What runs tests/faults with each effort."""
 
@@ -160,9 +175,10 @@ PAGES = {
     RESULTS: filled,
     EXPERIMENTS: lambda text: with_pipeline(with_stage_times(text)),
 }
-NUMBERED = ("scenes.md", "problems.md", "scaling.md")
+NUMBERED = ("scenes.md", "problems.md", "scaling.md", "method.md")
 PAGES |= {ROOT / "docs" / page: with_numbers for page in NUMBERED}
 PAGES[ROOT / "docs" / "reliability.md"] = with_efforts
+PAGES[ROOT / "docs" / "demonstrations.md"] = with_outcome
 """What brings each page up to date."""
 
 if __name__ == "__main__":
