@@ -29,7 +29,7 @@ from constraint_geodesics.constraints.polynomial import PolynomialConstraint, Re
 from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.methods import SearchMethod
 from constraint_geodesics.planner import PlannerError
-from constraint_geodesics.problem import SATISFIED
+from constraint_geodesics.problem import SATISFIED, Status
 from constraint_geodesics.progress import LINE_AFTER_S
 from constraint_geodesics.recording.recording import read_recording
 from constraint_geodesics.scene.cylinder import Cylinder
@@ -1065,6 +1065,34 @@ def test_without_parts_that_propose_curves_a_budget_is_not_waited_for(planner) -
     start, goal = pairs_of("free", 1, seed=1)[0]
     only = Parts(graph=False, tree=False)
     assert planner.plan(start, goal, "free", parts=only, budget_s=100.0).status == "solved"
+
+
+def answering(status: Status) -> Planner:
+    """Whose first candidates come to nothing."""
+
+    class Nothing(SearchMethod):
+        def candidates(self, *_: object) -> Iterator[Answer]:
+            yield Answer(status)
+
+    return Planner(packaged_planner().bundle, "nothing at once", Nothing())
+
+
+def test_what_is_not_found_at_once_is_looked_for_while_the_budget_lasts() -> None:
+    start, goal = pairs_of("level_cup", 1, seed=1)[0]
+    with answering("not_found") as patient:
+        assert patient.plan(start, goal, "level_cup").status == "not_found"
+        path = patient.plan(start, goal, "level_cup", budget_s=2.0)
+        assert (path.status, path.source) == ("solved", "tree"), path.explanation
+        assert path.certificate is not None
+        assert path.certificate.valid
+        began = time.perf_counter()
+        parts = Parts(tree=False)
+        assert (
+            patient.plan(start, goal, "level_cup", parts=parts, budget_s=60.0).status == "not_found"
+        )
+        assert time.perf_counter() - began < 30.0
+    with answering("not_connected") as patient:
+        assert patient.plan(start, goal, "level_cup", budget_s=60.0).status == "not_connected"
 
 
 @pytest.mark.parametrize("budget", [0.0, -1.0, float("nan"), float("inf")])

@@ -4,9 +4,9 @@ shortest of which is timed and certified, or why there is none.
 
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -20,7 +20,15 @@ from constraint_geodesics.goals.goal import Goal
 from constraint_geodesics.methods import Method
 from constraint_geodesics.problem import PlannerError, Status
 from constraint_geodesics.robot.inverse_kinematics import spread
-from constraint_geodesics.search.candidates import BENDS, Answer, Candidate, connection, rows_of
+from constraint_geodesics.search.candidates import (
+    BENDS,
+    Answer,
+    Candidate,
+    Parts,
+    Task,
+    connection,
+    rows_of,
+)
 from constraint_geodesics.search.explanations import not_connected, refused_end
 from constraint_geodesics.search.preparation import Query
 from constraint_geodesics.search.pursuit import Pursued, shortest, slid
@@ -29,7 +37,6 @@ from constraint_geodesics.trajectory import STANDING_S, TOUCHES, Asked, Statisti
 
 COINCIDENT_RAD = 1e-7
 """Ends that differ by less in every joint are one configuration."""
-NO_MORE = "no more curves"
 _WORTHWHILE = 1e-4
 """Share by which a curve must be shorter than the path so far to be certified."""
 _ROUND = BENDS + 1
@@ -52,6 +59,12 @@ _IMPROVED = 3
 """Configurations of a goal beside the one that was reached, the nearest, to which shorter paths are
 looked for.
 """
+_LARGER = 2.0
+"""So many times as large are the trees that are grown next."""
+Item = TypeVar("Item")
+Proposing = Callable[
+    [Task, Float[np.ndarray, "D"], Float[np.ndarray, "D"], Parts], Iterator[Candidate | None]
+]
 
 
 class _Further(NamedTuple):
@@ -184,6 +197,8 @@ class Answering:
 
         found = shortest(pursued, query.task, certify, more, is_connected)
         query = replace(query, looked_at=np.array([one.goal for one in pursued]))
+        if found is None and budget_s is not None:
+            found = self._searched_on(query, pursued, budget_s)
         if found is None:
             return self._failed(query, pursued), None
         path, reached = found
@@ -281,35 +296,41 @@ class Answering:
         self, query: Query, path: Trajectory, pursued: Sequence[Pursued], budget_s: float
     ) -> tuple[Trajectory, Pursued]:
         """The shortest certified path that is found before the time is over, and where it leads:
-        `path`, to the first of those that are pursued, if it remains that.  No curve is begun that
-        would end too late, going by the last of its kind, and for the first ones by the longest.
+        `path`, to the first of those that are pursued, if it remains that.
         """
         reached, worth = pursued[0], [one for one in pursued if one.distance < path.length_rad]
-        curves = _by_turns([self._improvements(query, one) for one in worth or pursued[:1]])
-        spent = time.perf_counter() - query.began
-        lasted = deque[float](maxlen=_ROUND * max(len(worth), 1))
-        while (
-            spent + (lasted[0] if len(lasted) == lasted.maxlen else max(lasted, default=0.0))
-            < budget_s
-        ):
-            item = next(curves, NO_MORE)
-            if isinstance(item, str):
-                break
-            one, candidate = item
+        worth = worth or [reached]
+        curves = _by_turns([self._led(query, one, self.method.improvements) for one in worth])
+        for one, candidate in _in_time(curves, query.began, budget_s, _ROUND * len(worth)):
             if candidate is not None and candidate.length < (1.0 - _WORTHWHILE) * path.length_rad:
                 found = self._certified(query, candidate, one)
                 if isinstance(found, Trajectory) and found.length_rad < path.length_rad:
                     path, reached = found, one
-            before, spent = spent, time.perf_counter() - query.began
-            lasted.append(spent - before)
         return path, reached
 
-    def _improvements(
-        self, query: Query, one: Pursued
+    def _searched_on(
+        self, query: Query, pursued: Sequence[Pursued], budget_s: float
+    ) -> tuple[Trajectory, Pursued] | None:
+        """The first path that is certified where none was found at once, and where it leads; None
+        where the time is over before.  What is refused, or what the graph holds to be unconnected,
+        is not looked for any longer.
+        """
+        left = [one for one in pursued if one.answer is None or one.answer.is_open]
+        left = sorted(left, key=lambda one: one.distance)[: 1 + _IMPROVED]
+        curves = _by_turns([self._led(query, one, self.method.further) for one in left])
+        for one, candidate in _in_time(curves, query.began, budget_s, 2 * len(left), _LARGER):
+            found = None if candidate is None else self._certified(query, candidate, one)
+            if isinstance(found, Trajectory):
+                return found, one
+        return None
+
+    def _led(
+        self, query: Query, one: Pursued, curves: Proposing
     ) -> Iterator[tuple[Pursued, Candidate | None]]:
+        """The method's further curves to a goal, unless it is refused."""
         if refused_end(replace(query, goal=one.goal), "goal", self.certifier.collisions):
             return
-        for found in self.method.improvements(query.task, query.start, one.goal, query.parts):
+        for found in curves(query.task, query.start, one.goal, query.parts):
             if found is not None and one.room is not None:
                 found = slid(query.task, found, one.room)
             yield one, found
@@ -430,6 +451,28 @@ def _beside_others(path: Trajectory, others: Sequence[Candidate]) -> Trajectory:
     told = ", ".join(f"{way.source} {way.length_rad:.3f}" for way in ways)
     line = f"{path.explanation}, the shortest of {len(ways) + 1} ways round (others: {told} rad)"
     return replace(path, explanation=line, statistics=replace(path.statistics, ways=ways))
+
+
+def _in_time(
+    items: Iterator[Item], began: float, budget_s: float, kinds: int, larger: float = 1.0
+) -> Iterator[Item]:
+    """Items until the time is over: none is begun that would end too late, going by the last of its
+    kind, and for the first ones by the longest.  kinds: items after which they come round again,
+    so many times as long.
+    """
+    spent = time.perf_counter() - began
+    lasted = deque[float](maxlen=max(kinds, 1))
+    while (
+        spent + larger * (lasted[0] if len(lasted) == lasted.maxlen else max(lasted, default=0.0))
+        < budget_s
+    ):
+        try:
+            item = next(items)
+        except StopIteration:
+            return
+        yield item
+        before, spent = spent, time.perf_counter() - began
+        lasted.append(spent - before)
 
 
 def _by_turns(

@@ -211,7 +211,10 @@ def plan(
     ] = None,
     budget: Annotated[
         float | None,
-        typer.Option(help="Look for shorter paths for about so many seconds; by default do not."),
+        typer.Option(
+            help="Look for shorter paths, or for any where none is found at once, for about so "
+            "many seconds; by default do not."
+        ),
     ] = None,
     snap: Annotated[
         bool,

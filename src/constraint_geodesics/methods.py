@@ -19,6 +19,7 @@ from constraint_geodesics.search.candidates import (
     Parts,
     Task,
     candidates,
+    further,
     improvements,
 )
 from constraint_geodesics.search.preparation import Draw
@@ -55,6 +56,14 @@ class Method(Protocol):
         """Further curves, for as long as there is time; None for one that is not sound."""
         ...
 
+    def further(
+        self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts
+    ) -> Iterator[Candidate | None]:
+        """Curves where no candidate came to a path, for as long as there is time; None after each
+        try.
+        """
+        ...
+
 
 class SearchMethod:
     """The planner's own: straight line, roadmap and trees, each refined by an elastic band."""
@@ -79,6 +88,12 @@ class SearchMethod:
     ) -> Iterator[Candidate | None]:
         """Bent lines and new trees."""
         return improvements(task, start, goal, parts)
+
+    def further(
+        self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts
+    ) -> Iterator[Candidate | None]:
+        """New, ever larger trees."""
+        return further(task, start, goal, parts)
 
 
 def open_method(name: str, source: str | Path | None, bundle: Bundle) -> Method:

@@ -342,8 +342,10 @@ class Planner:
         parts: of the planner to use, for comparisons.  budget_s: by default the first path that is
         certified is the answer; with a budget shorter ones, round the other side of something, are
         looked for while there is time for one more, by how long such a one took before, until so
-        many seconds have passed since the call; functions of a constraint's own are compiled
-        before, a roadmap that is not made yet is made within.  snap: a start that violates the
+        many seconds have passed since the call; where none is found at once, and the roadmap does
+        not hold the ends to be unconnected, new, ever larger trees are grown for as long.
+        Functions of a constraint's own are compiled before, a roadmap that is not made yet is made
+        within.  snap: a start that violates the
         constraint or a limit is moved to the nearest configuration that keeps them, where that is
         at most SNAP_RAD away, and SNAP_M for prismatic joints, and nothing is touched on the way;
         else such a start is refused.  velocity_scale, acceleration_scale: the shares of the limits

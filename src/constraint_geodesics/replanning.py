@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.answering import NO_MORE, TIMES, Answering, End, Refused
+from constraint_geodesics.answering import TIMES, Answering, End, Refused
 from constraint_geodesics.geometry.braking import Motion, State, ahead, going_on
 from constraint_geodesics.goals.goal import ConfigurationGoal
 from constraint_geodesics.problem import PlannerError, Status
@@ -29,6 +29,7 @@ _TIGHTENED = (0.7, 0.4)
 """Shares of the allowed violation that waypoints after a stop are drawn for: it ends off the
 constraint.
 """
+_NO_MORE = "no more tries"
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Replanning:
         stop = self._stop(query, rest)
         others = self._others(query, rest, stop)
         while time.perf_counter() - began < limit_s:
-            other = next(others, NO_MORE)
+            other = next(others, _NO_MORE)
             if isinstance(other, str):
                 break
             if other is not None and other.status == "solved":

@@ -242,6 +242,12 @@ class LearnedMethod:
             if isinstance(candidate, Candidate):
                 yield candidate
 
+    def further(
+        self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts
+    ) -> Iterator[Candidate | None]:
+        """None: all rounds were looked at."""
+        return iter(())
+
 
 class RefinedLearnedMethod(LearnedMethod):
     """The policy's curves, each relaxed by the planner's elastic band."""

@@ -274,6 +274,8 @@ class BodyTable:
         moving = [*self._robot, *(BodyKey(one.name, True) for one in scene.attached)]
         more = _pairs(bodies, places, moving, allowed, news)
         ends = np.concatenate([ends[(ends >= 0).all(axis=1)], more])
+        # in the order of the bodies, whatever came when: of what is as near the first counts
+        ends = ends[np.lexsort((ends.min(axis=1), ends.max(axis=1)))]
         self._now = _Now(scene, allowed, bodies, places, blocks, shapes, ends)
 
     @property

@@ -9,6 +9,7 @@ straight lines between them keep the constraint, and goes to the caller, who has
 Curves of another kind come from a method of their own (methods.py), through `refined` or not.
 """
 
+import itertools
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -67,6 +68,8 @@ TREES_APART = 2
 """Where the graph holds the ends to be unconnected, which it hardly ever errs in."""
 PATIENT = TreeSettings(iterations=4000, nodes=20_000)
 """Of one more pair, the last."""
+MOST_PATIENT = 4
+"""Where there is time, pairs are grown on whose iterations come to so many times as many."""
 NARROW_M = 0.0005
 """What is kept clear where no way with the settings' clearance was found [m]: a few times what the
 certificate asks for.
@@ -144,6 +147,11 @@ class Answer:
     at_start: Joined | None = None
     at_goal: Joined | None = None
     explanation: str = ""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether more tries may find what these did not."""
+        return self.status == "not_found" and not self.explanation
 
 
 def candidates(
@@ -314,6 +322,26 @@ def improvements(
         if parts.tree:
             yield next(_over_tree(task, start, goal, refine=True, seed=seed), None)
         seed += 1
+
+
+def further(
+    task: Task,
+    start: Float[np.ndarray, "D"],
+    goal: Float[np.ndarray, "D"],
+    parts: Parts = ALL_PARTS,
+) -> Iterator[Candidate | None]:
+    """Where no candidate came to a path, for as long as the caller has time: the ways of new trees,
+    of pairs by turns with the settings' clearance and with less, ever larger ones; None after each.
+    """
+    patience = 1
+    for seed in itertools.count(TREES + 1) if parts.tree else ():
+        settings = replace(
+            PATIENT, iterations=patience * PATIENT.iterations, nodes=patience * PATIENT.nodes
+        )
+        for one in (task, task.narrow):
+            yield from _over_tree(one, start, goal, parts.refinement, seed, settings)
+            yield None
+        patience = min(2 * patience, MOST_PATIENT)
 
 
 def _over_graph(
