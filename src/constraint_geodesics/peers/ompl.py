@@ -25,6 +25,7 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, new_room, retract, retract_all
 from constraint_geodesics.learning.lift import as_executed
 from constraint_geodesics.peers.elastic_band import answer, without_path
+from constraint_geodesics.peers.last_problem import LastProblem
 from constraint_geodesics.peers.ompl_settings import OmplSettings, Search
 from constraint_geodesics.problem import SATISFIED, PlanningProblem, Solution, refusal
 from constraint_geodesics.robot.kinematics import SerialRobot
@@ -56,32 +57,6 @@ class _Found(NamedTuple):
     time_s: float
 
 
-class Searches:
-    """The searches of the last problem: who takes a path as it was found, and who shortens it,
-    share one.  A search holds the time it took, whoever asks for it again.
-    """
-
-    def __init__(self) -> None:
-        self._problem: PlanningProblem | None = None
-        self._found: dict[tuple[Search, OmplSettings, int], _Found] = {}
-
-    def found(
-        self,
-        problem: PlanningProblem,
-        asked: tuple[Search, OmplSettings, int],
-        search: Callable[[], _Found],
-    ) -> _Found:
-        """Of a planner with a seed; for the same problem, as an object, nothing is searched
-        again.
-        """
-        if self._problem is not problem:
-            self._problem = problem
-            self._found.clear()
-        if asked not in self._found:
-            self._found[asked] = search()
-        return self._found[asked]
-
-
 @dataclass(frozen=True)
 class SamplingPlanner:
     """One of OMPL's planners with its settings.
@@ -93,7 +68,7 @@ class SamplingPlanner:
     name: Search
     settings: OmplSettings
     row_spacing_rad: float | None = None
-    searches: Searches = field(default_factory=Searches)
+    searches: LastProblem[_Found] = field(default_factory=LastProblem)
 
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """Look for a path until one is found (PRM, BiRRT) or the iterations are used up (RRT*

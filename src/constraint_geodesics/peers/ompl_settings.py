@@ -6,6 +6,7 @@ from pydantic import Field
 
 from constraint_geodesics.fields import Count, Positive
 from constraint_geodesics.peers.baseline import BaselineSettings, Context
+from constraint_geodesics.peers.last_problem import LastProblem
 from constraint_geodesics.problem import PathPlanner
 
 Search = Literal["prm", "prm_star", "rrt_star", "informed_rrt_star", "birrt"]
@@ -41,9 +42,9 @@ class OmplSettings(BaselineSettings):
 
     def make(self, context: Context) -> PathPlanner:
         """Rows as far apart as the judge wants them."""
-        from constraint_geodesics.peers.ompl import SamplingPlanner, Searches
+        from constraint_geodesics.peers.ompl import SamplingPlanner
 
-        searches = context.shared.setdefault("OMPL's searches", Searches())
+        searches = context.shared.setdefault("OMPL's searches", LastProblem())
         return SamplingPlanner(self.search, self, context.params.judge.row_spacing_rad, searches)
 
     @property

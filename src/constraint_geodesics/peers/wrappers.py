@@ -16,6 +16,7 @@ from constraint_geodesics.peers.elastic_band import (
     rows_along,
     task_of,
 )
+from constraint_geodesics.peers.last_problem import LastProblem
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.search.band import BandSettings, step_lengths
 from constraint_geodesics.search.candidates import Candidate, Task, less_and_less_relaxed, refined
@@ -184,8 +185,7 @@ class Remembered:
     """
 
     inner: PathPlanner
-    _problem: list[PlanningProblem] = field(default_factory=list)
-    _answers: dict[int, Solution] = field(default_factory=dict)
+    _answers: LastProblem[Solution] = field(default_factory=LastProblem)
 
     @property
     def name(self) -> str:
@@ -196,9 +196,4 @@ class Remembered:
         """The planner's answer; for the same problem, as an object, and seed it is not asked
         again.
         """
-        if not self._problem or self._problem[0] is not problem:
-            self._problem[:] = [problem]
-            self._answers.clear()
-        if seed not in self._answers:
-            self._answers[seed] = self.inner.plan(problem, seed)
-        return self._answers[seed]
+        return self._answers.found(problem, seed, lambda: self.inner.plan(problem, seed))
