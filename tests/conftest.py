@@ -33,15 +33,22 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         warmup.ensure()
 
 
-SLOW_FIRST = ("end_to_end", "report", "laws", "constraints", "geodesics", "tracking", "studies")
-"""Folders that take longest: what is left for the end is small, and no worker waits for another."""
+SLOW_FIRST = (
+    *("end_to_end", "report", "laws", "constraints", "geodesics", "tracking", "studies"),
+    *("test_doctor.py", "test_kills.py", "test_docs.py", "test_load.py", "test_warmup.py"),
+    *("test_planner.py", "test_no_network.py", "test_triangles.py", "test_without_pybullet.py"),
+)
+"""Folders and files that take longest: what is left for the end is small, and no worker waits for
+another.
+"""
 
 
 @pytest.hookimpl(tryfirst=True)  # xdist reads the groups in the same hook
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """A file stays on one worker, so that what its tests share is made once."""
     order = {folder: place for place, folder in enumerate(SLOW_FIRST)}
-    items.sort(key=lambda item: order.get(item.path.parent.name, len(order)))
+    names = {item: (item.path.parent.name, item.path.name) for item in items}
+    items.sort(key=lambda item: min(order.get(name, len(order)) for name in names[item]))
     long = config.getoption("faults") or config.getoption("soak")
     for item in items:
         if item.get_closest_marker("long") and not long:
