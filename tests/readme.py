@@ -96,6 +96,7 @@ def _at(value: Any, parts: list[str]) -> float:
     """A report's number; of a list the place in it, or the sum over all of it (+)."""
     for place, part in enumerate(parts):
         if part == "+":
+            assert isinstance(value, list), parts
             return sum(_at(own, parts[place + 1 :]) for own in value)
         value = value[int(part) if isinstance(value, list) else part]
     return value

@@ -2,6 +2,7 @@
 shortest of which is timed and certified, or why there is none.
 """
 
+import heapq
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,15 +21,7 @@ from constraint_geodesics.goals.goal import Goal
 from constraint_geodesics.methods import Method
 from constraint_geodesics.problem import PlannerError, Status
 from constraint_geodesics.robot.inverse_kinematics import spread
-from constraint_geodesics.search.candidates import (
-    BENDS,
-    Answer,
-    Candidate,
-    Parts,
-    Task,
-    connection,
-    rows_of,
-)
+from constraint_geodesics.search.candidates import BENDS, Answer, Candidate, connection, rows_of
 from constraint_geodesics.search.explanations import not_connected, refused_end
 from constraint_geodesics.search.preparation import Query
 from constraint_geodesics.search.pursuit import Pursued, shortest, slid
@@ -59,12 +52,7 @@ _IMPROVED = 3
 """Configurations of a goal beside the one that was reached, the nearest, to which shorter paths are
 looked for.
 """
-_LARGER = 2.0
-"""So many times as large are the trees that are grown next."""
 Item = TypeVar("Item")
-Proposing = Callable[
-    [Task, Float[np.ndarray, "D"], Float[np.ndarray, "D"], Parts], Iterator[Candidate | None]
-]
 
 
 class _Further(NamedTuple):
@@ -112,7 +100,7 @@ class Answering:
     ) -> Trajectory:
         """A path that begins in the direction of the query's velocity; where none of the straight
         line and the graph can, a stop straight on and a path from there.  Trees come last, and are
-        grown once: from where the arm stops, if it can.
+        grown from one place alone: from where the arm stops, if it can.
         """
         few = replace(query, parts=replace(query.parts, tree=False))
         found = self.found(few, goals, budget_s)
@@ -197,8 +185,11 @@ class Answering:
 
         found = shortest(pursued, query.task, certify, more, is_connected)
         query = replace(query, looked_at=np.array([one.goal for one in pursued]))
+        how = "the shortest found to any"
         if found is None and budget_s is not None:
-            found = self._searched_on(query, pursued, budget_s)
+            left = (one for one in pursued if _is_open(query, one, is_connected))
+            near = heapq.nsmallest(1 + _IMPROVED, left, key=lambda one: one.distance)
+            found, how = self._searched_on(query, near, budget_s), "found to one"
         if found is None:
             return self._failed(query, pursued), None
         path, reached = found
@@ -208,7 +199,7 @@ class Answering:
             path, reached = self._improved(query, path, worth, budget_s)
         line = path.explanation
         if len(pursued) > 1:
-            line += f", the shortest found to any of {len(pursued)} configurations"
+            line += f", {how} of {len(pursued)} configurations"
         if query.snapped_rad:
             line += f", from a start moved by {query.snapped_rad:.2g} rad"
         statistics = self._statistics(query, path.source)
@@ -300,7 +291,7 @@ class Answering:
         """
         reached, worth = pursued[0], [one for one in pursued if one.distance < path.length_rad]
         worth = worth or [reached]
-        curves = _by_turns([self._led(query, one, self.method.improvements) for one in worth])
+        curves = _by_turns([self._improvements(query, one) for one in worth])
         for one, candidate in _in_time(curves, query.began, budget_s, _ROUND * len(worth)):
             if candidate is not None and candidate.length < (1.0 - _WORTHWHILE) * path.length_rad:
                 found = self._certified(query, candidate, one)
@@ -308,32 +299,39 @@ class Answering:
                     path, reached = found, one
         return path, reached
 
+    def _improvements(
+        self, query: Query, one: Pursued
+    ) -> Iterator[tuple[Pursued, Candidate | None]]:
+        if refused_end(replace(query, goal=one.goal), "goal", self.certifier.collisions):
+            return
+        for found in self.method.improvements(query.task, query.start, one.goal, query.parts):
+            if found is not None and one.room is not None:
+                found = slid(query.task, found, one.room)
+            yield one, found
+
     def _searched_on(
         self, query: Query, pursued: Sequence[Pursued], budget_s: float
     ) -> tuple[Trajectory, Pursued] | None:
         """The first path that is certified where none was found at once, and where it leads; None
-        where the time is over before.  What is refused, or what the graph holds to be unconnected,
-        is not looked for any longer.
+        where the time is over before.
         """
-        left = [one for one in pursued if one.answer is None or one.answer.is_open]
-        left = sorted(left, key=lambda one: one.distance)[: 1 + _IMPROVED]
-        curves = _by_turns([self._led(query, one, self.method.further) for one in left])
-        for one, candidate in _in_time(curves, query.began, budget_s, 2 * len(left), _LARGER):
-            found = None if candidate is None else self._certified(query, candidate, one)
-            if isinstance(found, Trajectory):
-                return found, one
+        tries = _by_turns([self._tries(query, one) for one in pursued])
+        for one, curves in _in_time(tries, query.began, budget_s, 2 * len(pursued)):
+            for candidate in curves:
+                if one.room is not None:
+                    candidate = slid(query.task, candidate, one.room)
+                found = self._certified(query, candidate, one)
+                if isinstance(found, Trajectory):
+                    return found, one
+                one.failed = f"; the {candidate.source} curve fails: {found}"
+            one.answer = Answer("not_found")
         return None
 
-    def _led(
-        self, query: Query, one: Pursued, curves: Proposing
-    ) -> Iterator[tuple[Pursued, Candidate | None]]:
-        """The method's further curves to a goal, unless it is refused."""
+    def _tries(self, query: Query, one: Pursued) -> Iterator[tuple[Pursued, Iterator[Candidate]]]:
         if refused_end(replace(query, goal=one.goal), "goal", self.certifier.collisions):
             return
-        for found in curves(query.task, query.start, one.goal, query.parts):
-            if found is not None and one.room is not None:
-                found = slid(query.task, found, one.room)
-            yield one, found
+        for curves in self.method.further(query.task, query.start, one.goal, query.parts):
+            yield one, curves
 
     def _certified(self, query: Query, candidate: Candidate, one: Pursued) -> Trajectory | str:
         """The candidate as a trajectory if it is certified, otherwise why it is not: its end is the
@@ -453,18 +451,23 @@ def _beside_others(path: Trajectory, others: Sequence[Candidate]) -> Trajectory:
     return replace(path, explanation=line, statistics=replace(path.statistics, ways=ways))
 
 
-def _in_time(
-    items: Iterator[Item], began: float, budget_s: float, kinds: int, larger: float = 1.0
-) -> Iterator[Item]:
+def _is_open(query: Query, one: Pursued, is_connected: Callable[[Pursued], bool]) -> bool:
+    """Whether further tries may find a path to a configuration to which none was found: it is not
+    refused, and the graph does not hold it to be apart.
+    """
+    if one.answer is not None:
+        return one.answer.is_open
+    return not query.parts.graph or is_connected(one)
+
+
+def _in_time(items: Iterator[Item], began: float, budget_s: float, kinds: int) -> Iterator[Item]:
     """Items until the time is over: none is begun that would end too late, going by the last of its
-    kind, and for the first ones by the longest.  kinds: items after which they come round again,
-    so many times as long.
+    kind, and for the first ones by the longest.  kinds: items after which they come round again.
     """
     spent = time.perf_counter() - began
     lasted = deque[float](maxlen=max(kinds, 1))
     while (
-        spent + larger * (lasted[0] if len(lasted) == lasted.maxlen else max(lasted, default=0.0))
-        < budget_s
+        spent + (lasted[0] if len(lasted) == lasted.maxlen else max(lasted, default=0.0)) < budget_s
     ):
         try:
             item = next(items)
@@ -475,9 +478,7 @@ def _in_time(
         lasted.append(spent - before)
 
 
-def _by_turns(
-    several: Sequence[Iterator[tuple[Pursued, Candidate | None]]],
-) -> Iterator[tuple[Pursued, Candidate | None]]:
+def _by_turns(several: Sequence[Iterator[Item]]) -> Iterator[Item]:
     """One of each, again and again, until all are at their end."""
     waiting = deque(several)
     while waiting:

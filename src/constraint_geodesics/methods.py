@@ -58,10 +58,8 @@ class Method(Protocol):
 
     def further(
         self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts
-    ) -> Iterator[Candidate | None]:
-        """Curves where no candidate came to a path, for as long as there is time; None after each
-        try.
-        """
+    ) -> Iterator[Iterator[Candidate]]:
+        """Where no candidate came to a path, for as long as there is time: each try's curves."""
         ...
 
 
@@ -91,8 +89,8 @@ class SearchMethod:
 
     def further(
         self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts
-    ) -> Iterator[Candidate | None]:
-        """New, ever larger trees."""
+    ) -> Iterator[Iterator[Candidate]]:
+        """New trees."""
         return further(task, start, goal, parts)
 
 

@@ -343,7 +343,7 @@ class Planner:
         certified is the answer; with a budget shorter ones, round the other side of something, are
         looked for while there is time for one more, by how long such a one took before, until so
         many seconds have passed since the call; where none is found at once, and the roadmap does
-        not hold the ends to be unconnected, new, ever larger trees are grown for as long.
+        not hold the ends to be unconnected, new, larger trees are grown for as long.
         Functions of a constraint's own are compiled before, a roadmap that is not made yet is made
         within.  snap: a start that violates the
         constraint or a limit is moved to the nearest configuration that keeps them, where that is

@@ -244,8 +244,8 @@ class LearnedMethod:
 
     def further(
         self, task: Task, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"], parts: Parts
-    ) -> Iterator[Candidate | None]:
-        """None: all rounds were looked at."""
+    ) -> Iterator[Iterator[Candidate]]:
+        """No others: the curves of all rounds are candidates."""
         return iter(())
 
 

@@ -24,7 +24,7 @@ _PAIRS = 20
 class PlannerSettings(BaselineSettings):
     """method: how it looks for curves (`Planner.load`).  without: parts that are switched off.
     only: those that are left, null: all that the planner has by itself.  budget_s: time [s] it goes
-    on shortening its path for.
+    on shortening its path for, or looking for one.
     """
 
     family: ClassVar = "planner"

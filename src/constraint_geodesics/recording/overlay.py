@@ -347,7 +347,7 @@ def _series_of(chunks: Sequence[Chunk]) -> dict[str, _Lines]:
         elif recording.has(chunk, "Scalars:scalars"):
             rows = np.array(recording.component(chunk, "Scalars:scalars"), dtype=float)
             values[entity] = (rows, _time(chunk))
-    found = names.keys() & values.keys()
+    found = [entity for entity in names if entity in values]
     return {entity: _Lines(names[entity], *values[entity]) for entity in found}
 
 

@@ -268,13 +268,15 @@ class BodyTable:
         if allowed != before.allowed:  # of what is named there all pairs are looked at again
             named = set().union(*(allowed ^ before.allowed))
             news |= {key for key in bodies if key.name in named}
+        order = [*self._robot, *(BodyKey(name, True) for name in wanted)]  # the scene's own
+        bodies, blocks = ({key: own[key] for key in order} for own in (bodies, blocks))
         places = _places(bodies)
         stay = [-1 if key in news else places.get(key, -1) for key in before.bodies]
         ends = np.array(stay, int)[before.ends]
         moving = [*self._robot, *(BodyKey(one.name, True) for one in scene.attached)]
         more = _pairs(bodies, places, moving, allowed, news)
         ends = np.concatenate([ends[(ends >= 0).all(axis=1)], more])
-        # in the order of the bodies, whatever came when: of what is as near the first counts
+        # whatever came when: of what is as near the first counts
         ends = ends[np.lexsort((ends.min(axis=1), ends.max(axis=1)))]
         self._now = _Now(scene, allowed, bodies, places, blocks, shapes, ends)
 

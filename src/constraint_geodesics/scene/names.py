@@ -45,8 +45,9 @@ def require_names(
     shapes = (*workcell, *(one.shape for one in attached))
     given = [shape.name for shape in shapes]
     names = set(given)
-    for name in names.intersection(links):
-        raise SceneError(f"{name!r} is a link of the robot: give the shape another name")
+    for name in given:
+        if name in links:
+            raise SceneError(f"{name!r} is a link of the robot: give the shape another name")
     _require_distinct(given)
     for link in (*(own for s in shapes for own in s.exempt_links), *(one.link for one in attached)):
         if link not in links:

@@ -183,11 +183,11 @@ class World:
         shapes = (*fixed, *(one.shape for one in attached))
         pairs = [*allowed, *((s.name, link) for s in shapes for link in s.exempt_links)]
         pairs += [(one.name, other) for one in attached for other in (one.link, *one.touching)]
-        gone = {
+        gone = dict.fromkeys(  # in order: PyBullet gives their numbers to others
             name
             for name, own in self._shapes.items()
             if name not in wanted or not is_unchanged(wanted[name], own.made)
-        }
+        )
         news = {n: one for n, one in wanted.items() if n not in self._shapes or n in gone}
         made = self._made(news)  # all that can fail, before anything goes
         now = frozenset(map(frozenset, pairs)) | self._never
@@ -195,7 +195,7 @@ class World:
         # does all of it again
         try:
             # before a body goes, since PyBullet gives its number to another
-            over = {p for p in self._allowed if p not in now or p & gone}
+            over = {p for p in self._allowed if p not in now or not p.isdisjoint(gone)}
             self._allowed -= over
             self._filter(over, 1)
             for name in gone:

@@ -68,8 +68,8 @@ TREES_APART = 2
 """Where the graph holds the ends to be unconnected, which it hardly ever errs in."""
 PATIENT = TreeSettings(iterations=4000, nodes=20_000)
 """Of one more pair, the last."""
-MOST_PATIENT = 4
-"""Where there is time, pairs are grown on whose iterations come to so many times as many."""
+TIRELESS = TreeSettings(iterations=16_000, nodes=80_000)
+"""Of each pair where there is a budget."""
 NARROW_M = 0.0005
 """What is kept clear where no way with the settings' clearance was found [m]: a few times what the
 certificate asks for.
@@ -201,9 +201,8 @@ def candidates(
         for seed in range(TREES_APART if apart else TREES):
             yield None
             yield from _over_tree(task, start, goal, parts.refinement, seed)
-        narrower = task.settings.clearance_m > 2.0 * NARROW_M  # else the same passages are as wide
         last = ((0, None), (1, None), (TREES, None if apart else PATIENT))
-        for seed, settings in last if narrower else last[2:]:
+        for seed, settings in last if _is_wide(task) else last[2:]:
             yield None
             yield from _over_tree(task.narrow, start, goal, parts.refinement, seed, settings)
     yield answer
@@ -329,19 +328,20 @@ def further(
     start: Float[np.ndarray, "D"],
     goal: Float[np.ndarray, "D"],
     parts: Parts = ALL_PARTS,
-) -> Iterator[Candidate | None]:
-    """Where no candidate came to a path, for as long as the caller has time: the ways of new trees,
-    of pairs by turns with the settings' clearance and with less, ever larger ones; None after each.
+) -> Iterator[Iterator[Candidate]]:
+    """Where no candidate came to a path, for as long as the caller has time: the curves over the
+    way of each of ever more pairs of trees, grown by turns with the settings' clearance and with
+    less.
     """
-    patience = 1
+    tasks = (task, task.narrow) if _is_wide(task) else (task,)
     for seed in itertools.count(TREES + 1) if parts.tree else ():
-        settings = replace(
-            PATIENT, iterations=patience * PATIENT.iterations, nodes=patience * PATIENT.nodes
-        )
-        for one in (task, task.narrow):
-            yield from _over_tree(one, start, goal, parts.refinement, seed, settings)
-            yield None
-        patience = min(2 * patience, MOST_PATIENT)
+        for one in tasks:
+            yield _over_tree(one, start, goal, parts.refinement, seed, TIRELESS)
+
+
+def _is_wide(task: Task) -> bool:
+    """Whether less clearance opens further passages."""
+    return task.settings.clearance_m > 2.0 * NARROW_M
 
 
 def _over_graph(
