@@ -83,12 +83,12 @@ bench-geometry: env  ## time the geometry core again, after whatever it needs; w
 	dvc repro --single-item --force stages/dvc.yaml:benchmark_geometry
 
 TESTS := python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
-EXPERIMENTS := end_to_end geodesics geometry identification laws learning peers pipeline report studies tracking
+EXPERIMENTS := end_to_end faults/test_kills.py geodesics geometry identification laws learning peers pipeline report studies tracking
 
 test: env  ## run the tests of what people call: planner, shell, robots, scenes, goals, constraints, certificate, pages (minutes)
 	$(TESTS) $(EXPERIMENTS:%=--ignore tests/%)
 
-test-experiments: env  ## run all others: learning, laws of geometry, tracking, reports, baselines, studies, a small pipeline (half an hour)
+test-experiments: env  ## run all others: learning, laws of geometry, tracking, reports, baselines, studies, a small pipeline, kills (half an hour)
 	$(TESTS) $(EXPERIMENTS:%=tests/%)
 
 test-faults: env  ## break things on purpose: kills, full disks, bad input, hostile files, load (half an hour); writes reports/reliability.json
