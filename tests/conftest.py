@@ -46,9 +46,8 @@ another.
 @pytest.hookimpl(tryfirst=True)  # xdist reads the groups in the same hook
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """A file stays on one worker, so that what its tests share is made once."""
-    order = {folder: place for place, folder in enumerate(SLOW_FIRST)}
-    names = {item: (item.path.parent.name, item.path.name) for item in items}
-    items.sort(key=lambda item: min(order.get(name, len(order)) for name in names[item]))
+    order = {name: place for place, name in enumerate(SLOW_FIRST)}
+    items.sort(key=lambda item: min(order.get(n, len(order)) for n in item.path.parts[-2:]))
     long = config.getoption("faults") or config.getoption("soak")
     for item in items:
         if item.get_closest_marker("long") and not long:

@@ -76,8 +76,11 @@ def test_what_follows_a_scene_is_what_is_made_anew(planner: Planner) -> None:
     q = robot.sample(400, np.random.default_rng(0))
     task = planner._preparation.task(FREE)
     fresh = clearance_model(now, planner._certifier.collisions.apart)
-    for own, anew in zip(task.clearance.arrays[:3], fresh.arrays[:3], strict=True):
-        np.testing.assert_array_equal(own, anew)  # in the same order, too
+    for kept, made in zip(task.clearance.arrays[:3], fresh.arrays[:3], strict=True):
+        np.testing.assert_array_equal(kept, made)  # in the same order, too
+    np.testing.assert_allclose(
+        task.clearance.clearance(robot, q), fresh.clearance(robot, q), atol=1e-6
+    )
     own = planner._certifier
     with Certifier(now, own.limits) as anew, now.world() as world:
         assert set(own.collisions.collider.bodies) == set(anew.collisions.collider.bodies)
