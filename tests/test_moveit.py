@@ -196,7 +196,15 @@ def test_an_attached_object_takes_no_other_ones_place(planner: Planner, tmp_path
     with pytest.raises(MoveitError, match="its part 'cup_2' is called as another object"):
         add_moveit_scene(written(tmp_path, raw), planner.scene)
     assert planner.scene.now is before
-    objects[-1] = of_two_parts("cup", pose=standing)
+    planner.scene.add(Box("cup", (0.5, 0.0, 0.3), (0.1, 0.1, 0.1)))
+    before = planner.scene.now
+    objects.pop()
+    held["object"] = an_object("cup", 3, [0.1, 0.03], pose(0, 0, 0.07), frame="link6")
+    with pytest.raises(MoveitError, match="its part 'cup' is called as another object"):
+        add_moveit_scene(written(tmp_path, raw), planner.scene)
+    assert planner.scene.now is before, "what is not the file's own stays"
+    planner.scene.remove("cup")
+    objects.append(of_two_parts("cup", pose=standing))
     held["object"] = an_object("cup", 3, [0.1, 0.03], pose(0, 0, 0.07), frame="link6")
     add_moveit_scene(written(tmp_path, raw), planner.scene)
     assert [one.name for one in planner.scene.attached] == ["cup"]
@@ -219,6 +227,8 @@ def set_in(raw: Any, path: str, value: Any) -> Any:
         ("world.collision_objects.0.primitives.0.type", "blob", "is a blob"),
         ("world.collision_objects.0.primitives.0.dimensions", [1, -1, 1], "3 positive numbers"),
         ("world.collision_objects.0.primitives.0.dimensions", [1], "3 positive numbers"),
+        ("world.collision_objects.0.primitives.0.dimensions", "111", "dimensions: must be a list"),
+        ("world.collision_objects.0.primitive_poses.0.position", "123", "3 finite numbers"),
         ("world.collision_objects.0.primitive_poses", [], "1 primitives, 0 primitive_poses"),
         ("world.collision_objects.0.primitives", [], "0 primitives, 1 primitive_poses"),
         ("world.collision_objects.0.planes", [{"coef": [0, 0, 1, 0]}], "plane"),

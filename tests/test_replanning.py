@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
-from constraint_geodesics import Constraint, GoalRegion, Planner, Pose, Sphere, Trajectory
+from constraint_geodesics import Constraint, GoalRegion, Planner, Pose, Sphere, Trajectory, bundle
 from constraint_geodesics.geometry.braking import State, going_on
 from constraint_geodesics.planner import PlannerError
 from constraint_geodesics.trajectory import read_trajectory
@@ -492,6 +492,21 @@ def test_after_its_time_no_other_path_is_tried():
             planner.replan(path, at, limit_s=wrong)
     with pytest.raises(PlannerError, match="replan takes a trajectory, not a list"):
         planner.replan([0.0] * 6, 0.0)
+
+
+def test_a_roadmap_that_has_to_be_made_is_not_waited_for():
+    """Where a shape of the first ones moves there is none; `prepare` makes it."""
+    with Planner.load(bundle.PACKAGED) as planner:
+        path = planner.plan(*pairs_of(NAME, 1, 11)[0], NAME)
+        planner.scene.remove("table")
+        ball = Sphere("ball", tuple(planner.robot.skeleton(path.joints[-8])[-1]), 0.03)
+        planner.scene.add(ball)
+        made = planner._preparation._roadmaps
+        planner.replan(path, 0.0, limit_s=5.0)
+        assert not made
+        planner.replan(path, 0.0)
+        planner.prepare(NAME)
+        assert len(made) == 1
 
 
 def test_scales_stay_and_other_robots_are_refused():

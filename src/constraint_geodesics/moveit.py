@@ -1,12 +1,13 @@
 """MoveIt's planning scenes and motion requests, as YAML of its messages moveit_msgs/PlanningScene
 and moveit_msgs/MotionPlanRequest.
 
-What has no counterpart here is refused by its name, never left out: cones, planes, octomaps with
-something in them, other path constraints than an orientation's, links other than the tool's.
+What bounds a motion and has no counterpart here is refused by its name, never left out: cones,
+planes, octomaps with something in them, other path constraints than an orientation's, links other
+than the tool's.
 """
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
@@ -30,6 +31,7 @@ from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.planning_scene import PlanningScene
+from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.shape import Placement, Shape, ShapeError
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.text_files import write_text
@@ -92,36 +94,41 @@ def add_moveit_scene(file: Path, scene: PlanningScene) -> dict[str, float]:
         _require_none(state, "robot_state.multi_dof_joint_state", "joint_names")
         _require_at_base(raw, scene)
         joints = _joint_state(_entry(state, "joint_state", {}), "robot_state")
-        named = dict[str, list[str]]()
-        now, q = scene.now, _configuration(joints, scene.robot)
-        for number, own in enumerate(_list(world, "collision_objects")):
-            where = f"world.collision_objects[{number}]"
-            with _naming(where):
-                shapes = _shapes(own, where, lambda frame: _fixed(scene, frame))
-                named[str(own["id"])] = [shape.name for shape in shapes]
-                now = now.adding(*shapes)
-        for number, own in enumerate(_list(state, "attached_collision_objects")):
-            where = f"robot_state.attached_collision_objects[{number}]"
-            with _naming(where):
-                name, parts = str(own["object"]["id"]), _held(own, where, scene, q)
-                around = named.pop(name, [])
-                _require_free([held.name for held in parts], {name, *around}, now.names, where)
-                now = now.removing(*(part for part in around if part != name))
-                named[name] = [held.name for held in parts]
-                for held in parts:
-                    now = now.attaching(held)
-        known = {*scene.links, *scene.now.names, *named}
-        with _naming("allowed_collision_matrix"):
-            for first, second in _allowed(_entry(raw, "allowed_collision_matrix", {}), known):
-                for a in named.get(first, [first]):
-                    for b in named.get(second, [second]):
-                        now = now.allowing(a, b)
-        scene.become(now)
+        scene.change(lambda now: _added(now, raw, scene, _configuration(joints, scene.robot)))
     except (MoveitError, RobotError, SceneError, ShapeError) as error:
         raise MoveitError(f"{file}: {error}") from None
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise MoveitError(f"{file}: no planning scene of MoveIt: {_said(error)}") from None
     return joints
+
+
+def _added(now: Scene, raw: Any, scene: PlanningScene, q: np.ndarray | None) -> Scene:
+    """The scene with a file's objects.  q: the arm's configuration, where the file says it."""
+    named, there = dict[str, list[str]](), now.names
+    world, state = _entry(raw, "world", {}), _entry(raw, "robot_state", {})
+    for number, own in enumerate(_list(world, "collision_objects")):
+        where = f"world.collision_objects[{number}]"
+        with _naming(where):
+            shapes = _shapes(own, where, lambda frame: _fixed(scene, frame))
+            named[str(own["id"])] = [shape.name for shape in shapes]
+            now = now.adding(*shapes)
+    for number, own in enumerate(_list(state, "attached_collision_objects")):
+        where = f"robot_state.attached_collision_objects[{number}]"
+        with _naming(where):
+            name, parts = str(own["object"]["id"]), _held(own, where, scene, q)
+            around = named.pop(name, [])
+            _require_free(parts, around, now, where)
+            now = now.removing(*(part for part in around if part != name))
+            named[name] = [held.name for held in parts]
+            for held in parts:
+                now = now.attaching(held)
+    known = {*scene.links, *there, *named}
+    with _naming("allowed_collision_matrix"):
+        for first, second in _allowed(_entry(raw, "allowed_collision_matrix", {}), known):
+            for a in named.get(first, [first]):
+                for b in named.get(second, [second]):
+                    now = now.allowing(a, b)
+    return now
 
 
 def read_moveit_request(
@@ -240,8 +247,8 @@ def _require_none(raw: Any, path: str, name: str) -> None:
 
 def _numbers(raw: Any, names: str) -> list[float]:
     """Of a dictionary, or of a list in that order."""
-    found = [raw[name] for name in names] if isinstance(raw, dict) else list(raw)
-    values = [float(value) for value in found]
+    found = [raw[name] for name in names] if isinstance(raw, dict) else raw
+    values = [float(value) for value in found if not isinstance(found, str)]
     if len(values) != len(names) or not all(map(math.isfinite, values)):
         raise MoveitError(f"{raw}: must be {len(names)} finite numbers")
     return values
@@ -370,7 +377,8 @@ def _with_poses(raw: Any, shapes: str, poses: str, where: str) -> Iterator[tuple
 
 
 def _primitive(raw: Any, name: str, at: Placement, where: str) -> Shape:
-    kind, sizes = raw["type"], [float(x) for x in raw["dimensions"]]
+    kind, given = raw["type"], raw["dimensions"]
+    sizes = [float(x) for x in (_list(raw, "dimensions") if isinstance(given, str) else given)]
     kind = _KINDS.get(kind, str(kind)) if isinstance(kind, int) else str(kind).lower()
     counts = {"box": 3, "sphere": 1, "cylinder": 2}
     if kind not in counts:
@@ -411,11 +419,19 @@ def _mesh_file(raw: Any) -> Path:
     return file
 
 
-def _require_free(parts: Iterable[str], own: set[str], taken: Collection[str], where: str) -> None:
-    """That an attached object takes no other object's place."""
-    for part in parts:
-        if part in taken and part not in own:
-            raise MoveitError(f"{where}: its part {part!r} is called as another object: rename it")
+def _require_free(
+    parts: Sequence[Attached], own: Collection[str], scene: Scene, where: str
+) -> None:
+    """That an attached object takes no place but that of the file's own object in the world, or of
+    the same shape where that stands.
+    """
+    there = {shape.name: shape for shape in scene.workcell}
+    for held in parts:
+        taken = held.name in scene.names and held.name not in own
+        if taken and not (held.name in there and there[held.name].is_like(held.shape)):
+            raise MoveitError(
+                f"{where}: its part {held.name!r} is called as another object: rename it"
+            )
 
 
 def _held(raw: Any, where: str, scene: PlanningScene, q: np.ndarray | None) -> list[Attached]:

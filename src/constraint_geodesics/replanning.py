@@ -48,7 +48,7 @@ class Replanning:
         robot = self.answering.certifier.scene.robot
         if not robot.moves_like(trajectory.scene.robot):
             raise PlannerError(f"the trajectory is of another robot than {robot.name}")
-        query = self._query(trajectory, state, began)
+        query = self._query(trajectory, state, began, np.isfinite(limit_s))
         rest = _Rest(trajectory, state)
         collisions = self.answering.certifier.collisions
         if (end := refused_end(query, "goal", collisions)) is not None:
@@ -75,10 +75,10 @@ class Replanning:
             why = f"{why}; {limit_s:g} s are over"
         return self._timed(query, self._stopped(query, stop, why))
 
-    def _query(self, trajectory: Trajectory, state: State, began: float) -> Query:
-        asked = trajectory.asked
+    def _query(self, trajectory: Trajectory, state: State, began: float, in_haste: bool) -> Query:
+        asked, prepared = trajectory.asked, self.preparation
         return Query(
-            self.preparation.task(asked.constraint),
+            (prepared.task_without_delay if in_haste else prepared.task)(asked.constraint),
             asked.name,
             state.configuration,
             trajectory.wanted,

@@ -1,11 +1,14 @@
 """A scene that changes: what follows it is what would be made anew."""
 
+import os
 import pickle
 import sys
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from threading import Barrier, Event
 
 import numpy as np
 import pybullet_data
@@ -26,9 +29,12 @@ from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.point_cloud import PointCloud
 from constraint_geodesics.scene.scene import Scene, SceneError
+from constraint_geodesics.scene.scene_file import SceneFile
 from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.sphere import Sphere
+from constraint_geodesics.scene.urdf import quiet
 from constraint_geodesics.scene.world import BodyKey
+from constraint_geodesics.search.preparation import KEPT_TASKS
 
 CRATE = Box("crate", (0.45, 0.25, 0.2), (0.2, 0.2, 0.2))
 BALL = Sphere("ball", (-0.3, 0.4, 0.5), 0.12)
@@ -308,6 +314,36 @@ def test_a_roadmap_outlives_what_comes_and_goes(planner: Planner) -> None:
     planner.scene.remove("table")
     below = planner.robot.forward(planner.nodes("level_cup"))[0][:, 2]
     assert (below < 0.0).any()
+
+
+@pytest.mark.parametrize("comes", ["at first", "later"])
+def test_a_roadmap_is_made_anew_where_more_of_what_it_knows_may_touch(comes: str) -> None:
+    """Else it would hold apart what a shape held apart that may be touched now."""
+    with Planner.load(bundle.PACKAGED) as planner:
+        known = "table" if comes == "at first" else CRATE.name
+        if comes == "later":
+            planner.scene.add(CRATE)
+        before = planner.nodes("level_cup")
+        for link in ("link3", "link4", "link5", "link6"):
+            planner.scene.allow(known, link)
+        after = planner.nodes("level_cup")
+        assert np.array_equal(before, after) == (comes == "later")
+
+
+def test_what_is_prepared_for_a_name_is_kept(planner: Planner) -> None:
+    """Also for a name that came later, however many others are asked for."""
+    tilted = Constraint((0, 0, 0, 1, 1, 0), reference=Pose.from_rpy([0, 0, 0], [0.2, 3.0, 0]))
+    planner.constraints["tilted"] = tilted
+    prepared = planner._preparation
+    kept = prepared.task(tilted)
+    used = prepared.task(
+        Constraint((0, 0, 1, 0, 0, 0), reference=Pose.from_rpy([0, 0, 9], [0, 0, 0]))
+    )
+    for number in range(KEPT_TASKS + 10):
+        pose = Pose.from_rpy([0, 0, 0.01 * number], [0, 0, 0])
+        prepared.task(Constraint((0, 0, 1, 0, 0, 0), reference=pose))
+        assert prepared.task(used.manifold.constraint) is used, "asked for again and again"
+    assert prepared.task(tilted) is kept
 
 
 def test_a_scene_is_a_value(planner: Planner) -> None:
@@ -618,6 +654,51 @@ def test_threads_that_share_a_planner_have_their_own_shapes(planner: Planner) ->
         assert all(own in names and other not in names for names in seen[own])
     assert planner.scene.now.names == before.names
     in_step(planner)
+
+
+def test_a_file_that_is_added_takes_no_shape_of_another_query_along(planner: Planner) -> None:
+    """Nor does who looks at the scene see it; and nothing that others add is lost."""
+    inside, seen = Event(), dict[str, object]()
+    said = SceneFile(shapes={"pipe": PIPE})
+
+    def ask() -> None:
+        with planner.scene.including([BALL]):
+            inside.set()
+            time.sleep(0.3)
+
+    def read() -> None:
+        inside.wait(10.0)
+        seen["names"] = planner.scene.now.names
+
+    def load() -> None:
+        inside.wait(10.0)
+        said.into(planner.scene)
+
+    def add() -> None:
+        inside.wait(10.0)
+        planner.scene.add(CRATE)
+
+    with ThreadPoolExecutor(4) as pool:
+        for one in [pool.submit(work) for work in (ask, read, load, add)]:
+            one.result(60.0)
+    assert "ball" not in seen["names"]
+    assert {"pipe", "crate"} < set(planner.scene.now.names)
+    assert "ball" not in planner.scene.now.names
+    in_step(planner)
+
+
+def test_two_that_are_quiet_at_once_leave_the_output_as_it_was() -> None:
+    before, both = [os.fstat(stream).st_ino for stream in (1, 2)], Barrier(2)
+
+    def silent(waits_s: float) -> None:
+        both.wait(10.0)
+        with quiet():
+            time.sleep(waits_s)
+
+    with ThreadPoolExecutor(2) as pool:
+        for one in [pool.submit(silent, waits) for waits in (0.05, 0.1)]:
+            one.result(10.0)
+    assert [os.fstat(stream).st_ino for stream in (1, 2)] == before
 
 
 def test_what_pybullet_breaks_down_at_is_refused_by_its_name(planner: Planner) -> None:

@@ -10,7 +10,7 @@ from constraint_geodesics.fields import Angles3, Vector3
 from constraint_geodesics.robot.kinematics import rotation_from_rpy
 from constraint_geodesics.scene.pieces import Piece, read_pieces
 from constraint_geodesics.scene.shape import PlacedUrdf, Placement, Shape
-from constraint_geodesics.scene.urdf import find_urdf
+from constraint_geodesics.scene.urdf import find_urdf, quiet
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,12 @@ class Body(Shape):
 
     def add_to(self, bullet: Any) -> int:
         """All of the URDF, its moving joints at 0."""
-        return int(
-            bullet.loadURDF(
-                str(find_urdf(self.urdf)),
-                basePosition=self.position_m,
-                baseOrientation=bullet.getQuaternionFromEuler(self.rpy_rad),
-                useFixedBase=True,
+        with quiet():
+            return int(
+                bullet.loadURDF(
+                    str(find_urdf(self.urdf)),
+                    basePosition=self.position_m,
+                    baseOrientation=bullet.getQuaternionFromEuler(self.rpy_rad),
+                    useFixedBase=True,
+                )
             )
-        )

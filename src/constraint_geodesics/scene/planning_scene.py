@@ -39,31 +39,33 @@ class PlanningScene:
     ) -> None:
         self.lock = RLock()  # the planner's, too
         self._now, self._follow = scene, follow
+        self._robot = scene.robot
         self.links, self._link_pose = links, link_pose
 
     @property
     def now(self) -> Scene:
         """As it is: a value that no later change alters."""
-        return self._now
+        with self.lock:  # what others include for a while is not the scene
+            return self._now
 
     @property
     def robot(self) -> SerialRobot:
         """The robot."""
-        return self._now.robot
+        return self._robot
 
     @property
     def workcell(self) -> tuple[Shape, ...]:
         """The shapes around it."""
-        return self._now.workcell
+        return self.now.workcell
 
     @property
     def attached(self) -> tuple[Attached, ...]:
         """What it carries."""
-        return self._now.attached
+        return self.now.attached
 
     def world(self) -> World:
         """A fresh PyBullet world of the scene as it is now."""
-        return self._now.world()
+        return self.now.world()
 
     def link_pose(self, q: Float[np.ndarray, "D"], link: str) -> Float[np.ndarray, "4 4"]:
         """Of a link's frame in the base frame at a configuration [rad]."""
@@ -76,20 +78,17 @@ class PlanningScene:
         """Put shapes around the robot, in the base frame, beside what is there.  Several at once
         cost little more than one.
         """
-        with self.lock:
-            self.become(self._now.adding(*shapes))
+        self.change(lambda now: now.adding(*shapes))
 
     def remove(self, *names: str) -> None:
         """Take shapes away."""
-        with self.lock:
-            self.become(self._now.removing(*names))
+        self.change(lambda now: now.removing(*names))
 
     def move(self, name: str, pose: Any) -> None:
         """Put a shape's own frame, that about its middle or of its file, elsewhere: in the base
         frame, or for what is attached in its link's.  pose: a Pose, or a Placement.
         """
-        with self.lock:
-            self.become(self._now.moving(name, Placement.of(pose)))
+        self.change(lambda now: now.moving(name, Placement.of(pose)))
 
     def attach(self, shape: Shape, link: str, touching: Sequence[str] = ()) -> None:
         """Let a link carry a shape, placed in the link's frame; a shape around the robot of that
@@ -100,8 +99,7 @@ class PlanningScene:
         if isinstance(touching, str) or not isinstance(touching, Sequence):
             raise SceneError(f"touching = {shown(touching)}: must be a list of names")
         require_texts(link, *touching)
-        with self.lock:
-            self.become(self._now.attaching(Attached(shape, link, tuple(touching))))
+        self.change(lambda now: now.attaching(Attached(shape, link, tuple(touching))))
 
     def detach(self, name: str, at: Float[np.ndarray, "D"] | None = None) -> None:
         """Carry a shape no longer.  at: the configuration [rad] at which it is let go: it stays
@@ -117,8 +115,7 @@ class PlanningScene:
 
     def allow(self, first: str, second: str) -> None:
         """Let two bodies touch: shapes, attached or not, or links, by their names."""
-        with self.lock:
-            self.become(self._now.allowing(first, second))
+        self.change(lambda now: now.allowing(first, second))
 
     @contextmanager
     def including(self, shapes: Sequence[Shape]) -> Iterator[None]:
@@ -141,6 +138,13 @@ class PlanningScene:
             self.become(scene)
             raise
 
+    def change(self, changed: Callable[[Scene], Scene]) -> None:
+        """Become what a function makes of the scene, all of it or nothing, with no other thread's
+        change between.
+        """
+        with self.lock:
+            self.become(changed(self._now))
+
     def become(self, scene: Scene) -> None:
         """Take all of another scene of the same robot."""
         if not isinstance(scene, Scene):
@@ -154,10 +158,8 @@ class PlanningScene:
             try:
                 self._follow(scene)
                 self._now = scene
-            except Exception:
-                raise  # nobody has followed
             except BaseException:
-                # an interrupt: some may have followed, and others not
+                # after an interrupt some may have followed, and others not
                 self._now = before
                 self._follow(before)
                 raise

@@ -24,7 +24,7 @@ from constraint_geodesics.scene.attached import Attached
 from constraint_geodesics.scene.body import Body
 from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.planning_scene import PlanningScene
-from constraint_geodesics.scene.scene import SceneError
+from constraint_geodesics.scene.scene import Scene, SceneError
 from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.scene.shapes import AnyShape
 
@@ -67,7 +67,10 @@ class SceneFile(_Record):
         """Add all of it to a planner's scene, or nothing.  What stands there is attached where it
         is that shape; another one of its name is refused, which would take its place unseen.
         """
-        now = scene.now.adding(*self.shapes.values())
+        scene.change(self._added)
+
+    def _added(self, now: Scene) -> Scene:
+        now = now.adding(*self.shapes.values())
         around = {shape.name: shape for shape in now.workcell}
         for name, held in self.attached.items():
             if name in around and not around[name].is_like(held.shape):
@@ -76,7 +79,7 @@ class SceneFile(_Record):
             now = now.attaching(Attached(held.shape, held.link, held.touching))
         for first, second in self.allowed:
             now = now.allowing(first, second)
-        scene.become(now)
+        return now
 
 
 def read_scene(file: Path) -> SceneFile:

@@ -95,8 +95,8 @@ class Placement:
             return pose
         try:
             x, y, z = (float(value) for value in pose.position)
-            return cls((x, y, z), rpy_of(np.asarray(pose.rotation, float)))
-        except (AttributeError, TypeError):
+            return cls((x, y, z), rpy_of(np.asarray(pose.rotation, float).reshape(3, 3)))
+        except (AttributeError, TypeError, ValueError):
             line = f"{shown(pose)} is no pose: must be a Pose or a Placement"
             raise ShapeError(line) from None
 

@@ -6,8 +6,11 @@ import sys
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from threading import RLock
 
 from constraint_geodesics.robot.kinematics import RobotError
+
+_QUIET = RLock()
 
 
 def has_pybullet() -> bool:
@@ -52,16 +55,19 @@ def urdf_name(urdf: Path) -> str:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Silence the lines that PyBullet writes past Python straight to the process's output."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    saved = [(stream, os.dup(stream)) for stream in (1, 2)]
-    try:
-        with open(os.devnull, "w") as nothing:
-            for stream, _ in saved:
-                os.dup2(nothing.fileno(), stream)
-        yield
-    finally:
-        for stream, copy in saved:
-            os.dup2(copy, stream)
-            os.close(copy)
+    """Silence the lines that PyBullet writes past Python straight to the process's output, those of
+    other threads for as long with them: where files are loaded, and nowhere else.
+    """
+    with _QUIET:  # two at once would save each other's silence, and keep it
+        sys.stdout.flush()
+        sys.stderr.flush()
+        saved = [(stream, os.dup(stream)) for stream in (1, 2)]
+        try:
+            with open(os.devnull, "w") as nothing:
+                for stream, _ in saved:
+                    os.dup2(nothing.fileno(), stream)
+            yield
+        finally:
+            for stream, copy in saved:
+                os.dup2(copy, stream)
+                os.close(copy)

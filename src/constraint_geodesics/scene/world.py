@@ -217,12 +217,11 @@ class World:
         if not news:
             return made
         try:
-            with quiet():
-                for name, one in news.items():
-                    try:
-                        made[name] = self._add(one)
-                    except (self._bullet.error, SystemError) as error:
-                        raise RobotError(f"{name!r}: PyBullet can't make it: {error}") from None
+            for name, one in news.items():
+                try:
+                    made[name] = self._add(one)
+                except (self._bullet.error, SystemError) as error:
+                    raise RobotError(f"{name!r}: PyBullet can't make it: {error}") from None
         except BaseException:
             for own in made.values():
                 self._bullet.removeBody(own.body)

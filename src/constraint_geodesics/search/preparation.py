@@ -80,7 +80,7 @@ class Preparation:
     for.
 
     Roadmaps are made among the shapes that are there at first: what comes later is looked at where
-    a way leads.  Once one of the first is gone they are made anew.
+    a way leads.  Once one of the first is gone, or more of them may touch, they are made anew.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Preparation:
         self.band = self._band()
         self._tasks: dict[tuple, Task] = {}
         self._roadmaps: dict[tuple, Roadmap | None] = {}
-        self._named: frozenset[tuple] = frozenset()
+        self._named: Mapping[str, Constraint] = {}
 
     @contextmanager
     def changing(self, scene: Scene) -> Iterator[None]:
@@ -116,11 +116,13 @@ class Preparation:
         around = {shape.name: shape for shape in scene.workcell}
         left = tuple(own for own in self.scene.workcell if own == around.get(own.name))
         held = tuple(one for one in self.scene.attached if one in scene.attached)
-        if (left, held) != (self.scene.workcell, self.scene.attached):
-            first = replace(self.scene, workcell=left, attached=held)
-            later = set(scene.names) - set(first.names)
+        first = replace(self.scene, workcell=left, attached=held)
+        later = set(scene.names) - set(first.names)
+        touching = [frozenset(p for p in s.allowed if later.isdisjoint(p)) for s in (first, scene)]
+        if (left, held, touching[0]) != (self.scene.workcell, self.scene.attached, touching[1]):
             without = self._clearances.model(self.checks.apart, later)
-            self.scene, self._first_clearance, self._roadmaps = first, without, {}
+            self.scene = replace(first, allowed=touching[1])
+            self._first_clearance, self._roadmaps = without, {}
         self._clearance = clearance
 
     def _band(self) -> BandSettings:
@@ -138,8 +140,10 @@ class Preparation:
     def supply(
         self, constraints: Mapping[str, Constraint], roadmaps: Mapping[str, Roadmap]
     ) -> None:
-        """Constraints that are never forgotten, and the roadmaps that exist already."""
-        self._named = frozenset(constraint.key for constraint in constraints.values())
+        """Constraints that are never forgotten, later ones of this mapping too, and the roadmaps
+        that exist already.
+        """
+        self._named = constraints
         for name, roadmap in roadmaps.items():
             # the nodes are written in single precision, which may lie beyond a limit
             inside = np.clip(roadmap.joints, self.scene.robot.lower, self.scene.robot.upper)
@@ -150,13 +154,14 @@ class Preparation:
         key = constraint.key
         if key not in self._tasks:
             if len(self._tasks) >= KEPT_TASKS + len(self._named):
-                oldest = next(other for other in self._tasks if other not in self._named)
+                named = {own.key for own in self._named.values()}
+                oldest = next(other for other in self._tasks if other not in named)
                 del self._tasks[oldest]
                 self._roadmaps.pop(oldest, None)
             manifold = ConstraintManifold(self.scene.robot, constraint)
             roadmap = partial(self._roadmap, key, manifold)
             self._tasks[key] = Task(manifold, self._clearance, roadmap, self.band)
-        known = self._tasks[key]
+        known = self._tasks.pop(key)  # what was asked for last is forgotten last
         if known.clearance is not self._clearance:
             known = replace(known, clearance=self._clearance)
         kept = known.manifold.constraint
@@ -164,6 +169,11 @@ class Preparation:
             known = replace(known, manifold=ConstraintManifold(self.scene.robot, constraint))
         self._tasks[key] = known
         return known
+
+    def task_without_delay(self, constraint: Constraint) -> Task:
+        """The same, without a roadmap where that would have to be made."""
+        task = self.task(constraint)
+        return task if constraint.key in self._roadmaps else replace(task, roadmap=lambda: None)
 
     def _roadmap(self, key: tuple, manifold: ConstraintManifold) -> Roadmap | None:
         if key not in self._roadmaps:
