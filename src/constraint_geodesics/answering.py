@@ -396,6 +396,7 @@ class Answering:
             times,
             region=end.region,
             start_velocity=velocity,
+            scales=query.scales,
         )
         if certificate.violation is not None:
             return Refused(certificate.violation.kind, certificate.violation.message, certificate)
@@ -415,7 +416,7 @@ class Answering:
             times = np.maximum(times, self.pace(query).times(joints, None))
         constraint = query.task.manifold.constraint
         certificate = self.certifier.certify(
-            joints, constraint, query.start, query.goal, times, region=region
+            joints, constraint, query.start, query.goal, times, region=region, scales=query.scales
         )
         line = "the start is the goal"
         if certificate.violation is not None:

@@ -783,12 +783,11 @@ def test_an_arm_that_turns_into_its_path_is_looked_at_beside_it(scene, good) -> 
     assert answer.violation.message.startswith("as the arm turns into the line from row 0: ")
 
 
-def test_a_joint_that_moves_must_stop_before_its_limit(certifier, good) -> None:
+def test_a_joint_that_moves_must_be_able_to_stop_before_its_limit(certifier, good) -> None:
     """At rest a path may begin on a limit."""
     there, out, upper = np.eye(6)[4], np.eye(6)[5], certifier.scene.robot.upper[5]
-    start = np.where(out == 1.0, upper - 1e-4, good.joints[0])
-    rows, times = start + 0.02 * np.arange(9)[:, None] * there, 0.1 * np.arange(9)
-    room = np.sqrt(2.0 * LIMITS.acceleration_rad_s2[5] * 1e-4)
+    start, times = np.where(out == 1.0, upper - 1e-4, good.joints[0]), np.r_[0.0, 0.01:0.5:0.1]
+    rows, room = start + 0.2 * times[:, None] * there, np.sqrt(2e-4 * LIMITS.acceleration_rad_s2[5])
     for share, valid in ((0.0, True), (0.99, True), (1.01, False)):
         velocity = 0.2 * there + share * room * out
         found = certifier.certify(
@@ -798,6 +797,41 @@ def test_a_joint_that_moves_must_stop_before_its_limit(certifier, good) -> None:
         if not valid:
             assert found.violation.kind == "joint_limits"
             assert "needs" in found.violation.message
+
+
+def test_a_joint_that_moves_may_hardly_pass_its_limit_as_the_arm_turns(certifier, good) -> None:
+    """Whether the line leaves the joint where it is or leads it back: it turns evenly."""
+    there, out, upper = np.eye(6)[4], np.eye(6)[5], certifier.scene.robot.upper[5]
+    start, times = np.where(out == 1.0, upper - 1e-4, good.joints[0]), 0.1 * np.arange(9)
+    for back in (0.0, 0.02):
+        rows = start + 0.1 * np.arange(9)[:, None] * (0.2 * there - back * out)
+        turn, fast = np.linspace(0.0, 0.05, 20_001), np.arange(1, 60) / 2e3
+        reached = [(v * turn - 0.5 * (v + back) * turn**2 / 0.05).max() for v in fast]
+        most = np.interp(2e-4, reached, fast)
+        for share, valid in ((0.0, True), (0.98, True), (1.02, False)):
+            velocity = 0.2 * there + share * most * out
+            found = certifier.certify(
+                rows, FREE, times=times, collisions=False, start_velocity=velocity
+            )
+            assert found.valid == valid, found.violation
+            if not valid:
+                assert found.violation.kind == "joint_limits"
+                assert "beyond its limit before the line" in found.violation.message
+
+
+def test_shares_of_the_limits_are_certified(certifier, good) -> None:
+    """A motion that uses them up is refused at half of them."""
+    asked = good.joints, good.constraint, good.start, good.goal, good.times
+    assert certifier.certify(*asked, collisions=False).valid
+    for scales in ((1e-3, 1.0), (1.0, 1e-3)):
+        found = certifier.certify(*asked, collisions=False, scales=scales)
+        assert found.violation.kind == ("velocity" if scales[0] < 1.0 else "acceleration")
+
+
+def test_a_region_must_be_placed(certifier, good) -> None:
+    """It would be relative to the last row itself."""
+    with pytest.raises(CertificationError, match="region has no reference"):
+        certifier.certify(good.joints, FREE, region=Constraint((1, 1, 1, 0, 0, 0)))
 
 
 def test_a_motion_under_way_is_certified_from_its_velocity_alone(certifier, good) -> None:

@@ -29,6 +29,15 @@ def robot(request, tmp_path) -> SerialRobot:
     return request.getfixturevalue(request.param)
 
 
+def test_a_fixed_joint_may_have_an_axis_of_length_0(tmp_path) -> None:
+    flange = '<link name="flange"/><joint name="on" type="fixed"><parent link="tool"/>'
+    flange += '<child link="flange"/><axis xyz="0 0 0"/></joint></robot>'
+    file = tmp_path / "slide.urdf"
+    file.write_text(SLIDE.format(axis="0 0 1").replace("</robot>", flange))
+    *_, last = chain_of_urdf(file, "flange", ["slide"]).links
+    assert (last.name, last.kind) == ("flange", "fixed")
+
+
 def poses(chain: Chain, q: np.ndarray) -> np.ndarray:
     out = np.empty((len(q), 7))
     kernels.poses(chain, q, out)

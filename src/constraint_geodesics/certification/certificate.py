@@ -74,7 +74,8 @@ class Certificate:
     """What was found; a measure is nan where a path is too malformed to have it.
 
     max_violation: largest excess over the constraint's tolerance among the rows and the worst place
-    between them; violation_bound: proven for the whole piecewise linear path; both the larger of
+    between them; violation_bound: proven for the whole piecewise linear path, but not beside it,
+    where an arm turns into the first line from a start_velocity; both the larger of
     the angles' [rad] and the positions' [m], which also stand separately.  limit_distance_rad: to
     the nearest joint limit, negative outside.  goal_violation: by how much the last row is beyond
     the goal's region [rad or m]; nan where none was asked for.

@@ -46,6 +46,8 @@ looked at.
 """
 _LEFT = 1e-3
 """By how much the arm may leave the constraint [rad or m] while it turns into the first line."""
+_BEYOND_RAD = 1e-4
+"""By how much it may pass a joint limit meanwhile [rad, or m]."""
 _POSES = 24
 """Configurations at which the kinematics are compared with PyBullet's."""
 
@@ -96,6 +98,7 @@ class Certifier:
         robot = scene.robot
         self._dof = len(robot.joint_names)
         self._limits = np.array([robot.lower, robot.upper], float)
+        self._beyond = max(self.limits.limit_tolerance_rad, _BEYOND_RAD)
         self._velocity = np.asarray(robot.velocity, float)
         wanted = self.limits.acceleration_rad_s2
         if wanted is not None and len(wanted) != self._dof:
@@ -103,16 +106,18 @@ class Certifier:
                 f"acceleration_rad_s2 has {len(wanted)} entries for {self._dof} joints"
             )
         self._world = scene.world_if_installed()
-        loaded = (
-            chain_of_urdf(robot.urdf, robot.tool_link, robot.joint_names)
-            if self._world is None
-            else self._world.loaded_chain()
-        )
-        self._chain = read_chain(loaded, self._dof)
-        self.collisions = CollisionCheck(
-            scene, self._chain, self._world, self.limits.limit_tolerance_rad
-        )
-        self._pose_difference, self._wrong_pose = self._compared_with_pybullet()
+        try:
+            loaded = (
+                chain_of_urdf(robot.urdf, robot.tool_link, robot.joint_names)
+                if self._world is None
+                else self._world.loaded_chain()
+            )
+            self._chain = read_chain(loaded, self._dof)
+            self.collisions = CollisionCheck(scene, self._chain, self._world, self._beyond)
+            self._pose_difference, self._wrong_pose = self._compared_with_pybullet()
+        except BaseException:
+            self.close()
+            raise
 
     def change(self, scene: Scene) -> None:
         """Certify in another scene of the same robot from now on.  Raises RobotError or ValueError,
@@ -152,13 +157,15 @@ class Certifier:
         collisions: bool = True,
         region: Constraint | None = None,
         start_velocity: Float[np.ndarray, "D"] | None = None,
+        scales: tuple[float, float] = (1.0, 1.0),
     ) -> Certificate:
         """Check a path [rad], with its times [s] if it has them, and report the first promise it
         breaks.  collisions: whether they are looked at.  region: what the last row must keep, as a
         constraint with a reference.  start_velocity: at the first row [rad/s], by default 0; the
         first line must go on from it within the accelerations, in its direction and at half of its
-        speed at least, it must not lead off the constraint, and where accelerations are demanded
-        they must stop each joint before its limit.
+        speed at least, and the arm must not turn into it off the constraint or beyond a limit;
+        where accelerations are demanded they must stop each joint before its limit.  scales: shares
+        of the velocity and acceleration limits that the times must keep.
 
         A constraint without a reference is held relative to the tool's pose at `start`, or else at
         the first row.
@@ -166,13 +173,15 @@ class Certifier:
         rows and between them, times, velocity and acceleration, pose, collisions.  Once one promise
         is broken no later one is looked at; what is cheap to measure is measured all the same.
         Raises CertificationError if `start` or `goal` has the wrong shape, the start's velocity is
-        none or comes without times, or the reference is no pose.
+        none or comes without times, the region has no reference, or one is no pose.
         """
         began = time.perf_counter()
         for own, name in ((constraint, "constraint"), (region, "region")):
             if not isinstance(own, Constraint) and (own is not None or name == "constraint"):
                 what = f"{name} = {type(own).__name__}"
                 raise CertificationError(f"{what}: must be a Constraint")
+        if region is not None and not region.is_placed:
+            raise CertificationError("region has no reference: any last row would keep it")
         moving = self._moving(start_velocity, times)
         ends = self._end(start, "start"), self._end(goal, "goal")
         rows, violation = self._as_rows(joints)
@@ -187,8 +196,7 @@ class Certifier:
         with np.errstate(over="ignore", invalid="ignore"):
             kept = how_kept(Asked(self._chain, rows, constraint, first, self.limits))
             beyond = np.nan if region is None else self._off(rows[-1], region, rows[-1])
-        limits = MotionLimits(self._velocity, self.limits.acceleration_rad_s2, moving)
-        clock, duration = check_times(rows, times, limits)
+        clock, duration = check_times(rows, times, self._motion_limits(scales, moving))
         path = _Path(rows, steps, margins, length, longest, least, beyond, kept)
         begun = self._begun(path, constraint, first, moving, times)
         violation = next(chain(self._broken(path, *ends), clock, begun), self._wrong_pose)
@@ -284,6 +292,15 @@ class Certifier:
                     f"{needed[joint]:.4g} rad to stop, its limit is {room[joint]:.4g} rad away"
                 )
                 yield Violation("joint_limits", 0, float(beyond[joint]), allowed, text)
+        reached = _reached(path.rows, velocity, times)
+        beyond = np.maximum(lower - reached, reached - upper).max(axis=0)
+        if beyond.max() > (allowed := self._beyond):
+            joint = int(np.argmax(beyond))
+            text = (
+                f"joint {joint} of row 0 moves at {velocity[joint]:.4g} rad/s, and gets "
+                f"{beyond[joint]:.3g} rad beyond its limit before the line is followed"
+            )
+            yield Violation("joint_limits", 0, float(beyond[joint]), allowed, text)
         with np.errstate(over="ignore", invalid="ignore"):
             turned = _turned(path.rows, velocity, times)
             left = float(np.max([self._off(q, constraint, first) for q in turned]))
@@ -293,6 +310,11 @@ class Certifier:
                 f"m before the line is followed, {_LEFT:.3g} is allowed"
             )
             yield Violation("start_velocity", 0, left, _LEFT, text)
+
+    def _motion_limits(self, scales: tuple[float, float], moving: np.ndarray) -> MotionLimits:
+        most = self.limits.acceleration_rad_s2
+        scaled = None if most is None else tuple(scales[1] * value for value in most)
+        return MotionLimits(scales[0] * self._velocity, scaled, moving)
 
     def _as_it_turns(
         self, apart: Separation, rows: np.ndarray, velocity: np.ndarray, times: Any
@@ -384,9 +406,28 @@ def _turned(
     """Where an arm is while its velocity changes, evenly, from that at the first row to the first
     line's own in its middle.
     """
-    half = 0.5 * float(times[1] - times[0])
-    line, passed = 0.5 * (rows[1] - rows[0]) / half, half * _TURNED
+    half, line = _first_line(rows, times)
+    passed = half * _TURNED
     return rows[0] + passed * velocity + 0.5 * passed**2 / half * (line - velocity)
+
+
+def _reached(
+    rows: Float[np.ndarray, "T D"], velocity: Float[np.ndarray, "D"], times: Any
+) -> Float[np.ndarray, "2 D"]:
+    """What each joint reaches at most while the velocity changes so: where it turns back, if it
+    does, and where it is at the end.
+    """
+    half, line = _first_line(rows, times)
+    end = 0.5 * half * (velocity + line)
+    back = velocity * line < 0.0
+    peak = 0.5 * half * velocity**2 / np.where(back, velocity - line, 1.0)
+    return rows[0] + np.stack([np.where(back, peak, end), end])
+
+
+def _first_line(rows: Float[np.ndarray, "T D"], times: Any) -> tuple[float, np.ndarray]:
+    """Half of the first line's time [s], and its velocity."""
+    half = 0.5 * float(times[1] - times[0])
+    return half, 0.5 * (rows[1] - rows[0]) / half
 
 
 def _largest(own: Float[np.ndarray, "n 7"], theirs: Float[np.ndarray, "n 7"]) -> float:

@@ -179,23 +179,14 @@ class CollisionCheck:
         return Separation(malformed("clearance", None, text))
 
     def pose_difference(self, q: Float[np.ndarray, "n D"], world: World) -> float:
-        """How far any corner of a link's pieces is from where PyBullet has it at most [m]."""
-        frames = np.empty((2, q.shape[1] + 1, 12))
-        kernels.joint_frames(self.collider.arrays.chain, np.zeros(q.shape[1]), frames[0])
-        links = [(b, b.pose) for b in self.collider.bodies.values() if b.pose is not None]
-        largest = 0.0
-        for row in q:
-            kernels.joint_frames(self.collider.arrays.chain, row, frames[1])
-            theirs = world.link_poses(row, [body.name for body, _ in links])
-            for (body, at_zero), pose in zip(links, theirs, strict=True):
-                corners = np.concatenate([piece.corners for piece in body.pieces])
-                own = _in_base(corners, frames[1, body.frame])
-                in_link = (_in_base(corners, frames[0, body.frame]) - at_zero[:3, 3]) @ at_zero[
-                    :3, :3
-                ]
-                off = in_link @ pose[:3, :3].T + pose[:3, 3] - own
-                largest = max(largest, float(np.linalg.norm(off, axis=1).max()))
-        return largest
+        """How far the frame of any link, whether it has a collision shape or not, is from where
+        PyBullet has it at most: its origin [m], or the tip of an axis of 1 m.
+        """
+        links = list(self.collider.links)
+        own = [[self.collider.link_pose(row, link) for link in links] for row in q]
+        theirs = [world.link_poses(row, links) for row in q]
+        off = (np.array(own) - np.array(theirs))[..., :3, :]
+        return float(np.linalg.norm(off, axis=-2).max())
 
     def _decide(
         self, rows: np.ndarray, row: float, start: float, end: float, pair: float
@@ -311,10 +302,6 @@ def _depth_of_sharp(first: Body, second: Body) -> float:
 
 def _listed(pairs: Iterable[tuple[str, ...]]) -> str:
     return ", ".join(" with ".join(pair) for pair in pairs)
-
-
-def _in_base(points: Float[np.ndarray, "n 3"], frame: np.ndarray) -> Float[np.ndarray, "n 3"]:
-    return points @ frame[3:].reshape(3, 3).T + frame[:3]
 
 
 def _only(pairs: np.ndarray, row: int) -> np.ndarray:

@@ -46,7 +46,8 @@ def _link(
     axis = _triple(urdf, joint, "axis", "xyz", "1 0 0")
     column = joint_names.index(name) if name in joint_names else None
     length = math.hypot(*axis)
-    if length == 0.0 or (kind == "prismatic" and abs(length - 1.0) > _ROUNDING):
+    none = length == 0.0 and kind != "fixed"  # which some files give one of length 0
+    if none or (kind == "prismatic" and abs(length - 1.0) > _ROUNDING):
         # programs differ in whether such a slide moves by its value or by that times the length
         raise CertificationError(f"{urdf}: the axis of joint {name!r} is of length {length:.6g}")
     kind = _KINDS.get(kind, kind)
