@@ -196,6 +196,14 @@ def test_a_graph_without_its_constraint_is_refused(folder) -> None:
         Planner.load(folder)
 
 
+def test_a_graph_of_another_arm_is_refused(packaged: Bundle, tmp_path) -> None:
+    name, graph = next(iter(packaged.roadmaps.items()))
+    fewer = {name: replace(graph, joints=graph.joints[:, :5])}
+    replace(packaged, roadmaps=fewer).write(tmp_path)
+    with pytest.raises(BundleError, match=f"the roadmap of {name} has 5 joints.*the arm has 6"):
+        Planner.load(tmp_path)
+
+
 def test_a_bundle_says_where_it_came_from(folder, tmp_path, monkeypatch) -> None:
     assert open_bundle(folder)[1] == str(folder)
     assert open_bundle(str(folder))[1] == str(folder)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from constraint_geodesics import bundle, cli, cli_planning, progress
+from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.recording.recording import read_recording
 from constraint_geodesics.trajectory import read_trajectory
 from tests.planner_fixtures import NAMES, nodes_of, packaged_bundle, packaged_planner, pairs_of
@@ -102,7 +103,7 @@ def test_a_path_is_planned_and_its_files_are_written(command, query, tmp_path) -
     assert code == 0
     own = packaged_planner().plan(*pairs_of("level_cup", 1, seed=1)[0], "level_cup")
     figures = rf"{own.length_rad:.2f} rad, motion {own.times[-1]:.2f} s, planned in \d+ ms"
-    bound, clear = f"{own.violation_bound_rad:.1e}", f"{1e3 * own.clearance_m:.1f}"
+    bound, clear = f"{own.violation_bound:.1e}", f"{1e3 * own.clearance_m:.1f}"
     proven = rf"at most {bound} \(rad, m\) off level_cup anywhere, at least {clear} mm from .*"
     assert re.fullmatch(f"solved: {figures}; proven: {proven}\n", out), out
     assert err.strip() == f"planner: {bundle.PACKAGED}"
@@ -136,7 +137,7 @@ def test_an_answer_is_one_json_object(command, query, tmp_path) -> None:
     answer = strict(out)
     assert answer["status"] == "solved"
     assert answer["constraint"] == "level_cup"
-    assert 0.0 <= answer["violation_bound_rad"] <= 1e-4
+    assert 0.0 <= answer["violation_bound"] <= 1e-4
     out_of_reach = asked(query[0], TOUCHES_ITSELF, "free")
     code, out, _ = command(*out_of_reach, "--json", "--out", str(tmp_path / "path.csv"))
     assert code == 3
@@ -350,6 +351,27 @@ def test_wrong_usage_of_check_is_code_two(command, saved, tmp_path) -> None:
     code, out, err = command("check", str(bare))
     assert (code, out) == (2, "")
     assert "--constraint" in error_line(err)
+
+
+def test_a_path_comes_out_of_a_pipe(saved) -> None:
+    """Once: nothing of it is left for a second reading."""
+    program = [Path(sys.executable).parent / "geodesics", "check", "/dev/stdin"]
+    with subprocess.Popen(["cat", saved], stdout=subprocess.PIPE) as cat:
+        done = subprocess.run(
+            program, stdin=cat.stdout, capture_output=True, text=True, check=False
+        )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("valid: ")
+
+
+def test_a_constraint_of_ones_own_comes_from_a_file(command, query, tmp_path) -> None:
+    start, goal = query
+    file = tmp_path / "tilting.yaml"
+    about = json.dumps(Constraint((0, 0, 0, 1, 1, 0), (0, 0, 0, 0.1, 0.1, 0)).to_json())
+    file.write_text(f"constraint: {about}\n")
+    words = "--constraint", str(file), "--start", start, "--goal", goal
+    code, out, err = command("plan", *words)
+    assert code == 0, out + err
 
 
 def test_a_reference_in_a_file_that_is_no_pose_is_code_two(command, saved, tmp_path) -> None:

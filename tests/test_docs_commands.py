@@ -271,6 +271,7 @@ CASES = {
     "geodesics\tpla": ["plan"],
     "geodesics\tplan\t--constraint\tlevel": ["level_cup", "level_cup_relaxed"],
     "geodesics\tcheck\tpath.csv\t--constraint\ttool": ["tool_down"],
+    "geodesics\tplan\t--urdf\tarm.urdf\t--constraint\t": ["free", "level"],
     "geodesics\tbench\t--constraint\tsl": ["slide"],
     "geodesics\tbench\t--planner\tstraight": ["straight\\ +\\ band", "straight\\ latent\\ line"],
     "geodesics\tbench\t--planner\tstraight\\ l": ["straight\\ latent\\ line"],

@@ -128,10 +128,8 @@ def test_a_path_keeps_every_promise(planner, certifier, name) -> None:
             np.linalg.norm(np.diff(path.joints, axis=0), axis=1).sum(), rel=1e-12
         )
         assert path.length_rad >= np.linalg.norm(last - first) - 1e-12
-        assert manifold.violation(path.joints).max() <= path.max_violation_rad + 1e-6
-        assert (
-            path.max_violation_rad <= path.violation_bound_rad <= judged.violation_tolerance == 1e-4
-        )
+        assert manifold.violation(path.joints).max() <= path.max_violation + 1e-6
+        assert path.max_violation <= path.violation_bound <= judged.violation_tolerance == 1e-4
         assert path.planning_time_s > 0.0
         assert 0.0 <= path.collision_time_s <= path.planning_time_s
 
@@ -246,7 +244,7 @@ def test_ends_beside_the_constraint_within_its_tolerance_are_taken(planner) -> N
         assert 1e-5 < manifold.violation(beside) < 9e-5
         path = planner.plan(beside, goal, "level_cup")
         assert path.status == "solved", path.explanation
-        assert path.violation_bound_rad <= 1e-4
+        assert path.violation_bound <= 1e-4
         assert path.joints[0].tobytes() == beside.tobytes()
 
 
@@ -387,7 +385,7 @@ def test_what_can_not_be_planned_is_said(planner, tmp_path, status) -> None:
     assert one_line(path.explanation)
     assert path.joints.shape == (0, 6)
     assert path.times.shape == (0,)
-    assert np.isnan([path.length_rad, path.max_violation_rad, path.violation_bound_rad]).all()
+    assert np.isnan([path.length_rad, path.max_violation, path.violation_bound]).all()
     assert path.planning_time_s > 0.0
     for use in (path.save, path.record, path.draw):
         with pytest.raises(PlannerError, match="there is no path"):
@@ -508,7 +506,7 @@ def test_a_goal_that_is_the_start_is_a_path_that_stands(planner, tmp_path, name)
         np.testing.assert_allclose(path.at([0.0, 0.3, 1.0]), np.tile(q, (3, 1)), atol=1e-8)
         assert path.times[0] == 0.0
         assert (np.diff(path.times) > 0.0).all()
-        assert path.violation_bound_rad <= 1e-4
+        assert path.violation_bound <= 1e-4
         path.save(tmp_path / "path.csv")
         assert packaged_planner().check(tmp_path / "path.csv").valid
 
@@ -590,7 +588,7 @@ def test_a_constraint_never_seen_gets_its_graph_when_it_is_needed(small) -> None
     assert len(found) >= 10
     for path in found:
         assert path.source == "graph"
-        assert path.violation_bound_rad <= 1e-4
+        assert path.violation_bound <= 1e-4
         assert manifold.violation(path.at(np.linspace(0.0, 1.0, 60))).max() <= 1e-6
 
 
@@ -695,7 +693,7 @@ def test_a_saved_path_is_certified_by_itself(planner, tmp_path) -> None:
         certificate = packaged_planner().check(tmp_path / "path.csv")
         assert certificate.valid
         assert certificate.length_rad == path.length_rad
-        assert certificate.violation_bound == path.violation_bound_rad
+        assert certificate.violation_bound == path.violation_bound
     assert packaged_planner().check(tmp_path / "path.csv", "level_cup").valid, (
         "what slides is level"
     )
@@ -861,7 +859,7 @@ def test_a_summary_is_strict_json() -> None:
     assert summary["length_rad"] == path.length_rad
     assert summary["duration_s"] == path.times[-1]
     assert summary["source"] == path.source
-    assert summary["violation_bound_rad"] == path.violation_bound_rad
+    assert summary["violation_bound"] == path.violation_bound
 
 
 def test_a_planner_says_where_it_came_from_and_can_be_closed() -> None:

@@ -71,7 +71,7 @@ with Planner.load(PACKAGED) as planner:
     on_board = Constraint(axes=(1, 0, 0, 0, 1, 1), reference=board)
     for constraint in (on_board, tip_on_sphere(robot, (0.4, 0.0, 0.1), 0.3)):
         planner.prepare(constraint)
-        planner.plan(*planner.nodes(constraint)[[0, 1]], constraint).violation_bound_rad
+        planner.plan(*planner.nodes(constraint)[[0, 1]], constraint).violation_bound
     manifold = ConstraintManifold(robot, planner.constraints["level_cup"])
     retract(manifold, start[None] + 0.01), manifold.violation(start), manifold.inclusion(start)
     rows = path.joints.copy()

@@ -88,8 +88,8 @@ def write_files(
     arrays: Mapping[str, Mapping[str, np.ndarray]],
 ) -> None:
     """Write arrays as safetensors files, files that the card names, and the card beside them with
-    their checksums, all of them or none; who is killed between two of them leaves what the card
-    does not fit.
+    their checksums, all of them or none; who is killed between two of them, or can't put one in
+    its place, leaves what the card does not fit.
     """
     card, contents = taken_along(card)
     contents |= {name: save(dict(values)) for name, values in arrays.items()}

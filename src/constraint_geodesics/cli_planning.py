@@ -74,7 +74,7 @@ MoveitScene = Annotated[
 Limit = Annotated[
     str | None,
     typer.Option(
-        help="A name that `geodesics constraints` lists; by default what the file says.",
+        help="As for `plan`; by default what the file says.",
         shell_complete=completion.planned_constraints,
     ),
 ]
@@ -167,8 +167,9 @@ def plan(
     constraint: Annotated[
         str | None,
         typer.Option(
-            help="A name that `geodesics constraints` lists, or a file that `geodesics identify` "
-            "wrote; with --urdf free, or level: the tilt that the tool has at the start.",
+            help="A name that `geodesics constraints` lists, or a file: that of `geodesics "
+            "identify`, or one of your own (docs/first_path.md); with --urdf free, or level: the "
+            "tilt that the tool has at the start.",
             shell_complete=completion.planned_constraints,
         ),
     ] = None,
@@ -226,7 +227,11 @@ def plan(
         float, typer.Option(help="Share of the velocity limits that is used.")
     ] = 1.0,
     acceleration_scale: Annotated[
-        float, typer.Option(help="Share of the acceleration limits that is used.")
+        float,
+        typer.Option(
+            help="Share of the acceleration limits that is used; with --urdf those are 10 rad/s² "
+            "and 1 m/s²."
+        ),
     ] = 1.0,
     method: Annotated[
         str,
@@ -447,14 +452,12 @@ def check(
             with warnings.catch_warnings(record=True) as told:
                 warnings.simplefilter("ignore")
                 warnings.simplefilter("always", UserWarning)  # of shapes that are missing
-                certificate = loaded.check(file, own)
-            held = loaded.constraints[own] if isinstance(own, str) else own
-            if held is None:
-                held = read_trajectory(file, robot=loaded.robot).constraint
+                read = read_trajectory(file, loaded.robot.joint_names, loaded.robot)
+                certificate = loaded.check_read(read, own)
+            held = loaded.constraints[own] if isinstance(own, str) else own or read.constraint
             broken = certificate.violation
-            if broken is not None and broken.kind == "joint_limits" and file.is_file():
-                rows = read_trajectory(file, robot=loaded.robot).joints
-                refuse_degrees_of_table(file, rows, loaded.robot)
+            if broken is not None and broken.kind == "joint_limits":
+                refuse_degrees_of_table(file, read.joints, loaded.robot)
     except (
         *(BundleError, ConstraintError, MoveitError),
         *(PlannerError, RobotError, SceneError),

@@ -22,8 +22,12 @@ class Proposal(NamedTuple):
 
 
 def planned_constraints(context: Any, parameter: Any, incomplete: str) -> list[Any]:
-    """Constraints that the planner knows: of --planner, the pipeline, or the package."""
+    """Constraints that the planner knows: of --planner, the pipeline, or the package; or those of
+    any arm.
+    """
     del parameter
+    if context.params.get("urdf"):
+        return _items({"free": "", "level": ""}, incomplete)
     named = Path(str(context.params.get("planner") or "")) / "planner.json"
     card = next((file for file in (named, PIPELINE, PACKAGED) if file.is_file()), None)
     return _items(_described(_json(card).get("constraints")), incomplete)

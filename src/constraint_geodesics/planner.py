@@ -23,7 +23,7 @@ from pydantic import ValidationError
 
 from constraint_geodesics import warmup
 from constraint_geodesics.answering import Answering
-from constraint_geodesics.bundle import Bundle, open_bundle
+from constraint_geodesics.bundle import Bundle, BundleError, open_bundle
 from constraint_geodesics.certification.certifier import Certificate, Certifier, Limits
 from constraint_geodesics.constraints.constraint import (
     Constraint,
@@ -60,7 +60,7 @@ from constraint_geodesics.scene.shape import Shape
 from constraint_geodesics.search.candidates import ALL_PARTS, Parts
 from constraint_geodesics.search.nearest import Projection, projection
 from constraint_geodesics.search.preparation import Preparation, Query
-from constraint_geodesics.trajectory import Trajectory, read_trajectory
+from constraint_geodesics.trajectory import Read, Trajectory, read_trajectory
 from constraint_geodesics.values import LARGEST, checked_path, is_number, numbers, shown
 
 SNAP_RAD, SNAP_M = 0.01, 0.001
@@ -145,13 +145,21 @@ class Planner:
         settings = bundle.planner
         limits = limits_of(settings, bundle.judge, scene.robot)
         self._certifier = Certifier(scene, limits)
-        self._answering = Answering(self.method, self._certifier)
-        checks = self._certifier.collisions
-        self._preparation = Preparation(scene, checks, settings, self.method.draw)
-        bodies = checks.collider
-        self.scene = PlanningScene(scene, self._follow, bodies.links, bodies.link_pose)
-        roadmaps = bundle.roadmaps if self.method.roadmaps is None else self.method.roadmaps
-        self._preparation.supply(self.constraints, roadmaps)
+        try:
+            self._answering = Answering(self.method, self._certifier)
+            checks = self._certifier.collisions
+            self._preparation = Preparation(scene, checks, settings, self.method.draw)
+            bodies = checks.collider
+            self.scene = PlanningScene(scene, self._follow, bodies.links, bodies.link_pose)
+            roadmaps = bundle.roadmaps if self.method.roadmaps is None else self.method.roadmaps
+            for name, roadmap in roadmaps.items():
+                if roadmap.joints.shape[1] != scene.robot.dof:
+                    line = f"the roadmap of {name} has {roadmap.joints.shape[1]} joints"
+                    raise BundleError(f"{source}: {line}, the arm has {scene.robot.dof}")
+            self._preparation.supply(self.constraints, roadmaps)
+        except BaseException:
+            self._certifier.close()
+            raise
         self.band = self._preparation.band
 
     @classmethod
@@ -191,7 +199,8 @@ class Planner:
         touch, found by sampling.  tool: the pose of the tool's own frame in its link.  hold: values
         of joints that are not to move [rad or m].  workcell: shapes around the arm.  settings:
         accelerations, clearance, roadmaps; by default those of PlannerParams, with no more
-        clearance than CLEARANCE_SHARE of what the arm typically keeps.
+        clearance, unless they say clearance_share, than CLEARANCE_SHARE of what the arm typically
+        keeps.
         Raises RobotError, one line with the mend, where no arm can be made of the files.
         """
         for name, given in (("urdf", urdf), *([] if srdf is None else [("srdf", srdf)])):
@@ -218,7 +227,9 @@ class Planner:
         except ValidationError as error:
             raise RobotError(f"{urdf}: {one_line(error)}") from None
         around = WorkcellParams().including(*shapes_of(workcell, "workcell"))
-        settings = settings or PlannerParams(clearance_share=CLEARANCE_SHARE)
+        settings = settings or PlannerParams()
+        if "clearance_share" not in settings.model_fields_set:
+            settings = settings.model_copy(update={"clearance_share": CLEARANCE_SHARE})
         made = cls(Bundle(robot, around, {}, settings, JudgeParams(), {}), str(urdf))
         made.constraints |= OWN_CONSTRAINTS
         return made
@@ -399,7 +410,8 @@ class Planner:
         certified, else its waypoints come with the certificate that names what it breaks, under the
         status "in_collision" where it meets something.  A trajectory that stopped may be replanned:
         it goes on to the configuration that was wanted.  limit_s: after so many seconds no other
-        path is tried, and the arm stops; by default all are.
+        path is tried, and the arm stops; by default all are.  With it no roadmap is made that is
+        not there: `prepare` makes it before.
         Raises PlannerError for a time beyond 0 and the duration, an answer without a path, or a
         trajectory of another robot.  Shapes of `plan(scene=[…])` are not in the scene.
         """
@@ -438,7 +450,6 @@ class Planner:
                 done(len(answers))
         return answers
 
-    @_in_turn
     def check(
         self,
         file: str | Path,
@@ -455,9 +466,21 @@ class Planner:
         Raises PlannerError if the file can't be read, or neither names a constraint that exists.
         """
         self._require_open()
-        names = self.robot.joint_names
         path = Path(checked_path(file, "file", PlannerError))
-        joints, times, own, moving, among = read_trajectory(path, names, self.robot)
+        read = read_trajectory(path, self.robot.joint_names, self.robot)  # before others wait
+        return self.check_read(read, constraint, start=start, goal=goal)
+
+    def check_read(
+        self,
+        path: Read,
+        constraint: str | Constraint | None = None,
+        *,
+        start: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
+    ) -> Certificate:
+        """The same of a file that is read already."""
+        self._require_open()
+        joints, times, own, moving, among, file = path
         there = self.scene.now.names
         if missing := [name for name in among if name not in there]:
             line = f"{file} was planned among {', '.join(missing)}, which are not in this scene"
@@ -472,7 +495,8 @@ class Planner:
         )
         # one that is not placed is held as the first row has it, if that is anywhere
         held = self._held_at(own, np.where(np.abs(joints[0]) <= LARGEST, joints[0], 0.0))
-        return self._certifier.certify(joints, held, first, last, times, start_velocity=moving)
+        with self.scene.lock:
+            return self._certifier.certify(joints, held, first, last, times, start_velocity=moving)
 
     def _named(self, constraint: str | Constraint) -> tuple[Constraint, str]:
         if isinstance(constraint, Constraint):

@@ -102,7 +102,7 @@ class Trajectory:
     """A planner's answer; two of them are equal only if they are the same object.
 
     status: "solved", or why there is no path to the goal.  joints (T, D) [rad]: waypoints, both
-    ends exact, straight lines between them keep the constraint to within `violation_bound_rad`;
+    ends exact, straight lines between them keep the constraint to within `violation_bound`;
     (0, D) without a path.  times (T,) [s]: within the velocity and acceleration limits, at rest at
     the end, and at the start unless there is a `start_velocity` [rad/s, or m/s of prismatic
     joints].  explanation: one line for people.  certificate: None without a path.
@@ -163,14 +163,14 @@ class Trajectory:
         return np.nan if self.certificate is None else self.certificate.length_rad
 
     @property
-    def max_violation_rad(self) -> float:
+    def max_violation(self) -> float:
         """Largest excess over the tolerance where it was looked at [rad, or m where a held position
         is worse].
         """
         return np.nan if self.certificate is None else self.certificate.max_violation
 
     @property
-    def violation_bound_rad(self) -> float:
+    def violation_bound(self) -> float:
         """Its bound on the whole path [rad, or m]."""
         return np.nan if self.certificate is None else self.certificate.violation_bound
 
@@ -276,7 +276,8 @@ class Trajectory:
         path was certified in, and its certificate says so.  Where the velocity can't change so much
         on what is left of a line, or leads too far beside it, waypoints are drawn anew, along the
         same curve or close by: that is not proven, and the certificate is None.  `planner.replan`
-        certifies a stop in the scene as it is now.
+        certifies a stop in the scene as it is now, and how the arm turns into its first line, which
+        is here as it is on the path.
         Raises PlannerError without a path, for a time beyond 0 and the duration, or where the arm
         can't stop on the path any more.
         """
@@ -387,7 +388,7 @@ class Trajectory:
         self._require_path("draw")
         robot = self.scene.robot
         violation = ConstraintManifold(robot, self.constraint).violation(self.joints)
-        skeletons, bound = robot.skeleton(self.joints), self.violation_bound_rad
+        skeletons, bound = robot.skeleton(self.joints), self.violation_bound
         units = ["m" if sliding else "rad" for sliding in robot.chain.prismatic]
         motion = self.times, self.joints, robot.joint_names, units
         drawn = DrawnPath(*motion, skeletons, violation, bound)
@@ -398,8 +399,8 @@ class Trajectory:
         numbers = {
             "length_rad": self.length_rad,
             "duration_s": self.times[-1] if len(self.times) else np.nan,
-            "max_violation_rad": self.max_violation_rad,
-            "violation_bound_rad": self.violation_bound_rad,
+            "max_violation": self.max_violation,
+            "violation_bound": self.violation_bound,
             "clearance_m": self.clearance_m,
             "goal_violation": np.nan
             if self.certificate is None
@@ -517,14 +518,16 @@ def write_trajectory(
 
 class Read(NamedTuple):
     """What a CSV says of a path: waypoints [rad], and what it has of times [s], a constraint, the
-    velocity at the first waypoint [rad/s], and names of the shapes that it was planned among.
+    velocity at the first waypoint [rad/s], names of the shapes that it was planned among, and which
+    file it is.
     """
 
     joints: Float[np.ndarray, "T D"]
     times: Float[np.ndarray, "T"] | None
     constraint: Constraint | None
     start_velocity: Float[np.ndarray, "D"] | None
-    shapes: tuple[str, ...] = ()
+    shapes: tuple[str, ...]
+    file: Path
 
 
 def read_trajectory(
@@ -566,7 +569,7 @@ def read_trajectory(
     if start is not None and not timed:
         raise PlannerError(f"{file}: a {VELOCITY} goes with times: there is no column time_s")
     shapes = _shapes_of(file, *said[SHAPES]) if SHAPES in said else ()
-    return Read(joints, times, constraint, start, shapes)
+    return Read(joints, times, constraint, start, shapes, file)
 
 
 def _shapes_of(file: Path, number: int, text: str) -> tuple[str, ...]:

@@ -116,6 +116,7 @@ def test_fewer_planners_queries_and_constraints(params) -> None:
     assert not set(left_out) & set(kept)
     assert set(left_out) | set(kept) == set(params.benchmark.planners)
     assert all(entry.queries <= 2 and entry.seeds == 1 for entry in kept.values())
+    assert set(some.benchmark.recorded) == set(kept), "what is asked for is there to be replayed"
     assert fewer(params, 1, 1, None, ["RRT* 10 s"], 20.0)[1] == []
 
 

@@ -1,12 +1,25 @@
 """A constraint of two functions, from the planner to the recording."""
 
+import pickle
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.planner_fixtures import packaged_planner
 
-from constraint_geodesics.constraints.constraint import ConstraintManifold
-from constraint_geodesics.constraints.functions import made_by
+from constraint_geodesics.constraints.constraint import (
+    ConstraintError,
+    ConstraintManifold,
+    constraint_from_json,
+)
+from constraint_geodesics.constraints.functions import (
+    FunctionsConstraint,
+    constraint_factory,
+    made_by,
+    tip_on_sphere,
+)
 from constraint_geodesics.constraints.projection import retract
+from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.trajectory import read_trajectory
 
 SPHERE = "constraint_geodesics.constraints.functions:tip_on_sphere"
@@ -52,6 +65,23 @@ def test_its_path_is_read_again(path, manifold, tmp_path) -> None:
     np.testing.assert_array_equal(joints, path.joints)
     assert constraint.key == manifold.constraint.key
     assert packaged_planner().check(file).valid
+
+
+def test_what_a_factory_makes_when_it_is_called_knows_how(path, manifold, tmp_path) -> None:
+    """As if a file had named it, with arrays in the place of lists."""
+    robot = manifold.robot
+    made = tip_on_sphere(robot, CENTRE, radius_m=RADIUS)
+    assert made.key == manifold.constraint.key
+    again = pickle.loads(pickle.dumps(made))
+    np.testing.assert_array_equal(again.values(path.joints), made.values(path.joints))
+    assert constraint_from_json(made.to_json(), robot).key == made.key
+
+    @constraint_factory
+    def within(robot: SerialRobot) -> FunctionsConstraint:
+        return replace(tip_on_sphere(robot, CENTRE, RADIUS), origin=None)
+
+    with pytest.raises(ConstraintError, match="not made by a factory of a module"):
+        within(robot).to_json()
 
 
 def test_its_path_is_recorded(path, tmp_path) -> None:

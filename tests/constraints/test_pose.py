@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from constraint_geodesics.constraints.constraint import (
     Constraint,
@@ -36,6 +37,15 @@ def pose_of(robot, q) -> Pose:
 def test_a_constraint_that_cannot_be_meant_is_refused(arguments, message) -> None:
     with pytest.raises(ConstraintError, match=message):
         Constraint(**arguments)
+
+
+def test_a_pose_from_a_quaternion_is_the_rotation_that_it_says() -> None:
+    for xyzw in np.random.default_rng(0).normal(size=(50, 4)):
+        found = Pose.from_quaternion([0.1, 0.2, 0.3], 3.0 * xyzw)
+        np.testing.assert_allclose(found.rotation, Rotation.from_quat(xyzw).as_matrix(), atol=1e-12)
+    for wrong in ([0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 1.0], "none"):
+        with pytest.raises(ConstraintError, match="xyzw = .*: must be 4 finite numbers"):
+            Pose.from_quaternion([0.1, 0.2, 0.3], wrong)
 
 
 def test_a_held_axis_needs_a_reference(xarm) -> None:

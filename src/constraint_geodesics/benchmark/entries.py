@@ -309,7 +309,7 @@ def fewer(
         raise BaselineError(
             f"no planner is left: all of them are given more than {longest_s:g} s a query"
         )
-    less = {"planners": kept, "queries": queries, "batch": 1}
+    less = {"planners": kept, "queries": queries, "batch": 1, "recorded": tuple(kept)}
     changed: dict[str, Any] = {"benchmark": params.benchmark.model_copy(update=less)}
     for block, described in (("constraints", params.constraints), ("unseen", params.unseen)):
         some = described if constraints is None else constraints

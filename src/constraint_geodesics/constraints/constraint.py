@@ -65,6 +65,22 @@ class Pose:
         position = _three(position_m, "position_m", "m")
         return cls(position, rotation_from_rpy(_three(rpy_rad, "rpy_rad", "rad")))
 
+    @classmethod
+    def from_quaternion(cls, position_m: Any, xyzw: Any) -> "Pose":
+        """From a position [m] and a quaternion x, y, z, w, as ROS has it, of any length but 0."""
+        found = numbers(xyzw)
+        if found is None or found.shape != (4,) or not are_usable(found) or not found.any():
+            raise ConstraintError(f"xyzw = {shown(xyzw)}: must be 4 finite numbers, not all 0")
+        x, y, z, w = found / np.linalg.norm(found)
+        rotation = np.array(
+            [
+                [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+                [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+                [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+            ]
+        )
+        return cls(_three(position_m, "position_m", "m"), rotation)
+
 
 def _three(values: Any, name: str, unit: str) -> Float[np.ndarray, "3"]:
     found = numbers(values)

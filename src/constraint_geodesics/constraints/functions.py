@@ -9,8 +9,9 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, wraps
 from importlib import import_module
+from inspect import signature
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -147,8 +148,8 @@ class FunctionsConstraint(Constraint):
         """Factory, arguments and tolerances; ConstraintError for functions without a factory."""
         if self.origin is None:
             raise ConstraintError(
-                f"{self.label} was not made by a factory, so that it can't be written: see "
-                f"constraints.functions.constraint_factory"
+                f"{self.label} was not made by a factory of a module, so that it can't be "
+                f"written: see constraints.functions.constraint_factory"
             )
         return {
             "kind": self.kind,
@@ -178,9 +179,33 @@ def constraint_factory(
 ) -> Callable[..., FunctionsConstraint]:
     """Mark a function (robot, **arguments) → FunctionsConstraint that files may name: no other is
     called, whatever a file says.
+
+    What it makes knows how it was made, so that its paths can be saved, and worker processes make
+    it again: where it is a function of a module that can be imported, and its arguments are
+    numbers, texts, lists or arrays.
     """
-    function.__dict__["makes_constraints"] = True
-    return function
+    can_be_found = function.__module__ != "__main__" and function.__qualname__.isidentifier()
+
+    @wraps(function)
+    def making(robot: SerialRobot, *given: Any, **named: Any) -> FunctionsConstraint:
+        made, called = function(robot, *given, **named), signature(function)
+        _, *others = called.bind(robot, *given, **named).arguments.items()
+        try:
+            said = json.dumps(dict(others), sort_keys=True, default=_listed)
+        except (TypeError, ValueError):
+            return made
+        factory = f"{function.__module__}:{function.__qualname__}"
+        return replace(made, origin=Origin(factory, said, robot)) if can_be_found else made
+
+    making.__dict__["makes_constraints"] = True
+    return making
+
+
+def _listed(value: Any) -> Any:
+    """For JSON."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__}: is nothing that JSON holds")
 
 
 def made_by(factory: str, arguments: Mapping[str, Any], robot: SerialRobot) -> FunctionsConstraint:
@@ -196,10 +221,10 @@ def made_by(factory: str, arguments: Mapping[str, Any], robot: SerialRobot) -> F
     if not getattr(function, "makes_constraints", False):
         raise ConstraintError(f"factory = {factory!r}: is no constraint_factory")
     try:
-        made = function(robot, **arguments)
+        made: FunctionsConstraint = function(robot, **arguments)
     except TypeError as error:
         raise ConstraintError(f"factory = {factory!r}: {error}") from None
-    return replace(made, origin=Origin(factory, json.dumps(arguments, sort_keys=True), robot))
+    return made
 
 
 def _made_again(origin: Origin, bounds: tuple[RowBound, ...]) -> FunctionsConstraint:

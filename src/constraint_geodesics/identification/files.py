@@ -57,7 +57,8 @@ def save_constraint(identified: Identified, file: str | Path, where_shown: bool 
 
 
 def load_constraint(file: str | Path, robot: SerialRobot | None = None) -> Constraint:
-    """The constraint that `save_constraint` wrote.
+    """The constraint that `save_constraint` wrote, or of any file whose entry `constraint` is what
+    `Constraint.to_json` gives.
 
     robot: who it is for; relations of one tool say nothing of another's.  Raises ConstraintError,
     one line, if the file is missing or is none, or of another robot or tool.
@@ -70,11 +71,12 @@ def load_constraint(file: str | Path, robot: SerialRobot | None = None) -> Const
         raise ConstraintError(f"{file}: not a constraint's file: must be entries by name")
     try:
         about = CONSTRAINT.updated(about)
-        own = about["robot"]
-        names = own["name"], own["tool_link"]
-        if robot is not None:
-            _require_whose(names, own.get("tool"), robot)
-        return constraint_from_json(about["constraint"])
+        own = about.get("robot")  # what nobody found for an arm is for any
+        if own is not None:
+            names = own["name"], own["tool_link"]
+            if robot is not None:
+                _require_whose(names, own.get("tool"), robot)
+        return constraint_from_json(about["constraint"], robot)
     except (ConstraintError, FormatError) as error:
         raise ConstraintError(f"{file}: {error}") from None
     except (AttributeError, KeyError, TypeError, ValueError) as error:
