@@ -411,7 +411,7 @@ class Planner:
         status "in_collision" where it meets something.  A trajectory that stopped may be replanned:
         it goes on to the configuration that was wanted.  limit_s: after so many seconds no other
         path is tried, and the arm stops; by default all are.  With it no roadmap is made that is
-        not there: `prepare` makes it before.
+        not there: `prepare(trajectory.constraint)` makes it before.
         Raises PlannerError for a time beyond 0 and the duration, an answer without a path, or a
         trajectory of another robot.  Shapes of `plan(scene=[…])` are not in the scene.
         """
@@ -479,23 +479,23 @@ class Planner:
         goal: ArrayLike | None = None,
     ) -> Certificate:
         """The same of a file that is read already."""
-        self._require_open()
-        joints, times, own, moving, among, file = path
-        there = self.scene.now.names
-        if missing := [name for name in among if name not in there]:
-            line = f"{file} was planned among {', '.join(missing)}, which are not in this scene"
-            warnings.warn(line, stacklevel=3)
-        if constraint is not None:
-            own, _ = self._named(constraint)
-        if own is None:
-            raise PlannerError(f"{file} names no constraint: say which with --constraint")
-        first, last = (
-            None if q is None else checked_configuration(q, self.robot.dof, name)
-            for q, name in ((start, "start"), (goal, "goal"))
-        )
-        # one that is not placed is held as the first row has it, if that is anywhere
-        held = self._held_at(own, np.where(np.abs(joints[0]) <= LARGEST, joints[0], 0.0))
         with self.scene.lock:
+            self._require_open()
+            joints, times, own, moving, among, file = path
+            there = self.scene.now.names
+            if missing := [name for name in among if name not in there]:
+                line = f"{file} was planned among {', '.join(missing)}, which are not in this scene"
+                warnings.warn(line, stacklevel=3)
+            if constraint is not None:
+                own, _ = self._named(constraint)
+            if own is None:
+                raise PlannerError(f"{file} names no constraint: say which with --constraint")
+            first, last = (
+                None if q is None else checked_configuration(q, self.robot.dof, name)
+                for q, name in ((start, "start"), (goal, "goal"))
+            )
+            # one that is not placed is held as the first row has it, if that is anywhere
+            held = self._held_at(own, np.where(np.abs(joints[0]) <= LARGEST, joints[0], 0.0))
             return self._certifier.certify(joints, held, first, last, times, start_velocity=moving)
 
     def _named(self, constraint: str | Constraint) -> tuple[Constraint, str]:

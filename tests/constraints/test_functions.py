@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +25,27 @@ from constraint_geodesics.trajectory import read_trajectory
 
 SPHERE = "constraint_geodesics.constraints.functions:tip_on_sphere"
 CENTRE, RADIUS = np.array([0.35, 0.0, 0.15]), 0.25
+
+
+@constraint_factory
+def sphere_of(robot: SerialRobot, **arguments: Any) -> FunctionsConstraint:
+    return replace(tip_on_sphere(robot, **arguments), origin=None)
+
+
+@constraint_factory
+def sphere_of_three(robot: SerialRobot, *centre: float) -> FunctionsConstraint:
+    return replace(tip_on_sphere(robot, centre, RADIUS), origin=None)
+
+
+def unmarked(robot: SerialRobot) -> FunctionsConstraint:
+    return tip_on_sphere(robot, CENTRE, RADIUS)
+
+
+def plain(robot: SerialRobot, centre_m: list[float]) -> FunctionsConstraint:
+    return tip_on_sphere(robot, centre_m, RADIUS)
+
+
+marked = constraint_factory(plain)
 
 
 @pytest.fixture(scope="module")
@@ -70,18 +92,42 @@ def test_its_path_is_read_again(path, manifold, tmp_path) -> None:
 def test_what_a_factory_makes_when_it_is_called_knows_how(path, manifold, tmp_path) -> None:
     """As if a file had named it, with arrays in the place of lists."""
     robot = manifold.robot
-    made = tip_on_sphere(robot, CENTRE, radius_m=RADIUS)
-    assert made.key == manifold.constraint.key
-    again = pickle.loads(pickle.dumps(made))
-    np.testing.assert_array_equal(again.values(path.joints), made.values(path.joints))
-    assert constraint_from_json(made.to_json(), robot).key == made.key
+    for made in (
+        tip_on_sphere(robot, CENTRE, radius_m=RADIUS),
+        sphere_of(robot, centre_m=CENTRE, radius_m=RADIUS),
+    ):
+        again = pickle.loads(pickle.dumps(made))
+        np.testing.assert_array_equal(again.values(path.joints), made.values(path.joints))
+        read = constraint_from_json(made.to_json(), robot)
+        assert read.key == again.key == constraint_from_json(read.to_json(), robot).key
 
     @constraint_factory
     def within(robot: SerialRobot) -> FunctionsConstraint:
         return replace(tip_on_sphere(robot, CENTRE, RADIUS), origin=None)
 
-    with pytest.raises(ConstraintError, match="not made by a factory of a module"):
-        within(robot).to_json()
+    many = sphere_of_three(robot, *CENTRE)
+    for made in (within(robot), many):
+        with pytest.raises(ConstraintError, match="not made by a factory of a module"):
+            made.to_json()
+
+
+def test_what_is_made_by_calling_is_told_apart_by_its_functions(manifold) -> None:
+    """A factory may read a file that was written anew; what a file names is the same for all."""
+    first, second = (tip_on_sphere(manifold.robot, CENTRE, RADIUS) for _ in range(2))
+    assert first.key != second.key
+    arguments = {"centre_m": CENTRE.tolist(), "radius_m": RADIUS}
+    assert made_by(SPHERE, arguments, manifold.robot).key == manifold.constraint.key
+
+
+def test_a_factory_is_marked_where_it_stands(manifold) -> None:
+    """By its own name, and by that of what marks it."""
+    arguments = {"centre_m": CENTRE.tolist()}
+    for name in ("marked", "plain"):
+        found = made_by(f"{__name__}:{name}", arguments, manifold.robot)
+        read = constraint_from_json(found.to_json(), manifold.robot)
+        assert read.key == found.key
+    with pytest.raises(ConstraintError, match="is no constraint_factory"):
+        made_by(f"{__name__}:unmarked", {}, manifold.robot)
 
 
 def test_its_path_is_recorded(path, tmp_path) -> None:

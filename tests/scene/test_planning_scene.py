@@ -330,6 +330,20 @@ def test_a_roadmap_is_made_anew_where_more_of_what_it_knows_may_touch(comes: str
         assert np.array_equal(before, after) == (comes == "later")
 
 
+def test_permissions_that_change_nothing_leave_roadmaps_alone(planner: Planner) -> None:
+    """As in a file of MoveIt: of adjacent links, of some that never meet, and said twice."""
+    before, scene = planner._preparation._roadmaps, planner.scene
+    never = next((a.name, b.name) for a, b in planner._certifier.collisions.apart)
+    for pair in (("link1", "link2"), never, *planner.robot.allowed):
+        scene.allow(*pair)
+    assert planner._preparation._roadmaps is before
+    scene.allow("table", "link5")
+    anew = planner._preparation._roadmaps
+    assert anew is not before
+    scene.allow("link5", "table")
+    assert planner._preparation._roadmaps is anew
+
+
 def test_what_is_prepared_for_a_name_is_kept(planner: Planner) -> None:
     """Also for a name that came later, however many others are asked for."""
     tilted = Constraint((0, 0, 0, 1, 1, 0), reference=Pose.from_rpy([0, 0, 0], [0.2, 3.0, 0]))
@@ -663,8 +677,10 @@ def test_a_file_that_is_added_takes_no_shape_of_another_query_along(planner: Pla
 
     def ask() -> None:
         with planner.scene.including([BALL]):
+            assert "ball" in planner.scene.now.names
             inside.set()
             time.sleep(0.3)
+            seen["after"] = len(seen)  # who looks has not waited
 
     def read() -> None:
         inside.wait(10.0)
@@ -682,6 +698,7 @@ def test_a_file_that_is_added_takes_no_shape_of_another_query_along(planner: Pla
         for one in [pool.submit(work) for work in (ask, read, load, add)]:
             one.result(60.0)
     assert "ball" not in seen["names"]
+    assert seen["after"] == 1
     assert {"pipe", "crate"} < set(planner.scene.now.names)
     assert "ball" not in planner.scene.now.names
     in_step(planner)

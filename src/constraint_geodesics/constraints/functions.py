@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, wraps
 from importlib import import_module
-from inspect import signature
+from inspect import BoundArguments, signature
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -65,6 +65,9 @@ class Origin(NamedTuple):
 class FunctionsConstraint(Constraint):
     """Two functions of the joints and what is demanded of each row.
 
+    origin: how a factory made it, if one did.  is_named: whether a file named that: then it is the
+    same as all that are made so, else its functions say which it is.
+
     Raises ConstraintError for a row without a name, of another unit, or whose numbers are negative
     or not finite.
     """
@@ -74,6 +77,7 @@ class FunctionsConstraint(Constraint):
     jacobian: Writes
     bounds: tuple[RowBound, ...]
     origin: Origin | None = None
+    is_named: bool = False
 
     def __post_init__(self) -> None:
         if not self.bounds:
@@ -137,7 +141,8 @@ class FunctionsConstraint(Constraint):
     @property
     def key(self) -> tuple:
         """Factory and arguments, or the functions; and the bounds."""
-        made = (self.residual, self.jacobian) if self.origin is None else self.origin[:2]
+        own = (self.residual, self.jacobian)
+        made = self.origin[:2] if self.is_named and self.origin is not None else own
         return (self.kind, *made, self.bounds)
 
     def series(self, residual: Float[np.ndarray, "n m"]) -> list[Series]:
@@ -185,20 +190,36 @@ def constraint_factory(
     numbers, texts, lists or arrays.
     """
     can_be_found = function.__module__ != "__main__" and function.__qualname__.isidentifier()
+    called = signature(function)
 
     @wraps(function)
     def making(robot: SerialRobot, *given: Any, **named: Any) -> FunctionsConstraint:
-        made, called = function(robot, *given, **named), signature(function)
-        _, *others = called.bind(robot, *given, **named).arguments.items()
-        try:
-            said = json.dumps(dict(others), sort_keys=True, default=_listed)
-        except (TypeError, ValueError):
+        made, whole = function(robot, *given, **named), called.bind(robot, *given, **named)
+        said = _said(whole)
+        if said is None or not can_be_found:
             return made
         factory = f"{function.__module__}:{function.__qualname__}"
-        return replace(made, origin=Origin(factory, said, robot)) if can_be_found else made
+        return replace(made, origin=Origin(factory, said, robot))
 
-    making.__dict__["makes_constraints"] = True
+    function.__dict__["makes_constraints"] = making.__dict__["makes_constraints"] = True
     return making
+
+
+def _said(called: BoundArguments) -> str | None:
+    """The arguments of a call but the first, by name, as JSON; None where that can't hold them."""
+    _, *others = called.signature.parameters.values()
+    found = dict[str, Any]()
+    for parameter in others:
+        if parameter.name not in called.arguments:
+            continue
+        value = called.arguments[parameter.name]
+        if parameter.kind is parameter.VAR_POSITIONAL:
+            return None  # nobody can name them
+        found |= value if parameter.kind is parameter.VAR_KEYWORD else {parameter.name: value}
+    try:
+        return json.dumps(found, sort_keys=True, default=_listed)
+    except (TypeError, ValueError):
+        return None
 
 
 def _listed(value: Any) -> Any:
@@ -224,7 +245,8 @@ def made_by(factory: str, arguments: Mapping[str, Any], robot: SerialRobot) -> F
         made: FunctionsConstraint = function(robot, **arguments)
     except TypeError as error:
         raise ConstraintError(f"factory = {factory!r}: {error}") from None
-    return made
+    origin = Origin(factory, json.dumps(arguments, sort_keys=True), robot)
+    return replace(made, origin=origin, is_named=True)
 
 
 def _made_again(origin: Origin, bounds: tuple[RowBound, ...]) -> FunctionsConstraint:

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numba import njit
 
 from constraint_geodesics.compiled import COMPILE, LEAF
@@ -124,17 +124,25 @@ class Clearances:
         """Of the scene as it is now.  apart: as above, where others are known by now.  without:
         names of shapes that are left out.
         """
+        ends = self._ends(self._apart if apart is None else apart, without)
+        if not len(ends):
+            return NO_CLEARANCE
+        return ClearanceModel(ClearanceArrays(*self._table.arrays(ends), len(ends)))
+
+    def pairs(self, apart: Collection[Pair], without: Collection[str]) -> frozenset[Pair]:
+        """What that model looks at."""
+        keys = list(self._table.bodies)
+        return frozenset((keys[a], keys[b]) for a, b in self._ends(apart, without))
+
+    def _ends(self, apart: Collection[Pair], without: Collection[str]) -> Int[np.ndarray, "n 2"]:
+        """The pairs that may meet, by the places of their bodies."""
         table, frames = self._table, self._table.frames
-        kept = (frames[:, 0] != frames[:, 1]) & ~table.named(
-            self._apart if apart is None else apart
-        )
+        kept = (frames[:, 0] != frames[:, 1]) & ~table.named(apart)
         if without:
             left_out = {BodyKey(name, True) for name in without}
             kept &= ~np.array([key in left_out for key in table.bodies])[table.ends].any(axis=1)
-        ends = table.ends[kept]
-        if not len(ends):
-            return NO_CLEARANCE
-        return ClearanceModel(ClearanceArrays(*table.arrays(ends), len(ends)))
+        found: Int[np.ndarray, "n 2"] = table.ends[kept]
+        return found
 
 
 def clearance_model(scene: Scene, apart: Collection[Pair] = ()) -> ClearanceModel:

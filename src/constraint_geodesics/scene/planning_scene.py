@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from threading import RLock
+from threading import RLock, get_ident
 from typing import Any
 
 import numpy as np
@@ -38,15 +38,16 @@ class PlanningScene:
         link_pose: LinkPoses,
     ) -> None:
         self.lock = RLock()  # the planner's, too
-        self._now, self._follow = scene, follow
+        self._now = self._lasting = scene
+        self._guest: int | None = None  # the thread that includes shapes for a while
+        self._follow = follow
         self._robot = scene.robot
         self.links, self._link_pose = links, link_pose
 
     @property
     def now(self) -> Scene:
-        """As it is: a value that no later change alters."""
-        with self.lock:  # what others include for a while is not the scene
-            return self._now
+        """As it is: a value that no later change alters, without what another thread includes."""
+        return self._now if self._guest == get_ident() else self._lasting
 
     @property
     def robot(self) -> SerialRobot:
@@ -121,14 +122,16 @@ class PlanningScene:
     def including(self, shapes: Sequence[Shape]) -> Iterator[None]:
         """With more shapes for a while, and no other thread's."""
         with self.lock:
-            before = self._now
+            before, outer = self._now, self._guest
             try:
                 if shapes:
+                    self._guest = get_ident()
                     self.become(before.adding(*shapes))
                 yield
             finally:
                 if shapes and self._now is not before:
                     self._end_with(before)
+                self._guest = outer
 
     def _end_with(self, scene: Scene) -> None:
         """Become it, an interrupt or not."""
@@ -158,9 +161,13 @@ class PlanningScene:
             try:
                 self._follow(scene)
                 self._now = scene
+                if self._guest is None:
+                    self._lasting = scene
             except BaseException:
                 # after an interrupt some may have followed, and others not
                 self._now = before
+                if self._guest is None:
+                    self._lasting = before
                 self._follow(before)
                 raise
 

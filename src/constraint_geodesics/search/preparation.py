@@ -94,6 +94,7 @@ class Preparation:
         self.draw = draw or scene.robot.sample
         self._clearances = Clearances(scene, checks.apart)
         self._clearance = self._first_clearance = self._clearances.model()
+        self._pairs = self._clearances.pairs(checks.apart, ())
         self.band = self._band()
         self._tasks: dict[tuple, Task] = {}
         self._roadmaps: dict[tuple, Roadmap | None] = {}
@@ -116,14 +117,15 @@ class Preparation:
         around = {shape.name: shape for shape in scene.workcell}
         left = tuple(own for own in self.scene.workcell if own == around.get(own.name))
         held = tuple(one for one in self.scene.attached if one in scene.attached)
-        first = replace(self.scene, workcell=left, attached=held)
-        later = set(scene.names) - set(first.names)
-        touching = [frozenset(p for p in s.allowed if later.isdisjoint(p)) for s in (first, scene)]
-        if (left, held, touching[0]) != (self.scene.workcell, self.scene.attached, touching[1]):
-            without = self._clearances.model(self.checks.apart, later)
-            self.scene = replace(first, allowed=touching[1])
-            self._first_clearance, self._roadmaps = without, {}
-        self._clearance = clearance
+        first = replace(self.scene, workcell=left, attached=held, allowed=scene.allowed)
+        later, apart = set(scene.names) - set(first.names), self.checks.apart
+        is_changed, pairs = (left, held) != (self.scene.workcell, self.scene.attached), self._pairs
+        if is_changed or scene.allowed != self.scene.allowed:  # which may allow what never met
+            pairs = self._clearances.pairs(apart, later)
+        if is_changed or pairs != self._pairs:
+            without = self._clearances.model(apart, later)
+            self._first_clearance, self._pairs, self._roadmaps = without, pairs, {}
+        self.scene, self._clearance = first, clearance
 
     def _band(self) -> BandSettings:
         """With the clearance that this arm can keep."""
