@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,11 +38,18 @@ def sphere_of_three(robot: SerialRobot, *centre: float) -> FunctionsConstraint:
     return replace(tip_on_sphere(robot, centre, RADIUS), origin=None)
 
 
+@constraint_factory
+def sphere_of_numbers(robot: SerialRobot, numbers: dict[int, Any]) -> FunctionsConstraint:
+    return replace(tip_on_sphere(robot, numbers[0], numbers[1]), origin=None)
+
+
 def unmarked(robot: SerialRobot) -> FunctionsConstraint:
     return tip_on_sphere(robot, CENTRE, RADIUS)
 
 
-def plain(robot: SerialRobot, centre_m: list[float]) -> FunctionsConstraint:
+def plain(
+    robot: SerialRobot, centre_m: list[float], file: Path | None = None
+) -> FunctionsConstraint:
     return tip_on_sphere(robot, centre_m, RADIUS)
 
 
@@ -105,8 +113,8 @@ def test_what_a_factory_makes_when_it_is_called_knows_how(path, manifold, tmp_pa
     def within(robot: SerialRobot) -> FunctionsConstraint:
         return replace(tip_on_sphere(robot, CENTRE, RADIUS), origin=None)
 
-    many = sphere_of_three(robot, *CENTRE)
-    for made in (within(robot), many):
+    many = sphere_of_three(robot, *CENTRE), sphere_of_numbers(robot, {0: CENTRE, 1: RADIUS})
+    for made in (within(robot=robot), *many):
         with pytest.raises(ConstraintError, match="not made by a factory of a module"):
             made.to_json()
 
@@ -128,6 +136,8 @@ def test_a_factory_is_marked_where_it_stands(manifold) -> None:
         assert read.key == found.key
     with pytest.raises(ConstraintError, match="is no constraint_factory"):
         made_by(f"{__name__}:unmarked", {}, manifold.robot)
+    with pytest.raises(ConstraintError, match="plain.*Path"):
+        made_by(f"{__name__}:plain", arguments | {"file": Path()}, manifold.robot)
 
 
 def test_its_path_is_recorded(path, tmp_path) -> None:

@@ -633,6 +633,10 @@ def test_an_interrupted_change_has_changed_nothing(
         pressed[:] = [True]  # while they are taken away
     assert planner.scene.now is before
     in_step(planner)
+    planner.scene.add(PIPE)
+    with ThreadPoolExecutor(1) as another:
+        assert another.submit(lambda: planner.scene.now).result(10.0) is planner.scene.now
+    planner.scene.remove("pipe")
     q = planner.robot.sample(1500, np.random.default_rng(9))
     with planner.scene.world() as world:
         np.testing.assert_array_equal(own._world.free(q), world.free(q))

@@ -187,19 +187,20 @@ def constraint_factory(
 
     What it makes knows how it was made, so that its paths can be saved, and worker processes make
     it again: where it is a function of a module that can be imported, and its arguments are
-    numbers, texts, lists or arrays.
+    numbers, texts, lists or arrays.  Make it once: each call is a constraint of its own, with a
+    roadmap of its own.  What files name is one for the same arguments, and must not hang on more.
     """
     can_be_found = function.__module__ != "__main__" and function.__qualname__.isidentifier()
     called = signature(function)
 
     @wraps(function)
-    def making(robot: SerialRobot, *given: Any, **named: Any) -> FunctionsConstraint:
-        made, whole = function(robot, *given, **named), called.bind(robot, *given, **named)
+    def making(*given: Any, **named: Any) -> FunctionsConstraint:
+        made, whole = function(*given, **named), called.bind(*given, **named)
         said = _said(whole)
         if said is None or not can_be_found:
             return made
-        factory = f"{function.__module__}:{function.__qualname__}"
-        return replace(made, origin=Origin(factory, said, robot))
+        factory, robot = f"{function.__module__}:{function.__qualname__}", whole.args[0]
+        return replace(made, origin=Origin(factory, said, robot), is_named=False)
 
     function.__dict__["makes_constraints"] = making.__dict__["makes_constraints"] = True
     return making
@@ -213,13 +214,21 @@ def _said(called: BoundArguments) -> str | None:
         if parameter.name not in called.arguments:
             continue
         value = called.arguments[parameter.name]
-        if parameter.kind is parameter.VAR_POSITIONAL:
+        if parameter.kind in (parameter.POSITIONAL_ONLY, parameter.VAR_POSITIONAL):
             return None  # nobody can name them
         found |= value if parameter.kind is parameter.VAR_KEYWORD else {parameter.name: value}
     try:
-        return json.dumps(found, sort_keys=True, default=_listed)
+        said = json.dumps(found, sort_keys=True, default=_listed)
     except (TypeError, ValueError):
         return None
+    return said if _has_texts(found) else None
+
+
+def _has_texts(value: Any) -> bool:
+    """Whether all keys of dictionaries in it are texts, as JSON's are."""
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and _has_texts(own) for key, own in value.items())
+    return not isinstance(value, list | tuple) or all(map(_has_texts, value))
 
 
 def _listed(value: Any) -> Any:
@@ -243,10 +252,10 @@ def made_by(factory: str, arguments: Mapping[str, Any], robot: SerialRobot) -> F
         raise ConstraintError(f"factory = {factory!r}: is no constraint_factory")
     try:
         made: FunctionsConstraint = function(robot, **arguments)
+        said = json.dumps(arguments, sort_keys=True, default=_listed)
     except TypeError as error:
         raise ConstraintError(f"factory = {factory!r}: {error}") from None
-    origin = Origin(factory, json.dumps(arguments, sort_keys=True), robot)
-    return replace(made, origin=origin, is_named=True)
+    return replace(made, origin=Origin(factory, said, robot), is_named=True)
 
 
 def _made_again(origin: Origin, bounds: tuple[RowBound, ...]) -> FunctionsConstraint:

@@ -24,7 +24,7 @@ class PlanningScene:
     """Shapes around the robot, shapes that it carries, and what may touch.  Every change is in
     force for the next query; what raises SceneError, or RobotError for a shape that can't be
     bounded, has changed nothing, and so has what is interrupted.  While one thread changes it, or
-    its planner answers, others wait.
+    its planner answers, others that change it wait.
 
     follow: takes the changed scene, all or nothing.  links: names of all links of the robot.
     link_pose: of one of them in the base frame at a configuration [rad].
@@ -129,9 +129,11 @@ class PlanningScene:
                     self.become(before.adding(*shapes))
                 yield
             finally:
-                if shapes and self._now is not before:
-                    self._end_with(before)
-                self._guest = outer
+                try:
+                    if shapes and self._now is not before:
+                        self._end_with(before)
+                finally:
+                    self._guest = outer
 
     def _end_with(self, scene: Scene) -> None:
         """Become it, an interrupt or not."""

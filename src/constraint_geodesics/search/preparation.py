@@ -16,6 +16,7 @@ from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.geometry.graph import components
 from constraint_geodesics.params import PlannerParams
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.scene.attached import is_unchanged
 from constraint_geodesics.scene.clearance import ClearanceModel, Clearances
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.world import World
@@ -115,8 +116,16 @@ class Preparation:
         # made first and kept last, so that an interrupt leaves nothing half done
         clearance = self._clearances.model(self.checks.apart)
         around = {shape.name: shape for shape in scene.workcell}
-        left = tuple(own for own in self.scene.workcell if own == around.get(own.name))
-        held = tuple(one for one in self.scene.attached if one in scene.attached)
+        left = tuple(
+            own
+            for own in self.scene.workcell
+            if own.name in around and is_unchanged(around[own.name], own)
+        )
+        held = tuple(
+            own
+            for own in self.scene.attached
+            if any(is_unchanged(one, own) for one in scene.attached)
+        )
         first = replace(self.scene, workcell=left, attached=held, allowed=scene.allowed)
         later, apart = set(scene.names) - set(first.names), self.checks.apart
         is_changed, pairs = (left, held) != (self.scene.workcell, self.scene.attached), self._pairs
