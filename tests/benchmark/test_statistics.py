@@ -196,6 +196,12 @@ def test_planners_that_were_asked_less_are_compared_on_what_they_were_asked() ->
     assert (table.loc["peer", "queries"], table.loc["peer", "verdict"]) == (2, "behind")
 
 
+def test_who_is_given_a_budget_may_end_shortly_after_it() -> None:
+    rows = [row("ours", 0, 0, 1.1, 0.01), row("peer", 0, 0, 1.0, 1.03)]
+    table = ours_against_baselines(table_of(rows), {"ours": 0.0}, [], [0.97, 1.0])
+    assert table["verdict"].tolist() == ["behind", "ahead"]
+
+
 def test_a_budget_that_no_solvable_query_was_asked_with_counts_as_the_one_before() -> None:
     rows = [row("ours", q, 0, 1.0 if q else np.nan, 0.01) for q in range(3)]
     rows += [row("ours 1 s", 0, 0, np.nan, 1.1), row("peer", 1, 0, 1.5, 0.01)]

@@ -18,6 +18,7 @@ from constraint_geodesics.identification import (
     load_constraint,
     save_constraint,
 )
+from constraint_geodesics.identification.demonstrations import demonstrations_from
 from constraint_geodesics.identification.identify import with_tolerance
 from constraint_geodesics.planner import Planner
 
@@ -255,6 +256,45 @@ def test_files_are_read_as_arrays_are(xarm, tmp_path) -> None:
     (tmp_path / "text.csv").write_text("a,b\nc,d\n")
     with pytest.raises(DemonstrationError, match="not a table of numbers"):
         identify(tmp_path / "text.csv", xarm)
+
+
+def test_columns_are_never_taken_for_others(xarm, tmp_path) -> None:
+    """By their order where names are half of them right, or beside one that is no text."""
+    shown, names = np.concatenate(demonstrations("cup", xarm, 4)), list(xarm.joint_names)
+    table = pd.DataFrame(shown, columns=names)
+    numbers = pd.Series(np.repeat(np.arange(4), len(shown) // 4))
+    told, motions = demonstrations_from(pd.concat([numbers, table], axis=1), xarm)
+    assert not motions or len(told) == 1
+    np.testing.assert_array_equal(np.unique(np.concatenate(told), axis=0), np.unique(shown, axis=0))
+    swapped = [names[1], names[0], "joint_3", *names[3:]]
+    file = tmp_path / "swapped.csv"
+    table.set_axis(swapped, axis=1).to_csv(file, index=False)
+    with pytest.raises(DemonstrationError, match=f"swapped.csv: among its columns.*{names[2]}"):
+        demonstrations_from(file, xarm)
+    file.write_text(",".join(["0.1"] * 5 + [""]) + "\n" + table.to_csv(index=False, header=False))
+    with pytest.raises(DemonstrationError, match="its first row is 0.1,.*numbers alone, or names"):
+        demonstrations_from(file, xarm)
+
+
+def test_a_tip_on_a_sphere_whose_axis_lies_in_it_is_found(kuka) -> None:
+    """What is found later is looked at on other rows, too."""
+    centre, radius = np.array([0.4, 0.0, 0.5]), 0.25
+
+    def off(q: np.ndarray) -> np.ndarray:
+        places, turns = kuka.forward(q)
+        away = places - centre
+        return np.stack(
+            [(away**2).sum(-1) - radius**2, np.einsum("ni,ni->n", away, turns[..., 2])], axis=-1
+        )
+
+    q, step = kuka.sample(1500, np.random.default_rng(2)), 1e-6
+    for _ in range(30):
+        slopes = [(off(q + step * e) - off(q - step * e)) / (2 * step) for e in np.eye(kuka.dof)]
+        q = q - np.einsum("nij,nj->ni", np.linalg.pinv(np.stack(slopes, axis=-1)), off(q))
+    good = (np.abs(off(q)).max(axis=1) < 1e-12) & (kuka.limit_distance(q) > 0.0)
+    found = identify(q[good][:250], kuka)
+    assert found.constraint is not None
+    assert len(found.constraint.relations) == 2
 
 
 def free_ends(planner: Planner, shown: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -146,3 +146,16 @@ def test_fewer_configurations_make_fewer_starts(world: World) -> None:
 
 def test_the_band_is_named_after_its_planner() -> None:
     assert BandAfter(MultiStartBand(name="bends")).name == "bends + band"
+
+
+def test_a_band_in_place_of_a_path_that_is_not_sound_may_be_longer(world: World) -> None:
+    """A planner that looks at single configurations cuts a corner; the band goes round."""
+    (asked,) = problems(world, "level_cup", 1)
+    given = band_after(asked, BIRRT.plan(asked, 0), BandSettings())
+    least = length(given.joints) * (1.0 - 1e-3)
+    shorter = replace(given, joints=given.joints[[0, -1]])
+    picky = replace(asked, is_sound=lambda rows: length(rows) >= least)
+    assert length(shorter.joints) < least
+    found = band_after(picky, shorter, BandSettings())
+    assert picky.is_sound is not None
+    assert length(found.joints) >= least or not picky.is_sound(found.joints)

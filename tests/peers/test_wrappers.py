@@ -78,6 +78,13 @@ def test_a_path_that_is_not_sound_is_no_shortest_one(problem) -> None:
     assert (claimed.status, claimed.joints[-1, 0]) == ("solved", 1.0)
 
 
+def test_restarts_after_a_path_that_is_not_sound_take_shorter_steps(problem) -> None:
+    inner, halved = Listed((1.0,)), Listed((3.0, 2.0))
+    longer = replace(problem, is_sound=lambda joints: bool(joints[-1, 0] > 1.5))
+    assert Restarted(inner, 0.05, halved).plan(longer, 0).joints[-1, 0] == 2.0
+    assert (len(inner.seeds), halved.seeds[:2]) == (1, [1, 2])
+
+
 def test_where_nobody_can_tell_the_first_path_is_the_answer(problem) -> None:
     inner = Listed((5.0, 1.0))
     assert UntilSound(inner, 10.0).plan(problem, 0).joints[-1, 0] == 5.0

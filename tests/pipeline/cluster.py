@@ -31,14 +31,16 @@ class Cluster:
 
 
 @contextmanager
-def cluster(folder: Path, workers: int = 2, allowed_failures: int = 0) -> Iterator[Cluster]:
+def cluster(
+    folder: Path, workers: int = 2, allowed_failures: int = 0, threads: int = 1
+) -> Iterator[Cluster]:
     """Whose processes must stop in order when asked to, where none has killed them.
 
     allowed_failures: how often a task may lose its worker and go to another.
     """
     file, log = folder / "scheduler.json", folder / "log.txt"
     loopback = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
-    one = ["--no-nanny", "--nthreads", "1", "--local-directory", str(folder)]
+    one = ["--no-nanny", "--nthreads", str(threads), "--local-directory", str(folder)]
     root = Path(__file__).parents[2]
     environment = {
         **os.environ,

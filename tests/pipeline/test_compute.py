@@ -205,6 +205,14 @@ def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
     assert not logged, "a traceback beside it"
 
 
+def test_a_worker_with_several_threads_is_refused(tmp_path: Path) -> None:
+    """Seeds that run together would draw from one generator."""
+    with cluster(tmp_path, workers=1, threads=2) as machines:
+        with pytest.raises(ComputeError, match="start it with --nthreads 1") as caught:
+            parallel_map(abs, [1, 2], machines.compute)
+    assert "\n" not in str(caught.value)
+
+
 def test_workers_do_not_outlive_a_killed_run(tmp_path: Path) -> None:
     """They would go on with the run's items beside the one that continues it."""
     code = (

@@ -31,6 +31,10 @@ WITHIN = (0.01, 0.05, 0.10)
 TIED = 1e-4
 """Relative difference below which two lengths count as one."""
 RESAMPLES = 1000
+LATE = 0.05
+"""Share of a budget by which an answer may come after it: who is given a second ends shortly after.
+The planner is held to less: within a budget it is one that was given a shorter one.
+"""
 AHEAD = 1e-3
 """Relative difference of two p95 below which neither planner is ahead."""
 
@@ -220,7 +224,7 @@ def ours_against_baselines(
     rows: pd.DataFrame, ours: Mapping[str, float], own: Sequence[str], budgets: Sequence[float]
 ) -> pd.DataFrame:
     """Where a baseline is ahead of the planner on p95 of length over best known within a time
-    budget, failures infinite.
+    budget, or LATE after it, failures infinite.
 
     ours: the planner's names with the budget [s] that each is given, 0 for the first answer; within
     a budget the one with the longest that is shorter counts, of those that were asked a query which
@@ -235,14 +239,14 @@ def ours_against_baselines(
         groups = dict(list(found.groupby("planner", sort=False)))
         for budget in budgets:
             given = [name for name in ours if ours[name] < budget and name in groups]
-            chosen = max(given, key=ours.__getitem__)
+            chosen, in_time = max(given, key=ours.__getitem__), (1.0 + LATE) * budget
             for name, theirs in groups.items():
                 if name in ours or name in own:
                     continue
                 mine = groups[chosen][groups[chosen]["query"].isin(theirs["query"])]
                 both = (
-                    _within(mine, budget),
-                    _within(theirs[theirs["query"].isin(mine["query"])], budget),
+                    _within(mine, in_time),
+                    _within(theirs[theirs["query"].isin(mine["query"])], in_time),
                 )
                 about = dict(zip(CASE, case, strict=True)) | {"budget_s": budget}
                 figures = {

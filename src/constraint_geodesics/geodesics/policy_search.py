@@ -37,6 +37,7 @@ from constraint_geodesics.geodesics.proposals import MeanPolicy, Met, random_rou
 from constraint_geodesics.geodesics.solver import goal_images
 from constraint_geodesics.geometry.manifold import GeometryError
 from constraint_geodesics.params import GeodesicParams, PpoParams
+from constraint_geodesics.pipeline.code import code_digest
 from constraint_geodesics.text_files import DamagedFileError, reading, write_bytes, written
 
 MOST_CHECKED = 40
@@ -271,6 +272,12 @@ def _checkpoint(file: Path) -> dict[str, Any]:
         return content
 
 
+def _code_of(problem: Any) -> list[str]:
+    """The modules that a training hangs on: this one, and the problem's if it is of the package."""
+    package, _, own = type(problem).__module__.partition(".")
+    return ["geodesics.policy_search", *([own] if package == __name__.partition(".")[0] else [])]
+
+
 class _Progress(BaseCallback):
     """Reports each rollout and keeps a checkpoint from which training goes on exactly."""
 
@@ -285,8 +292,10 @@ class _Progress(BaseCallback):
         super().__init__()
         self.environment, self.every, self.report = environment, params.checkpoint_steps, report
         self.total = params.steps
-        # a checkpoint belongs to its inputs: with other data, parameters or seed it is not found
-        key = joblib.hash((environment.problem.fingerprint(), params.model_dump(), seed))
+        # a checkpoint belongs to its inputs: with other data, parameters, seed or code it is not
+        # found
+        code, problem = code_digest(*_code_of(environment.problem)), environment.problem
+        key = joblib.hash((problem.fingerprint(), params.model_dump(), seed, code))
         self.file = scratch / f"{key}.pt"
         self.rows: list[dict[str, float]] = []
         self._saved_at = self._reported_at = 0

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from constraint_geodesics import values
 from constraint_geodesics.formats import NUMBER, TABLE, FormatError
 from constraint_geodesics.robot.kinematics import SerialRobot
-from constraint_geodesics.text_files import read_text
+from constraint_geodesics.text_files import is_number, read_text
 
 FEWEST_ROWS = 12
 """Rows of all demonstrations together."""
@@ -52,7 +52,7 @@ def demonstrations_from(
     if isinstance(given, (str, Path)):
         given = _read(Path(given), robot)
     if hasattr(given, "to_numpy") and hasattr(given, "columns"):  # a table of pandas
-        names = [name for name in given.columns if isinstance(name, str)]
+        names = [str(name) for name in given.columns]
         given = _told_apart("the table", names, given.to_numpy(), robot)
     shown, motions = _arrays(given)
     found = [_checked(rows, k, robot, motions) for k, rows in enumerate(shown)]
@@ -160,6 +160,9 @@ def _read(file: Path, robot: SerialRobot) -> Any:
             table = np.array(lines, float)
         except ValueError:  # a line of names stands above
             names = lines.pop(0)
+            if 2 * sum(map(is_number, names)) > len(names):
+                line = f"{file}: its first row is {','.join(names)[:80]}"
+                raise DemonstrationError(f"{line}: must be numbers alone, or names") from None
             table = np.array(lines, float)
     except (OSError, ValueError, csv.Error) as error:
         why = error.strerror if isinstance(error, OSError) else error
@@ -201,6 +204,9 @@ def _told_apart(file: Path | str, names: list[str], table: np.ndarray, robot: Se
             f"{file}: beside {', '.join(sorted(unlike))} its columns are named otherwise than the "
             f"joints: {', '.join(robot.joint_names)}"
         )
+    elif some := set(robot.joint_names).intersection(names):
+        missing = ", ".join(name for name in robot.joint_names if name not in some)
+        raise DemonstrationError(f"{file}: among its columns {', '.join(names)} is no {missing}")
     else:
         return table
     if numbers is None:

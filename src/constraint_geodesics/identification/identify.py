@@ -9,7 +9,7 @@ combination that was found.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -288,6 +288,7 @@ class _Search:
     missing: list[str] = field(default_factory=list)
     joint: int | None = None
     bounds: tuple[Bound, ...] = ()
+    _on_others: dict[int, Any] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def relations(self) -> tuple[AnyRelation, ...]:
@@ -299,13 +300,17 @@ class _Search:
         """All of them."""
         return tuple(own for step in self.steps for own in step.sides)
 
-    @cached_property
+    @property
     def on_others(self) -> list[tuple[Sample, tuple["_Step", ...]]]:
         """The rows of each fold, and each step as it is found on all others."""
-        return [
-            (self.sample[out], tuple(step.on(self.sample[~out]) for step in self.steps))
-            for out in self.folds
-        ]
+        count = len(self.steps)  # they become more
+        if count not in self._on_others:
+            self._on_others[count] = [
+                (self.sample[out], tuple(step.on(self.sample[~out]) for step in self.steps))
+                for out in self.folds
+            ]
+        found: list[tuple[Sample, tuple[_Step, ...]]] = self._on_others[count]
+        return found
 
 
 def _searched(sample: Sample) -> _Search:

@@ -21,8 +21,13 @@ def until_sound(
     """A planner that is asked again for `budget_s` [s] while its path is not sound, from the second
     attempt on with half its step, where it has one.
     """
-    halved = settings.with_half_step
-    return UntilSound(make(settings), budget_s, None if halved == settings else make(halved))
+    return UntilSound(make(settings), budget_s, halved(make, settings))
+
+
+def halved(make: Callable[[Settings], PathPlanner], settings: Settings) -> PathPlanner | None:
+    """The planner with half its step; None where it has none."""
+    own = settings.with_half_step
+    return None if own == settings else make(own)
 
 
 def made_together(
@@ -50,7 +55,7 @@ def made_together(
         began = time.perf_counter()
         try:
             if own.restarts_s is not None:
-                made[name] = Restarted(planner_of(own), own.restarts_s)
+                made[name] = Restarted(planner_of(own), own.restarts_s, halved(planner_of, own))
             elif own.random:
                 made[name] = until_sound(planner_of, own, own.given_s or again_s)
             else:

@@ -102,7 +102,7 @@ class SamplingPlanner:
     def _found(self, problem: PlanningProblem, settings: OmplSettings, seed: int) -> _Found:
         began = time.perf_counter()
         _start_random_numbers(seed)
-        space = _Space(problem, settings)
+        space = _Space(problem, settings, seed=seed)
         path, iterations = _SEARCHES[self.name](space, settings, began + settings.budget_s)
         return _Found(space, path, iterations, time.perf_counter() - began)
 
@@ -185,11 +185,13 @@ class _HeldAxes(base.Constraint):
     as deep as the planner's roadmap spreads its own, and not onto its edge.
     """
 
-    def __init__(self, manifold: ConstraintManifold, step: float, sampler: Sampler | None) -> None:
+    def __init__(
+        self, manifold: ConstraintManifold, step: float, sampler: Sampler | None, seed: int
+    ) -> None:
         super().__init__(manifold.robot.dof, manifold.codim, SATISFIED)
         self._single = _Single(manifold)
         self._sampler = sampler
-        self._samples, self._shares = False, np.random.default_rng(0)
+        self._samples, self._shares = False, np.random.default_rng(seed)
         self._within = 1.0 / int(manifold.rows.held.sum()) if manifold.rows.tolerance.any() else 0.0
         self._exact = manifold.rows.exact
         self.step = step  # along the constraint, that which OMPL has now
@@ -261,6 +263,7 @@ class _Space:
     """Where a tree's samples come from; by default from OMPL.  Only the projected space can take
     one.
     """
+    seed: int = 0
     information: Any = field(init=False)
     definition: Any = field(init=False)
     expect_sample: Callable[[], None] = field(init=False)
@@ -270,7 +273,7 @@ class _Space:
         if self.sampler is not None:
             kind = "projected"
         joints = _joint_space(manifold.robot)
-        axes = _HeldAxes(manifold, self.settings.delta_rad, self.sampler)
+        axes = _HeldAxes(manifold, self.settings.delta_rad, self.sampler, self.seed)
         self._axes, self.expect_sample = axes, axes.expect_sample
         if self.is_plain:
             self.information = base.SpaceInformation(joints)

@@ -5,6 +5,7 @@ is sound, and a memory.
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float
@@ -34,11 +35,13 @@ class Restarted:
 
     An attempt that has begun is not interrupted; one that would not end in time by the mean of
     those before is not begun.  An answer that no other seed can change (a refusal, a misfit) ends
-    the search at once.  A path that is not sound counts for nothing where the problem can tell.
+    the search at once.  A path that is not sound counts for nothing where the problem can tell;
+    `second` is asked after one, where there is one.
     """
 
     inner: PathPlanner
     budget_s: float
+    second: PathPlanner | None = None
 
     @property
     def name(self) -> str:
@@ -51,11 +54,14 @@ class Restarted:
         """
         began = time.perf_counter()
         best, shortest, attempts, iterations = None, np.inf, 0, 0
+        asked = self.inner
         while True:
-            answer = self.inner.plan(problem, SEEDS * seed + attempts)
+            answer = asked.plan(problem, SEEDS * seed + attempts)
             attempts += 1
             iterations += answer.iterations
-            length = np.inf if _is_unsound(problem, answer) else _length(answer)
+            length = _length(answer)
+            if _is_unsound(problem, answer):
+                length, asked = np.inf, self.second or self.inner
             if best is None or length < shortest:
                 best, shortest = answer, length
             spent = time.perf_counter() - began
@@ -137,8 +143,8 @@ class BandAfter:
 
 def band_after(problem: PlanningProblem, planned: Solution, settings: BandSettings) -> Solution:
     """A planned path shortened by a band, time and iterations added to its own; without a path, or
-    where no band is sound that is shorter, what it was, on rows that keep the constraint between
-    them if those are sound.
+    where no band is sound that is shorter, or at all where the path itself is not sound, what it
+    was, on rows that keep the constraint between them if those are sound.
     """
     began = time.perf_counter()
     if (
@@ -148,18 +154,18 @@ def band_after(problem: PlanningProblem, planned: Solution, settings: BandSettin
     ):
         return planned
     own = rows_along(problem.manifold, planned.joints)
-    longest = float(step_lengths(own).sum())
+    longest, kept = float(step_lengths(own).sum()), cache(lambda: _is_kept(problem, own))
     rows, iterations = None, 0
     task = task_of(problem, settings)
     for candidate in _bands_along(task, planned.joints):
         iterations += candidate.iterations
-        if candidate.length < longest:
+        if candidate.length < longest or not kept():
             relaxed = free_rows(problem, candidate)
             if relaxed is not None and _is_kept(problem, relaxed):
                 rows = relaxed
                 break
     if rows is None:
-        rows = own if _is_kept(problem, own) else planned.joints
+        rows = own if kept() else planned.joints
     spent = time.perf_counter() - began
     return Solution("solved", rows, planned.time_s + spent, planned.iterations + iterations)
 

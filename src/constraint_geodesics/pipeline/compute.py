@@ -215,6 +215,11 @@ def _dask_client(address: str) -> Iterator["Client"]:
             raise ComputeError(
                 f"compute.dask_address={address!r}: the scheduler has no workers"
             ) from error
+        if max(client.nthreads().values(), default=1) > 1:
+            raise ComputeError(  # they would share the generators of random numbers
+                f"compute.dask_address={address!r}: a worker has several threads: start it with "
+                "--nthreads 1"
+            )
         yield client
 
 

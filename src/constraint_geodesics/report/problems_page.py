@@ -37,7 +37,8 @@ NOTE = (
     "here found. Wrongly certified: paths that the certificate takes and PyBullet does not. Ready "
     "for the scene: what comes once a scene and is in no time of a query, in the median: the "
     "planner follows a change with its certifier, search and PyBullet's world; the others are lent "
-    "the judge's certifier, whose making is not counted. OMPL's planners ask through Python for "
+    "the judge's certifier, whose making is not counted. The planner's roadmap, one a constraint, "
+    "is made before the first query, in no time here. OMPL's planners ask through Python for "
     "every state, and PRM makes its roadmap anew for each query"
 )
 

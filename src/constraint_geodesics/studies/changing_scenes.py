@@ -148,8 +148,8 @@ def sudden(planner: Planner, name: str, count: int, seed: int) -> Rows:
         ball = _in_the_way(planner, path, stop, rng)
         if ball is None:
             continue
-        planner.scene.add(ball)
         began = time.perf_counter()
+        planner.scene.add(ball)
         answer = planner.replan(path, at_s)
         spent = 1e3 * (time.perf_counter() - began)
         valid = answer.certificate is not None and answer.certificate.valid
