@@ -58,7 +58,7 @@ FEW = 20
 PYTHON_NOTE = (
     "† is OMPL's: it asks through Python for every state of its search. All ask the certifier's "
     "compiled check; what draws at random is asked again while its path is not certified, OMPL's "
-    "with half the step, but those that are restarted: one that takes all its time has one more "
+    "with half the step: one that takes all its time has one more "
     "whole try. A band after one of OMPL's begins with the path as it is found; one without a band "
     "is shortened by OMPL, looked at more closely where that touches something. Where a planner "
     "cannot work under a constraint (OMPL's atlas and tangent bundle have no tangent space for a "
