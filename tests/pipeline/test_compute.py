@@ -207,9 +207,11 @@ def test_a_scheduler_that_is_killed_is_one_line(tmp_path: Path) -> None:
 
 def test_a_worker_with_several_threads_is_refused(tmp_path: Path) -> None:
     """Seeds that run together would draw from one generator."""
-    with cluster(tmp_path, workers=1, threads=2) as machines:
-        with pytest.raises(ComputeError, match="start it with --nthreads 1") as caught:
-            parallel_map(abs, [1, 2], machines.compute)
+    with (
+        cluster(tmp_path, workers=1, threads=2) as machines,
+        pytest.raises(ComputeError, match="start it with --nthreads 1") as caught,
+    ):
+        parallel_map(abs, [1, 2], machines.compute)
     assert "\n" not in str(caught.value)
 
 
