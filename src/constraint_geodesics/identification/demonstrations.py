@@ -161,9 +161,12 @@ def _read(file: Path, robot: SerialRobot) -> Any:
         except ValueError:  # a line of names stands above
             names = lines.pop(0)
             if 2 * sum(map(is_number, names)) > len(names):
-                line = f"{file}: its first row is {','.join(names)[:80]}"
+                odd = next(name for name in names if not is_number(name))
+                line = f"{file}: its first row has {odd!r} among numbers"
                 raise DemonstrationError(f"{line}: must be numbers alone, or names") from None
             table = np.array(lines, float)
+    except DemonstrationError:
+        raise
     except (OSError, ValueError, csv.Error) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise DemonstrationError(f"{file}: not a table of numbers: {why}") from None
