@@ -160,8 +160,10 @@ def _read(file: Path, robot: SerialRobot) -> Any:
             table = np.array(lines, float)
         except ValueError:  # a line of names stands above
             names = lines.pop(0)
+            odd = next((name for name in names if not is_number(name)), None)
+            if odd is None:
+                raise
             if 2 * sum(map(is_number, names)) > len(names):
-                odd = next(name for name in names if not is_number(name))
                 line = f"{file}: its first row has {odd!r} among numbers"
                 raise DemonstrationError(f"{line}: must be numbers alone, or names") from None
             table = np.array(lines, float)
