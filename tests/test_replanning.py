@@ -1,6 +1,7 @@
 """The planner of an arm that moves: from a velocity, to a stop, and round what is new."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 
@@ -66,6 +67,15 @@ def on_the_way(path: Trajectory, at_s: float, rng: np.random.Generator) -> Spher
         finally:
             planner.scene.remove("sudden")
     return None
+
+
+def blocked() -> Iterator[tuple[Trajectory, float, Sphere]]:
+    """Paths, each with a time and what comes then into its way."""
+    for path in planned(20):
+        at = 0.25 * path.times[-1]
+        ball = on_the_way(path, at, np.random.default_rng(1))
+        if ball is not None:
+            yield path, at, ball
 
 
 def touched(answer: Trajectory, planner: Planner) -> int:
@@ -472,21 +482,14 @@ def test_a_goal_that_is_touched_stops_the_arm_at_once_and_is_named():
 
 def test_after_its_time_no_other_path_is_tried():
     planner = packaged_planner()
-    for path in planned(20):
-        at = 0.25 * path.times[-1]
-        ball = on_the_way(path, at, np.random.default_rng(1))
-        if ball is None:
-            continue
-        planner.scene.add(ball)
-        try:
-            answer = planner.replan(path, at, limit_s=1e-9)
-        finally:
-            planner.scene.remove("sudden")
-        assert answer.status == "stopped"
-        assert "1e-09 s are over" in answer.explanation
-        break
-    else:
-        pytest.fail("nothing could be put on the way")
+    path, at, ball = next(blocked())
+    planner.scene.add(ball)
+    try:
+        answer = planner.replan(path, at, limit_s=1e-9)
+    finally:
+        planner.scene.remove("sudden")
+    assert answer.status == "stopped"
+    assert "1e-09 s are over" in answer.explanation
     for wrong in (0.0, -1.0, np.inf, "soon"):
         with pytest.raises(PlannerError, match="limit_s = .*positive number of seconds"):
             planner.replan(path, at, limit_s=wrong)
@@ -498,11 +501,7 @@ def test_a_roadmap_that_has_to_be_made_is_not_waited_for():
     """Where a shape of the first ones is gone there is none."""
     with Planner.load(bundle.PACKAGED) as planner:
         planner.scene.remove("table")
-        for path in planned(20):
-            at = 0.25 * path.times[-1]
-            ball = on_the_way(path, at, np.random.default_rng(1))
-            if ball is None:
-                continue
+        for path, at, ball in blocked():
             planner.scene.add(ball)
             planner.replan(path, at, limit_s=60.0)
             assert not planner._preparation._roadmaps

@@ -783,20 +783,27 @@ def test_an_arm_that_turns_into_its_path_is_looked_at_beside_it(scene, good) -> 
     assert answer.violation.message.startswith("as the arm turns into the line from row 0: ")
 
 
-def test_a_joint_that_moves_must_be_able_to_stop_before_its_limit(certifier, good) -> None:
-    """At rest a path may begin on a limit."""
-    there, out, upper = np.eye(6)[4], np.eye(6)[5], certifier.scene.robot.upper[5]
-    start, times = np.where(out == 1.0, upper - 1e-4, good.joints[0]), np.r_[0.0, 0.01:0.5:0.1]
-    rows, room = start + 0.2 * times[:, None] * there, np.sqrt(2e-4 * LIMITS.acceleration_rad_s2[5])
+def assert_limited(certifier, rows, times, along, fastest, said) -> None:
+    """A velocity along the first line and beside it is certified up to the fastest one beside it;
+    what is faster passes a joint limit, as is said.
+    """
     for share, valid in ((0.0, True), (0.99, True), (1.01, False)):
-        velocity = 0.2 * there + share * room * out
+        velocity = along + share * fastest
         found = certifier.certify(
             rows, FREE, times=times, collisions=False, start_velocity=velocity
         )
         assert found.valid == valid, found.violation
         if not valid:
             assert found.violation.kind == "joint_limits"
-            assert "needs" in found.violation.message
+            assert said in found.violation.message
+
+
+def test_a_joint_that_moves_must_be_able_to_stop_before_its_limit(certifier, good) -> None:
+    """At rest a path may begin on a limit."""
+    there, out, upper = np.eye(6)[4], np.eye(6)[5], certifier.scene.robot.upper[5]
+    start, times = np.where(out == 1.0, upper - 1e-4, good.joints[0]), np.r_[0.0, 0.01:0.5:0.1]
+    rows, room = start + 0.2 * times[:, None] * there, np.sqrt(2e-4 * LIMITS.acceleration_rad_s2[5])
+    assert_limited(certifier, rows, times, 0.2 * there, room * out, "needs")
 
 
 def test_a_joint_that_moves_may_hardly_pass_its_limit_as_the_arm_turns(certifier, good) -> None:
@@ -808,19 +815,12 @@ def test_a_joint_that_moves_may_hardly_pass_its_limit_as_the_arm_turns(certifier
         turn, fast = np.linspace(0.0, 0.05, 20_001), np.arange(1, 60) / 2e3
         reached = [(v * turn - 0.5 * (v + back) * turn**2 / 0.05).max() for v in fast]
         most = np.interp(2e-4, reached, fast)
-        for share, valid in ((0.0, True), (0.98, True), (1.02, False)):
-            velocity = 0.2 * there + share * most * out
-            found = certifier.certify(
-                rows, FREE, times=times, collisions=False, start_velocity=velocity
-            )
-            assert found.valid == valid, found.violation
-            if not valid:
-                assert found.violation.kind == "joint_limits"
-                assert "beyond its limit before the line" in found.violation.message
+        said = "beyond its limit before the line"
+        assert_limited(certifier, rows, times, 0.2 * there, most * out, said)
 
 
 def test_shares_of_the_limits_are_certified(certifier, good) -> None:
-    """A motion that uses them up is refused at half of them."""
+    """A motion that uses them up is refused at a small share of them."""
     asked = good.joints, good.constraint, good.start, good.goal, good.times
     assert certifier.certify(*asked, collisions=False).valid
     for scales in ((1e-3, 1.0), (1.0, 1e-3)):

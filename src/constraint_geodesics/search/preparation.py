@@ -127,13 +127,13 @@ class Preparation:
             if any(is_unchanged(one, own) for one in scene.attached)
         )
         first = replace(self.scene, workcell=left, attached=held, allowed=scene.allowed)
-        later, apart = set(scene.names) - set(first.names), self.checks.apart
-        is_changed, pairs = (left, held) != (self.scene.workcell, self.scene.attached), self._pairs
+        is_changed = (left, held) != (self.scene.workcell, self.scene.attached)
         if is_changed or scene.allowed != self.scene.allowed:  # which may allow what never met
+            later, apart = set(scene.names) - set(first.names), self.checks.apart
             pairs = self._clearances.pairs(apart, later)
-        if is_changed or pairs != self._pairs:
-            without = self._clearances.model(apart, later)
-            self._first_clearance, self._pairs, self._roadmaps = without, pairs, {}
+            if is_changed or pairs != self._pairs:
+                without = self._clearances.model(apart, later)
+                self._first_clearance, self._pairs, self._roadmaps = without, pairs, {}
         self.scene, self._clearance = first, clearance
 
     def _band(self) -> BandSettings:
