@@ -180,7 +180,7 @@ ui: env  ## compare the runs in MLflow's dashboard, on this machine only
 replay: .venv/planning  ## replay a path in Rerun: make replay FILE=data/recordings/...
 	geodesics replay $(FILE)
 
-clean:  ## remove unfinished work, not results
+clean:  ## remove unfinished work and what sweeps remember, not results
 	@test ! -e .geodesics/runs || geodesics recover  # what MLflow has not got yet lies there, and stays
 	find .geodesics -mindepth 1 -maxdepth 1 ! -name runs -exec rm -rf {} + 2>/dev/null || true
 	@rmdir .geodesics/runs .geodesics 2>/dev/null || true

@@ -11,8 +11,12 @@ import ctypes
 import hashlib
 import json
 import math
+import multiprocessing
+import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -207,26 +211,47 @@ def _append(file: Path, line: str) -> None:
         lines.write(line + "\n")
 
 
-def _answered(batch: QueryBatch, query: Query, jobs: Sequence[_Job]) -> Iterator[dict[str, Any]]:
-    """Rows of one query.  All planners ask the certifier's compiled check, of configurations, lines
-    and whole paths.
+@dataclass(frozen=True)
+class _Opened:
+    """A query with what answers and judges it, and the seconds that making each part took.  All
+    planners ask the certifier's compiled check, of configurations, lines and whole paths.
     """
+
+    scene: Scene
+    certifier: Certifier
+    planners: Mapping[str, PathPlanner]
+    made_s: Mapping[str, float]
+    problem: PlanningProblem
+    clearance_s: float
+
+
+@contextmanager
+def _opened(batch: QueryBatch, query: Query, names: Sequence[str]) -> Iterator[_Opened]:
     scene, manifold = query.in_scene(batch.scene), batch.manifold
-    names = list(dict.fromkeys(job.baseline.name for job in jobs))
     with (
         Certifier(scene, judge_limits(batch.judge)) as certifier,
         batch.build(names, scene, query.constraint, manifold) as (planners, made_s),
-        _watched(batch, query, scene) as look,
     ):
         began = time.perf_counter()
         clearance = clearance_model(scene, certifier.collisions.apart)
         clearance_s = time.perf_counter() - began
         problem = problem_of(query.start, query.goal, manifold, certifier, clearance)
+        yield _Opened(scene, certifier, planners, made_s, problem, clearance_s)
+
+
+def _answered(batch: QueryBatch, query: Query, jobs: Sequence[_Job]) -> Iterator[dict[str, Any]]:
+    """Rows of one query."""
+    names = list(dict.fromkeys(job.baseline.name for job in jobs))
+    with (
+        _opened(batch, query, names) as opened,
+        _watched(batch, query, opened.scene) as look,
+    ):
+        scene, manifold, certifier = opened.scene, batch.manifold, opened.certifier
         grown_by: dict[tuple[str, int], float] = {}
         for job in jobs:
             baseline = job.baseline
             with _core_share() as share:
-                found, grown = _asked(batch, job, planners[baseline.name], problem)
+                found, grown = _asked(batch, job, opened)
             grown = max(grown, grown_by.get((baseline.after, job.seed), 0.0))
             grown_by[baseline.name, job.seed] = grown
             measures = measure_path(
@@ -242,10 +267,10 @@ def _answered(batch: QueryBatch, query: Query, jobs: Sequence[_Job]) -> Iterator
             recording = ""
             if batch.record is not None and len(found.joints) > 1:
                 recording = batch.record(answer)
-            prepared_s = clearance_s if baseline.uses_clearance else 0.0
+            prepared_s = opened.clearance_s if baseline.uses_clearance else 0.0
             more = {
                 "peak_memory_mb": grown,
-                "scene_s": made_s.get(baseline.name, 0.0) + prepared_s,
+                "scene_s": opened.made_s.get(baseline.name, 0.0) + prepared_s,
                 "recording": recording,
                 "core_share": share[0],
                 **look(answer),
@@ -271,15 +296,41 @@ def _nothing_more(_answer: Answer) -> Mapping[str, Any]:
     return {}
 
 
-def _asked(
-    batch: QueryBatch, job: _Job, planner: PathPlanner, problem: PlanningProblem
-) -> tuple[Solution, float]:
-    """A planner's answer, and the memory it took [MB].  One that is new to this process answers
-    once before it is timed: that loads its code.
+def _asked(batch: QueryBatch, job: _Job, opened: _Opened) -> tuple[Solution, float]:
+    """A planner's answer, and the memory it took [MB].
+
+    A row that was begun twice without an end is answered by a process of its own: it may have ended
+    the ones before, or went down with them.
     """
     if _started(batch, job) > 1:
-        nothing = np.empty((0, len(problem.start)))
-        return Solution("not_found", nothing, 0.0, 0, "the process died in it twice"), math.nan
+        return _asked_alone(batch, job)
+    return _timed(job, opened)
+
+
+def _asked_alone(batch: QueryBatch, job: _Job) -> tuple[Solution, float]:
+    nothing = np.empty((0, len(job.query.start)))
+    if multiprocessing.current_process().daemon:  # may start none: a worker of Dask's nanny
+        return Solution("not_found", nothing, 0.0, 0, "processes died in it twice"), math.nan
+    spawning = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, spawning, _leave_interrupts_to_parent) as own:
+        try:
+            return own.submit(_answer_alone, batch, job).result()
+        except BrokenProcessPool:
+            return Solution("not_found", nothing, 0.0, 0, "its process died in it"), math.nan
+
+
+def _leave_interrupts_to_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _answer_alone(batch: QueryBatch, job: _Job) -> tuple[Solution, float]:
+    with _opened(batch, job.query, [job.baseline.name]) as opened:
+        return _timed(job, opened)
+
+
+def _timed(job: _Job, opened: _Opened) -> tuple[Solution, float]:
+    """One that is new to this process answers once before it is timed: that loads its code."""
+    planner, problem = opened.planners[job.baseline.name], opened.problem
     warm = (job.baseline.name, job.query.scene)
     if warm not in _WARM:
         _planned(planner, replace(problem), job.seed)  # another object: not to be remembered
@@ -288,9 +339,7 @@ def _asked(
 
 
 def _started(batch: QueryBatch, job: _Job) -> int:
-    """Note that a row is begun; how often it was before without an end, since the last interrupt:
-    once a kill, twice a crash of its own.
-    """
+    """Note that a row is begun; how often it was before without an end, since the last interrupt."""
     mark = json.dumps({"started": job.key, "fingerprint": job.baseline.fingerprint})
     text = batch.file.read_text() if batch.file.is_file() else ""
     _append(batch.file, mark)
