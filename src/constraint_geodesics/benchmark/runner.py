@@ -242,16 +242,12 @@ def _opened(batch: QueryBatch, query: Query, names: Sequence[str]) -> Iterator[_
 def _answered(batch: QueryBatch, query: Query, jobs: Sequence[_Job]) -> Iterator[dict[str, Any]]:
     """Rows of one query."""
     names = list(dict.fromkeys(job.baseline.name for job in jobs))
-    with (
-        _opened(batch, query, names) as opened,
-        _watched(batch, query, opened.scene) as look,
-    ):
+    with _opened(batch, query, names) as opened, _watched(batch, query, opened.scene) as look:
         scene, manifold, certifier = opened.scene, batch.manifold, opened.certifier
         grown_by: dict[tuple[str, int], float] = {}
         for job in jobs:
             baseline = job.baseline
-            with _core_share() as share:
-                found, grown = _asked(batch, job, opened)
+            found, grown, share = _asked(batch, job, opened)
             grown = max(grown, grown_by.get((baseline.after, job.seed), 0.0))
             grown_by[baseline.name, job.seed] = grown
             measures = measure_path(
@@ -272,7 +268,7 @@ def _answered(batch: QueryBatch, query: Query, jobs: Sequence[_Job]) -> Iterator
                 "peak_memory_mb": grown,
                 "scene_s": opened.made_s.get(baseline.name, 0.0) + prepared_s,
                 "recording": recording,
-                "core_share": share[0],
+                "core_share": share,
                 **look(answer),
             }
             yield _row(job, found, measures, more)
@@ -296,50 +292,55 @@ def _nothing_more(_answer: Answer) -> Mapping[str, Any]:
     return {}
 
 
-def _asked(batch: QueryBatch, job: _Job, opened: _Opened) -> tuple[Solution, float]:
-    """A planner's answer, and the memory it took [MB].
+_Asked = tuple[Solution, float, float]
+"""A planner's answer, the memory it took [MB] and the share of a core that it had."""
 
-    A row that was begun twice without an end is answered by a process of its own: it may have ended
-    the ones before, or went down with them.
+
+def _asked(batch: QueryBatch, job: _Job, opened: _Opened) -> _Asked:
+    """A row that was begun twice without an end is answered by a process of its own: it may have
+    ended the ones before, or went down with them.
     """
     if _started(batch, job) > 1:
         return _asked_alone(batch, job)
     return _timed(job, opened)
 
 
-def _asked_alone(batch: QueryBatch, job: _Job) -> tuple[Solution, float]:
+def _asked_alone(batch: QueryBatch, job: _Job) -> _Asked:
     nothing = np.empty((0, len(job.query.start)))
     if multiprocessing.current_process().daemon:  # may start none: a worker of Dask's nanny
-        return Solution("not_found", nothing, 0.0, 0, "processes died in it twice"), math.nan
+        return Solution("not_found", nothing, 0.0, 0, "processes died in it"), math.nan, math.nan
     spawning = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, spawning, _leave_interrupts_to_parent) as own:
         try:
             return own.submit(_answer_alone, batch, job).result()
         except BrokenProcessPool:
-            return Solution("not_found", nothing, 0.0, 0, "its process died in it"), math.nan
+            failed = Solution("not_found", nothing, 0.0, 0, "its process died in it")
+            return failed, math.nan, math.nan
 
 
 def _leave_interrupts_to_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _answer_alone(batch: QueryBatch, job: _Job) -> tuple[Solution, float]:
+def _answer_alone(batch: QueryBatch, job: _Job) -> _Asked:
     with _opened(batch, job.query, [job.baseline.name]) as opened:
         return _timed(job, opened)
 
 
-def _timed(job: _Job, opened: _Opened) -> tuple[Solution, float]:
+def _timed(job: _Job, opened: _Opened) -> _Asked:
     """One that is new to this process answers once before it is timed: that loads its code."""
     planner, problem = opened.planners[job.baseline.name], opened.problem
     warm = (job.baseline.name, job.query.scene)
     if warm not in _WARM:
         _planned(planner, replace(problem), job.seed)  # another object: not to be remembered
         _WARM.add(warm)
-    return _measured_memory(lambda: _planned(planner, problem, job.seed))
+    with _core_share() as share:
+        found, grown = _measured_memory(lambda: _planned(planner, problem, job.seed))
+    return found, grown, share[0]
 
 
 def _started(batch: QueryBatch, job: _Job) -> int:
-    """Note that a row is begun; how often it was before without an end, since the last interrupt."""
+    """Note that a row is begun; how often it was before, without an end, since an interrupt."""
     mark = json.dumps({"started": job.key, "fingerprint": job.baseline.fingerprint})
     text = batch.file.read_text() if batch.file.is_file() else ""
     _append(batch.file, mark)
