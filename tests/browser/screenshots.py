@@ -331,7 +331,7 @@ def main(wanted: Sequence[str]) -> int:
         return 2
     chosen = {name: shot for name, shot in SHOTS.items() if name in wanted or not wanted}
     IMAGES.mkdir(exist_ok=True)
-    code = 0
+    code, taken = 0, {}
     with chromium() as browser, contextlib.ExitStack() as open_until_end:
         dashboard = ""
         for name, shot in chosen.items():
@@ -342,6 +342,7 @@ def main(wanted: Sequence[str]) -> int:
                         open_until_end.enter_context(copied_dashboard())
                     )
                 (IMAGES / f"{name}.png").write_bytes(compressed(shot.take(browser, dashboard)))
+                taken[name] = shot.alt  # only now: the words are of the new picture
                 print(f"docs/images/{name}.png  {time.monotonic() - began:.0f} s", flush=True)
             except (
                 MissingRunError,
@@ -349,7 +350,6 @@ def main(wanted: Sequence[str]) -> int:
             ) as error:  # the latter: a page did not show what it should
                 print(f"{name}: {error}", file=sys.stderr)
                 code = 1
-    taken = {name: shot.alt for name, shot in SHOTS.items() if (IMAGES / f"{name}.png").is_file()}
     for page in DOCS.glob("*.md"):
         text = page.read_text()
         if (new := with_pictures(text, taken)) != text:

@@ -57,7 +57,7 @@ def counting(part: str, effort: Effort) -> Iterator[Row]:
     effort comes back when the body has passed, so `make soak`'s figures, with their commit, stay
     when `make test-faults` follows.  It comes back also where the body is skipped.
     """
-    before, row, began = _exchanged(part, None), Row(), time.monotonic()
+    before, row, began, commit = _exchanged(part, None), Row(), time.monotonic(), _commit()
     try:
         yield row
     except pytest.skip.Exception:
@@ -69,7 +69,7 @@ def counting(part: str, effort: Effort) -> Iterator[Row]:
         _exchanged(part, before)
         return
     about = {
-        "commit": _commit(),
+        "commit": commit,
         "seconds": round(time.monotonic() - began, 1),
         "processor": machine()["processor"],
     }

@@ -1,11 +1,12 @@
 """Requests at random against the planner: no exception but a typed one, and no path that an oracle
 of its own calls wrong: PyBullet's shapes and its poses of the tool every 0.005 rad (0.02 in `make
 test`), and limits, constraint, ends, velocities and accelerations by other formulas than the
-planner's.
+planner's; of an arm that moves at first also the turn into its path.
 """
 
 import json
 import math
+import time
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,13 +19,15 @@ import pytest
 from joblib import Parallel, delayed
 from scipy.spatial.transform import Rotation
 
-from constraint_geodesics.constraints.constraint import Pose
+from constraint_geodesics.bundle import PACKAGED
+from constraint_geodesics.constraints.constraint import Constraint, Pose
 from constraint_geodesics.goals.region import GoalRegion
 from constraint_geodesics.pipeline.code import code_digest, digest
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import Status
 from constraint_geodesics.trajectory import Trajectory
-from tests.faults import requests
+from tests import planner_fixtures as fixtures
+from tests.faults import bad_calls, requests
 from tests.faults.effort import Effort, counting
 from tests.faults.requests import A_SCENE, SEED, Request, request, scene_of
 from tests.planner_fixtures import packaged_planner
@@ -38,6 +41,11 @@ DEEP_M = 1e-6
 OFF = 1e-4 + 1e-9
 """What a path may be off its constraint [rad or m]."""
 SLACK = 1e-6
+TURN_OFF, TURN_BEYOND = 1e-3, 1e-4
+"""What an arm may be off its constraint [rad or m], and beyond a joint limit [rad], while it turns
+into its path: as the documentation says."""
+TURN_ROWS = 33
+"""Configurations of a turn that the oracle looks at."""
 KEPT = Path(".geodesics/soak/random_requests.json")
 """Where the figures of a run of hours are kept, so that it goes on where it was ended."""
 KEPT_EVERY = 20 * A_SCENE
@@ -53,6 +61,9 @@ class Figures:
     exceptions: int = 0
     wrongly_certified: int = 0
     configurations: int = 0
+    solved_with_trees: int = 0
+    solved_in_motion: int = 0
+    seconds: float = 0.0
     statuses: Counter[str] = field(default_factory=Counter)
     wrong: list[str] = field(default_factory=list)
 
@@ -67,22 +78,28 @@ def test_random_requests(effort: Effort) -> None:
     with counting("random_requests", effort) as row:
         figures = _asked(effort)
         row |= {name: own for name, own in vars(figures).items() if isinstance(own, int)}
-        row["solved"] = figures.statuses["solved"]
+        row |= {"solved": figures.statuses["solved"], "seconds": round(figures.seconds, 1)}
         assert not figures.wrong, "\n".join(figures.wrong[:20])
         assert figures.answered > 0.3 * figures.requests
         assert figures.statuses["solved"] > 0.1 * figures.requests
         assert figures.refused > 0.05 * figures.requests
         assert figures.configurations > 10 * figures.requests
+        assert figures.solved_with_trees > 0.01 * figures.requests
+        assert figures.solved_in_motion > 0.003 * figures.requests
+    if effort.name == "soak":
+        KEPT.unlink()  # it is counted: the next run is one of its own
 
 
 def _asked(effort: Effort) -> Figures:
     """All requests: their scenes are answered side by side where they are many."""
-    figures = _begun(effort)
+    figures, began = _begun(effort), time.monotonic()
+    before = figures.seconds
     blocks = range(figures.requests // A_SCENE, effort.requests // A_SCENE)
     workers = 1 if effort.name == "quick" else -1
     answered = Parallel(workers, return_as="generator")
     for own in answered(delayed(_block)(STEP_RAD[effort.name], block) for block in blocks):
         figures.add(own)
+        figures.seconds = before + time.monotonic() - began
         if figures.requests % KEPT_EVERY == 0:
             _keep(effort, figures)
     _keep(effort, figures)
@@ -103,7 +120,7 @@ def _block(step: float, block: int) -> Figures:
     return figures
 
 
-@pytest.mark.parametrize("spoil", ["collision", "constraint", "limits", "end", "velocity"])
+@pytest.mark.parametrize("spoil", ["collision", "constraint", "limits", "end", "velocity", "turn"])
 def test_the_oracle_sees_what_is_wrong(spoil: str) -> None:
     planner = packaged_planner()
     path, asked = _solved(planner)
@@ -116,13 +133,27 @@ def test_the_oracle_sees_what_is_wrong(spoil: str) -> None:
         joints[1, 0] = 4.0
     elif spoil == "end":
         joints[-1] += 1e-4
-    else:
+    elif spoil == "velocity":
         times *= 0.5
     with Judge(planner.scene.now, {}) as judge:
         assert not _faults(planner, asked, path, judge, 0.005)[0]
+        if spoil == "turn":  # to the side, so fast that the cup tilts before the path is reached
+            aside = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+            asked = replace(asked, words=asked.words | {"start_velocity": aside})
+            times[1:] += 0.1
         spoiled = replace(path, joints=joints, times=times)
         faults, _ = _faults(planner, asked, spoiled, judge, 0.005)
     assert any(spoil in fault for fault in faults), faults
+
+
+def test_the_oracle_sees_a_constraint_that_was_not_asked() -> None:
+    planner = packaged_planner()
+    path, asked = _solved(planner)
+    with Judge(planner.scene.now, {}) as judge:
+        for constraint in ("slide", Constraint((0, 0, 0, 1, 1, 0)), Constraint((1,) * 6)):
+            other = replace(asked, words=asked.words | {"constraint": constraint})
+            faults, _ = _faults(planner, other, path, judge, 0.02)
+            assert any("not the one that was asked" in fault for fault in faults), constraint
 
 
 @pytest.mark.parametrize("kind", [Pose, GoalRegion, list])
@@ -188,6 +219,8 @@ def _ask(planner: Planner, asked: Request, judge: Judge, figures: Figures, step:
         else:
             more, looked = _faults(planner, asked, path, judge, step)
         figures.configurations += looked
+        figures.solved_with_trees += getattr(asked.words.get("parts"), "tree", True)
+        figures.solved_in_motion += asked.kind == "moving"
         figures.wrongly_certified += bool(more)
         faults += more
     figures.wrong += [f"{where}: {fault}" for fault in faults]
@@ -224,9 +257,54 @@ def _faults(
     off = _off(judge, robot.tool_link, path.constraint, rows)
     if off > OFF:
         found.append(f"constraint: off by {off:.3g}")
+    if not _asked_for(planner, asked, path, judge):
+        found.append("constraint: not the one that was asked")
+    found += _turn_faults(planner, asked, path, judge)
     found += _end_faults(judge, robot.tool_link, asked, joints)
     found += _motion_faults(planner, asked, joints, times)
     return found, len(rows)
+
+
+def _asked_for(planner: Planner, asked: Request, path: Trajectory, judge: Judge) -> bool:
+    """Whether what the path is said to keep is what was asked; held where it starts, if the request
+    does not say where.
+    """
+    said = asked.words["constraint"]
+    meant, own = planner.constraints[said] if isinstance(said, str) else said, path.constraint
+    if not meant.is_placed:
+        (place,), (turn,) = judge.poses(path.joints[:1], planner.robot.tool_link)
+        meant = meant.relative_to(Pose(place, turn))
+    if (meant.axes, meant.tolerance) != (own.axes, own.tolerance):
+        return False
+    if not any(meant.axes):
+        return True
+    away = Rotation.from_matrix(own.reference.rotation @ meant.reference.rotation.T).magnitude()
+    apart = np.abs(own.reference.position - meant.reference.position).max()
+    return bool(max(apart, away) < SLACK)
+
+
+def _turn_faults(planner: Planner, asked: Request, path: Trajectory, judge: Judge) -> list[str]:
+    """Of an arm that moves at first: its velocity becomes the first line's evenly until the middle
+    of that line's time.
+    """
+    begin = asked.words.get("start_velocity")
+    if begin is None or not np.any(begin):
+        return []
+    robot, found, (first, second) = planner.robot, list[str](), path.joints[:2]
+    lasting = 0.5 * (path.times[1] - path.times[0])
+    line = 0.5 * (second - first) / lasting
+    s = np.linspace(0.0, 1.0, TURN_ROWS)[:, None]
+    rows = first + lasting * (s * begin + 0.5 * s**2 * (line - begin))
+    least, names = min((judge.deepest(row) for row in rows), key=lambda one: one[0])
+    if least < -DEEP_M:
+        found.append(f"turn: collision of {names}: {least:.3g} m")
+    beyond = float(np.maximum(robot.lower - rows, rows - robot.upper).max())
+    if beyond > TURN_BEYOND + SLACK:
+        found.append(f"turn: beyond the limits by {beyond:.3g}")
+    off = _off(judge, robot.tool_link, path.constraint, rows)
+    if off > TURN_OFF + SLACK:
+        found.append(f"turn: off the constraint by {off:.3g}")
+    return found
 
 
 def _dense(joints: np.ndarray, step: float) -> np.ndarray:
@@ -347,5 +425,7 @@ def _keep(effort: Effort, figures: Figures) -> None:
 
 def _of() -> list[Any]:
     """What the figures hang on: requests and oracle as well as the planner."""
-    asked = [digest(Path(file)) for file in (__file__, requests.__file__, oracle.__file__)]
-    return [SEED, *asked, code_digest("planner")]
+    files = (__file__, requests.__file__, bad_calls.__file__, fixtures.__file__, oracle.__file__)
+    asked = [digest(Path(file)) for file in files]
+    packaged = [digest(file) for file in sorted(PACKAGED.rglob("*")) if file.is_file()]
+    return [SEED, *asked, *packaged, code_digest("planner")]

@@ -198,13 +198,15 @@ def _components(chunk: Chunk) -> list[str]:
 
 def _ends_once(chunks: Sequence[Chunk]) -> list[Chunk]:
     """Starts and goals that several paths share are marked once."""
-    kept, seen = [], []
+    kept: list[Chunk] = []
+    seen: list[tuple[str, Any]] = []
     for chunk in chunks:
         marks = chunk.entity_path.endswith(("/tool/start", "/tool/goal"))
         row = recording.component(chunk, "Points3D:positions") if marks else None
-        if row is None or row not in seen:
+        mark = (chunk.entity_path.rpartition("/")[2], row)  # a closed path begins where it ends
+        if row is None or mark not in seen:
             kept.append(chunk)
-            seen += [] if row is None else [row]
+            seen += [] if row is None else [mark]
     return kept
 
 

@@ -185,12 +185,18 @@ def _sooner(others: pd.DataFrame) -> Told:
 
 def _shorter(others: pd.DataFrame) -> Told:
     shorter = others[others["ratio_p95_all"] * (1.0 + AHEAD) < others["reference_ratio_p95_all"]]
-    return _by_largest_gap(
-        shorter,
+    sure = shorter[shorter["queries"] >= FEW]
+    clauses, details = _by_largest_gap(
+        sure,
         "ratio_p95_all",
         _lengths,
         lambda row: f"{_lengths(row)} on {row['solvable']} queries, in {_times(row)}",
     )
+    few = len(shorter) - len(sure)
+    if few:
+        said = f"{few}{' more' if clauses else ''} over fewer than {FEW} queries"
+        (details if clauses else clauses).append(said)
+    return clauses, details
 
 
 def _times(row: Mapping[Any, Any]) -> str:

@@ -262,11 +262,18 @@ class StageRun:
 
     def child_names(self) -> list[str]:
         """Of the runs below this one that were started, by whatever process, oldest first."""
-        query, order = f"tags.`mlflow.parentRunId` = '{self.run_id}'", "attributes.start_time ASC"
+        query, order = f"tags.`mlflow.parentRunId` = '{self.run_id}'", ["attributes.start_time ASC"]
+        names: dict[str, None] = {}
+        page: str | None = None
         with explained(self.tracking_uri):
             client = client_of(self.tracking_uri)
-            found = client.search_runs([self.experiment_id], query, order_by=[order])
-        return list(dict.fromkeys(run.data.tags["child"] for run in found))
+            while page is None or page:
+                found = client.search_runs(
+                    [self.experiment_id], query, order_by=order, page_token=page
+                )
+                names |= {run.data.tags["child"]: None for run in found}
+                page = found.token or ""
+        return list(names)
 
     def figure(self, file: Path) -> None:
         """Keep a copy of a figure with the run."""

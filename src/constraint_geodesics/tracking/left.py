@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 RUNS = Path(".geodesics") / "runs"
 """Relative to the checkout."""
-HELD, UNSENT = "process.json", "unsent.jsonl"
+HELD, UNSENT, SENT = "process.json", "unsent.jsonl", "sent"
 
 
 class AtWorkError(RuntimeError):
@@ -43,8 +43,9 @@ class Left:
     @property
     def unsent(self) -> int:
         """How much its store did not take."""
-        file = self.folder / UNSENT
-        return sum(map(bool, file.read_text("utf-8").splitlines())) if file.is_file() else 0
+        file, sent = self.folder / UNSENT, self.folder / SENT
+        kept = sum(map(bool, file.read_text("utf-8").splitlines())) if file.is_file() else 0
+        return max(kept - int(sent.read_text("utf-8")), 0) if kept and sent.is_file() else kept
 
 
 def hold(root: Path, name: str, store: str) -> Path:

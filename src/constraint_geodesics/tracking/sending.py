@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from constraint_geodesics.text_files import write_text
-from constraint_geodesics.tracking.left import UNSENT, Left, left_runs, taken
+from constraint_geodesics.tracking.left import SENT, UNSENT, Left, left_runs, taken
 from constraint_geodesics.tracking.store import (
     TrackingError,
     check_database,
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 PROCESS = "process"
 """The tag of a run that names its folder."""
-SENT, FILES = "sent", "files"
+FILES = "files"
 CHILD = "child:"
 """Before the name of a run that is looked up below its parent when it is told something."""
 
@@ -164,13 +164,13 @@ def _begin(client: "MlflowClient", told: Mapping[str, Any]) -> str:
 def _child(client: "MlflowClient", parent: str, name: str) -> str:
     """The last run of a name below another."""
     experiment = client.get_run(parent).info.experiment_id
-    below, order = f"tags.`mlflow.parentRunId` = '{parent}'", ["attributes.start_time DESC"]
-    found = client.search_runs([experiment], below, order_by=order)
-    own = (str(run.info.run_id) for run in found if run.data.tags.get("child") == name)
-    run_id = next(own, None)
-    if run_id is None:
+    quote = '"' if "'" in name else "'"
+    own = f"tags.`mlflow.parentRunId` = '{parent}' and tags.child = {quote}{name}{quote}"
+    order = ["attributes.start_time DESC"]
+    found = client.search_runs([experiment], own, order_by=order, max_results=1)
+    if not found:
         raise TrackingError(f"MLflow has no run {name!r} below {parent}", refused=True)
-    return run_id
+    return str(found[0].info.run_id)
 
 
 def _metrics(client: "MlflowClient", _: Sender, run_id: str, told: Mapping[str, Any]) -> None:

@@ -20,9 +20,9 @@ NOTE, MADE = "mlflow.note.content", "geodesics.views"
 differs, and what somebody changed in the dashboard stays until then."""
 FIRST_MS = 1_700_000_000_000
 """When the last view in the menu was made, as the menu understands it: the youngest is on top."""
-NAME_PX, CREATED_PX, TEXT_PX, FIGURE_PX = 285, 100, 150, 96
+NAME_PX, CREATED_PX, TEXT_PX, FIGURE_PX, LETTER_PX = 285, 100, 150, 96, 8
 """Widths of columns.  The first holds the longest name of a run; all of COMPARED is seen in a
-window of 1400."""
+window of 1400.  A figure's column is as wide as its own name."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class View:
     """Which runs, in which order, with which columns; charts: kind and metric of each.
 
     tags, metrics: the columns' names.  order: the tag or metric that the runs are sorted by, lowest
-    first: in the order of time MLflow would hide children below their parents.
+    first unless told: in the order of time MLflow would hide children below their parents.
     """
 
     key: str
@@ -41,6 +41,7 @@ class View:
     tags: Sequence[str] = ()
     metrics: Sequence[str] = ()
     charts: Sequence[tuple[str, str]] = ()
+    highest_first: bool = False
 
     @property
     def columns(self) -> list[str]:
@@ -57,11 +58,14 @@ class View:
         """What the page is to show."""
         widths = {"attributes.`Run Name`": NAME_PX, "runDateAndNestInfo": CREATED_PX}
         widths |= {f"tags.`{name}`": TEXT_PX for name in self.tags}
-        widths |= {f"metrics.`{name}`": FIGURE_PX for name in self.metrics}
+        widths |= {
+            f"metrics.`{name}`": max(FIGURE_PX, LETTER_PX * (len(name) + 2))
+            for name in self.metrics
+        }
         shown = {
             "searchFilter": self.search,
             "orderByKey": self.order,
-            "orderByAsc": True,
+            "orderByAsc": not self.highest_first,
             "selectedColumns": self.columns,
             "columnOrder": [*widths, "duration"],
             "columnWidths": {**widths, "duration": FIGURE_PX},
@@ -75,9 +79,10 @@ VIEWS = (
         "Results",
         "every answered set of queries: constraint, planner, seed, success, length, time",
         "metrics.`success` >= 0 and tags.child LIKE '%'",
-        "tags.`constraint`",
-        ("constraint", "planner", "seed"),
+        "metrics.`success`",
+        ("constraint", "scene", "planner", "seed"),
         COMPARED,
+        highest_first=True,
     ),
     View(
         "constraints",
@@ -86,7 +91,7 @@ VIEWS = (
         "tags.stage = 'train_geodesics' and tags.child IS NULL",
         "tags.`constraint`",
         ("constraint", "manifold"),
-        (*COMPARED, "success_at_random_mean", "queries_connected", "seeds/success_std"),
+        ("success", "success_at_random_mean", *COMPARED[1:], "queries_connected"),
         [("BAR", "success"), ("BAR", "success_at_random_mean"), ("BAR", "median_ms")],
     ),
     View(
