@@ -94,6 +94,13 @@ _WATCHED = (
     *("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen"),
     *("pickle.find_class", "socket.connect", "socket.getaddrinfo"),
 )
+_CHANGING = {
+    **dict.fromkeys(("mkdir", "remove", "rmdir", "truncate", "chmod", "utime"), slice(1)),
+    "rename": slice(2),
+    "symlink": slice(1, 2),
+    "link": slice(1, 2),
+}
+"""Calls of `os` that change what some of their paths name."""
 
 
 class Watch:
@@ -110,10 +117,18 @@ class Watch:
         if event in _WATCHED:
             self.seen.append(f"{event} {arguments}")
         elif event == "open" and isinstance(arguments[0], str):
-            writes = isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR)
-            file = Path(arguments[0]).absolute()
-            if writes and not file.is_relative_to(self.folder) and str(file) != os.devnull:
-                self.seen.append(f"{event} {arguments}")
+            if isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR):
+                self._changed(event, arguments[:1])
+        elif event.removeprefix("os.") in _CHANGING:
+            self._changed(event, arguments[_CHANGING[event.removeprefix("os.")]])
+
+    def _changed(self, event: str, paths: tuple[Any, ...]) -> None:
+        assert self.folder is not None
+        for path in paths:
+            if isinstance(path, str | os.PathLike):
+                file = Path(os.path.normpath(Path(path).absolute()))
+                if not file.is_relative_to(self.folder) and str(file) != os.devnull:
+                    self.seen.append(f"{event} {file}")
 
     @contextmanager
     def over(self, folder: Path) -> Iterator[list[str]]:
@@ -706,7 +721,7 @@ def test_a_hostile_file_is_refused_in_one_line_or_harms_nothing(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     began, refusal = time.process_time(), None
-    with WATCH.over(tmp_path.parent) as seen:
+    with WATCH.over(tmp_path) as seen:
         try:
             CASES[name](tmp_path)
         except (ValueError, OSError) as error:
@@ -730,6 +745,15 @@ def test_a_hostile_file_is_refused_in_one_line_or_harms_nothing(
     assert len(line.splitlines()) == 1, line
     assert "hunter2" not in line
     assert "root:" not in line
+
+
+@pytest.mark.parametrize("escape", [Path.touch, Path.mkdir, lambda file: file.symlink_to("x")])
+def test_what_reaches_out_of_its_folder_is_seen(escape: Callable[[Path], Any], tmp_path) -> None:
+    folder = tmp_path / "own"
+    (folder / "planner").mkdir(parents=True)
+    with WATCH.over(folder) as seen:
+        escape(folder / "planner" / ".." / ".." / "escaped")
+    assert any(str(tmp_path / "escaped") in own for own in seen)
 
 
 def test_there_are_enough_of_them() -> None:

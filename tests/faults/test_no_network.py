@@ -55,11 +55,20 @@ COMMANDS = {
     "doctor": [*CLI, "doctor"],
     "learning": [
         *(sys.executable, "-c"),
-        "import lightning, stable_baselines3, rerun, dask.distributed, dvc.repo\n"
+        "import lightning, stable_baselines3, rerun, dask.distributed\n"
         "from constraint_geodesics.tracking.store import mlflow_module\n"
         "mlflow_module().MlflowClient('sqlite:///mlflow.db').create_experiment('own')",
     ],
 }
+TELLING = [
+    *(sys.executable, "-c"),
+    "import time, mlflow\n"
+    "mlflow.MlflowClient('sqlite:///mlflow.db').create_experiment('own')\n"
+    "time.sleep(3)",
+]
+"""MLflow tells its makers of its use where this project does not keep it from that."""
+SILENT = ("PYTEST_CURRENT_TEST", "CI", "GITHUB_ACTIONS", "GITLAB_CI", "JENKINS_URL", "DVC_TEST")
+"""Of the environment: where they are, those tools tell nothing of themselves."""
 
 
 LONG = ("learning",)
@@ -141,6 +150,48 @@ def test_what_is_asked_outside_this_machine_is_seen(tmp_path: Path) -> None:
     assert "192.0.2.1" in "".join(_guarded(ASKING, tmp_path)[1])
 
 
+@pytest.mark.long
+def test_mlflow_is_seen_where_it_is_not_told_to_be_silent(tmp_path: Path) -> None:
+    """Or that it asks nothing would be the tests' doing, not the project's."""
+    assert _guarded(TELLING, tmp_path)[1]
+
+
+@pytest.mark.long
+def test_dvc_tells_nobody_of_its_use(tmp_path: Path, effort: Effort) -> None:
+    """It does, once, where it has none of the project's settings, by a process that our guard does
+    not see.
+    """
+    with counting("nothing_asked_dvc", effort) as row, socket.socket() as makers:
+        makers.bind(("127.0.0.1", 0))
+        makers.listen()
+        there = f"http://127.0.0.1:{makers.getsockname()[1]}"
+        for name, settings in (("with", (ROOT / ".dvc" / "config").read_text()), ("without", "")):
+            folder = tmp_path / name
+            (folder / ".dvc").mkdir(parents=True)
+            (folder / ".dvc" / "config").write_text(settings)
+            (folder / "dvc.yaml").write_text("stages: {own: {cmd: echo}}")
+            subprocess.run(
+                ["bash", "-ec", "git init -q && dvc repro -q"],
+                cwd=folder,
+                env={**_environment(tmp_path), "DVC_ANALYTICS_ENDPOINT": there},
+                check=True,
+                timeout=120,
+            )
+        makers.settimeout(60.0)
+        told, _ = makers.accept()
+        with told, pytest.raises(TimeoutError):
+            makers.settimeout(5.0)
+            makers.accept()
+        row |= {"commands": 1, "asked": 0}
+
+
+def _environment(tmp_path: Path) -> dict[str, str]:
+    """As a user's: tools that are silent in tests are not."""
+    found = {name: value for name, value in os.environ.items() if name not in SILENT}
+    path = os.pathsep.join([str(Path(sys.executable).parent), found["PATH"]])
+    return found | {"HOME": str(tmp_path), "PATH": path}
+
+
 def _guarded(
     command: Sequence[str], tmp_path: Path
 ) -> tuple["subprocess.CompletedProcess[str]", list[str]]:
@@ -152,7 +203,7 @@ def _guarded(
     (tmp_path / "work").mkdir()
     asked = tmp_path / "asked"
     path = os.pathsep.join([str(tmp_path / "site"), str(ROOT / "src")])
-    environment = {**os.environ, "PYTHONPATH": path, "ASKED": str(asked)}
+    environment = {**_environment(tmp_path), "PYTHONPATH": path, "ASKED": str(asked)}
     alone = ["unshare", "-rn"] if _can_unshare() else []
     done = subprocess.run(
         [*alone, *command],
