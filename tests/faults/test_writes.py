@@ -5,6 +5,7 @@ previous file or none, one line that names the file, and nothing half written th
 import builtins
 import errno
 import io
+import json
 import os
 import random
 import re
@@ -15,7 +16,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
+from constraint_geodesics.benchmark import runner
 from constraint_geodesics.benchmark.row import (
     COLUMNS,
     KEY,
@@ -37,7 +39,13 @@ from constraint_geodesics.benchmark.row import (
 )
 from constraint_geodesics.bundle import PACKAGED, Bundle, read_bundle
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
-from constraint_geodesics.geodesics.policy_search import Actor, TrainedPolicy, save_policy
+from constraint_geodesics.geodesics.learned_method import read_learned
+from constraint_geodesics.geodesics.policy_search import (
+    Actor,
+    TrainedPolicy,
+    _checkpoint,
+    save_policy,
+)
 from constraint_geodesics.geodesics.proposals import MeanPolicy
 from constraint_geodesics.geometry.braking import Motion
 from constraint_geodesics.learning.dataset import (
@@ -51,6 +59,7 @@ from constraint_geodesics.learning.dataset import (
     write_queries,
 )
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.learning.path_diffusion import PathDiffusion
 from constraint_geodesics.learning.submanifold import (
     GraphSubmanifold,
     load_submanifold,
@@ -61,10 +70,14 @@ from constraint_geodesics.pipeline.paths import read_paths, save_paths
 from constraint_geodesics.pipeline.stage import SHOWN
 from constraint_geodesics.recording.png import save_png
 from constraint_geodesics.recording.recording import PathRecord, read_recording, record_path
+from constraint_geodesics.studies.cup import Execution
+from constraint_geodesics.studies.execution import load_execution, save_execution
 from constraint_geodesics.text_files import write_text, written
+from constraint_geodesics.tracking.left import UNSENT
+from constraint_geodesics.tracking.sending import Sender
 from constraint_geodesics.trajectory import read_trajectory, write_trajectory
 from tests.faults.effort import QUICK, Effort, all_passed, counting
-from tests.planner_fixtures import packaged_planner
+from tests.planner_fixtures import packaged_learned, packaged_planner, untrained_diffusion
 
 ROWS = np.linspace(-1.0, 1.0, 120).reshape(20, 6)
 FREE = Constraint((0,) * 6, (0,) * 6)
@@ -160,6 +173,30 @@ def _paths(folder: Path, number: int) -> None:
     save_paths([ROW], [_rows(number)], folder)
 
 
+def _learned(folder: Path, number: int) -> None:
+    whole = packaged_learned()
+    some = {name: whole.submanifolds[name] for name in list(whole.submanifolds)[number:][:1]}
+    replace(whole, submanifolds=some).write(folder)
+
+
+def _diffusion(folder: Path, number: int) -> None:
+    arrays = untrained_diffusion().arrays
+    PathDiffusion({**arrays, "seen_mean": arrays["seen_mean"] + number}).save(folder)
+
+
+def _checkpoint_of(folder: Path, number: int) -> None:
+    """As the training of policies writes it."""
+    torch.manual_seed(number)
+    with written(folder / "seed.pt") as part, part.open("wb") as opened:
+        torch.save({"policy": Actor(4, [8], 2).state_dict(), "steps": number}, opened)
+
+
+def _execution(folder: Path, number: int) -> None:
+    times, balls, cup = np.linspace(0.0, 1.0, 20), np.zeros((20, 3, 3)), np.zeros((20, 7))
+    own = Execution(3, 2, 0.01, 0.1, 1.0, times, _rows(number), balls, cup)
+    save_execution(folder / "execution.npz", own)
+
+
 def _picture(folder: Path, number: int) -> None:
     figure = Figure((2, 1))
     figure.subplots().plot(_rows(number)[number:])
@@ -224,6 +261,31 @@ ARTIFACTS: dict[str, Artifact] = {
         ("queries.csv",),
         lambda folder: vars(read_queries(folder / "queries.csv")),
         sealed=False,
+    ),
+    "learned method": Artifact(
+        _learned,
+        ("learned.json", "manifold.safetensors", "policy.safetensors", "submanifolds.safetensors"),
+        lambda folder: {
+            name: own.joints for name, own in read_learned(folder).submanifolds.items()
+        },
+    ),
+    "path diffusion": Artifact(
+        _diffusion,
+        ("path_diffusion.json", "path_diffusion.safetensors"),
+        lambda folder: dict(PathDiffusion.load(folder).arrays),
+    ),
+    "checkpoint": Artifact(
+        _checkpoint_of,
+        ("seed.pt",),
+        lambda folder: {
+            name: own.numpy() for name, own in _checkpoint(folder / "seed.pt")["policy"].items()
+        },
+        sealed=False,  # what no checksum of a zip file covers says nothing of the weights
+    ),
+    "execution": Artifact(
+        _execution,
+        ("execution.npz",),
+        lambda folder: asdict(load_execution(folder / "execution.npz")),
     ),
     "picture": Artifact(
         _picture,
@@ -374,6 +436,46 @@ def test_a_file_that_was_damaged_is_refused_or_says_what_it_said(
         (tmp_path / file).write_bytes(content)
     assert judged >= len(whole), "a file that was emptied at least"
     TRIED["survived"] += judged
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.9])
+def test_a_row_for_which_there_is_no_room_costs_no_other(share: float, tmp_path: Path) -> None:
+    """The line is cut off within a write; what is kept later begins a line of its own."""
+    file = tmp_path / "rows.jsonl"
+    rows = [
+        dict(zip(KEY, ("p", "free", "table", k, 0), strict=True)) | {"fingerprint": "0"}
+        for k in range(3)
+    ]
+    first, second, third = map(row_line, rows)
+    runner._append(file, first)
+    whole = file.stat().st_size
+    with pytest.raises(OSError, match="File too large"), full_at(whole + int(share * len(second))):
+        runner._append(file, second)
+    if not file.read_bytes().endswith(b"\n"):  # as `run_batch` begins
+        runner._append(file, "")
+    runner._append(file, third)
+    assert read_rows(file, {"p": "0"}) == [rows[0], rows[2]]
+    TRIED.update(injected=1, survived=1)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.9])
+def test_a_call_to_mlflow_for_which_there_is_no_room_costs_no_other(
+    share: float, tmp_path: Path
+) -> None:
+    sender, file = Sender("nowhere", tmp_path, "parent"), tmp_path / UNSENT
+    calls = [{"call": "metrics", "run": "r", "time": k, "metrics": {"a": 1.0}} for k in range(3)]
+    sender._keep(file, calls[0])
+    whole = file.stat().st_size
+    room = whole + int(share * len(json.dumps(calls[1])))
+    with pytest.raises(OSError, match="File too large"), full_at(room):
+        sender._keep(file, calls[1])
+    sender._keep(file, calls[2])
+    told: list[Any] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Sender, "tell", lambda self, call: told.append(call))
+        assert sender.tell_kept() == 2
+    assert told == [calls[0], calls[2]]
+    TRIED.update(injected=1, survived=1)
 
 
 def test_a_kept_row_that_was_damaged_is_asked_again(tmp_path: Path, effort: Effort) -> None:

@@ -355,8 +355,9 @@ class _Progress(BaseCallback):
             "unreported": [environment.savings, environment.episode_returns, environment.solved],
             "rows": self.rows,
         }
-        with written(self.file) as part:
-            torch.save(content, part)
+        # into an open file: by a name torch says of a full disk neither that nor the name
+        with written(self.file) as part, part.open("wb") as opened:
+            torch.save(content, opened)
         self._saved_at = self.num_timesteps
 
     def restore(self, model: PPO) -> None:
