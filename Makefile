@@ -91,10 +91,14 @@ test: env  ## run the tests of what people call: planner, shell, robots, scenes,
 test-experiments: env  ## run all others: learning, laws of geometry, tracking, reports, baselines, studies, a small pipeline, kills (half an hour)
 	$(TESTS) $(EXPERIMENTS:%=tests/%)
 
-test-faults: env  ## break things on purpose: kills, full disks, bad input, hostile files, load (half an hour); writes reports/reliability.json
+.venv/servers: tests/faults/requirements.lock .venv/installed
+	.venv/bin/python $(HASHED) -r tests/faults/requirements.lock
+	@touch $@
+
+test-faults: env .venv/servers  ## break things on purpose: kills, full disks, bad input, hostile files, load (half an hour); writes reports/reliability.json
 	GEODESICS_RELIABILITY=reports/reliability.json python -m pytest tests/faults --faults
 
-soak: env  ## the same for hours, with more of each: 20 kills a stage, 100,000 requests; go on after an interruption by calling it again
+soak: env .venv/servers  ## the same for hours, with more of each: 20 kills a stage, 100,000 requests; go on after an interruption by calling it again
 	GEODESICS_RELIABILITY=reports/reliability.json python -m pytest tests/faults --soak
 
 .venv/browser: tests/browser/requirements.lock .venv/installed

@@ -16,7 +16,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 LOCKS = (
     *("requirements.hashes", "docs/requirements.lock", "tests/browser/requirements.lock"),
-    ".ci/requirements.lock",
+    *("tests/faults/requirements.lock", ".ci/requirements.lock"),
 )
 _PIN = re.compile(r"^[A-Za-z0-9._-]+==\S+", re.MULTILINE)
 

@@ -19,7 +19,10 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
 VERSIONS, HASHES = ROOT / "requirements.lock", ROOT / "requirements.hashes"
-OTHERS = ("docs/requirements.lock", "tests/browser/requirements.lock", ".ci/requirements.lock")
+OTHERS = (
+    *("docs/requirements.lock", "tests/browser/requirements.lock"),
+    *("tests/faults/requirements.lock", ".ci/requirements.lock"),
+)
 PLANNING = "constraint-geodesics[record]"
 ABOVE = (
     "# What planning needs: `make plan`.  `make lock` writes this file; versions are those of",

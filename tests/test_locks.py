@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 HASHED = (
     *("requirements.hashes", "docs/requirements.lock", "tests/browser/requirements.lock"),
-    ".ci/requirements.lock",
+    *("tests/faults/requirements.lock", ".ci/requirements.lock"),
 )
 _ENTRY = re.compile(r"^([\w.-]+)==(\S+) \\\n((?:    --hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", re.M)
 

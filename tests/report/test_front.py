@@ -64,13 +64,13 @@ def test_the_row_stands_beside_the_best_of_the_rest_with_its_commit(layout):
     better = summary("BiRRT", (0.9, 0.85), (1.2, 2.0))
     write_overview(layout, *own, *prm, *better)
     row = planner_row(layout)
-    assert [cells[0] for cells in row.rows] == ["planner", "BiRRT"]
+    assert [cells[0] for cells in row.rows] == ["planner", "BiRRT", "PRM"]
     assert row.rows[0][1:5] == ["30 × 1", "100.0%", "1.001", "2"]
     assert row.rows[1][6:] == ["85.0%", "2.000", "2"]
     assert [span for _, span in row.groups] == [4, 4]
     assert "commit 0123456789ab, 2026-01-01" in row.note
     write_overview(layout, *own, *summary("PRM", (0.95, 0.9), (1.2, 2.0)), *birrt)
-    assert [cells[0] for cells in planner_row(layout).rows] == ["planner", "PRM"]
+    assert [cells[0] for cells in planner_row(layout).rows] == ["planner", "PRM", "BiRRT"]
 
 
 def test_the_planner_is_also_shown_on_the_queries_of_the_best_of_the_rest(layout):
@@ -81,7 +81,7 @@ def test_the_planner_is_also_shown_on_the_queries_of_the_best_of_the_rest(layout
     same |= {"reference_ratio_p95_all": 1.1, "reference_time_median_s": 0.004}
     write_overview(layout, *[row | same for row in (*many, *fewer)])
     row = planner_row(layout)
-    assert row.rows[-1] == [SAME, *["30 × 1", "100.0%", "1.100", "4"] * 2]
+    assert row.rows[-1] == [SAME.format("PRM"), *["30 × 1", "100.0%", "1.100", "4"] * 2]
     assert row.planners == ["planner", "PRM", "planner"]
     assert SAME_NOTE in row.note
 

@@ -33,7 +33,7 @@ def overview_of(*rows):
     return benchmark_summary(all_constraints(pd.DataFrame(rows)), "planner")
 
 
-def answers(planner, time_s, length, *, scene="table", queries=4, constraint="level_cup"):
+def answers(planner, time_s, length, *, scene="table", queries=FEW, constraint="level_cup"):
     """A planner's rows; the best known length is 2 rad, and a length of nan is a failure."""
     return [
         {
@@ -106,9 +106,16 @@ def test_what_is_sooner_or_shorter_is_named_with_both_figures():
         == "1 in the workcell, the largest gap 1.000 times the best known against 1.050."
     )
     assert shorter.details == [
-        "“SLSQP” in the workcell, 1.000 times the best known against 1.050 on 4 queries, in 2,000 "
-        "ms against 10"
+        "“SLSQP” in the workcell, 1.000 times the best known against 1.050 on 20 queries, in "
+        "2,000 ms against 10"
     ]
+
+
+def test_a_length_over_few_queries_is_only_counted():
+    few = {"queries": FEW - 1}
+    planner, other = answers("planner", 0.01, 2.1, **few), answers("SLSQP", 2.0, 2.0, **few)
+    (loss,) = losses(overview_of(*planner, *other), verdicts(SLSQP=["behind"]))
+    assert loss.sentence == f"1 over fewer than {FEW} queries."
 
 
 def test_within_the_same_time_few_queries_are_only_counted():

@@ -33,8 +33,10 @@ BELOW = (
     "constraints and searches it by policies."
 )
 NOT_RUN = "How it stands beside others is measured by make bench, which has left no rows here."
-SAME = "planner on the same queries"
-SAME_NOTE = "The last row is the planner's on the queries of the row above it. "
+REST = 2
+"""Planners that stand beside ours: the one that solves most may be slow."""
+SAME = "planner on the queries of {}"
+SAME_NOTE = "Where another was asked fewer queries, the planner's row below it is on these. "
 COLUMNS = ("queries × seeds", "solved", "length, p95", "median [ms]")
 FOOTINGS = {"trained on": "constraints it was trained on", "never seen": "constraints never seen"}
 """Groups of constraints in the figures of the policies, in words."""
@@ -57,39 +59,34 @@ def opening(layout: Layout, measured: bool) -> list[str]:
 
 
 def planner_row(layout: Layout) -> Table:
-    """The planner's row of the benchmark in both scenes, and that of the best of the rest; where
-    this one was asked fewer queries, the planner's on these too, if the benchmark's rows are there.
+    """The planner's row of the benchmark in both scenes, and those of the best of the rest; where
+    one of these was asked fewer queries, the planner's on them below it.
     """
     overview = _overview(layout)
     about = json.loads((layout.root / "reports" / "benchmark" / "about.json").read_text())
     scenes = {scene: words for scene, words in WHERE.items() if scene in set(overview["scene"])}
     found = {(row["planner"], row["scene"]): row for row in overview.to_dict("records")}
-    planners = [PLANNER, *best_of_families(overview)[:1]]
-    rows = [
-        [name, *(cell for scene in scenes for cell in _row_cells(found[name, scene]))]
-        for name in planners
-    ]
-    fewer = [
-        name
-        for name in planners[1:]
-        if any(found[name, scene]["queries"] < found[PLANNER, scene]["queries"] for scene in scenes)
-    ]
-    same = [
-        [SAME, *(cell for scene in scenes for cell in _row_cells(found[name, scene], "reference_"))]
-        for name in fewer
-    ]
+    rows, planners = [], []
+    for name in (PLANNER, *best_of_families(overview)[:REST]):
+        own = [found[name, scene] for scene in scenes]
+        rows.append([name, *(cell for row in own for cell in _row_cells(row))])
+        planners.append(name)
+        if any(row["queries"] < found[PLANNER, row["scene"]]["queries"] for row in own):
+            same = [cell for row in own for cell in _row_cells(row, "reference_")]
+            rows.append([SAME.format(name), *same])
+            planners.append(PLANNER)
     note = (
         "All constraints together; solved: of what any planner solved; length: over the best "
-        f"known, failures infinite. {SAME_NOTE if same else ''}The best of the rest is the first "
-        f"by this rule: {CHOICE} {origin(about)}."
+        f"known, failures infinite. {SAME_NOTE if PLANNER in planners[1:] else ''}The best of the "
+        f"rest are the first {REST} by this rule: {CHOICE} {origin(about)}."
     )
     return Table(
         "The planner beside the best of the rest",
         note,
         ("planner", *COLUMNS * len(scenes)),
-        [*rows, *same],
+        rows,
         groups=[(words, len(COLUMNS)) for words in scenes.values()],
-        planners=[*planners, *[PLANNER] * len(same)],
+        planners=planners,
     )
 
 
