@@ -47,8 +47,11 @@ def main() -> None:
     for file in OTHERS:
         text = (ROOT / file).read_text()
         above = [line for line in text.splitlines() if line.startswith("#")]
-        pins = "\n".join("==".join(pin) for pin in _PIN.findall(text))
-        (ROOT / file).write_text("\n".join([*above, *hashed(pins).values()]) + "\n")
+        pins = _PIN.findall(text)
+        found = hashed("\n".join("==".join(pin) for pin in pins))
+        # what they need besides is of another file
+        entries = [found[name] for name in sorted(_normal(name) for name, _ in pins)]
+        (ROOT / file).write_text("\n".join([*above, *entries]) + "\n")
 
 
 def hashed(pins: str) -> dict[str, str]:
