@@ -22,6 +22,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from safetensors.numpy import save
@@ -685,7 +687,15 @@ case("csv: a constraint 10^5 lists deep", "line 1: not a constraint: maximum rec
 )
 
 
-@case("parquet: a pickle", "shown.parquet: Could not open Parquet")
+@case("parquet: kilobytes that unpack to more than is read", "longer than 256 MiB, unpacked")
+def _(folder: Path) -> Any:
+    zeros = pa.table({"observation.state": pa.array(np.zeros(50_000_000))})
+    pq.write_table(zeros, folder / "shown.parquet", compression="zstd", row_group_size=10**9)
+    assert (folder / "shown.parquet").stat().st_size < 10**6
+    return demonstrations_from(folder / "shown.parquet", load_robot(SIX_AXIS, "tool"))
+
+
+@case("parquet: a pickle", "shown.parquet: Parquet magic bytes not found")
 def _(folder: Path) -> Any:
     (folder / "shown.parquet").write_bytes(pickle.dumps(Bomb(folder / CANARY)))
     return demonstrations_from(folder / "shown.parquet", load_robot(SIX_AXIS, "tool"))

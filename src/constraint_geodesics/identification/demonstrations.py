@@ -221,13 +221,13 @@ def _told_apart(file: Path | str, names: list[str], table: np.ndarray, robot: Se
 
 def _read_lerobot(file: Path) -> Any:
     try:
-        import pandas as pd
+        from constraint_geodesics.parquet_files import read_parquet
     except ImportError:
         raise DemonstrationError(
-            f"{file}: reading parquet needs pandas: pip install 'constraint_geodesics[pipeline]'"
+            f"{file}: reading parquet needs pyarrow: pip install 'constraint_geodesics[pipeline]'"
         ) from None
     try:
-        table = pd.read_parquet(file)
+        table = read_parquet(file).to_pandas()
         if STATE not in table:
             raise DemonstrationError(f"{file}: there is no column {STATE!r}, as LeRobot writes it")
         groups = table.groupby(EPISODE) if EPISODE in table else [(0, table)]

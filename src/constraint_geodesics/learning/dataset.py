@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
+from constraint_geodesics.parquet_files import read_parquet
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.text_files import read_text, written
 
@@ -199,7 +200,7 @@ def write_joints(shards: Sequence[Shard], file: Path, about: dict[str, str]) -> 
 def read_joints(file: Path) -> JointSet:
     """Read and check one set.  Raises DatasetError with file and column of a bad row."""
     try:
-        table = pq.read_table(file, page_checksum_verification=True).to_pandas()
+        table = read_parquet(file).to_pandas()
     except FileNotFoundError:
         raise DatasetError(f"{file}: missing") from None
     except (OSError, ValueError, pa.ArrowException) as error:

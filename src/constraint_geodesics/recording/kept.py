@@ -25,7 +25,8 @@ _MARGIN_M, _THIN_M = 0.08, 0.001
 held exactly.
 """
 _THIN = rr.Radius.ui_points(1.5)
-_ROUND = np.linspace(0.0, 2.0 * np.pi, 33)[:, None]
+_TURNS = np.linspace(0.0, 2.0 * np.pi, 41)
+_ROUND = np.column_stack([np.cos(_TURNS), np.sin(_TURNS)])
 
 Drawing = tuple[Any, ...]
 
@@ -47,8 +48,7 @@ def kept_drawings(
         lines = np.stack([np.zeros((3, 3)), ends], axis=1)
         yield f"{PLACE}/kept", rr.LineStrips3D(lines, colors=AXES, radii=[_THIN])
     elif len(angles) == 2:
-        loosely = float(rows.tolerance[3 + angles[0]]) if rows.together.any() else 0.0
-        yield from _upright(reference.rotation, angles, loosely)
+        yield from _upright(reference.rotation, angles, rows.tolerance[3 + angles])
 
 
 def _region(held: np.ndarray, tolerance: np.ndarray, place: np.ndarray, tool: np.ndarray) -> Any:
@@ -59,9 +59,9 @@ def _region(held: np.ndarray, tolerance: np.ndarray, place: np.ndarray, tool: np
     return rr.Boxes3D(centers=[centre], half_sizes=[half], **style)
 
 
-def _upright(turn: np.ndarray, angles: np.ndarray, loosely: float) -> Iterator[Drawing]:
+def _upright(turn: np.ndarray, angles: np.ndarray, loosely: np.ndarray) -> Iterator[Drawing]:
     """The base axis that the tool may turn about, as the tool sees it; the plane across it, and the
-    circle in which the arrow's tip has to stay.
+    ring in which the arrow's tip has to stay.
     """
     (free,) = set(range(3)) - set(angles.tolist())
     axis = np.eye(3)[free]
@@ -71,9 +71,11 @@ def _upright(turn: np.ndarray, angles: np.ndarray, loosely: float) -> Iterator[D
     size = {"lengths": [_THIN_M], "radii": [LEVEL_M], "quaternions": [rr.Quaternion(xyzw=lying)]}
     plane = rr.Cylinders3D(**size, colors=[(*CARRIED, 90)], fill_mode="solid")
     limit: tuple[Any, ...] = ()
-    if 0.0 < loosely < 0.5 * np.pi:
-        first, second = np.eye(3)[angles]
-        about = loosely * (np.cos(_ROUND) * first + np.sin(_ROUND) * second)
+    if (loosely > 0.0).all() and (loosely < 0.5 * np.pi).all():
+        # angles of one tolerance are bounded together, else each by its own
+        apart = loosely[0] != loosely[1]
+        ring = _ROUND / (np.abs(_ROUND).max(axis=1, keepdims=True) if apart else 1.0)
+        about = (loosely * ring) @ np.eye(3)[angles]
         circle = Rotation.from_rotvec(about).apply(UPRIGHT_M * axis)
         limit = (rr.LineStrips3D([circle], colors=[LIMIT], radii=[_THIN]),)
     yield f"{PLACE}/level", plane, *limit
