@@ -12,6 +12,7 @@ from constraint_geodesics.bundle import read_bundle
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
+from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.robot.kinematics import load_robot
@@ -44,7 +45,7 @@ def main(params: Params, layout: Layout) -> None:
     settings = {"scenes": SCENES, "lines": LINES, "grazed": GRAZED, "thickets": THICKETS}
     work = Work(STAGE, STAGE, settings, [layout.planner])
     with tracked_stage(work, params.tracking.experiment, layout.root) as run:
-        report = proved(params, layout)
+        report = {"machine": run_header(layout.root), **proved(params, layout)}
         file = layout.root / "reports" / "collision_proof.json"
         write_text(file, json.dumps(report, indent=1) + "\n")
         counts = ("paths", "free", "certified", "wrongly_certified", "undecided", "refused")

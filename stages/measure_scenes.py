@@ -19,6 +19,7 @@ from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies import changing_scenes as study
+from constraint_geodesics.studies.problem_runs import quantiles
 from constraint_geodesics.text_files import write_text
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
@@ -54,9 +55,7 @@ def measured(params: Params, layout: Layout, file: Path) -> dict[str, Any]:
             "stops": _each(study.stops, planner, params.constraints, STOPS),
             "sphere": _each(study.beside_a_sphere, planner, params.constraints, SPHERES),
             # last: it leaves another scene
-            "first shape gone": list(
-                study.after_a_first_shape(planner, [*params.constraints], SEED)
-            ),
+            "first shape gone": list(study.after_a_first_shape(planner, [*params.constraints])),
         }
     frames = {name: pd.DataFrame(rows) for name, rows in tables.items()}
     about = run_header(layout.root)
@@ -64,7 +63,7 @@ def measured(params: Params, layout: Layout, file: Path) -> dict[str, Any]:
         "machine": about,
         "changes_ms": study.change_figures(frames["changes"]),
         "mesh_of_5000_triangles": study.mesh_figures(frames["meshes"]),
-        "first_shape_gone": study.by_constraint(frames["first shape gone"]),
+        "roadmap_once_a_first_shape_is_gone": quantiles("ms", frames["first shape gone"].ms),
         "cup_carried": study.answer_figures(frames["cup"]),
         "sudden_spheres": study.by_constraint(frames["sudden"]),
         "stops": study.by_constraint(frames["stops"]),

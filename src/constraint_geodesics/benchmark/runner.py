@@ -229,8 +229,9 @@ class _Opened:
 def _opened(batch: QueryBatch, query: Query, names: Sequence[str]) -> Iterator[_Opened]:
     scene, manifold = query.in_scene(batch.scene), batch.manifold
     with (
-        Certifier(scene, judge_limits(batch.judge)) as certifier,
+        # first the planners, by a clock of their own: what the judge makes of a scene is kept
         batch.build(names, scene, query.constraint, manifold) as (planners, made_s),
+        Certifier(scene, judge_limits(batch.judge)) as certifier,
     ):
         began = time.perf_counter()
         clearance = clearance_model(scene, certifier.collisions.apart)

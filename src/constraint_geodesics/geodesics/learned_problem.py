@@ -302,9 +302,12 @@ class LearnedProblem:
     def sample_pairs(
         self, count: int, rng: np.random.Generator
     ) -> Float[np.ndarray, "2 {count} D"]:
-        """Starts and goals of `pairs`, or of `joints` where there are none."""
+        """Starts and goals of `pairs`, or two of `joints` where there are none."""
         if self.pairs is None:
-            return self.joints[rng.integers(len(self.joints), size=(2, count))]
+            drawn = rng.integers(len(self.joints), size=(2, count))
+            while (same := drawn[0] == drawn[1]).any() and len(self.joints) > 1:
+                drawn[1, same] = rng.integers(len(self.joints), size=int(same.sum()))
+            return self.joints[drawn]
         return self.pairs[rng.integers(len(self.pairs), size=count)].transpose(1, 0, 2)
 
     def sample_curves(self, ends: Ends, rng: np.random.Generator) -> Phi:

@@ -20,6 +20,7 @@ from constraint_geodesics.palette import (
 )
 from constraint_geodesics.report.benchmark_figures import Styles, styles_of
 from constraint_geodesics.report.cells import Cells, fixed, markdown_table
+from constraint_geodesics.studies.growth import MOST
 
 COLUMNS = 3
 OTHERS = (VERMILION, PURPLE, BLACK)
@@ -35,7 +36,7 @@ LABELS = {
 """What is below each axis' panel."""
 NOTE = (
     "shaded: quartiles;  dotted: fit to sizes above 0;  "
-    "hollow: fewer than half of the queries solved"
+    f"hollow: fewer than {100 * MOST:.0f} % of the queries solved, in no exponent"
 )
 LEGEND_ROOM = 0.27
 """Of a panel's height, above what is drawn."""
@@ -77,7 +78,7 @@ def _draw_panel(panel: Axes, table: pd.DataFrame, fits: pd.DataFrame) -> None:
         panel.plot(value, own["seconds"], label=f"{what}: {_slope(fit)}", **style)
         panel.fill_between(value, own["low"], own["high"], color=colour, alpha=0.12, linewidth=0)
         # nan, no query, is filled
-        inside = ["white" if share < 0.5 else colour for share in own["solved"]]
+        inside = ["white" if share < MOST else colour for share in own["solved"]]
         edge: Any = {"edgecolors": colour, "linewidths": 0.9, "zorder": 3}
         panel.scatter(value, own["seconds"], s=14, c=inside, **edge)
         above = value[value > 0]

@@ -76,6 +76,9 @@ for no search.
 TRIES = 500
 """Random configurations among which free ones, or places for spheres, are looked for."""
 
+MOST = 0.9
+"""Share of the queries that must be solved for a time to tell how solving grows."""
+
 Batch = Callable[[Float[np.ndarray, "B D"], Float[np.ndarray, "B D"]], Sequence[bool]]
 """Answers B queries of `CONSTRAINT`, given their starts and goals [rad]; which of them are solved.
 """
@@ -239,15 +242,15 @@ def slopes(table: pd.DataFrame) -> pd.DataFrame:
     """Exponents: for each (axis, what) the least-squares line of log seconds over log value.
 
     Columns: axis, what, slope, standard_error (nan with two points), seconds_at_1 and points.
-    Values of 0, times that are not positive and finite, and those of which less than half was
-    solved, where the median is the planner's own limit, are left out; all nan where fewer than two
+    Values of 0, times that are not positive and finite, and those of which less than MOST was
+    solved, where the median is also that of giving up, are left out; all nan where fewer than two
     distinct values remain.
     """
     rows = []
     for (axis, what), own in table.groupby(["axis", "what"], sort=False):
         value, seconds = own["value"].to_numpy(float), own["seconds"].to_numpy(float)
         used = (value > 0) & (seconds > 0) & np.isfinite(seconds)
-        used &= ~(own["solved"].to_numpy(float) < 0.5)
+        used &= ~(own["solved"].to_numpy(float) < MOST)
         line = _line(np.log(value[used]), np.log(seconds[used]))
         rows.append((axis, what, *line, int(used.sum())))
     columns = ["axis", "what", "slope", "standard_error", "seconds_at_1", "points"]
