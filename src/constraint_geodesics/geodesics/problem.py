@@ -259,13 +259,14 @@ class ChartProblem:
         return Costs(length, length, np.isfinite(length) & self.stays_inside(phi, ends))
 
     def observed(self, phi: Phi, ends: Ends) -> Observed:
-        """Costs, and a step down the energy."""
+        """Costs, and a step down the squared length."""
         costs = self.evaluate(phi, ends)
         return Observed(costs, self.descent(phi, ends), np.zeros((len(phi), 0)))
 
     def descent(self, phi: Phi, ends: Ends) -> Phi:
         """The step that leads to the least energy, if the metric stayed what it is along each
-        curve: −H⁻¹ ∇E with H = 2 ∫ ḃ_k ḃ_l M(γ) dt, at most LONGEST_STEP of the ends' distance.
+        curve: −H⁻¹ ∇(L²), which is that of the energy at constant speed, with
+        H = 2 ∫ ḃ_k ḃ_l M(γ) dt, at most LONGEST_STEP of the ends' distance.
         """
         rule = rules(tuple(self.curve.breaks))[1]
         length = length_function(self.manifold, self.curve, rule)

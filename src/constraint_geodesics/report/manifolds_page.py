@@ -54,7 +54,9 @@ def _given(settings: CompareManifoldsParams, params: Params, found: Mapping[str,
     return (
         f"Each learner is trained on the same {found['rows']:,} configurations free of collision, "
         f"with {len(settings.seeds)} seeds (mean ± deviation), and asked about "
-        f"{found['held_out']:,} others. The VAE has at most {vae.epochs} epochs in batches of "
+        f"{found['held_out']:,} others. The VAE keeps {share(vae.held_out)} of its own back, by "
+        f"which its training ends, and its samples have a width that was chosen so that as many are free "
+        f"as of the data. It has at most {vae.epochs} epochs in batches of "
         f"{vae.batch_size}; the GPLVM {gplvm.steps:,} steps of {gplvm.batch_size} rows and "
         f"{gplvm.inducing} inducing points; the GAN {gan.steps:,} steps of its generator with "
         f"{gan.critic_steps} of its critic each, of {gan.batch_size} rows. A GAN has no encoder: "
