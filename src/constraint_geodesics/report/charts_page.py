@@ -73,7 +73,8 @@ def _sentences(charts: Mapping[str, Any]) -> list[str]:
     sentences = [
         f"In joint space itself the policy solves {share(_mean(joint, 'solved'), 1)} with a p95 of "
         f"{fixed(_p95(joint), 3)}; in the best learned chart, of {best[1]} dimensions and "
-        f"{best[0]} data, {share(_mean(learned[best], 'solved'), 1)} and {fixed(_p95(learned[best]), 3)}."
+        f"{best[0]} data, {share(_mean(learned[best], 'solved'), 1)} and "
+        f"{fixed(_p95(learned[best]), 3)}."
     ]
     if low:
         least, most = (pick(_mean(own, "solved") for own in low) for pick in (min, max))
