@@ -175,13 +175,26 @@ class Dying:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+class Leaving:
+    name = "band"
+
+    def plan(self, problem, seed):
+        raise SystemExit(1)
+
+
 @contextmanager
 def build_dying(names, scene, constraint, manifold):
     yield {"band": Dying()}, {"band": 0.0}
 
 
-def test_a_planner_that_kills_every_process_is_given_up(batch) -> None:
-    own = replace(batch, queries=batch.queries[:1], baselines=ASKED[:1], build=build_dying)
+@contextmanager
+def build_leaving(names, scene, constraint, manifold):
+    yield {"band": Leaving()}, {"band": 0.0}
+
+
+@pytest.mark.parametrize("build", [build_dying, build_leaving])
+def test_a_planner_that_ends_every_process_is_given_up(batch, build) -> None:
+    own = replace(batch, queries=batch.queries[:1], baselines=ASKED[:1], build=build)
     for _ in range(2):
         runner._WARM.clear()  # as in a new process
         with pytest.raises(SystemExit):

@@ -695,6 +695,13 @@ def _(folder: Path) -> Any:
     return demonstrations_from(folder / "shown.parquet", load_robot(SIX_AXIS, "tool"))
 
 
+@case("parquet: one long text, many times", "there is no column 'observation.state'")
+def _(folder: Path) -> Any:
+    texts = pa.table({"observation.state": pa.array(["a" * 2**20] * 10).dictionary_encode()})
+    pq.write_table(texts, folder / "shown.parquet", compression="zstd")
+    return demonstrations_from(folder / "shown.parquet", load_robot(SIX_AXIS, "tool"))
+
+
 @case("parquet: a pickle", "shown.parquet: Parquet magic bytes not found")
 def _(folder: Path) -> Any:
     (folder / "shown.parquet").write_bytes(pickle.dumps(Bomb(folder / CANARY)))

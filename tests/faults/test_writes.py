@@ -45,6 +45,7 @@ from constraint_geodesics.geodesics.policy_search import (
     TrainedPolicy,
     _checkpoint,
     save_policy,
+    write_checkpoint,
 )
 from constraint_geodesics.geodesics.proposals import MeanPolicy
 from constraint_geodesics.geometry.braking import Motion
@@ -187,8 +188,8 @@ def _diffusion(folder: Path, number: int) -> None:
 def _checkpoint_of(folder: Path, number: int) -> None:
     """As the training of policies writes it."""
     torch.manual_seed(number)
-    with written(folder / "seed.pt") as part, part.open("wb") as opened:
-        torch.save({"policy": Actor(4, [8], 2).state_dict(), "steps": number}, opened)
+    content = {"policy": Actor(4, [8], 2).state_dict(), "steps": number}
+    write_checkpoint(content, folder / "seed.pt")
 
 
 def _execution(folder: Path, number: int) -> None:

@@ -1,12 +1,16 @@
 """The study of scenes that change, small, on the real planner; its figures on known rows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
-from tests.planner_fixtures import packaged_planner
+from tests.planner_fixtures import packaged_bundle, packaged_planner
 
 from constraint_geodesics.params import Params
+from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.scene import Scene
+from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.studies import changing_scenes as study
 from constraint_geodesics.studies.clutter import MAKERS
 
@@ -20,6 +24,43 @@ def test_every_sphere_is_on_the_way_and_no_answer_touches_it() -> None:
     assert set(rows.status) == {"solved"}
     assert not rows.touches.any()
     assert planner.scene.now == before
+
+
+def test_what_a_path_or_a_stop_touches_is_seen_whatever_the_path_says_stands_there() -> None:
+    planner = packaged_planner()
+    path = next(study._long_paths(planner, NAME, 3))
+    tool, _ = planner.robot.forward(path.at(0.5))
+    around = planner.scene.now.adding(Sphere("ball", tuple(tool.tolist()), 0.03))
+    stop = path.stop(0.4 * float(path.times[-1]))
+    assert stop.status == "stopped"
+    for own in (path, stop):
+        assert not study.touches(own, own.scene)
+    assert study.touches(path, around)
+    whole = replace(stop, joints=path.joints)
+    assert study.touches(whole, around)
+
+
+def test_roadmaps_are_made_anew_once_a_first_shape_is_gone() -> None:
+    with Planner(packaged_bundle(), "packaged") as planner:
+        (row,) = study.after_a_first_shape(planner, [NAME])
+        assert row["ms"] > 50.0, "a roadmap takes longer"
+        assert "table" not in planner.scene.now.names
+
+
+def test_a_query_that_no_budget_solves_is_asked_for_longer_and_in_no_budget_s_figures() -> None:
+    kinds = {0.0: np.nan, 30.0: np.nan, 100.0: np.nan, 500.0: np.nan, 10_000.0: 2.0}
+    rows = pd.DataFrame(
+        [
+            {"constraint": NAME, "query": 0, "budget_ms": budget, "ms": 1.0, "touches": False}
+            | {"length_rad": length, "status": "solved" if length == length else "not_found"}
+            for budget, length in kinds.items()
+        ]
+    )
+    found = study.sphere_figures(rows)
+    assert set(found["all"]) == {"first answer", "30 ms", "100 ms", "500 ms"}
+    assert {own["solved"] for own in found["all"].values()} == {0}
+    assert {own["queries"] for own in found["all"].values()} == {1}
+    assert found["solved with no budget"] == 0
 
 
 def test_the_cup_is_carried_while_it_is_asked_and_gone_after(params: Params) -> None:

@@ -12,7 +12,7 @@ from constraint_geodesics.benchmark.judge import judge_limits
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import constraint_manifold
 from constraint_geodesics.geodesics.episodes import observation_size
-from constraint_geodesics.geodesics.proposals import MeanPolicy
+from constraint_geodesics.geodesics.proposals import MeanPolicy, rounds
 from constraint_geodesics.learning.dataset import ShardTask, draw_free, draw_queries
 from constraint_geodesics.learning.learned_manifold import joint_space
 from constraint_geodesics.studies import proposals as bench
@@ -83,6 +83,16 @@ def test_controls_search_for_the_time_they_are_given(asked) -> None:
         began = time.perf_counter()
         next(method(asked[0], 0.2))
         assert time.perf_counter() - began >= 0.2
+
+
+def test_the_search_without_a_policy_looks_at_the_straight_line_once(asked, compared) -> None:
+    own, policy = asked[0], compared.policies[0]
+    assert compared.settings.heads > 1
+    still = bench.without_actions(policy, compared.settings.heads)
+    alone = compared.settings.model_copy(update={"heads": 1})
+    first = next(rounds(own.problem, still, alone, own.ends, np.random.default_rng(0)))
+    looked = first.phi[: alone.rollouts]
+    assert (~looked.any(axis=1)).sum() == 1
 
 
 def test_its_own_branches_alone_draw_no_random_curve(compared) -> None:

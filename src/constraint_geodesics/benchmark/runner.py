@@ -4,7 +4,8 @@ kept as it comes.
 Rows are appended to one file for each batch of queries, and each carries a fingerprint of all it
 depends on: a benchmark that was killed goes on where it stopped, and after a change only the rows
 it touches are run again.  All planners answer a query one after another, in one process on one
-thread, so that a slow spell of the machine hits them alike.
+thread, so that a slow spell of the machine hits them alike; but for rows that may have ended the
+processes before, which have one of their own.
 """
 
 import ctypes
@@ -12,13 +13,13 @@ import hashlib
 import json
 import math
 import multiprocessing
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +37,7 @@ from constraint_geodesics.benchmark.row import KEY, key_of, read_rows, row_line
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.params import ComputeParams, JudgeParams
-from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.compute import end_after, parallel_map
 from constraint_geodesics.problem import PathPlanner, PlanningProblem, Solution
 from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.scene import Scene
@@ -311,21 +312,27 @@ def _asked_alone(batch: QueryBatch, job: _Job) -> _Asked:
     if multiprocessing.current_process().daemon:  # may start none: a worker of Dask's nanny
         return Solution("not_found", nothing, 0.0, 0, "processes died in it"), math.nan, math.nan
     spawning = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, spawning, _leave_interrupts_to_parent) as own:
-        try:
-            return own.submit(_answer_alone, batch, job).result()
-        except BrokenProcessPool:
-            failed = Solution("not_found", nothing, 0.0, 0, "its process died in it")
-            return failed, math.nan, math.nan
+    answers, answering = spawning.Pipe(duplex=False)
+    own = spawning.Process(target=_answer_alone, args=(batch, job, answering, os.getpid()))
+    own.start()
+    answering.close()  # so that its end is seen
+    try:
+        found: _Asked = answers.recv()
+        return found
+    except EOFError:
+        failed = Solution("not_found", nothing, 0.0, 0, "its process died in it")
+        return failed, math.nan, math.nan
+    finally:
+        own.kill()
+        own.join()
 
 
-def _leave_interrupts_to_parent() -> None:
+def _answer_alone(batch: QueryBatch, job: _Job, answering: Connection, parent: int) -> None:
+    """An interrupt is its parent's to take, with which it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _answer_alone(batch: QueryBatch, job: _Job) -> _Asked:
+    end_after(parent)
     with _opened(batch, job.query, [job.baseline.name]) as opened:
-        return _timed(job, opened)
+        answering.send(_timed(job, opened))
 
 
 def _timed(job: _Job, opened: _Opened) -> _Asked:

@@ -8,7 +8,7 @@ import json
 import sys
 import time
 import zipfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -263,6 +263,12 @@ def ppo_model(environment: VecEnv, params: GeodesicParams, seed: int) -> PPO:
     return model
 
 
+def write_checkpoint(content: Mapping[str, Any], file: Path) -> None:
+    """Into an open file: by a name torch says of a full disk neither that nor the name."""
+    with written(file) as part, part.open("wb") as opened:
+        torch.save(content, opened)
+
+
 def _checkpoint(file: Path) -> dict[str, Any]:
     """Raises DamagedFileError; torch itself does not look at the checksums that it writes."""
     with reading(file), zipfile.ZipFile(file) as whole:
@@ -355,9 +361,7 @@ class _Progress(BaseCallback):
             "unreported": [environment.savings, environment.episode_returns, environment.solved],
             "rows": self.rows,
         }
-        # into an open file: by a name torch says of a full disk neither that nor the name
-        with written(self.file) as part, part.open("wb") as opened:
-            torch.save(content, opened)
+        write_checkpoint(content, self.file)
         self._saved_at = self.num_timesteps
 
     def restore(self, model: PPO) -> None:

@@ -136,7 +136,10 @@ def rounds(
     straight = begin(problem, ends, np.zeros((1, problem.curve.coefficients)))
     heads = replace(straight[np.zeros(params.heads, dtype=int)], head=np.arange(params.heads))
     moves = displaced(params, heads, policy.act(observe(params, heads)))
-    known = [_met(straight.phi, straight, -1), _looked_at(problem, ends, moves)]
+    moves = moves[moves.any(axis=1)]  # one that stays where it is is the straight line again
+    known = [_met(straight.phi, straight, -1)]
+    if len(moves):
+        known.append(_looked_at(problem, ends, moves))
     for _ in range(params.rounds):
         number = params.rollouts - params.heads
         looked = _many_looked_at(problem, ends, known, number, params.kept, rng)

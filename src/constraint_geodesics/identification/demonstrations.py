@@ -224,14 +224,16 @@ def _read_lerobot(file: Path) -> Any:
         from constraint_geodesics.parquet_files import read_parquet
     except ImportError:
         raise DemonstrationError(
-            f"{file}: reading parquet needs pyarrow: pip install 'constraint_geodesics[pipeline]'"
+            f"{file}: reading parquet needs pandas and pyarrow: pip install "
+            "'constraint_geodesics[pipeline]'"
         ) from None
     try:
-        table = read_parquet(file).to_pandas()
+        table = read_parquet(file)
         if STATE not in table:
             raise DemonstrationError(f"{file}: there is no column {STATE!r}, as LeRobot writes it")
         groups = table.groupby(EPISODE) if EPISODE in table else [(0, table)]
         return [np.array(own[STATE].tolist(), float) for _, own in groups]
     except (OSError, TypeError, ValueError) as error:
-        told = str(error) if isinstance(error, DemonstrationError) else f"{file}: {error}"
+        said = getattr(error, "strerror", None) or str(error)
+        told = said if isinstance(error, DemonstrationError) else f"{file}: {said}"
         raise DemonstrationError(" ".join(told.split())[:300]) from None

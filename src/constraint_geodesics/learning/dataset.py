@@ -200,7 +200,7 @@ def write_joints(shards: Sequence[Shard], file: Path, about: dict[str, str]) -> 
 def read_joints(file: Path) -> JointSet:
     """Read and check one set.  Raises DatasetError with file and column of a bad row."""
     try:
-        table = read_parquet(file).to_pandas()
+        table = read_parquet(file)
     except FileNotFoundError:
         raise DatasetError(f"{file}: missing") from None
     except (OSError, ValueError, pa.ArrowException) as error:

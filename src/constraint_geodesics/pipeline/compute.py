@@ -109,7 +109,7 @@ class _Task(Generic[Item, Result]):
 
     def below(self, parent: int, folder: str, index: int, item: Item) -> tuple[int, Result]:
         """In a worker on this machine, which may be left from work in another folder."""
-        _end_after(parent)
+        end_after(parent)
         os.chdir(folder)
         return self.in_worker(index, item)
 
@@ -126,7 +126,7 @@ class _Task(Generic[Item, Result]):
 
 
 @cache
-def _end_after(parent: int) -> None:
+def end_after(parent: int) -> None:
     """End this process soon after its parent: a killed run would go on in it, beside the one that
     continues.
     """

@@ -191,7 +191,8 @@ def changes(planner: Planner, others: int, count: int, seed: int) -> Rows:
         with TemporaryDirectory() as folder:
             bracket = write_bracket(Path(folder))
             for number, (kind, make) in product(range(count), MAKERS.items()):
-                halves = HALF_M * rng.uniform(0.9, 1.1, size=2)  # shapes that are new, each
+                # new ones, but for the parts of the mesh
+                halves = HALF_M * rng.uniform(0.9, 1.1, size=2)
                 crate, load = (
                     make(name, _somewhere(rng), half, rng, bracket)
                     for name, half in zip(("crate", "load"), halves.tolist(), strict=True)
@@ -210,7 +211,7 @@ def _somewhere(rng: np.random.Generator) -> Placement:
 def _changed(
     planner: Planner, shape: Shape, load: Shape, elsewhere: Placement
 ) -> Iterator[tuple[str, float]]:
-    """load: which the scene has not had before."""
+    """load: which the scene has not had before, but for a mesh, whose parts are kept."""
     scene, link = planner.scene, planner.robot.tool_link
     held = load.placed(Placement((0.0, 0.0, 0.1)))
     steps: Sequence[tuple[str, Callable[[], object]]] = (

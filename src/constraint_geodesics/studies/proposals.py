@@ -260,7 +260,7 @@ class Compared:
         controls = list(self.policies)[:CONTROLS]
         found += [(OWN, seed, by_policy(self.policies[seed], own, seed)) for seed in controls]
         still = without_actions(next(iter(self.policies.values())), self.settings.heads)
-        alone = self.settings.model_copy(update={"heads": 1})  # more would begin with one curve
+        alone = self.settings.model_copy(update={"heads": 1})  # several would look at one curve
         found += [(STILL, seed, by_policy(still, alone, seed)) for seed in controls]
         found.append((STRAIGHT, controls[0], straight))
         found += [(RANDOM, seed, at_random(seed)) for seed in controls]
@@ -476,8 +476,9 @@ def policy_figures(rows: pd.DataFrame) -> dict[str, Any]:
     """Method → figures of any rows of `run_policies`, over seeds.
 
     Each of SHARES has its mean, interquartile mean and the 95 % bootstrap interval of the latter;
-    beaten_in_*: probability that a seed of the policy solves more, or has a smaller p95, than one
-    of the method, on the queries that the method was asked (Agarwal et al. 2021).
+    beaten_in_*: probability that a seed of the policy solves more, or has a smaller p95 with
+    failures infinite, than one of the method, on the queries that the method was asked (Agarwal et
+    al. 2021).
     """
     seeds, figures = seed_figures(rows), dict[str, Any]()
     scores = {str(name): own for name, own in seeds.groupby("method", sort=False)}

@@ -44,8 +44,15 @@ class Left:
     def unsent(self) -> int:
         """How much its store did not take."""
         file, sent = self.folder / UNSENT, self.folder / SENT
-        kept = sum(map(bool, file.read_text("utf-8").splitlines())) if file.is_file() else 0
+        kept = sum(map(_is_whole, file.read_text("utf-8").splitlines())) if file.is_file() else 0
         return max(kept - int(sent.read_text("utf-8")), 0) if kept and sent.is_file() else kept
+
+
+def _is_whole(line: str) -> bool:
+    """Not blank, and not cut short by a kill."""
+    with suppress(ValueError):
+        return bool(json.loads(line))
+    return False
 
 
 def hold(root: Path, name: str, store: str) -> Path:
