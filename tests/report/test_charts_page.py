@@ -43,7 +43,7 @@ def test_the_page_says_what_the_figures_say(params, layout) -> None:
     text = charts_markdown(params, layout)
     assert ORIGIN in text
     assert "In joint space itself the policy solves 99.0% with a p95 of 1.010" in text
-    assert "best learned chart, of 6 dimensions and task data, 100.0%, 1.015" in text
+    assert "best learned chart, of 6 dimensions and task data, 100.0% and 1.015" in text
     assert "With fewer dimensions than joints it solves 40.0% to 50.0%." in text
     assert "in 2 dimensions 25.0% (25 to 25) of the geodesics with the variance term" in text
     assert "50 queries, of which 49 are solved in any chart" in text
