@@ -13,11 +13,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lock import HASHES, OTHERS
+
 ROOT = Path(__file__).resolve().parents[1]
-LOCKS = (
-    *("requirements.hashes", "docs/requirements.lock", "tests/browser/requirements.lock"),
-    *("tests/faults/requirements.lock", ".ci/requirements.lock"),
-)
+LOCKS = (HASHES, *OTHERS)
 _PIN = re.compile(r"^[A-Za-z0-9._-]+==\S+", re.MULTILINE)
 
 

@@ -50,8 +50,8 @@ def main() -> None:
         pins = _PIN.findall(text)
         found = hashed("\n".join("==".join(pin) for pin in pins))
         # what they need besides is of another file
-        entries = [found[name] for name in sorted(_normal(name) for name, _ in pins)]
-        (ROOT / file).write_text("\n".join([*above, *entries]) + "\n")
+        kept = [found[name] for name in sorted(_normal(name) for name, _ in pins)]
+        (ROOT / file).write_text("\n".join([*above, *kept]) + "\n")
 
 
 def hashed(pins: str) -> dict[str, str]:

@@ -1,6 +1,6 @@
 """What may be installed: locked versions with the hashes of their files, and nothing else."""
 
-import importlib.util
+import importlib
 import re
 from pathlib import Path
 from types import ModuleType
@@ -16,13 +16,10 @@ _ENTRY = re.compile(r"^([\w.-]+)==(\S+) \\\n((?:    --hash=sha256:[0-9a-f]{64}(?
 
 
 def script(name: str) -> ModuleType:
-    """One of .ci/, which is no package."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / ".ci" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    """One of .ci/, which is no package; they import each other."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(ROOT / ".ci")
+        return importlib.import_module(name)
 
 
 def normal(name: str) -> str:

@@ -36,7 +36,13 @@ from constraint_geodesics.text_files import write_text
 from constraint_geodesics.tracking.experiment import Work, begin_run, tracked_stage
 from constraint_geodesics.tracking.left import AtWorkError, left_runs
 from constraint_geodesics.tracking.sending import recover
-from constraint_geodesics.tracking.store import TrackingError, open_store, tracking_uri, ui_command
+from constraint_geodesics.tracking.store import (
+    MOST_RUNS,
+    TrackingError,
+    open_store,
+    tracking_uri,
+    ui_command,
+)
 from tests.end_to_end import smoke
 from tests.faults.effort import SOAK, Effort, counting
 
@@ -97,7 +103,7 @@ def statuses(folder: Path) -> dict[str, list[str]]:
     client, found = MlflowClient(f"sqlite:///{folder / 'mlflow.db'}"), dict[str, list[str]]()
     ids = [own.experiment_id for own in client.search_experiments()]
     order = ["attributes.start_time ASC"]
-    for run in client.search_runs(ids, max_results=50_000, order_by=order):
+    for run in client.search_runs(ids, max_results=MOST_RUNS, order_by=order):
         found.setdefault(run.info.run_name, []).append(run.info.status)
     return found
 

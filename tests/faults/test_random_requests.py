@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from constraint_geodesics.bundle import PACKAGED
 from constraint_geodesics.constraints.constraint import Constraint, Pose
 from constraint_geodesics.goals.region import GoalRegion
-from constraint_geodesics.pipeline.code import code_digest, digest
+from constraint_geodesics.pipeline.code import code_digest, data_digest, digest
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import Status
 from constraint_geodesics.trajectory import Trajectory
@@ -248,21 +248,32 @@ def _faults(
     """What is wrong with a path, and how many configurations were looked at."""
     robot, found, joints, times = planner.robot, list[str](), path.joints, path.times
     rows = _dense(joints, step)
-    least, names = min((judge.deepest(row) for row in rows), key=lambda one: one[0])
-    if least < -DEEP_M:
-        found.append(f"collision of {names}: {least:.3g} m")
-    beyond = float(np.maximum(robot.lower - rows, rows - robot.upper).max())
-    if beyond > SLACK:
-        found.append(f"limits: beyond by {beyond:.3g}")
-    off = _off(judge, robot.tool_link, path.constraint, rows)
-    if off > OFF:
-        found.append(f"constraint: off by {off:.3g}")
+    found += _row_faults(planner, path, judge, rows, beyond=SLACK, off=OFF)
     if not _asked_for(planner, asked, path, judge):
         found.append("constraint: not the one that was asked")
     found += _turn_faults(planner, asked, path, judge)
     found += _end_faults(judge, robot.tool_link, asked, joints)
     found += _motion_faults(planner, asked, joints, times)
     return found, len(rows)
+
+
+def _row_faults(
+    planner: Planner, path: Trajectory, judge: Judge, rows: np.ndarray, *, beyond: float, off: float
+) -> list[str]:
+    """What configurations touch, and where they are further than allowed beyond the joint limits
+    [rad] or off the constraint [rad or m].
+    """
+    robot, found = planner.robot, list[str]()
+    least, names = min((judge.deepest(row) for row in rows), key=lambda one: one[0])
+    if least < -DEEP_M:
+        found.append(f"collision of {names}: {least:.3g} m")
+    passed = float(np.maximum(robot.lower - rows, rows - robot.upper).max())
+    if passed > beyond:
+        found.append(f"limits: beyond by {passed:.3g}")
+    missed = _off(judge, robot.tool_link, path.constraint, rows)
+    if missed > off:
+        found.append(f"constraint: off by {missed:.3g}")
+    return found
 
 
 def _asked_for(planner: Planner, asked: Request, path: Trajectory, judge: Judge) -> bool:
@@ -290,21 +301,13 @@ def _turn_faults(planner: Planner, asked: Request, path: Trajectory, judge: Judg
     begin = asked.words.get("start_velocity")
     if begin is None or not np.any(begin):
         return []
-    robot, found, (first, second) = planner.robot, list[str](), path.joints[:2]
+    first, second = path.joints[:2]
     lasting = 0.5 * (path.times[1] - path.times[0])
     line = 0.5 * (second - first) / lasting
     s = np.linspace(0.0, 1.0, TURN_ROWS)[:, None]
     rows = first + lasting * (s * begin + 0.5 * s**2 * (line - begin))
-    least, names = min((judge.deepest(row) for row in rows), key=lambda one: one[0])
-    if least < -DEEP_M:
-        found.append(f"turn: collision of {names}: {least:.3g} m")
-    beyond = float(np.maximum(robot.lower - rows, rows - robot.upper).max())
-    if beyond > TURN_BEYOND + SLACK:
-        found.append(f"turn: beyond the limits by {beyond:.3g}")
-    off = _off(judge, robot.tool_link, path.constraint, rows)
-    if off > TURN_OFF + SLACK:
-        found.append(f"turn: off the constraint by {off:.3g}")
-    return found
+    allowed = {"beyond": TURN_BEYOND + SLACK, "off": TURN_OFF + SLACK}
+    return [f"turn: {fault}" for fault in _row_faults(planner, path, judge, rows, **allowed)]
 
 
 def _dense(joints: np.ndarray, step: float) -> np.ndarray:
@@ -427,5 +430,4 @@ def _of() -> list[Any]:
     """What the figures hang on: requests and oracle as well as the planner."""
     files = (__file__, requests.__file__, bad_calls.__file__, fixtures.__file__, oracle.__file__)
     asked = [digest(Path(file)) for file in files]
-    packaged = [digest(file) for file in sorted(PACKAGED.rglob("*")) if file.is_file()]
-    return [SEED, *asked, *packaged, code_digest("planner")]
+    return [SEED, *asked, data_digest(PACKAGED), code_digest("planner")]

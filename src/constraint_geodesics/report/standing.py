@@ -167,7 +167,7 @@ def _within(budgets: pd.DataFrame) -> Told:
 def _sooner(others: pd.DataFrame) -> Told:
     sooner = others[others["time_median_s"] < others["reference_time_median_s"]]
     serving = sooner[sooner["success_of_solvable"] >= SERVES]
-    clauses, details = _by_largest_gap(
+    told = _by_largest_gap(
         serving,
         "time_median_s",
         _times,
@@ -176,27 +176,27 @@ def _sooner(others: pd.DataFrame) -> Told:
             f"{share(row['reference_success_of_solvable'], 1)})"
         ),
     )
-    rest = len(sooner) - len(serving)
-    if rest:
-        said = f"{rest}{' more' if clauses else ''} that solve less than half"
-        (details if clauses else clauses).append(said)
-    return clauses, details
+    return _with_rest(told, len(sooner) - len(serving), "that solve less than half")
 
 
 def _shorter(others: pd.DataFrame) -> Told:
     shorter = others[others["ratio_p95_all"] * (1.0 + AHEAD) < others["reference_ratio_p95_all"]]
     sure = shorter[shorter["queries"] >= FEW]
-    clauses, details = _by_largest_gap(
+    told = _by_largest_gap(
         sure,
         "ratio_p95_all",
         _lengths,
         lambda row: f"{_lengths(row)} on {row['solvable']} queries, in {_times(row)}",
     )
-    few = len(shorter) - len(sure)
-    if few:
-        said = f"{few}{' more' if clauses else ''} over fewer than {FEW} queries"
-        (details if clauses else clauses).append(said)
-    return clauses, details
+    return _with_rest(told, len(shorter) - len(sure), f"over fewer than {FEW} queries")
+
+
+def _with_rest(told: Told, rest: int, said: str) -> Told:
+    """And how many more there are that are not named, if any."""
+    clauses, details = told
+    if rest:
+        (details if clauses else clauses).append(f"{rest}{' more' if clauses else ''} {said}")
+    return told
 
 
 def _times(row: Mapping[Any, Any]) -> str:

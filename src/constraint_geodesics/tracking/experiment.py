@@ -27,6 +27,7 @@ from constraint_geodesics.text_files import write_text
 from constraint_geodesics.tracking.left import hold, release
 from constraint_geodesics.tracking.sending import CHILD, PROCESS, Sender, recover
 from constraint_geodesics.tracking.store import (
+    MOST_RUNS,
     TrackingError,
     client_of,
     dataset_of,
@@ -263,17 +264,12 @@ class StageRun:
     def child_names(self) -> list[str]:
         """Of the runs below this one that were started, by whatever process, oldest first."""
         query, order = f"tags.`mlflow.parentRunId` = '{self.run_id}'", ["attributes.start_time ASC"]
-        names: dict[str, None] = {}
-        page: str | None = None
         with explained(self.tracking_uri):
             client = client_of(self.tracking_uri)
-            while page is None or page:
-                found = client.search_runs(
-                    [self.experiment_id], query, order_by=order, page_token=page
-                )
-                names |= {run.data.tags["child"]: None for run in found}
-                page = found.token or ""
-        return list(names)
+            found = client.search_runs(
+                [self.experiment_id], query, max_results=MOST_RUNS, order_by=order
+            )
+        return list(dict.fromkeys(run.data.tags["child"] for run in found))
 
     def figure(self, file: Path) -> None:
         """Keep a copy of a figure with the run."""

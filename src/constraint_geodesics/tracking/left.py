@@ -18,7 +18,7 @@ import uuid
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -43,16 +43,17 @@ class Left:
     @property
     def unsent(self) -> int:
         """How much its store did not take."""
-        file, sent = self.folder / UNSENT, self.folder / SENT
-        kept = sum(map(_is_whole, file.read_text("utf-8").splitlines())) if file.is_file() else 0
-        return max(kept - int(sent.read_text("utf-8")), 0) if kept and sent.is_file() else kept
+        calls, done = kept_calls(self.folder)
+        return len(calls) - done
 
 
-def _is_whole(line: str) -> bool:
-    """Not blank, and not cut short by a kill."""
-    with suppress(ValueError):
-        return bool(json.loads(line))
-    return False
+def kept_calls(folder: Path) -> tuple[list[dict[str, Any]], int]:
+    """What a run told its store that this did not take, and how much of it was told since."""
+    unsent, sent, calls = folder / UNSENT, folder / SENT, []
+    for line in unsent.read_text("utf-8").split("\n") if unsent.is_file() else ():
+        with suppress(ValueError):  # blank, or killed while it was written
+            calls.append(json.loads(line))
+    return calls, int(sent.read_text("utf-8")) if calls and sent.is_file() else 0
 
 
 def hold(root: Path, name: str, store: str) -> Path:

@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from constraint_geodesics.text_files import write_text
-from constraint_geodesics.tracking.left import SENT, UNSENT, Left, left_runs, taken
+from constraint_geodesics.tracking.left import SENT, UNSENT, Left, kept_calls, left_runs, taken
 from constraint_geodesics.tracking.store import (
+    MOST_RUNS,
     TrackingError,
     check_database,
     client_of,
@@ -86,10 +87,7 @@ class Sender:
 
         Raises TrackingError at the first that the store does not take.
         """
-        unsent, sent = self.folder / UNSENT, self.folder / SENT
-        lines = unsent.read_text("utf-8").split("\n") if unsent.is_file() else []
-        calls = [told for told in map(_read, lines) if told is not None]
-        done = int(sent.read_text()) if sent.is_file() else 0
+        calls, done = kept_calls(self.folder)
         for place, told in enumerate(calls[done:], done + 1):
             try:
                 self.tell(told)
@@ -97,8 +95,8 @@ class Sender:
                 if not error.refused:
                     raise
                 print(f"{error}; it is not told this again", file=sys.stderr)
-            write_text(sent, str(place))
-        unsent.unlink(missing_ok=True)
+            write_text(self.folder / SENT, str(place))
+        (self.folder / UNSENT).unlink(missing_ok=True)
         return len(calls) - done
 
     def _keep(self, unsent: Path, told: dict[str, Any]) -> None:
@@ -138,21 +136,13 @@ def _recovered(left: Left, uri: str) -> list[str]:
         client = client_of(uri)
         experiments = [own.experiment_id for own in client.search_experiments()]
         wanted = f"tags.{PROCESS} = '{left.folder.name}' and attributes.status = 'RUNNING'"
-        running = client.search_runs(experiments, wanted, max_results=10_000)
+        running = client.search_runs(experiments, wanted, max_results=MOST_RUNS)
         for run in running:
             client.set_terminated(run.info.run_id, "KILLED")
     shutil.rmtree(left.folder, ignore_errors=True)
     ended = f"ended as KILLED, {len(running)} of its runs were still running" if running else ""
     sent = f"told MLflow {told} things that it had not taken" if told else ""
     return [f"{left.name}: {', '.join(filter(None, (sent, ended)))}"] if sent or ended else []
-
-
-def _read(line: str) -> dict[str, Any] | None:
-    try:
-        told: dict[str, Any] = json.loads(line)
-    except json.JSONDecodeError:  # blank, or killed while it was written
-        return None
-    return told
 
 
 def _begin(client: "MlflowClient", told: Mapping[str, Any]) -> str:

@@ -42,6 +42,8 @@ LONGEST_VALUE = 6000
 DIGITS = 9
 """Of a reported number: enough to compare runs, too few to show the last bits of another processor.
 """
+MOST_RUNS = 50_000
+"""That MLflow names at once."""
 FIRST_ANSWER_S = 15
 LOOPBACK, DATABASE = "127.0.0.1", "mlflow.db"
 PLANNER_MODEL, CHAMPION = "constraint_geodesics", "champion"
