@@ -416,7 +416,7 @@ def _tables(planner: Planner, read: dict[str, Reader], folder: Path) -> Iterator
     for name, states, said in (
         ("no column", None, "'observation.state'"),
         ("five joints", [[0.0] * 5] * 20, "(20, 5)"),
-        ("words", ["here"] * 20, "'here'"),
+        ("words", ["here"] * 20, "column 'observation.state' holds texts"),
         ("ragged", [[0.0] * (5 + k % 2) for k in range(20)], "own.parquet"),
     ):
         frame = table.drop(columns="observation.state")
@@ -434,7 +434,7 @@ def _tables(planner: Planner, read: dict[str, Reader], folder: Path) -> Iterator
         ("no rows", joints[:0], "has no rows"),
         ("no places of the tool", joints.drop(columns=without), "column 'tool_x'"),
         ("NaN", joints.assign(joint_1=np.nan), "'joint_1' contains null"),
-        ("words", joints.assign(joint_1="far"), "'joint_1' to have type"),
+        ("words", joints.assign(joint_1="far"), "column 'joint_1' holds texts"),
         ("another column", joints.assign(joint=0.0), "column 'joint'"),
         ("NaN for a place", joints.assign(tool_z=np.nan), "tool_z"),
         ("numbers for flags", joints.assign(self_collision=0.5), "self_collision"),

@@ -695,7 +695,7 @@ def _(folder: Path) -> Any:
     return demonstrations_from(folder / "shown.parquet", load_robot(SIX_AXIS, "tool"))
 
 
-@case("parquet: one long text, many times", "there is no column 'observation.state'")
+@case("parquet: one long text, many times", "column 'observation.state' holds texts, not numbers")
 def _(folder: Path) -> Any:
     texts = pa.table({"observation.state": pa.array(["a" * 2**20] * 10).dictionary_encode()})
     pq.write_table(texts, folder / "shown.parquet", compression="zstd")

@@ -228,7 +228,7 @@ def _read_lerobot(file: Path) -> Any:
             "'constraint_geodesics[pipeline]'"
         ) from None
     try:
-        table = read_parquet(file)
+        table = read_parquet(file, (STATE, EPISODE))
         if STATE not in table:
             raise DemonstrationError(f"{file}: there is no column {STATE!r}, as LeRobot writes it")
         groups = table.groupby(EPISODE) if EPISODE in table else [(0, table)]
