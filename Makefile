@@ -82,8 +82,10 @@ bench-geometry: env  ## time the geometry core again, after whatever it needs; w
 	dvc repro label_joints train_manifold train_analytic
 	dvc repro --single-item --force stages/dvc.yaml:benchmark_geometry
 
-TESTS := python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
-EXPERIMENTS := end_to_end faults/test_kills.py geodesics geometry identification laws learning peers pipeline report studies tracking
+# what hangs outside Python hears no other limit: it is ended after longer than any test's own, and named
+TESTS := python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder \
+	-o faulthandler_timeout=2100 -o faulthandler_exit_on_timeout=true
+EXPERIMENTS := benchmark end_to_end faults/test_kills.py geodesics geometry identification laws learning peers pipeline report studies tracking
 
 test: env  ## run the tests of what people call: planner, shell, robots, scenes, goals, constraints, certificate, pages (minutes)
 	$(TESTS) $(EXPERIMENTS:%=--ignore tests/%)

@@ -41,6 +41,7 @@ from constraint_geodesics.recording.recording import (
     about_of,
     read_recording,
     record_path,
+    rerun_command,
 )
 from constraint_geodesics.recording.viewer import open_recordings
 from constraint_geodesics.robot.kinematics import load_robot, rotation_from_rpy
@@ -120,6 +121,17 @@ def transform_of(values):
     if "quaternion" in values:
         transform[:3, :3] = Rotation.from_quat(values["quaternion"]).as_matrix()
     return transform
+
+
+def test_a_viewer_that_was_slow_takes_our_layout_too(tmp_path):
+    manifold, joints = manifold_and_joints(*XARM)
+    file = tmp_path / "path.rrd"
+    record_path(file, path_of(joints), manifold, [TABLE], frames=FRAMES)
+    told = subprocess.run(
+        rerun_command("rrd", "print", str(file)), capture_output=True, text=True, check=True
+    ).stdout
+    (activated,) = [line for line in told.splitlines() if "BlueprintActivation" in line]
+    assert "make_active: true" in activated
 
 
 @pytest.mark.parametrize(("robot", "meshes"), [(XARM, 7), (KUKA, 8)], ids=["xarm6", "kuka"])

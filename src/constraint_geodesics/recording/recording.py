@@ -274,8 +274,10 @@ def write_recording(
     content = stream.binary_stream()  # its own files would be half written where a disk is full
     with stream:
         if blueprint is not None:
-            stream.send_blueprint(blueprint, make_active=False)
-            stream.flush()  # the viewer keeps its own layout of what comes before
+            # active: where the viewer was slow and has drawn something first, it would keep to a
+            # layout of its own
+            stream.send_blueprint(blueprint)
+            stream.flush()
         if name:
             stream.send_recording_name(name)
         rr.send_chunks(chunks, recording=stream)
