@@ -122,8 +122,8 @@ def two_seeds(browser: "Browser", dashboard: str) -> bytes:
     found = runs_found(dashboard, f"{POLICIES} and tags.child LIKE 'seed %'")
     two = [of_child(found, f"seed {seed}") for seed in (0, 1)]
     paint(dashboard, *two)
-    names = ", ".join(repr(run["info"]["run_name"]) for run in two)
-    search = f"{POLICIES} and attributes.run_name IN ({names})"
+    ids = ", ".join(repr(run["info"]["run_id"]) for run in two)
+    search = f"attributes.run_id IN ({ids})"
     with shown_view(browser, dashboard, VIEW["seeds"], search=search, mode="CHART") as page:
         until(lambda: len(line_colours(page)) == 2, "the learning curves of two seeds")
         return settled(page)
