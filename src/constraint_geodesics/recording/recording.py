@@ -274,8 +274,7 @@ def write_recording(
     content = stream.binary_stream()  # its own files would be half written where a disk is full
     with stream:
         if blueprint is not None:
-            # active: where the viewer was slow and has drawn something first, it would keep to a
-            # layout of its own
+            # first, and active: a viewer that drew something before keeps to a layout of its own
             stream.send_blueprint(blueprint)
             stream.flush()
         if name:
