@@ -12,7 +12,12 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
-from constraint_geodesics.text_files import DamagedFileError, read_content, require_short
+from constraint_geodesics.text_files import (
+    DamagedFileError,
+    read_content,
+    reason_of,
+    require_short,
+)
 
 
 class ArrayFileError(DamagedFileError):
@@ -36,7 +41,7 @@ def read_weights(file: Path, sha256: str | None = None) -> dict[str, np.ndarray]
     try:
         arrays: dict[str, np.ndarray] = load(content)
     except (SafetensorError, KeyError, TypeError, ValueError, OverflowError, MemoryError) as error:
-        raise ArrayFileError(f"{file}: not safetensors: {_first_line(error)}") from None
+        raise ArrayFileError(f"{file}: not safetensors: {reason_of(error)}") from None
     require_finite(arrays, file)
     return arrays
 
@@ -54,12 +59,12 @@ def read_npz(file: Path) -> dict[str, np.ndarray]:
     except FileNotFoundError:
         raise ArrayFileError(f"{file}: missing") from None
     except OSError as error:
-        raise ArrayFileError(f"{file}: {error.strerror or _first_line(error)}") from None
+        raise ArrayFileError(f"{file}: {reason_of(error)}") from None
     except (
         *(EOFError, ValueError, KeyError, TypeError, MemoryError, OverflowError),
         *(RuntimeError, SyntaxError, zipfile.BadZipFile, zlib.error),
     ) as error:
-        raise ArrayFileError(f"{file}: no npz file of arrays: {_first_line(error)}") from None
+        raise ArrayFileError(f"{file}: no npz file of arrays: {reason_of(error)}") from None
 
 
 def require_finite(arrays: Mapping[str, np.ndarray], file: Path) -> None:
@@ -73,7 +78,3 @@ def require_finite(arrays: Mapping[str, np.ndarray], file: Path) -> None:
             raise ArrayFileError(
                 f"{file}: {name!r} has {values[place]} at {list(place)}: must be finite"
             )
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]

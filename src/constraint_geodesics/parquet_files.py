@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
-import pyarrow as pa
 import pyarrow.parquet as pq
 
-from constraint_geodesics.text_files import read_content, require_short
+from constraint_geodesics.text_files import open_at_once, require_short
 
 _NUMBER = 8  # bytes
 _TEXTS = ("BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
@@ -21,8 +20,10 @@ def read_parquet(file: Path, wanted: Sequence[str] = ()) -> pd.DataFrame:
     are longer than what is read of any file, ValueError for a column of texts, and what pyarrow
     raises for no table.
     """
-    content = pa.BufferReader(read_content(file, piped=False))
-    with pq.ParquetFile(content, page_checksum_verification=True) as table:
+    with (
+        open_at_once(file) as content,
+        pq.ParquetFile(content, page_checksum_verification=True) as table,
+    ):
         columns = [table.schema.column(k) for k in range(len(table.schema))]
         asked = [
             k

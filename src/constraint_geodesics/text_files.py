@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from gzip import BadGzipFile, GzipFile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 MOST_BYTES = 256 * 2**20
 """Of a file: a million waypoints are less."""
@@ -37,26 +37,34 @@ def read_content(file: Path, most: int = MOST_BYTES, *, piped: bool = True) -> b
     OSError, with a `strerror`, for one that can't be read, has more than `most` bytes, or is a pipe
     that nothing comes from for PATIENCE_S.
     """
-    with open(file, "rb", opener=_at_once) as data:
-        if stat.S_ISREG(os.fstat(data.fileno()).st_mode):
-            content = data.read(most + 1)
-        elif piped:
-            content = _from_pipe(data.fileno(), file, most)
-        else:
-            raise OSError(None, "is no regular file", str(file))
+    with open_at_once(file, piped=piped) as data:
+        plain = _is_plain(data)
+        content = data.read(most + 1) if plain else _from_pipe(data.fileno(), file, most)
     require_short(len(content), file, most)
     return content
+
+
+def open_at_once(file: Path, *, piped: bool = False) -> BinaryIO:
+    """A file, open to be read; a pipe that nobody writes to would keep a plain `open`.
+
+    Raises OSError, with a `strerror`, for one that can't be read, and a pipe or a device unless it
+    may be `piped`.
+    """
+    data = open(file, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
+    if not (piped or _is_plain(data)):
+        data.close()
+        raise OSError(None, "is no regular file", str(file))
+    return data
+
+
+def _is_plain(data: BinaryIO) -> bool:
+    return stat.S_ISREG(os.fstat(data.fileno()).st_mode)
 
 
 def require_short(size: int, file: Path, most: int = MOST_BYTES, what: str = "") -> None:
     """Raises OSError, with a `strerror`, where a file has more bytes than are read."""
     if size > most:
         raise OSError(None, f"longer than {most / 2**20:g} MiB{what}", str(file))
-
-
-def _at_once(name: str, flags: int) -> int:
-    """Opens it; a pipe that nobody writes to would keep us here already."""
-    return os.open(name, flags | os.O_NONBLOCK)
 
 
 def _from_pipe(pipe: int, file: Path, most: int) -> bytes:
@@ -90,8 +98,13 @@ def reading(file: Path) -> Iterator[None]:
     except Exception as error:  # readers of a format have kinds of their own, or none at all
         if isinstance(error, OSError) and error.filename is not None:
             raise
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DamagedFileError(f"{file}: damaged: {reason}") from error
+        raise DamagedFileError(f"{file}: damaged: {reason_of(error)}") from error
+
+
+def reason_of(error: BaseException) -> str:
+    """What an error says, in one line, without the name of its file."""
+    said = (error.strerror if isinstance(error, OSError) else None) or str(error)
+    return " ".join(said.split())[:200] or type(error).__name__
 
 
 def is_number(word: str) -> bool:

@@ -37,7 +37,7 @@ from constraint_geodesics.search.band import project, step_lengths
 from constraint_geodesics.search.candidates import Candidate
 from constraint_geodesics.search.run_out import left_over, rows_from, run_out, run_outs
 from constraint_geodesics.search.space import space_of
-from constraint_geodesics.text_files import is_number, read_text, write_text
+from constraint_geodesics.text_files import is_number, read_text, reason_of, write_text
 from constraint_geodesics.values import checked_path, finite_number, numbers, shown
 
 CONSTRAINT, VELOCITY, SHAPES = "constraint", "start_velocity", "shapes"
@@ -542,8 +542,7 @@ def read_trajectory(
     try:
         text = read_text(file, "utf-8-sig")
     except (OSError, UnicodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise PlannerError(f"{file}: can't be read: {why}") from None
+        raise PlannerError(f"{file}: can't be read: {reason_of(error)}") from None
     lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
     said: dict[str, tuple[int, str]] = {}
     table: list[tuple[int, str]] = []

@@ -21,6 +21,7 @@ from constraint_geodesics.identification import (
 from constraint_geodesics.identification.demonstrations import demonstrations_from
 from constraint_geodesics.identification.identify import with_tolerance
 from constraint_geodesics.planner import Planner
+from constraint_geodesics.text_files import MOST_BYTES
 
 
 def missed(task, found, robot) -> dict[str, float]:
@@ -256,6 +257,17 @@ def test_files_are_read_as_arrays_are(xarm, tmp_path) -> None:
     (tmp_path / "text.csv").write_text("a,b\nc,d\n")
     with pytest.raises(DemonstrationError, match="not a table of numbers"):
         identify(tmp_path / "text.csv", xarm)
+
+
+def test_images_of_a_file_are_not_read(xarm, tmp_path) -> None:
+    rows = np.concatenate(demonstrations("cup", xarm, 2))
+    image = np.random.default_rng(0).bytes(MOST_BYTES // len(rows) + 1)
+    table = pd.DataFrame({"observation.state": list(rows), "observation.image": image})
+    file = tmp_path / "seen.parquet"
+    table.to_parquet(file, compression=None, use_dictionary=False)
+    assert file.stat().st_size > MOST_BYTES
+    (found,), _ = demonstrations_from(file, xarm)
+    np.testing.assert_array_equal(found, rows)
 
 
 def test_columns_are_never_taken_for_others(xarm, tmp_path) -> None:

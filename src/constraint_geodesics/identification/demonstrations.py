@@ -11,7 +11,7 @@ from jaxtyping import Float
 from constraint_geodesics import values
 from constraint_geodesics.formats import NUMBER, TABLE, FormatError
 from constraint_geodesics.robot.kinematics import SerialRobot
-from constraint_geodesics.text_files import is_number, read_text
+from constraint_geodesics.text_files import is_number, read_text, reason_of
 
 FEWEST_ROWS = 12
 """Rows of all demonstrations together."""
@@ -170,7 +170,7 @@ def _read(file: Path, robot: SerialRobot) -> Any:
     except DemonstrationError:
         raise
     except (OSError, ValueError, csv.Error) as error:
-        why = error.strerror if isinstance(error, OSError) else error
+        why = reason_of(error)
         raise DemonstrationError(f"{file}: not a table of numbers: {why}") from None
     _require_format(file, [line for line in stream if line.startswith("#")])
     if table.ndim != 2 or not table.size:
@@ -233,7 +233,7 @@ def _read_lerobot(file: Path) -> Any:
             raise DemonstrationError(f"{file}: there is no column {STATE!r}, as LeRobot writes it")
         groups = table.groupby(EPISODE) if EPISODE in table else [(0, table)]
         return [np.array(own[STATE].tolist(), float) for _, own in groups]
+    except DemonstrationError:
+        raise
     except (OSError, TypeError, ValueError) as error:
-        said = getattr(error, "strerror", None) or str(error)
-        told = said if isinstance(error, DemonstrationError) else f"{file}: {said}"
-        raise DemonstrationError(" ".join(told.split())[:300]) from None
+        raise DemonstrationError(f"{file}: {reason_of(error)}") from None

@@ -22,7 +22,7 @@ from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.parquet_files import read_parquet
 from constraint_geodesics.scene.scene import Scene
-from constraint_geodesics.text_files import read_text, written
+from constraint_geodesics.text_files import read_text, reason_of, written
 
 POSE_COLUMNS = (*(f"tool_{x}" for x in "xyz"), *(f"quaternion_{x}" for x in "xyzw"))
 RPY_COLUMNS = ("roll", "pitch", "yaw")
@@ -204,7 +204,7 @@ def read_joints(file: Path) -> JointSet:
     except FileNotFoundError:
         raise DatasetError(f"{file}: missing") from None
     except (OSError, ValueError, pa.ArrowException) as error:
-        raise DatasetError(f"{file}: no table of configurations: {_said(error)}") from None
+        raise DatasetError(f"{file}: no table of configurations: {reason_of(error)}") from None
     if table.empty:
         raise DatasetError(f"{file}: has no rows")
     frame = _checked(table, file)
@@ -229,7 +229,7 @@ def read_queries(file: Path) -> Queries:
         frame = pd.read_csv(text, index_col="query", float_precision="round_trip")
         first, last = (frame.filter(like=f"{end}_").to_numpy(float) for end in ("start", "goal"))
     except (OSError, KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"{file}: no table of queries: {_said(error)}") from None
+        raise DatasetError(f"{file}: no table of queries: {reason_of(error)}") from None
     if first.shape != last.shape or not first.size:
         what = f"starts {first.shape} and goals {last.shape}"
         raise DatasetError(f"{file}: no table of queries: has {what}")
@@ -237,12 +237,6 @@ def read_queries(file: Path) -> Queries:
     if len(bad):
         raise DatasetError(f"{file}: query {frame.index[bad[0]]}: must be finite numbers")
     return Queries(first, last)
-
-
-def _said(error: Exception) -> str:
-    return (
-        error.strerror or "" if isinstance(error, OSError) else " ".join(str(error).split())[:200]
-    )
 
 
 def joints_of(frame: pd.DataFrame) -> Float[np.ndarray, "n D"]:
