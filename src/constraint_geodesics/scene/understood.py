@@ -9,7 +9,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from constraint_geodesics.params import RobotParams
+from constraint_geodesics.params import PlannerParams, RobotParams
 from constraint_geodesics.robot.description import Arm, arm_to, read_description
 from constraint_geodesics.robot.kinematics import RobotError
 from constraint_geodesics.scene.allowed_collisions import (
@@ -41,6 +41,12 @@ class Understood:
     def lines(self) -> Iterator[str]:
         """For people."""
         yield from self.arm.lines()
+        most = PlannerParams()
+        yield (
+            f"accelerations, of which a URDF says nothing: {most.acceleration_rad_s2:g} rad/s² of "
+            f"turning joints, {most.acceleration_m_s2:g} m/s² of sliding ones; less with "
+            "--acceleration-scale"
+        )
         by_reason: dict[str, list[str]] = {}
         for first, second, reason in self.allowed:
             by_reason.setdefault(reason, []).append(f"{first} with {second}")
@@ -76,6 +82,10 @@ class Understood:
                 }
                 for joint in arm.moved
             ],
+            "acceleration_assumed": {
+                "rad_s2": PlannerParams().acceleration_rad_s2,
+                "m_s2": PlannerParams().acceleration_m_s2,
+            },
             "held": dict(arm.held),
             "may_touch": [
                 {"links": [first, second], "reason": reason}
