@@ -128,6 +128,19 @@ def test_an_arm_whose_answer_is_late_stops() -> None:
     assert sights[0].at_s == first.asked_s
 
 
+def test_nothing_is_looked_at_until_a_late_answer_is_there() -> None:
+    happenings = list(study.run(episodes(1)[0], Blind(thinks_s=5.0 * study.LATENCY_S)))
+    answers = [k for k, one in enumerate(happenings) if isinstance(one, Answered)]
+    answer, after = happenings[answers[0]], happenings[answers[0] + 1 : answers[1]]
+    assert isinstance(answer, Answered)
+    busy_s = answer.asked_s + answer.spent_s
+    times = [one.at_s for one in after if isinstance(one, Moved)]
+    assert times[0] == answer.begins_s < busy_s - study.TICK_S
+    np.testing.assert_allclose(np.diff(times), study.TICK_S)
+    for one in after:
+        assert isinstance(one, Moved) or one.at_s >= busy_s
+
+
 def test_an_arm_that_stops_plans_while_it_brakes_and_brakes_where_it_touches_something() -> None:
     thinks_s, contacts, rests = 0.03, 0, 0
     for episode in episodes(13)[::3]:

@@ -5,9 +5,9 @@ The control looks every TICK_S.  An obstacle is seen once its surface is within 
 of the arm or of what it carries.  The answer is asked for from the state of the arm LATENCY_S
 later, and the arm goes on along its old path until then.  The time that the answer takes is
 measured: where it comes later than LATENCY_S, the arm takes the stop on its path from that state
-instead, and the late answer is dropped.  What comes near meanwhile is seen at the next tick after
-the answer.  An arm that stops plans from where it will rest, and the clock goes on while it does:
-from its last answer on, since where it comes to rest is known by then.
+instead, and the late answer is dropped, once it is there.  What comes near meanwhile is seen at
+the next tick after the answer.  An arm that stops plans from where it will rest, and the clock goes
+on while it does: from its last answer on, since where it comes to rest is known by then.
 
 An obstacle appears beyond the braking distance where the arm, had it only braked from the state
 that the answer begins in, would have touched nothing that it knows, by PyBullet: no contact is
@@ -233,12 +233,11 @@ class _Simulation:
 
     def happenings(self) -> Iterator[Happening]:
         while self.now_s <= LONGEST_S:
-            path, at_s = self.leg.path, self.at(self.now_s)
-            q = path.state(at_s).configuration
-            yield Moved(self.now_s, q)
-            if not self.eyes.world.is_free(q):
+            path, at_s, moved = self.leg.path, self.at(self.now_s), self._moved()
+            yield moved
+            if not self.eyes.world.is_free(moved.joints):
                 return
-            seen = self.eyes.look(q, self.now_s)
+            seen = self.eyes.look(moved.joints, self.now_s)
             yield from seen
             if seen:
                 yield from self._answered([one.obstacle for one in seen])
@@ -271,6 +270,9 @@ class _Simulation:
         self.failed = 0
         answer = Answered(asked_s, self.now_s, spent, found, late, moving, can_stop)
         yield self._followed(answer)
+        if self.idle_s > self.now_s:  # busy with an answer that is too late
+            yield self._moved()
+            yield from self._waiting(self.idle_s)
 
     def _from_rest(self) -> Iterator[Happening]:
         asked_s, began = self.now_s, time.perf_counter()
@@ -291,8 +293,11 @@ class _Simulation:
         until = int(np.ceil(until_s / TICK_S - 1e-6))
         while self.tick < until - 1:
             self.tick += 1
-            yield Moved(self.now_s, self.leg.path.state(self.at(self.now_s)).configuration)
+            yield self._moved()
         self.tick = max(self.tick, until)
+
+    def _moved(self) -> Moved:
+        return Moved(self.now_s, self.leg.path.state(self.at(self.now_s)).configuration)
 
     def _can_stop(self, from_s: float, at_s: float) -> bool:
         """Whether going on until `at_s` and braking then touches nothing that is known."""
