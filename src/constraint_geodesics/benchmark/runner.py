@@ -308,9 +308,8 @@ def _asked(batch: QueryBatch, job: _Job, opened: _Opened) -> _Asked:
 
 
 def _asked_alone(batch: QueryBatch, job: _Job) -> _Asked:
-    nothing = np.empty((0, len(job.query.start)))
     if multiprocessing.current_process().daemon:  # may start none: a worker of Dask's nanny
-        return Solution("not_found", nothing, 0.0, 0, "processes died in it"), math.nan, math.nan
+        return _failed(len(job.query.start), "processes died in it"), math.nan, math.nan
     spawning = multiprocessing.get_context("spawn")
     answers, answering = spawning.Pipe(duplex=False)
     own = spawning.Process(target=_answer_alone, args=(batch, job, answering, os.getpid()))
@@ -320,8 +319,7 @@ def _asked_alone(batch: QueryBatch, job: _Job) -> _Asked:
         found: _Asked = answers.recv()
         return found
     except EOFError:
-        failed = Solution("not_found", nothing, 0.0, 0, "its process died in it")
-        return failed, math.nan, math.nan
+        return _failed(len(job.query.start), "its process died in it"), math.nan, math.nan
     finally:
         own.kill()
         own.join()
@@ -361,9 +359,12 @@ def _planned(planner: PathPlanner, problem: PlanningProblem, seed: int) -> Solut
     try:
         return planner.plan(problem, seed)
     except Exception as error:  # a baseline's library may raise anything
-        nothing = np.empty((0, problem.manifold.robot.dof))
         text = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        return Solution("not_found", nothing, time.perf_counter() - began, 0, text)
+        return _failed(problem.manifold.robot.dof, text, time.perf_counter() - began)
+
+
+def _failed(dof: int, why: str, spent_s: float = 0.0) -> Solution:
+    return Solution("not_found", np.empty((0, dof)), spent_s, 0, why)
 
 
 def _row(
