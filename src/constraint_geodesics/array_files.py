@@ -12,12 +12,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
-from constraint_geodesics.text_files import (
-    DamagedFileError,
-    read_content,
-    reason_of,
-    require_short,
-)
+from constraint_geodesics.text_files import DamagedFileError, read_content, reason_of, require_short
 
 
 class ArrayFileError(DamagedFileError):
