@@ -44,17 +44,17 @@ def read_content(file: Path, most: int = MOST_BYTES, *, piped: bool = True) -> b
     return content
 
 
-def open_at_once(file: Path, *, piped: bool = False) -> BinaryIO:
+@contextmanager
+def open_at_once(file: Path, *, piped: bool = False) -> Iterator[BinaryIO]:
     """A file, open to be read; a pipe that nobody writes to would keep a plain `open`.
 
     Raises OSError, with a `strerror`, for one that can't be read, and a pipe or a device unless it
     may be `piped`.
     """
-    data = open(file, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
-    if not (piped or _is_plain(data)):
-        data.close()
-        raise OSError(None, "is no regular file", str(file))
-    return data
+    with open(file, "rb", opener=lambda name, how: os.open(name, how | os.O_NONBLOCK)) as data:
+        if not (piped or _is_plain(data)):
+            raise OSError(None, "is no regular file", str(file))
+        yield data
 
 
 def _is_plain(data: BinaryIO) -> bool:
