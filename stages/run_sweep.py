@@ -7,14 +7,13 @@ import shutil
 import sys
 from pathlib import Path
 
-from constraint_geodesics.errors import ParamsError
 from constraint_geodesics.pipeline.experiments import (
     ExperimentClone,
     ExperimentError,
     experiment_names,
 )
 from constraint_geodesics.pipeline.layout import SWEEP_FOLDER, Layout
-from constraint_geodesics.pipeline.stage import complain
+from constraint_geodesics.pipeline.stage import SHOWN, complain
 from constraint_geodesics.pipeline.threads import ONE_THREAD
 from constraint_geodesics.report.sweep_table import write_ranking
 from constraint_geodesics.studies.search_space import read_space
@@ -71,5 +70,5 @@ if __name__ == "__main__":
     os.environ.update(ONE_THREAD)
     try:
         main(Path(sys.argv[1]))
-    except (ParamsError, OSError, RuntimeError) as error:
+    except SHOWN as error:
         raise SystemExit(complain(error)) from None

@@ -199,12 +199,19 @@ def test_configurations_are_numbers_with_spaces_or_commas_negative_ones_first(
         (asked(ZEROS, ZEROS, "cup"), "'cup'.*level_cup"),
         ((*asked(ZEROS, ZEROS, "free"), "--budget", "0"), "budget_s = 0"),
         (("plan", "--start", "0.5", "-0.5", "0"), "--start takes its numbers in quotes"),
-        ((*asked(ZEROS, ZEROS), "--out", "a", "--record", "./a"), "one file can't hold them all"),
+        (
+            (*asked(ZEROS, ZEROS), "--out", "a", "--record", "./a"),
+            "--out, --record a: one file can't hold both",
+        ),
+        (
+            (*asked(ZEROS, ZEROS, "wipe.yaml"), "--out", "./wipe.yaml"),
+            r"--constraint, --out wipe\.yaml: one file can't hold both",
+        ),
         ((*asked(ZEROS, ZEROS), "--picture", "a.jpg"), r"written as PNG: a\.png"),
     ],
     ids=(
         *("three", "seven", "word", "nothing", "nan", "inf", "name", "budget"),
-        *("unquoted", "one file", "jpg"),
+        *("unquoted", "one file", "over its input", "jpg"),
     ),
 )
 def test_wrong_usage_of_plan_is_code_two(command, words, said) -> None:

@@ -111,6 +111,7 @@ def test_what_is_missing_comes_with_its_mend(robot, tmp_path: Path) -> None:
         ((str(PANDA), "--tool-link", "panda_hand", "--hold", "x=1"), "'x' can't be held"),
         ((str(PANDA), "--tool-link", "panda_hand", "--hold", "panda_joint1=nan"), "a number"),
         ((str(PANDA), "--tool-link", "panda_hand", "--hold", "panda_joint1=inf"), "a number"),
+        ((str(PANDA), "--tool-link", "panda_hand", "--hold", "panda_joint1=1e10"), "hold"),
     ],
 )
 def test_wrong_usage_is_one_line(robot, words: tuple[str, ...], said: str) -> None:

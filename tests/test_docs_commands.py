@@ -301,8 +301,12 @@ def test_names_are_proposed_where_files_are_missing_or_broken(tmp_path) -> None:
         "those of the package"
     )
     assert complete("geodesics\tbench\t--planner\t", tmp_path) == []
-    (tmp_path / "params.yaml").write_text("benchmark: [")
-    assert complete("geodesics\tbench\t--planner\t", tmp_path) == []
+    typed = ("benchmark: [", "benchmark: [planners]", "benchmark: {planners: [birrt]}", "5")
+    for text in typed:
+        (tmp_path / "params.yaml").write_text(text)
+        assert complete("geodesics\tbench\t--planner\t", tmp_path) == []
+    (tmp_path / "params.yaml").write_text("benchmark: {planners: {birrt: , prm: {kind: prm}}}")
+    assert complete("geodesics\tbench\t--planner\t", tmp_path) == ["birrt", "prm"]
 
 
 def test_completion_loads_nothing_heavy(folder) -> None:

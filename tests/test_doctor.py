@@ -391,6 +391,28 @@ def test_missing_meshes_are_recognised(tmp_path) -> None:
     assert str(root / name) in found.mend
 
 
+def test_what_a_planner_takes_along_is_found_beside_its_card(tmp_path) -> None:
+    root = robot_checkout(tmp_path, "arm.urdf")
+    shutil.copy(ROOT / "tests" / "robots" / "six_axis.urdf", root / "arm.urdf")
+    shutil.copy(ROOT / "tests" / "robots" / "wrist.obj", root)
+    (root / "data/planner/files").mkdir(parents=True)
+    shutil.move(root / "arm.urdf", root / "data/planner/files/arm.urdf")
+    shutil.move(root / "wrist.obj", root / "data/planner/files/wrist.obj")
+    params = yaml.safe_load((root / "params.yaml").read_text())
+    params["robot"]["urdf"] = "files/arm.urdf"
+    (root / "params.yaml").unlink()
+    (root / "data/planner/planner.json").write_text(json.dumps(params))
+    assert "files/arm.urdf with" in only(look("robot", root), "ok").message
+
+
+def test_meshes_are_looked_for_where_ros_has_packages(tmp_path) -> None:
+    root = robot_checkout(tmp_path / "checkout", "arm.urdf")
+    shutil.copy(data_path() / "xarm" / "xarm6_robot.urdf", root / "arm.urdf")
+    assert "14 of its meshes are missing" in only(look("robot", root), "problem").message
+    here = with_environ(ROS_PACKAGE_PATH=str(data_path() / "xarm"))
+    assert only(look("robot", root, here), "ok")
+
+
 def test_meshes_missing_from_pybullets_own_are_installed_again(tmp_path) -> None:
     site = tmp_path / "site" / "pybullet_data"
     shutil.copytree(data_path() / "xarm", site / "xarm", ignore=shutil.ignore_patterns("link1.stl"))

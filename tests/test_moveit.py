@@ -294,6 +294,8 @@ def test_what_can_not_be_kept_is_named(
     [
         ([], "no mesh: has no faces, or corners that are no finite numbers"),
         ([[0, 1, 9]], "no mesh: a face with a corner that is not there"),
+        ([[0, 1, -2]], "no mesh: a face with a corner that is not there"),
+        ([[0, 1, 2.9]], "no mesh: a face with a corner that is not there"),
         ([[0, 1, 2]], "a mesh without volume can't be bounded: take a box in its place"),
     ],
 )

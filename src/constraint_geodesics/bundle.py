@@ -10,7 +10,6 @@ wrote it: what a folder names (URDFs, meshes, modules) and holds (graphs) is loo
 import hashlib
 import json
 import shutil
-import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -37,7 +36,7 @@ from constraint_geodesics.params import (
     WorkcellParams,
     one_line,
 )
-from constraint_geodesics.plugs import MLFLOW, plug
+from constraint_geodesics.plugs import MLFLOW, is_trusted, plug
 from constraint_geodesics.robot.kinematics import RobotError
 from constraint_geodesics.scene.urdf import data_path
 from constraint_geodesics.search.roadmap import Roadmap
@@ -243,7 +242,7 @@ def _from_elsewhere(folder: Path) -> Bundle:
             )
     for name, constraint in bundle.constraints.items():
         module = getattr(constraint, "factory", "").partition(":")[0]
-        if module and not (module in sys.modules or module.startswith(f"{__package__}.")):
+        if module and not is_trusted(module):
             raise BundleError(
                 f"{folder / CARD}: constraints.{name}.factory: import {module} before, if you "
                 f"trust it: no module is imported because a planner's files name it"

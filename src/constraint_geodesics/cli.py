@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from constraint_geodesics.recording.catalogue import Filter, Listed
 
+LONGEST_S = 2.0
 JSON = typer.Option(False, "--json", help="Print the answer as one JSON object.")
 OF_CONSTRAINT: dict[str, Any] = {"shell_complete": completion.listed_constraints}
 
@@ -234,7 +235,7 @@ def bench(
     planner: list[str] | None = typer.Option(
         None, help="By default all.", shell_complete=completion.benchmarked_planners
     ),
-    longest: float = typer.Option(2.0, help="Leave out planners with more seconds a query."),
+    longest: float = typer.Option(LONGEST_S, help="Leave out planners with more seconds a query."),
     out: Path = typer.Option(Path(".geodesics/bench"), help="Folder of rows, table and summary."),
     problems: Path | None = typer.Option(
         None,
@@ -261,8 +262,9 @@ def bench(
     """
     require("bench")
     if problems is not None:
-        if constraint:
-            line = "--problems goes without --constraint: its file says what is held"
+        if constraint or queries != 1 or seeds != 1 or longest != LONGEST_S:
+            line = "--problems goes without --constraint, --queries, --seeds and --longest: its "
+            line += "file says what is held, --every how many, --time-limit how long"
             raise SystemExit(complain(ValueError(line), WRONG_USAGE))
         if time_limit is not None and not 0.0 < time_limit < math.inf:
             line = f"--time-limit {time_limit:g}: must be a positive number of seconds"

@@ -15,8 +15,6 @@ FAR_RAD = 2.0 * math.pi
 """Beyond a joint's limits: nearer is a whole turn too much, or another mistake."""
 ROOM_RAD = 1e-3
 """By which a rounded number of degrees may lie beyond a limit."""
-TURNS_RAD = 4.0 * math.pi
-"""No pose is given with angles that are larger, but in degrees."""
 MOST_DEGREES = 720.0
 
 
@@ -55,9 +53,10 @@ def refuse_degrees_of_pose(values: Sequence[float], option: str) -> None:
     numbers, look like degrees.
     """
     from constraint_geodesics.planner import PlannerError
+    from constraint_geodesics.values import MOST_ANGLE
 
     angles = values[3:]
-    if TURNS_RAD < max(map(abs, angles)) <= MOST_DEGREES:
+    if MOST_ANGLE < max(map(abs, angles)) <= MOST_DEGREES:
         shown = " ".join(f"{x:g}" for x in angles)
         mended = _words([*values[:3], *map(math.radians, angles)])
         line = f'{option}: roll pitch yaw = {shown} look like degrees; in rad: {option} "{mended}"'

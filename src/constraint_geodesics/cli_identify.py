@@ -89,7 +89,7 @@ def identify_constraint(
     if record is not None:
         require("record")
     try:
-        require_apart({"the demonstrations": demonstrations, "--out": out, "--record": record})
+        require_apart({"--out": out, "--record": record}, [("the demonstrations", demonstrations)])
         if where_shown and out is None:
             raise PlannerError("--where-shown is of the file that --out names: give it, too")
         if not 0.0 <= loosely < math.inf:

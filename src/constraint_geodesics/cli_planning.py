@@ -4,7 +4,7 @@ import json
 import math
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -261,7 +261,17 @@ def plan(
         require("record")
     arm = Arm(planner, urdf, tool_link, tool_pose, hold, srdf, scene, attach)
     try:
-        require_apart({"--out": out, "--record": record, "--picture": picture})
+        read = [
+            *(("--attach", file) for file in attach or ()),
+            ("--constraint", constraint),
+            ("--demonstrations", demonstrations),
+            ("--moveit-request", moveit_request),
+            ("--moveit-scene", moveit_scene),
+            *(("--scene", file) for file in scene or ()),
+            ("--srdf", srdf),
+            ("--urdf", urdf),
+        ]
+        require_apart({"--out": out, "--record": record, "--picture": picture}, read)
         if picture is not None and picture.suffix.lower() != ".png":
             line = f"--picture {picture}: a picture is written as PNG: {picture.stem}.png"
             raise PlannerError(line)
@@ -323,15 +333,24 @@ def plan(
     raise SystemExit(0 if path.status == "solved" else NO_PATH)
 
 
-def require_apart(named: Mapping[str, Path | None]) -> None:
-    """Raises PlannerError where one file would be written over another.  named: by option."""
+def require_apart(
+    written: Mapping[str, Path | None], read: Sequence[tuple[str, str | Path | None]] = ()
+) -> None:
+    """Raises PlannerError where one file would be written over another, or over one that is read;
+    both with their options.
+    """
     from constraint_geodesics.planner import PlannerError
 
-    files = {
-        f"{option} {file}": file.resolve() for option, file in named.items() if file is not None
-    }
-    if len(set(files.values())) < len(files):
-        raise PlannerError(f"{', '.join(files)}: one file can't hold them all")
+    known = dict[Path, str]()
+    for option, given in read:
+        if given is not None:
+            known.setdefault(Path(given).resolve(), option)
+    for option, file in written.items():
+        if file is None:
+            continue
+        other = known.setdefault(file.resolve(), option)
+        if other != option:
+            raise PlannerError(f"{other}, {option} {file}: one file can't hold both")
 
 
 def _told(path: "Trajectory") -> str:
@@ -505,7 +524,9 @@ def show_robot(
     """Say what is understood of a robot: its chain, limits, the links that may touch and why, and
     what is missing.  Exit code 0: understood; 2: wrong usage, or a URDF that can't be used.
     """
-    from constraint_geodesics.params import RobotParams
+    from pydantic import ValidationError
+
+    from constraint_geodesics.params import RobotParams, one_line
     from constraint_geodesics.robot.description import read_description
     from constraint_geodesics.robot.kinematics import RobotError
     from constraint_geodesics.scene.arm import FOUND
@@ -530,6 +551,8 @@ def show_robot(
             )
             understood = understand(params)
             about, lines = understood.summary(), list(understood.lines())
+    except ValidationError as error:
+        raise SystemExit(complain(RobotError(one_line(error)), WRONG_USAGE)) from None
     except RobotError as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
     print(json.dumps(about) if as_json else "\n".join(lines))

@@ -30,21 +30,19 @@ def planned_constraints(context: Any, parameter: Any, incomplete: str) -> list[A
         return _items({"free": "", "level": ""}, incomplete)
     named = Path(str(context.params.get("planner") or "")) / "planner.json"
     card = next((file for file in (named, PIPELINE, PACKAGED) if file.is_file()), None)
-    return _items(_described(_json(card).get("constraints")), incomplete)
+    return _items(_named(_json(card), "constraints", "description"), incomplete)
 
 
 def listed_constraints(context: Any, parameter: Any, incomplete: str) -> list[Any]:
     """Constraints of params.yaml."""
     del context, parameter
-    return _items(_described(_params().get("constraints")), incomplete)
+    return _items(_named(_params(), "constraints", "description"), incomplete)
 
 
 def benchmarked_planners(context: Any, parameter: Any, incomplete: str) -> list[Any]:
     """Planners of the benchmark."""
     del context, parameter
-    planners = (_params().get("benchmark") or {}).get("planners") or {}
-    kinds = {name: str(entry.get("kind", "")) for name, entry in planners.items()}
-    return _items(kinds, incomplete)
+    return _items(_named(_by_name(_params()).get("benchmark"), "planners", "kind"), incomplete)
 
 
 def methods(context: Any, parameter: Any, incomplete: str) -> list[Any]:
@@ -63,8 +61,15 @@ def recordings(context: Any, parameter: Any, incomplete: str) -> list[Any]:
     return _items(dict.fromkeys([*made, *near], ""), incomplete)
 
 
-def _described(entries: Any) -> dict[str, str]:
-    return {name: str(entry.get("description", "")) for name, entry in (entries or {}).items()}
+def _named(document: Any, entries: str, about: str) -> dict[str, str]:
+    """The names below an entry, and what each says under `about`: as far as there are some."""
+    own = _by_name(_by_name(document).get(entries))
+    return {str(name): str(_by_name(entry).get(about, "")) for name, entry in own.items()}
+
+
+def _by_name(value: Any) -> Mapping[Any, Any]:
+    """What a file has under a name, where that holds entries by name; it may be half typed."""
+    return value if isinstance(value, Mapping) else {}
 
 
 def _items(names: Mapping[str, str], incomplete: str) -> list[Proposal]:

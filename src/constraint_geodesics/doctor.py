@@ -455,7 +455,7 @@ def check_robot(root: Path, here: Surroundings) -> Answers:
     reinstall = "python -m pip install --force-reinstall --no-deps pybullet"
     reinstall += f"=={pinned}" if pinned else ""
     for name, where in _urdf_names(root, here).items():
-        places = [root / name, *([data / name] if data else [])]
+        places = [root / name, (root / where).parent / name, *([data / name] if data else [])]
         urdf = next((place for place in places if place.is_file()), None)
         if urdf is None:
             message = (
@@ -471,7 +471,7 @@ def check_robot(root: Path, here: Surroundings) -> Answers:
         except (OSError, XmlFileError) as error:
             yield _problem(f"{urdf}: not XML: {error}", reinstall if packaged else "mend the file")
             continue
-        missing = list(dict.fromkeys(mesh for mesh in meshes if not _mesh_found(mesh, urdf)))
+        missing = list(dict.fromkeys(mesh for mesh in meshes if not _mesh_found(mesh, urdf, here)))
         counted.append(f"{name} with {len(meshes)} meshes")
         if missing:
             put = f"put them in one of the folders above {urdf}, as the URDF names them"
@@ -507,10 +507,13 @@ def _urdf_names(root: Path, here: Surroundings) -> dict[str, str]:
     return named
 
 
-def _mesh_found(name: str, urdf: Path) -> bool:
-    """PyBullet and Rerun look in all folders above a URDF."""
+def _mesh_found(name: str, urdf: Path, here: Surroundings) -> bool:
+    """PyBullet and Rerun look in all folders above a URDF; the planner also where ROS does."""
     bare = re.sub(r"^(package|model|file)://", "", name)
-    return any((folder / bare).is_file() for folder in urdf.resolve().parents)
+    named = (here.environ.get(of, "") for of in ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"))
+    ros = [Path(entry) for entries in named for entry in entries.split(os.pathsep) if entry]
+    packages = [place for own in ros for place in (own, own / "share", own.parent)]
+    return any((folder / bare).is_file() for folder in (*urdf.resolve().parents, *packages))
 
 
 # Rerun's window and its recordings

@@ -1,11 +1,10 @@
 """Numbers and names as params.yaml may hold them, checked by Pydantic."""
 
-import math
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from constraint_geodesics.values import LARGEST
+from constraint_geodesics.values import LARGEST, MOST_ANGLE
 
 Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
@@ -36,12 +35,10 @@ def _different(seeds: tuple[int, ...]) -> tuple[int, ...]:
 Seeds = Annotated[tuple[Seed, ...], Field(min_length=1), AfterValidator(_different)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 Vector3 = tuple[Finite, Finite, Finite]
-_TURNS_RAD = 4.0 * math.pi
-"""No pose is given with angles that are larger, but in degrees."""
 
 
 def _no_degrees(angle: float) -> float:
-    if abs(angle) > _TURNS_RAD:
+    if abs(angle) > MOST_ANGLE:
         raise ValueError(f"{angle:g}: must be within ±4π: angles are in rad, not degrees")
     return angle
 

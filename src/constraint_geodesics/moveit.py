@@ -397,11 +397,13 @@ def _mesh(raw: Any, name: str, at: Placement, where: str) -> Mesh:
     """An inline mesh, whose faults are told by the name of its object: it has no file that a user
     knows.
     """
-    found = Mesh(name, _mesh_file(raw), at)
+    file = None
     try:
+        file = _mesh_file(raw)
+        found = Mesh(name, file, at)
         found.pieces()
-    except RobotError as error:
-        text = str(error).removeprefix(f"{found.file}: ")
+    except (MoveitError, RobotError) as error:
+        text = str(error).removeprefix(f"{file}: ")
         raise MoveitError(f"{where}: {name!r}: {text}") from None
     return found
 
@@ -409,9 +411,12 @@ def _mesh(raw: Any, name: str, at: Placement, where: str) -> Mesh:
 def _mesh_file(raw: Any) -> Path:
     """An inline mesh as a file of the user's cache, named by its content."""
     lines = ["v " + " ".join(map(repr, _numbers(own, "xyz"))) for own in raw["vertices"]]
+    count = len(lines)
     for own in raw["triangles"]:
         indices = own["vertex_indices"] if isinstance(own, dict) else own
-        lines.append("f " + " ".join(str(int(k) + 1) for k in indices))
+        if not all(isinstance(k, int) and 0 <= k < count for k in indices):
+            raise MoveitError("no mesh: a face with a corner that is not there")
+        lines.append("f " + " ".join(str(k + 1) for k in indices))
     text = "\n".join(lines) + "\n"
     file = arms_folder() / f"mesh-{sha256(text.encode()).hexdigest()[:16]}.obj"
     if not file.is_file():

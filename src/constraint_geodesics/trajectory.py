@@ -386,6 +386,7 @@ class Trajectory:
         from constraint_geodesics.recording.png import save_png
 
         self._require_path("draw")
+        checked_path(file, "file", PlannerError)
         robot = self.scene.robot
         violation = ConstraintManifold(robot, self.constraint).violation(self.joints)
         skeletons, bound = robot.skeleton(self.joints), self.violation_bound

@@ -7,6 +7,8 @@ import numpy as np
 
 LARGEST = 1e9
 """Of any number: beyond it squares and sums overflow, and nothing here is counted or measured."""
+MOST_ANGLE = 4.0 * np.pi
+"""Larger numbers than two turns [rad] are taken for degrees."""
 _SHOWN = 80
 """Letters of a refused value in a message."""
 

@@ -57,6 +57,17 @@ def test_what_is_near_both_keeps_each(robot, name) -> None:
         assert ConstraintManifold(robot, own).violation(found).max() < 1e-7
 
 
+def test_what_has_no_reference_is_held_where_the_path_starts(robot) -> None:
+    placed, floating = held((0, 0, 1, 0, 0, 0)), Constraint((0, 0, 0, 1, 1, 0))
+    made = Both(placed, floating)
+    assert not made.is_placed
+    pose = Pose(*robot.forward(robot.sample(1, np.random.default_rng(0))[0]))
+    at = made.relative_to(pose)
+    assert isinstance(at, Both)
+    assert at.is_placed
+    assert (at.first, at.second) == (placed, floating.relative_to(pose))
+
+
 def test_what_one_holds_already_is_not_held_twice() -> None:
     pose, cup = held((1,) * 6), held((0, 0, 0, 1, 1, 0))
     free = Constraint((0,) * 6)

@@ -10,6 +10,7 @@ import numpy as np
 
 from constraint_geodesics.constraints.constraint import Constraint, Pose, constraint_from_json
 from constraint_geodesics.goals.region import GoalRegion
+from constraint_geodesics.identification.files import load_constraint
 from constraint_geodesics.identification.identify import identify
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.scene.body import Body
@@ -204,6 +205,8 @@ def _motions(planner: Planner, path: Trajectory) -> Iterator[Bad]:
     yield from _each("s", path.at, [None, *shares, 2.0, [[0.5]]], "s = ")
     frames: list[Any] = [None, "x", NAN, -1, 1, [], True, 10**9]
     yield from _each("frames", lambda x: path.record("x.rrd", x), frames, "frames")
+    yield from _each("draw", path.draw, [None, 5, NAN, "", b"x"], "file = ")
+    yield from _each("constraint", load_constraint, [None, 5, NAN, "", b"x"], "file = ")
     yield from _each("save", path.save, [None, 5, NAN, "", b"x"], "file = ")
 
 

@@ -14,6 +14,8 @@ import struct
 import sys
 import time
 import zipfile
+import zlib
+from base64 import b64encode
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
@@ -32,6 +34,7 @@ from constraint_geodesics import bundle
 from constraint_geodesics.benchmark.problem_files import read_problems
 from constraint_geodesics.bundle import CARD, ROADMAPS, card_digest, open_bundle
 from constraint_geodesics.constraints.constraint import constraint_from
+from constraint_geodesics.constraints.spline import Spline
 from constraint_geodesics.geodesics import learned_method
 from constraint_geodesics.geodesics.learned_method import MANIFOLD, POLICY, read_learned
 from constraint_geodesics.geodesics.policy_search import (
@@ -584,6 +587,42 @@ case("moveit: a call", CALLED)(
     text("scene.yaml", f"world: {CALL}\n", lambda file: add_moveit_scene(file, None))  # type: ignore[arg-type]
 )
 case("constraint: a call", CALLED)(text("constraint.yaml", CALL, load_constraint))
+
+
+def spline(**changed: Any) -> dict[str, Any]:
+    own = {
+        "frame": np.eye(3).tolist(),
+        "origin": 3 * [0.0],
+        "lower": 3 * [0.0],
+        "spacing": 3 * [1.0],
+        "degrees": [3, 0, 0],
+        "shape": [4, 1, 1],
+        "coefficients": b64encode(zlib.compress(bytes(32))).decode(),
+    }
+    return own | changed
+
+
+@case("constraint: a spline that unpacks to gigabytes", "more than 256 MiB, unpacked")
+def _(folder: Path) -> Any:
+    assert Spline.from_json(spline()).coefficients.size == 4
+    bomb = b64encode(zlib.compress(bytes(2**29), 1)).decode()
+    assert len(bomb) < 2**22
+    return Spline.from_json(spline(coefficients=bomb))
+
+
+@case("constraint: a module to import", "no module is imported because a file names it")
+def _(folder: Path) -> Any:
+    (folder / "evil_twin.py").write_text(f"open({str(folder / CANARY)!r}, 'w')\n")
+    described = {"kind": "functions", "factory": "evil_twin:make", "arguments": {}, "tolerance": []}
+    whole = json.dumps({"format": 1, "constraint": described})
+    sys.path.insert(0, str(folder))
+    try:
+        read = lambda file: load_constraint(file, load_robot(SIX_AXIS, "tool"))  # noqa: E731
+        return text("constraint.yaml", whole, read)(folder)
+    finally:
+        sys.path.remove(str(folder))
+
+
 case("params: a call", CALLED)(text("params.yaml", f"{PARAMS}\nx: {CALL}\n", load_params))
 case("params: anchors", MANY)(text("params.yaml", f"{ANCHORS}\n{PARAMS}", load_params))
 for _name, _stage in (("a command", "free; touch canary"), ("a substitution", "$(touch canary)")):
@@ -641,6 +680,19 @@ for _name, (_content, _said) in XML.items():
     case(f"collada: {_name}", _said)(text("mesh.dae", _content, as_obj))
 
 
+DOUBLED = (
+    "<COLLADA><library_geometries><geometry id='g'/></library_geometries><library_nodes>"
+    + "".join(
+        f"<node id='n{k}'>" + 2 * f"<instance_node url='#n{k + 1}'/>" + "</node>" for k in range(40)
+    )
+    + "<node id='n40'><instance_geometry url='#g'/></node></library_nodes>"
+    "<library_visual_scenes><visual_scene id='s'><node><instance_node url='#n0'/></node>"
+    "</visual_scene></library_visual_scenes>"
+    "<scene><instance_visual_scene url='#s'/></scene></COLLADA>"
+)
+case("collada: 2^40 geometries of four kilobytes", "it places more than 10000 geometries")(
+    text("mesh.dae", DOUBLED, as_obj)
+)
 NO_MESH = "passwd is no mesh that can be read"
 
 

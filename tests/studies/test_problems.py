@@ -12,7 +12,13 @@ import pytest
 from tests.benchmark.problem_fixtures import problem, shape, small_file, written
 
 from constraint_geodesics import bundle
-from constraint_geodesics.benchmark.arm_source import PipelineArm, UrdfArm, opened
+from constraint_geodesics.benchmark.arm_source import (
+    MOST_OPEN,
+    PipelineArm,
+    UrdfArm,
+    close_opened,
+    opened,
+)
 from constraint_geodesics.benchmark.dense_check import watched
 from constraint_geodesics.benchmark.problem_files import Problem, ProblemFileError, read_problems
 from constraint_geodesics.benchmark.row import write_table
@@ -21,7 +27,7 @@ from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import ConstraintManifold
 from constraint_geodesics.params import BaselineParams, load_params
 from constraint_geodesics.peers.baseline import BaselineError
-from constraint_geodesics.problem import Solution
+from constraint_geodesics.problem import PlannerError, Solution
 from constraint_geodesics.report.problems_page import problems_markdown, totals_markdown
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.shape import Placement
@@ -184,6 +190,7 @@ ARM = """<robot name="two">
     <origin xyz="0 0 0.4"/><axis xyz="0 1 0"/>
     <limit lower="-2" upper="2" velocity="1" effort="1"/></joint>
 </robot>"""
+SIX_AXIS = Path(__file__).parents[1] / "robots" / "six_axis.urdf"
 SRDF = '<robot name="two">{pairs}</robot>'
 PAIR = '<disable_collisions link1="base" link2="tool" reason="Never"/>'
 
@@ -199,12 +206,28 @@ def test_an_arm_whose_files_change_in_place_is_asked_again(tmp_path) -> None:
     for height, pairs in ((0.1, ""), (0.2, ""), (0.1, PAIR), (0.1, "")):
         mesh.write_text(TRIANGLE.format(height=height))
         srdf.write_text(SRDF.format(pairs=pairs))
-        opened.cache_clear()  # as a later run
+        close_opened()  # as a later run
         found = read_problems(file, UrdfArm(str(urdf), "tool", str(srdf)))
         (batch,) = batches(found, asked(tmp_path, planner={"kind": "planner"}))
         seen.append(batch.baselines[0].fingerprint)
     assert len(set(seen)) == 3
     assert seen[0] == seen[3]
+
+
+def test_planners_beyond_the_last_few_are_closed_and_opened_anew(tmp_path) -> None:
+    close_opened()
+    files = [tmp_path / f"{k}.srdf" for k in range(MOST_OPEN + 1)]
+    for file in files:
+        file.write_text(SRDF.format(pairs=""))
+    arms = [UrdfArm(str(SIX_AXIS), "tool", str(file)) for file in files]
+    first = opened(arms[0])
+    assert opened(arms[0]) is first
+    for arm in arms[1:]:
+        opened(arm)
+    with pytest.raises(PlannerError, match="closed"):
+        first.plan(np.zeros(6), np.ones(6), "free")
+    assert opened(arms[0]) is not first
+    close_opened()
 
 
 def test_problems_with_one_key_are_refused_before_any_work(problems, tmp_path) -> None:

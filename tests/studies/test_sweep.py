@@ -97,6 +97,9 @@ def test_what_is_kept_is_read_again_and_counts_as_done(layout) -> None:
     figures = configuration_figures(own, layout)
     assert (figures["seeds"], figures["efficiency"], figures["ratio_p50"]) == (1, 0.5, 2.0)
     assert figures["each_seed"]["time_ms"] == [4.0]
+    (kept,) = layout.sweep.rglob("seed-1.json")
+    kept.write_text(kept.read_text()[:-20])
+    assert own.seeds_left(layout) == [0, 1, 2], "a damaged one is made again"
 
 
 def test_a_sweep_without_data_names_the_file_and_what_makes_it(tmp_path) -> None:

@@ -43,9 +43,11 @@ def browser(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_the_printed_page_is_opened_once_it_answers_and_the_server_ends_with_the_command(
-    checkout: Path, browser: Path
+    checkout: Path, browser: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port = free_port()
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")  # which nobody is to ask
+    monkeypatch.delenv("no_proxy", raising=False)
     words = ["-m", "constraint_geodesics.cli", "ui", "--open", "--port", str(port)]
     process = subprocess.Popen(
         [sys.executable, *words], cwd=checkout, stdout=subprocess.PIPE, text=True
@@ -59,6 +61,7 @@ def test_the_printed_page_is_opened_once_it_answers_and_the_server_ends_with_the
             time.sleep(0.2)
         assert browser.read_text().split() == [page]
         assert "/runs?workflowType=machine_learning" in page  # no view finds such a run
+        monkeypatch.delenv("http_proxy")
         assert urllib.request.urlopen(page, timeout=10).status == 200
     finally:
         process.send_signal(signal.SIGTERM)

@@ -2,7 +2,6 @@
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Protocol
 
@@ -11,6 +10,9 @@ from constraint_geodesics.robot.arm_file import write_arm
 from constraint_geodesics.robot.description import Arm, arm_to, read_description
 from constraint_geodesics.scene.arm import arms_folder
 from constraint_geodesics.scene.urdf import find_urdf
+
+MOST_OPEN = 4
+"""Planners that a process keeps open."""
 
 
 class ArmSource(Hashable, Protocol):
@@ -82,7 +84,21 @@ class PipelineArm:
         return Planner.load(self.folder)
 
 
-@lru_cache(maxsize=4)
+_OPEN: dict[ArmSource, Planner] = {}
+"""In the order in which they were asked for last."""
+
+
 def opened(arm: ArmSource) -> Planner:
-    """The arm's planner, one in each process, whose scene whoever asks sets before each query."""
-    return arm.open()
+    """The arm's planner, one in each process, whose scene whoever asks sets before each query.  It
+    is closed, and its world with it, once MOST_OPEN others are asked for.
+    """
+    planner = _OPEN.pop(arm, None) or arm.open()
+    _OPEN[arm] = planner
+    close_opened(MOST_OPEN)
+    return planner
+
+
+def close_opened(keep: int = 0) -> None:
+    """Close all of them but the last so many."""
+    while len(_OPEN) > keep:
+        _OPEN.pop(next(iter(_OPEN))).close()

@@ -13,6 +13,7 @@ from pathlib import Path
 import pandas as pd
 
 from constraint_geodesics.benchmark.statistics import ratio_of
+from constraint_geodesics.text_files import written
 
 SCHEMA = """
 CREATE TABLE experiments (
@@ -48,8 +49,6 @@ def export_arena(
     about: commit, lock file, processor and date, for the experiments' records.  settings: of each
     planner, as text.
     """
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.unlink(missing_ok=True)
     status, statuses = pd.factorize(rows["status"])
     planner, planners = pd.factorize(rows["planner"])
     cases = rows.groupby(["constraint", "scene"], sort=False)
@@ -80,7 +79,7 @@ def export_arena(
             }
         ).sort_values("experimentid", kind="stable"),
     }
-    with closing(sqlite3.connect(file)) as database, database:
+    with written(file) as part, closing(sqlite3.connect(part)) as database, database:
         database.executescript(SCHEMA)
         for name, table in tables.items():
             table.to_sql(name, database, if_exists="append", index=False)

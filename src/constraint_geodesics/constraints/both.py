@@ -11,7 +11,12 @@ import numpy as np
 from jaxtyping import Float
 from numba import carray, int64
 
-from constraint_geodesics.constraints.constraint import Constraint, Series, constraint_from_json
+from constraint_geodesics.constraints.constraint import (
+    Constraint,
+    Pose,
+    Series,
+    constraint_from_json,
+)
 from constraint_geodesics.constraints.kernels import (
     LINEARISE_WORDS,
     ConstraintArrays,
@@ -42,7 +47,7 @@ def both(first: Constraint, second: Constraint) -> Constraint:
 
 @dataclass(frozen=True)
 class Both(Constraint):
-    """The rows of two placed constraints, one after the other.
+    """The rows of two constraints, one after the other.
 
     Rows of the second that are bounded together, as those of the first are, become bounds of each:
     the box within the ball.
@@ -84,6 +89,18 @@ class Both(Constraint):
         own = max(counts) * LANES * (1 + robot.dof)
         data = np.concatenate([head, one.data, other.data])
         return ConstraintArrays(self.rows, data, _compiled().address, 0, int(head[5]) + own)
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether both are."""
+        return self.first.is_placed and self.second.is_placed
+
+    def relative_to(self, pose: Pose) -> Constraint:
+        """With what has no reference yet held at `pose`."""
+        parts = (
+            part if part.is_placed else part.relative_to(pose) for part in (self.first, self.second)
+        )
+        return Both(*parts)
 
     def compile(self) -> None:
         """What both need."""

@@ -34,6 +34,7 @@ from constraint_geodesics.constraints.kernels import (
     call,
     floats,
 )
+from constraint_geodesics.plugs import is_trusted
 from constraint_geodesics.robot.kernels import new_posture, pose_of
 from constraint_geodesics.robot.kinematics import SerialRobot
 
@@ -165,9 +166,17 @@ class FunctionsConstraint(Constraint):
 
     @classmethod
     def from_json(cls, about: Mapping[str, Any], robot: SerialRobot | None) -> Constraint:
-        """What `to_json` wrote, for a robot."""
+        """What `to_json` wrote, for a robot.  Raises ConstraintError for a factory in a module
+        that nobody has imported: a file's word is no reason to run it.
+        """
         if robot is None:
             raise ConstraintError(f"{about['factory']} can't be called without a robot")
+        module = str(about["factory"]).partition(":")[0]
+        if not is_trusted(module):
+            raise ConstraintError(
+                f"factory = {about['factory']!r}: import {module} before, if you trust it: no "
+                f"module is imported because a file names it"
+            )
         return made_by(about["factory"], about["arguments"], robot)._with(about["tolerance"])
 
     @classmethod

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, ClassVar, NamedTuple
-from zlib import compress, decompress
+from zlib import compress, decompressobj
 from zlib import error as zlib_error
 
 import numpy as np
@@ -35,6 +35,7 @@ from constraint_geodesics.constraints.relations import RelationsConstraint
 from constraint_geodesics.constraints.tool_features import FEATURES, into_joints
 from constraint_geodesics.robot.kernels import geometric_jacobian, poses_of, posture_in
 from constraint_geodesics.robot.kinematics import SerialRobot
+from constraint_geodesics.text_files import MOST_BYTES
 
 ORDER = 6
 """Basis functions that are not zero at a place: one more than the largest degree."""
@@ -169,7 +170,11 @@ class Spline:
         own = dict(about)
         shape = own.pop("shape")
         try:
-            numbers = np.frombuffer(decompress(b64decode(own["coefficients"])))
+            unpacking = decompressobj()
+            content = unpacking.decompress(b64decode(own["coefficients"]), MOST_BYTES)
+            if not unpacking.eof:
+                raise ValueError(f"cut short, or more than {MOST_BYTES / 2**20:g} MiB, unpacked")
+            numbers = np.frombuffer(content)
             return cls(**{**own, "coefficients": numbers.reshape(shape)})
         except (ValueError, zlib_error) as error:
             raise ConstraintError(f"spline: coefficients: {error}") from None

@@ -169,6 +169,8 @@ class LearnedMethod:
 
         Raises BundleError if its files are missing, altered, or of another robot.
         """
+        if isinstance(source, str) and ":/" in source:
+            raise BundleError(f"{source}: holds no learned method: name a folder")
         folder = bundle_folder(source)
         inside = folder / FOLDER
         place = inside if inside.is_dir() else folder.parent / FOLDER

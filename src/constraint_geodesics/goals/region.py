@@ -85,6 +85,4 @@ class GoalRegion:
         yield from found
         yield None
         # both may hold an angle at two references, and keep one of them
-        yield from (
-            q for q in members_of(together, many) if q is None or region.violation(q) <= SATISFIED
-        )
+        yield from (q for q in members_of(together, many) if region.violation(q) <= SATISFIED)

@@ -19,8 +19,6 @@ SPREAD_RAD = 1e-3
 """Rows that differ by less in every joint are one."""
 OUTSIDE = 0.02
 """Rows beyond the joint limits by more are of another robot, or in degrees [rad or m]."""
-TURNS = 4.0 * np.pi
-"""Larger numbers than two turns look like degrees [rad]."""
 IN_A_ROW = 0.3
 """Rows whose steps are shorter than this share of their distances are a motion, not draws."""
 STATE, EPISODE = "observation.state", "episode_index"
@@ -139,7 +137,10 @@ def _checked(
     outside = float(np.maximum(-robot.limit_distance(rows), 0.0).mean())
     if outside > OUTSIDE:
         why = "are they another robot's?"
-        if robot.limit_distance(np.radians(rows)).min() >= -OUTSIDE and np.abs(rows).max() > TURNS:
+        if (
+            robot.limit_distance(np.radians(rows)).min() >= -OUTSIDE
+            and np.abs(rows).max() > values.MOST_ANGLE
+        ):
             why = "they look like degrees: give radians"
         raise DemonstrationError(
             f"{where}: outside the joint limits by {outside:.3g} rad in the mean; {why}"

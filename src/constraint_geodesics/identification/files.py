@@ -16,6 +16,7 @@ from constraint_geodesics.params import ParamsError, read_yaml
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.shape import Placement
 from constraint_geodesics.text_files import written
+from constraint_geodesics.values import checked_path
 
 SUFFIXES = (".yaml", ".yml")
 SAME_TOOL = 1e-6
@@ -30,7 +31,7 @@ def save_constraint(identified: Identified, file: str | Path, where_shown: bool 
     """
     from ruamel.yaml import YAML
 
-    file = Path(file)
+    file = Path(checked_path(file, "file", ConstraintError))
     constraint = identified.supported if where_shown else identified.constraint
     if constraint is None:
         raise ConstraintError(f"there is no constraint to save: {identified.explanation}")
@@ -64,7 +65,7 @@ def load_constraint(file: str | Path, robot: SerialRobot | None = None) -> Const
     one line, if the file is missing or is none, or of another robot or tool.
     """
     try:
-        about: Any = read_yaml(Path(file))
+        about: Any = read_yaml(Path(checked_path(file, "file", ConstraintError)))
     except (ParamsError, UnicodeDecodeError) as error:
         raise ConstraintError(str(error)) from None
     if not isinstance(about, dict):

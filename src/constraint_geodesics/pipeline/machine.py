@@ -26,12 +26,14 @@ def run_header(root: Path) -> dict[str, str]:
     """Where a report is from: commit and digest of dvc.lock, blank where there is none, date, and
     `machine`.
     """
-    commit = subprocess.run(
-        ["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=False
-    )
+    asked = ["git", "rev-parse", "HEAD"]
+    try:
+        commit = subprocess.run(asked, cwd=root, capture_output=True, text=True, check=False).stdout
+    except OSError:  # no git here
+        commit = ""
     lock = root / "dvc.lock"
     return {
-        "commit": commit.stdout.strip(),
+        "commit": commit.strip(),
         "dvc.lock": hashlib.sha256(lock.read_bytes()).hexdigest() if lock.is_file() else "",
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         **machine(),

@@ -12,6 +12,7 @@ import math
 import os
 import re
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,6 +71,7 @@ ROOT_FRAME = "tf#/"
 _START, _GOAL, _NOW = (rgb(own) for own in (palette.START, palette.GOAL, palette.BLUE))
 _WIDTH, _THIN, _POINT, _END = (rr.Radius.ui_points(size) for size in (2.0, 0.8, 5.0, 7.0))
 """Of lines, of those of other ways, moving points and a path's ends, in points of the screen."""
+_ENVIRONMENT = threading.Lock()
 _OLD_ID = re.compile(
     r"(?P<constraint>.+)-query(?P<query>\d+)-(?P<planner>.+?)"
     r"(-seed(?P<seed>\d+)|-(?P<executed>executed))$"
@@ -501,16 +503,17 @@ def mesh_chunks(urdf: Path, entity: str, frame_prefix: str | None = None) -> lis
 def _package_path(urdf: Path) -> Iterator[None]:
     """Let Rerun look for package:// meshes in the folders above the URDF, as PyBullet does."""
     name = "ROS_PACKAGE_PATH"
-    before = os.environ.get(name)
     folders = [str(folder) for folder in urdf.resolve().parents]
-    os.environ[name] = os.pathsep.join(folders + ([before] if before else []))
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[name]
-        else:
-            os.environ[name] = before
+    with _ENVIRONMENT:  # another thread may record as well
+        before = os.environ.get(name)
+        os.environ[name] = os.pathsep.join(folders + ([before] if before else []))
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = before
 
 
 def _way_chunks(robot: SerialRobot, ways: Sequence[Float[np.ndarray, "T D"]]) -> Iterator[Chunk]:

@@ -5,7 +5,9 @@ All readers of a robot take it from one file: the URDF of that arm alone, writte
 cache under a name that tells its content.
 """
 
+import atexit
 import json
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -89,7 +91,9 @@ def arms_folder() -> Path:
         with tempfile.TemporaryFile(dir=folder):
             return folder
     except OSError:
-        return Path(tempfile.mkdtemp(prefix="arms-"))
+        own = Path(tempfile.mkdtemp(prefix="arms-"))
+        atexit.register(shutil.rmtree, own, ignore_errors=True)
+        return own
 
 
 def _allowed(

@@ -17,6 +17,8 @@ from constraint_geodesics.robot.kinematics import RobotError, rotation_about
 from constraint_geodesics.xml_files import XmlFileError, read_xml
 
 _LINES = ("lines", "linestrips")
+_MOST_PLACED = 10_000
+"""Geometries: nodes that name each other twice would place any number of them."""
 Element = ElementTree.Element
 
 
@@ -53,7 +55,9 @@ def _parts(mesh: Path) -> Iterator[tuple[Float[np.ndarray, "n 3"], list[list[int
     scene = root.find("scene/instance_visual_scene")
     if scene is None:
         raise ValueError("no scene")
-    for geometry, pose in _placed(_of(scene.get("url"), named), frame, named):
+    for count, (geometry, pose) in enumerate(_placed(_of(scene.get("url"), named), frame, named)):
+        if count == _MOST_PLACED:
+            raise ValueError(f"it places more than {_MOST_PLACED} geometries")
         corners, faces = _faces(geometry, named)
         placed = corners @ pose[:3, :3].T + pose[:3, 3]
         if not np.isfinite(placed).all():

@@ -24,6 +24,8 @@ from constraint_geodesics.scene.bodies import Body, may_meet
 from constraint_geodesics.scene.pieces import read_pieces
 from constraint_geodesics.scene.urdf import find_urdf, has_pybullet
 
+_ASSUMED = PlannerParams()
+
 
 @dataclass(frozen=True)
 class Understood:
@@ -41,10 +43,10 @@ class Understood:
     def lines(self) -> Iterator[str]:
         """For people."""
         yield from self.arm.lines()
-        most = PlannerParams()
         yield (
-            f"accelerations, of which a URDF says nothing: {most.acceleration_rad_s2:g} rad/s² of "
-            f"turning joints, {most.acceleration_m_s2:g} m/s² of sliding ones; less with "
+            "accelerations, of which a URDF says nothing: "
+            f"{_ASSUMED.acceleration_rad_s2:g} rad/s² of turning joints, "
+            f"{_ASSUMED.acceleration_m_s2:g} m/s² of sliding ones; less with "
             "--acceleration-scale"
         )
         by_reason: dict[str, list[str]] = {}
@@ -83,8 +85,8 @@ class Understood:
                 for joint in arm.moved
             ],
             "acceleration_assumed": {
-                "rad_s2": PlannerParams().acceleration_rad_s2,
-                "m_s2": PlannerParams().acceleration_m_s2,
+                "rad_s2": _ASSUMED.acceleration_rad_s2,
+                "m_s2": _ASSUMED.acceleration_m_s2,
             },
             "held": dict(arm.held),
             "may_touch": [

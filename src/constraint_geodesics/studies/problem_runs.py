@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pandas as pd
@@ -43,6 +44,7 @@ from constraint_geodesics.peers.ompl_settings import OmplSettings
 from constraint_geodesics.peers.registry import after, kind_of, settings_of
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
+from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import PathPlanner
 from constraint_geodesics.scene.scene import Scene
 
@@ -57,8 +59,8 @@ COLUMNS = (
 with the ends, if anything; looked_at: configurations that PyBullet was asked about; core_share: of
 a core that the process had meanwhile.
 """
-_PREPARED: set[tuple[Any, ...]] = set()
-"""Arms and constraints whose roadmaps this process has."""
+_PREPARED: WeakKeyDictionary[Planner, set[Any]] = WeakKeyDictionary()
+"""Constraints whose roadmaps a planner of this process has."""
 _TAKEN_IN_S: dict[ArmSource, float] = {}
 """What the last change of its planner's scene took."""
 
@@ -106,10 +108,10 @@ class ProblemBuilder:
             planner.scene.become(scene)
             _TAKEN_IN_S[self.arm] = time.perf_counter() - began
         changed_s = _TAKEN_IN_S.get(self.arm, 0.0)
-        prepared = self.arm, manifold.constraint.key
-        if prepared not in _PREPARED:
+        prepared = _PREPARED.setdefault(planner, set())
+        if manifold.constraint.key not in prepared:
             planner.prepare(manifold.constraint)
-            _PREPARED.add(prepared)
+            prepared.add(manifold.constraint.key)
         shared: dict[str, Any] = {"planner": planner}
         context = Context(scene, constraint, manifold, self.params, Layout(), shared)
         made, took = made_together(settings, context, self.limit_s)

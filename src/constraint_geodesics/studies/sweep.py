@@ -21,7 +21,7 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.studies.search_space import Changes, SearchSpace, label_of
 from constraint_geodesics.studies.sweep_ranking import FIGURES, seed_figures
-from constraint_geodesics.text_files import reading, write_text
+from constraint_geodesics.text_files import kept_json, reading, write_text
 from constraint_geodesics.tracking.experiment import (
     StageRun,
     Subject,
@@ -65,8 +65,8 @@ class Configuration:
         return label_of(self.changes)
 
     def seeds_left(self, layout: Layout) -> list[int]:
-        """Those that are not done."""
-        return [s for s in self.params.sweep.seeds if not self._file(layout, s).is_file()]
+        """Those that are not done, or whose file is damaged."""
+        return [s for s in self.params.sweep.seeds if kept_json(self._file(layout, s)) is None]
 
     def keep(self, layout: Layout, seed: int, result: Mapping[str, Any]) -> None:
         """Write one seed's result; an interruption leaves all of it or nothing."""
@@ -184,8 +184,8 @@ def tell_ranks(sweep: Sweep, ranked: Sequence[Mapping[str, Any]]) -> None:
     rows = {row["configuration"]: {name: row[name] for name in shown} for row in ranked}
     for own in sweep.configurations:
         file = _told(own, sweep.layout)
-        if file.is_file() and own.name in rows:
-            told = json.loads(file.read_text())
+        told = kept_json(file)
+        if told is not None and own.name in rows:
             log_figures(told["tracking_uri"], told["run_id"], rows[own.name])
 
 
@@ -194,7 +194,8 @@ def _finish(own: Configuration, sweep: Sweep) -> None:
     caller makes of it.
     """
     told, seeds = _told(own, sweep.layout), list(own.params.sweep.seeds)
-    if not told.is_file() or json.loads(told.read_text())["seeds"] != seeds:
+    known = kept_json(told)
+    if known is None or known["seeds"] != seeds:
         run = _tell(own, sweep)
         _write(told, {"seeds": seeds, "tracking_uri": run.tracking_uri, "run_id": run.run_id})
     sweep.finished(own)

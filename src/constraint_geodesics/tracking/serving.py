@@ -20,7 +20,7 @@ import uvicorn
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from constraint_geodesics.bundle import read_bundle
+from constraint_geodesics.bundle import open_bundle
 from constraint_geodesics.tracking.store import (
     TrackingError,
     fetch_artifacts,
@@ -162,7 +162,7 @@ def serve(address: str, root: Path, served: Served, tell: Callable[[], None]) ->
         model = files.parent.parent
         if not (model / "MLmodel").is_file():
             raise TrackingError(f"{address}: no registered planner, as models:/NAME@ALIAS")
-        read_bundle(files)  # here it is one line, in a worker it would be a traceback
+        open_bundle(files)  # here it is one line, in a worker it would be a traceback
         os.environ.update({_MODEL: str(model), _WAITING: str(served.waiting)})
         tell()
         uvicorn.run(
