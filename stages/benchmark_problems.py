@@ -3,11 +3,12 @@ their scenes; goes on where an earlier run of it stopped.
 """
 
 import sys
+from pathlib import Path
 
 from constraint_geodesics.benchmark.arm_source import UrdfArm
 from constraint_geodesics.benchmark.problem_files import Problem, every, read_problems
 from constraint_geodesics.params import Params
-from constraint_geodesics.pipeline.code import code_digest, digest
+from constraint_geodesics.pipeline.code import code_digest, data_digest, digest
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.report.problems_page import report_answers
@@ -21,7 +22,7 @@ STAGE = "benchmark_problems"
 def main(params: Params, layout: Layout) -> None:
     """Write data/problem_rows/ as answers come, then reports/problems.csv.gz, .json and .md."""
     own, file = params.problems, layout.root / params.problems.file
-    if not file.is_file():
+    if not file.exists():
         what = "the problems are not in this repository; docs/problems.md says where they are from"
         raise FileNotFoundError(f"{file}: missing: {what}")
     problems = read_problems(file)
@@ -36,7 +37,7 @@ def main(params: Params, layout: Layout) -> None:
     )
     each = "" if own.every == 1 else f", of each scene one in {own.every}"
     about = [
-        f"the problems of {file.name} (SHA-256 {digest(file)}…){each}",
+        f"the problems of {file.name} (SHA-256 {_digest(file)}…){each}",
         f"{own.limit_s:g} s for a query, {own.held_limit_s:g} s with a held tilt",
         *held_beyond(problems),
     ]
@@ -45,6 +46,10 @@ def main(params: Params, layout: Layout) -> None:
     work = Work(STAGE, STAGE, settings, [file])
     with tracked_stage(work, params.tracking.experiment, layout.root) as run:
         report_answers(run, layout, "problems", title, about, asked, of)
+
+
+def _digest(file: Path) -> str:
+    return data_digest(file)[:16] if file.is_dir() else digest(file)
 
 
 def held_beyond(problems: list[Problem]) -> list[str]:

@@ -11,7 +11,7 @@ from constraint_geodesics.planner import Planner
 from tests.planner_fixtures import packaged_planner, pairs_of
 from tests.test_cli_plan import called, error_line, strict, words_of
 
-PANDA = ("--urdf", "franka_panda/panda.urdf", "--tool", "panda_grasptarget")
+PANDA = ("--urdf", "franka_panda/panda.urdf", "--tool-link", "panda_grasptarget")
 OWN = ("--planner", str(bundle.PACKAGED))
 Q = "--start=0 -0.3 0 -2.0 0 1.8 0.5"
 POSE = "0.4 0.2 0.4 3.14159265 0 0.5"
@@ -113,8 +113,8 @@ def test_a_start_that_is_off_is_moved_on_request(geodesics) -> None:
         ((*PANDA, Q, "--goal-pose", POSE, *OWN), "--urdf goes without"),
         ((*PANDA, Q, "--goal-pose", POSE, "--hold", "finger"), "joint=value"),
         ((*PANDA, Q, "--goal-pose", POSE, "--tool-pose", "1 2"), "--tool-pose.*six finite numbers"),
-        ((*OWN, Q, "--goal-pose", POSE, "--tool", "hand"), "need --urdf"),
-        (("--urdf", "no.urdf", "--tool", "hand", Q, "--goal-pose", POSE), "no such URDF"),
+        ((*OWN, Q, "--goal-pose", POSE, "--tool-link", "hand"), "need --urdf"),
+        (("--urdf", "no.urdf", "--tool-link", "hand", Q, "--goal-pose", POSE), "no such URDF"),
     ],
 )
 def test_wrong_usage_is_code_two_and_one_line(geodesics, words, said) -> None:

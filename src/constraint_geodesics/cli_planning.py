@@ -45,8 +45,7 @@ Urdf = Annotated[
     typer.Option(help="Another arm: a URDF, here or in pybullet_data; nothing is trained."),
 ]
 ToolLink = Annotated[
-    str | None,
-    typer.Option("--tool-link", "--tool", help="Of that arm: the link that carries the tool."),
+    str | None, typer.Option("--tool-link", help="Of that arm: the link that carries the tool.")
 ]
 ToolPose = Annotated[
     str | None, typer.Option(help=f"The pose of the tool's own frame in that link, as {POSE}.")
@@ -514,7 +513,7 @@ def show_robot(
     tool_link: Annotated[
         str | None,
         typer.Option(
-            "--tool-link", "--tool", help="Link that carries the tool; without it, those there are."
+            "--tool-link", help="Link that carries the tool; without it, those there are."
         ),
     ] = None,
     hold: Hold = None,

@@ -169,8 +169,9 @@ class Planner:
         `planner.source` says which it was.
 
         method: how curves are looked for.  "planner": straight line, roadmap and trees, refined;
-        nothing in it is learned.  "learned": by a trained policy in its chart, as the paper
-        does; "learned+band": the same, refined by the planner's elastic band.
+        nothing in it is learned.  "learned": cubic curves that a trained policy proposes, in
+        joint space as the package has it, in a learned chart where the paper searches;
+        "learned+band": the same, refined by the planner's elastic band.
         Raises BundleError if files are missing or altered, PlannerError for another method.
         """
         if source is not None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from tests.benchmark.problem_fixtures import small_file, written
+from tests.benchmark.problem_fixtures import moveit_pair, small_file, written
 
 from constraint_geodesics import bundle
 from constraint_geodesics.params import Params, load_params
@@ -68,6 +68,14 @@ def test_problems_of_a_file_and_a_held_tilt_become_a_report(layout, capfd) -> No
     _, again, _ = run("problems", params, layout)
     assert "problems:" not in capfd.readouterr().err, "nothing was left to do"
     pd.testing.assert_frame_equal(rows, again)
+
+
+def test_the_problems_may_be_a_folder_of_moveits(layout) -> None:
+    moveit_pair(layout.root / "problems" / "crate", "0001")
+    params = params_with(problems__file="problems", problems__tilted=0, problems__planners=ONE)
+    told, _, text = run("problems", params, layout)
+    assert told["figures"]["free"]["crate"]["planner"]["problems"] == 1
+    assert "The problems of problems (SHA-256 " in text
 
 
 def test_clutter_becomes_a_report(layout) -> None:

@@ -1,5 +1,7 @@
 """The paper's system as a method of the planner: one learned manifold, the constraint's part of it,
-and cubic curves that a trained policy finds there, alone or refined.
+and cubic curves that a trained policy proposes in its chart, alone or refined.  The chart is what
+it was trained in: joint space, in the pipeline as it stands, or the learned manifold, as in the
+paper.
 
 A query's ends are joined to the sub-manifold's graph (eq. 8); where they lie in different
 components there is no path.  Otherwise the policy proposes curves in rounds (eqs. 9-15), which are
