@@ -100,8 +100,7 @@ def write_tables(
     shown = overview[overview["planner"].isin(params.benchmark.drawn)]
     illustrated = params.geodesics.illustrated_constraints[0]
     case = rows[(rows["constraint"] == illustrated) & (rows["scene"] == TABLE)]
-    ours, own = own_names(settings)
-    ahead = ours_against_baselines(rows, ours, own, BUDGETS)
+    ahead = ours_against_baselines(rows, whole_planner(settings), BUDGETS)
     costs = break_even_table(rows, json.loads(layout.training_times.read_text()), reference)
     written_tables = (
         ("summary", summary, tables.benchmark_markdown(summary)),
@@ -123,19 +122,15 @@ def write_tables(
     return {name: table for name, table, _ in written_tables if table is not None}
 
 
-def own_names(settings: Settings) -> tuple[dict[str, float], list[str]]:
-    """The planner's names with the budget [s] of each, 0 for the first answer; and those of it
-    without some part, but for those that have no roadmap: they are baselines, as are the learned
-    methods.
+def whole_planner(settings: Settings) -> dict[str, float]:
+    """The planner's names with the budget [s] of each, 0 for the first answer.  Without some part
+    it is a baseline, as are the learned methods.
     """
-    own = {
-        name: one
+    return {
+        name: one.given_s
         for name, one in settings.items()
-        if isinstance(one, PlannerSettings) and one.method == "planner"
+        if isinstance(one, PlannerSettings) and one.method == "planner" and not one.switched_off
     }
-    ours = {name: one.given_s for name, one in own.items() if not one.switched_off}
-    bare = [name for name, one in own.items() if "graph" in one.switched_off]
-    return ours, [name for name in own if name not in ours and name not in bare]
 
 
 if __name__ == "__main__":

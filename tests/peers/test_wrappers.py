@@ -65,6 +65,13 @@ def test_one_attempt_is_made_however_short_the_time(problem) -> None:
     assert len(inner.seeds) == 1
 
 
+def test_an_attempt_that_is_remembered_counts_with_the_time_it_took(problem) -> None:
+    inner = Listed((3.0, 1.0), each_s=0.6)
+    found = Restarted(inner, 1.0).plan(problem, 0)
+    assert (len(inner.seeds), found.joints[1, 0]) == (1, 3.0)
+    assert 0.6 <= found.time_s < 0.7
+
+
 def shorter_than(length: float, problem: PlanningProblem) -> PlanningProblem:
     """The problem with such paths as its sound ones."""
     return replace(problem, is_sound=lambda joints: bool(joints[-1, 0] < length))

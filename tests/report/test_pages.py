@@ -562,7 +562,7 @@ def test_findings_come_from_the_tables(run):
     table = compare_planners(params, layout)
     told = findings(params, table, dict.fromkeys(params.manifolds, HELD_OUT))
     planner, paper, caution = told
-    assert planner.about.startswith("planner: 6 latent dimensions, curves retracted")
+    assert planner.about.startswith("planner: 6 latent dimensions, curves of joint space retracted")
     assert (
         "accepts 100% of the learned geodesics (free 100%, level_cup 100%, slide 100%)"
         in planner.sentences[0]

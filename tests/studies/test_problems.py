@@ -164,6 +164,13 @@ def test_all_planners_answer_in_every_scene_and_are_judged_twice(rows) -> None:
     assert f"## Scene by scene: {TILTED}" in text
 
 
+def test_who_a_constraint_is_not_for_has_no_figures_of_it(rows) -> None:
+    own = [row for row in rows if (row["planner"], row["constraint"]) == ("planner", TILTED)]
+    kept = [row | {"planner": "bundle", "status": "not_applicable"} for row in own]
+    found = figures(table_of([*rows, *kept], lambda name: 10.0))
+    assert found == figures(table_of(rows, lambda name: 10.0))
+
+
 def test_a_changed_scene_limit_or_code_is_asked_again(problems, tmp_path) -> None:
     of = asked(tmp_path, planner={"kind": "planner"})
     (batch,) = batches(problems[:1], of)

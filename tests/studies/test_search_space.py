@@ -84,6 +84,8 @@ def test_every_configuration_of_the_project_s_space_can_be_trained() -> None:
         ("search: grid\nspace: {}", "space="),
         ("search: best\nspace: {policies.steps: [1]}", "search='best'"),
         ("search: grid\nspace: {labels.seed: [1]}", r"space.labels.seed: must begin with"),
+        ("search: grid\nspace: {geodesics.ppo.gamma: [0.3]}", r"gamma: must begin with"),
+        ("search: grid\nspace: {policies.steps: [9]}", r"policies.steps: a sweep has its own"),
         ("search: grid\nspace: {policies.steps: {low: 1, high: 2}}", "a grid needs a list"),
         ("search: grid\nspace: {policies.steps: []}", "policies.steps"),
         (f"search: grid\nspace: {{'{TOGETHER}': [[0.5]]}}", r"needs 2 values"),

@@ -34,6 +34,7 @@ from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.scene.arm import mesh_digests
 from constraint_geodesics.scene.scene import Scene, robot_from
 from constraint_geodesics.scene.urdf import find_urdf
+from constraint_geodesics.text_files import kept_json
 
 JUDGED_BY = "benchmark.runner"
 """The module that asks the planners and judges their answers: every row depends on what it imports.
@@ -229,10 +230,15 @@ def _data_of(run: Run, settings: BaselineSettings) -> str:
 
 def training_times(params: Params, layout: Layout) -> dict[str, float]:
     """Seconds that stages took to make what each planner needs, from data to files: training, and
-    the roadmaps of those that have any; 0 for those that need nothing.
+    the roadmaps of those that have any; 0 for those that need nothing.  Of policies, which are
+    trained with many seeds, one is used.
     """
     settings, frame = all_settings(params), pd.read_csv(layout.stage_times)
     seconds = dict(zip(frame["stage"], frame["seconds"], strict=True))
+    told = kept_json(layout.report("train_policies", params.policies.chart))
+    if told is not None:
+        policies = [stage for stage in seconds if stage.split()[0] == "train_policies"]
+        seconds |= dict.fromkeys(policies, float(told["seconds_mean"]))
     searched = params.geodesics.searched[0]
     needed = {
         name: (*own.trained, *["build_planner"] * own.uses_roadmaps)

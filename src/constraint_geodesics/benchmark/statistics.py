@@ -221,14 +221,14 @@ def all_constraints(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def ours_against_baselines(
-    rows: pd.DataFrame, ours: Mapping[str, float], own: Sequence[str], budgets: Sequence[float]
+    rows: pd.DataFrame, ours: Mapping[str, float], budgets: Sequence[float]
 ) -> pd.DataFrame:
     """Where a baseline is ahead of the planner on p95 of length over best known within a time
     budget, or LATE after it, failures infinite.
 
     ours: the planner's names with the budget [s] that each is given, 0 for the first answer; within
     a budget the one with the longest that is shorter counts, of those that were asked a query which
-    somebody solves.  own: names that are no baselines, such as the planner without a part.
+    somebody solves.
     One row a case, budget and baseline: success and p95 of both within the budget, over the queries
     that the baseline was asked, and `verdict`: of the baseline, "ahead" or "behind" if its p95 is
     shorter or longer by more than AHEAD, else "tied"; where both are infinite, success decides in
@@ -241,7 +241,7 @@ def ours_against_baselines(
             given = [name for name in ours if ours[name] < budget and name in groups]
             chosen, in_time = max(given, key=ours.__getitem__), (1.0 + LATE) * budget
             for name, theirs in groups.items():
-                if name in ours or name in own:
+                if name in ours:
                     continue
                 mine = groups[chosen][groups[chosen]["query"].isin(theirs["query"])]
                 both = (

@@ -65,9 +65,11 @@ class GradientSolver:
 
     def solve(self, problem: ChartProblem, ends: Ends) -> list[Geodesic]:
         """The shortest minimum found between each start and goal."""
+        began = time.perf_counter()
         simpler = self.simpler(problem, ends)
         starts = Candidates.join([*simpler, self.candidates(problem, ends)])
-        return self.refine(problem, ends, starts, given=simpler[0] if simpler else None)
+        given = simpler[0] if simpler else None
+        return self.refine(problem, ends, starts, given=given, began=began)
 
     def simpler(self, problem: ChartProblem, ends: Ends) -> list[Candidates]:
         """The cubics found, as curves of a family that has more freedom; none for one that has not.

@@ -116,15 +116,17 @@ class LatentGraphSearch:
         lengths = np.concatenate([self._lengths, link_lengths])
         numbers = {(int(a), int(b)): row for row, (a, b) in enumerate(edges)}
         kept = np.ones(len(edges), dtype=bool)
+        lines: dict[tuple[int, int], Float[np.ndarray, "k D"] | None] = {}
         for searched in range(1, self.settings.rounds + 1):
             route = shortest_path(n + 2, edges[kept], lengths[kept], n, n + 1).nodes
             if not len(route):
                 return None, searched
-            pieces = [
-                self._line(problem, joints[a], joints[b]) for a, b in itertools.pairwise(route)
-            ]
-            for a, b, piece in zip(route[:-1], route[1:], pieces, strict=True):
-                kept[numbers[min(a, b), max(a, b)]] = piece is not None
+            pieces = []
+            for way in itertools.pairwise(map(int, route)):
+                if way not in lines:  # most of a route is that of the round before
+                    lines[way] = self._line(problem, joints[way[0]], joints[way[1]])
+                pieces.append(lines[way])
+                kept[numbers[min(way), max(way)]] = lines[way] is not None
             whole = [piece for piece in pieces if piece is not None]
             if len(whole) == len(pieces):
                 return np.concatenate([whole[0][:1], *(piece[1:] for piece in whole)]), searched

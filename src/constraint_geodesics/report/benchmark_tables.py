@@ -68,9 +68,10 @@ _LEARNED = "learned"
 """The planner of the benchmark that the paper's learned geodesics stand next to."""
 TABLE_I_NOTE = (
     "The paper's lengths have no unit and are of one query, on its own machine with a GPU; ours "
-    "are latent lengths (eq. 2, on the `planner` manifold) of valid paths over all queries and "
-    "seeds of a method. So compare the ratios ×: the average over that of the learned geodesics, "
-    "here of the same queries. `planner` is not learned and has no row in the paper."
+    "are latent lengths (eq. 2, on the `planner` manifold, which does nothing but measure here: "
+    "`learned` searches in joint space) of valid paths over all queries and seeds of a method. So "
+    "compare the ratios ×: the average over that of the learned geodesics, here of the same "
+    "queries. `planner` is not learned and has no row in the paper."
 )
 
 

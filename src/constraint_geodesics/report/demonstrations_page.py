@@ -208,7 +208,8 @@ def _training_rows(cells: Figures) -> Cells:
     for name in LEARNED:
         own = [methods[name] for _, _, methods in _cells(cells) if name in methods]
         if own:
-            means = (sum(cell.get(key) or 0.0 for cell in own) / len(own) for key in TIMES)
+            known = ([cell[key] for cell in own if cell.get(key) is not None] for key in TIMES)
+            means = (sum(values) / len(values) if values else None for values in known)
             rows.append((name, *map(short, means)))
     return rows
 

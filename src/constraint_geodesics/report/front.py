@@ -30,7 +30,8 @@ PURPOSE = (
 BELOW = (
     "Below stand its row beside the best of the rest, what learning adds to a search and what it "
     "does not, and every table and figure of the pipeline, which learns one manifold for all "
-    "constraints and searches it by policies."
+    "constraints and trains policies that search in the chart that params.yaml names: "
+    "policies.chart."
 )
 NOT_RUN = "How it stands beside others is measured by make bench, which has left no rows here."
 REST = 2
@@ -161,7 +162,7 @@ def _learning_table(params: Params, compared: Mapping[str, Mapping[str, Any]]) -
         for method in (POLICY, STILL)
     ]
     note = (
-        "One cubic a query, with the same time for both; interquartile means over the seeds and "
+        "One cubic a query, found in the same rounds; interquartile means over the seeds and "
         "their 95 % intervals; solved: of what anything solves; length: over the shortest "
         "certified path known, of what was solved. From "
         "reports/benchmark_policies/policies.json; all methods stand below."

@@ -287,9 +287,9 @@ def _draw_training(params: Params, layout: Layout) -> Drawn:
 def _draw_comparison(table: pd.DataFrame, manifold: str) -> Drawn:
     caption = (
         "Share of valid paths; joint length of valid paths over the shortest valid path that any "
-        "planner found for the same query; time of every row, failures included. Marks are "
-        "medians, lines reach to the 95th percentile. The straight latent line takes no search, so "
-        "it has no time."
+        "planner found for the same query; time of every row of queries that any planner solves, "
+        "failures included. Marks are medians, lines reach to the 95th percentile. The straight "
+        "line takes no search, so it has no time."
     )
     title = f"Success, length and time: {manifold}"
     figure = figures.planner_comparison(table[table["manifold"] == manifold])

@@ -14,6 +14,7 @@ import pandas as pd
 import pandera.pandas as pandera
 
 from constraint_geodesics.benchmark.statistics import APART, RANDOM, STRAIGHT, Counted, summarise
+from constraint_geodesics.learning.learned_manifold import JOINT_SPACE
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.cells import (
@@ -273,13 +274,15 @@ def _found_on(
     )
     others = _by_planner(rows[~rows["planner"].isin([LEARNED, *APART])], "success")
     decoded = "curves decoded and their ends corrected, nothing retracted"
-    how = "curves retracted onto the constraint" if settings.retract else decoded
+    chart = "joint space" if params.policies.chart == JOINT_SPACE else "its latent space"
+    retracted = f"curves of {chart} retracted onto the constraint"
+    how = retracted if settings.retract else decoded
     shares = ", ".join(f"{name} {share:.0%}" for name, share in learned["success"].items())
     worst, median = (short(learned[f"violation_{which}_deg"].max()) for which in ("max", "median"))
     sentences = [
         f"The judge accepts {_share(learned, 'success')} of the learned geodesics ({shares}).",
         f"Under the same constraints it accepts {_share(straight, 'success')} of the straight "
-        f"latent lines, and of the sampling planners' answers: {others}.",
+        f"lines of the chart, and of the sampling planners' answers: {others}.",
         f"The learned geodesics returned violate the constraint by {worst}° at worst; the median "
         f"path of the worst constraint by {median}°.",
         _shortest_under(rows),

@@ -238,9 +238,10 @@ _ASKED = ["scene", "constraint", "query"]
 
 def figures(table: pd.DataFrame) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
     """By constraint and scene, and of all its scenes together ("all"), the figures of each planner
-    by name.
+    by name; none of one that a constraint is not for.
     """
     found: dict[str, dict[str, dict[str, dict[str, Any]]]] = {}
+    table = table[table["status"] != "not_applicable"]
     counted = table.assign(
         solved=table["valid"] & ~table["touches"] & (table["time_s"] <= table["limit_s"])
     )

@@ -25,8 +25,10 @@ from constraint_geodesics.errors import ParamsError
 from constraint_geodesics.fields import Count, Finite, Seed
 from constraint_geodesics.params import one_line, read_yaml
 
-SEARCHED = ("policies.", "geodesics.", "sweep.steps")
+SEARCHED = ("policies.", "geodesics.degree", "sweep.steps")
 """Where the entries lie that a policy's training depends on."""
+NOT_SEARCHED = ("policies.seeds", "policies.steps")
+"""In whose place a sweep has its own."""
 DIGITS = 3
 """Of a number drawn from a range."""
 DRAWN_IN_VAIN = 1000
@@ -99,6 +101,8 @@ class SearchSpace(BaseModel):
         for entry in ", ".join(self.space).split(", "):
             if not entry.startswith(SEARCHED):
                 raise ValueError(f"space.{entry}: must begin with {' or '.join(SEARCHED)}")
+            if entry in NOT_SEARCHED:
+                raise ValueError(f"space.{entry}: a sweep has its own: sweep.seeds, sweep.steps")
         return self
 
     def changes(self) -> list[Changes]:

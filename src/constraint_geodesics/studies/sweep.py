@@ -260,7 +260,7 @@ def _optima(sweep: Sweep, owners: Iterable[Configuration]) -> dict[str, dict[str
 
 def _family(params: Params, layout: Layout, constraint: str) -> str:
     """A digest of what the shortest curves depend on."""
-    geodesics = params.geodesics.model_dump(include={"degree", "length_degree"})
+    geodesics = params.policy_settings().model_dump(include={"degree", "length_degree"})
     judged = params.sweep.model_dump(include={"queries", "query_seed"})
     return fingerprint(constraint, geodesics, judged, _shared(params, layout))
 
