@@ -8,6 +8,7 @@ from typing import Any
 
 import pandas as pd
 
+from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
@@ -38,14 +39,13 @@ def main(params: Params, layout: Layout) -> None:
         cells = cells_of(params, layout, STAGE)
         found = parallel_map(measure, cells, params.compute, description="demonstrations")
         table = pd.DataFrame([row for rows in found for row in rows])
-        packed = {"method": "gzip", "mtime": 0}
-        with written(reports / "demonstrations.csv.gz") as part:
-            table.to_csv(part, index=False, compression=packed, float_format="%.6g")
+        about = run_header(layout.root)
+        write_table(table.round(8), reports / "demonstrations.csv.gz", about)
         figures: dict[str, Any] = {
             "cells": summary(table, own.peer_pairs),
             "ranks": ranks(table),
             "free_motion": free_motion(free_arms(), own.seeds),
-            "machine": run_header(layout.root),
+            "machine": about,
         }
         picture = demonstrations_figure(example(params, layout))
         with written(reports / "demonstrations.png") as part:

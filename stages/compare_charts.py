@@ -5,13 +5,13 @@ variance term where the data has a hole; five seeds each, half an hour on two co
 import shutil
 import sys
 
+from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.studies.charts import measure, summary, table_of, tasks_of
-from constraint_geodesics.text_files import written
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "compare_charts"
@@ -27,12 +27,9 @@ def main(params: Params, layout: Layout) -> None:
         tasks = tasks_of(params, layout)
         found = parallel_map(measure, tasks, params.compute, description="charts")
         table = table_of([row for rows in found for row in rows])
-        kept = {"method": "gzip", "mtime": 0}
-        with written(reports / f"{STAGE}.csv.gz") as part:
-            table.to_csv(part, index=False, compression=kept, float_format="%.6g")
-        run.report(
-            {**summary(table), "machine": run_header(layout.root)}, reports / f"{STAGE}.json"
-        )
+        about = run_header(layout.root)
+        write_table(table.round(8), reports / f"{STAGE}.csv.gz", about)
+        run.report({**summary(table), "machine": about}, reports / f"{STAGE}.json")
         for task in tasks:  # finished: the next run of this stage starts from nothing
             shutil.rmtree(task.scratch, ignore_errors=True)
 

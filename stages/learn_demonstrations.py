@@ -7,6 +7,7 @@ import sys
 
 import pandas as pd
 
+from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.params import Params
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.pipeline.layout import Layout
@@ -14,7 +15,6 @@ from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.studies.demonstrations import by_cell, cells_of, summary
 from constraint_geodesics.studies.learned_demonstrations import measure
-from constraint_geodesics.text_files import written
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "learn_demonstrations"
@@ -28,10 +28,9 @@ def main(params: Params, layout: Layout) -> None:
         cells = cells_of(params, layout, STAGE)
         found = parallel_map(measure, cells, params.compute, description="learned of rows")
         table = pd.DataFrame([row for rows in found for row in rows])
-        packed = {"method": "gzip", "mtime": 0}
-        with written(reports / "learned_demonstrations.csv.gz") as part:
-            table.to_csv(part, index=False, compression=packed, float_format="%.6g")
-        figures = {"cells": summary(table, own.peer_pairs), "machine": run_header(layout.root)}
+        about = run_header(layout.root)
+        write_table(table.round(8), reports / "learned_demonstrations.csv.gz", about)
+        figures = {"cells": summary(table, own.peer_pairs), "machine": about}
         run.cells(by_cell(figures["cells"]))
         run.report(figures, reports / "learned_demonstrations.json")
         for cell in cells:  # finished: the next run of this stage starts from nothing

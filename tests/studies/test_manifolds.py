@@ -1,5 +1,7 @@
 """The comparison of learners: exact figures where nothing is learned, and the same rows for all."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -51,6 +53,7 @@ def test_every_learner_sees_the_same_rows_and_none_that_it_is_asked_about(tasks,
 @pytest.mark.parametrize("learner", list(LEARNERS))
 def test_every_learner_is_measured_alike(tasks, learner) -> None:
     rows = measure(next(own for own in tasks if own.learner == learner))
+    assert json.loads(json.dumps(rows)) == rows, "as they are kept"
     table = pd.DataFrame(rows)
     assert set(table["constraint"]) == {"", *tasks[0].constraints}
     assert not table.duplicated(["constraint", "figure"]).any()

@@ -302,6 +302,12 @@ class PolicyTask:
     policies: Path
 
 
+def policy_rows(task: PolicyTask) -> list[dict[str, Any]]:
+    """The rows of `run_policies` as JSON holds them."""
+    rows = run_policies(task).to_dict("records")
+    return [{str(name): value for name, value in row.items()} for row in rows]
+
+
 def run_policies(task: PolicyTask) -> pd.DataFrame:
     """One row a query, method and seed, in the workcell or with a sphere on the way.
 
