@@ -43,7 +43,7 @@ def kept_map(
     left = [k for k, rows in enumerate(found) if rows is None]
     todo = [items[k] for k in left]
     for place, rows in as_finished(function, todo, settings, description=description):
-        file = files[left[place]]
-        write_text(file, json.dumps(rows))
-        found[left[place]] = kept_json(file)  # as whoever goes on with it has them
+        text = json.dumps(rows)
+        write_text(files[left[place]], text)
+        found[left[place]] = json.loads(text)  # as whoever goes on with it has them
     return [rows for rows in found if rows is not None]

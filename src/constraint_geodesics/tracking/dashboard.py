@@ -33,9 +33,9 @@ def serve_and_open(command: Sequence[str], page: str) -> int:
 
 def _answers(server: "subprocess.Popen[bytes]", address: str) -> bool:
     deadline = time.monotonic() + STARTS_S
+    # this machine's own address: a proxy that the user has set would be asked outside
+    direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     while server.poll() is None and time.monotonic() < deadline:
-        # this machine's own address: a proxy that the user has set would be asked outside
-        direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
         with contextlib.suppress(OSError), direct.open(address, timeout=5):
             return True
         time.sleep(0.2)
