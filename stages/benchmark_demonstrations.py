@@ -10,7 +10,7 @@ import pandas as pd
 
 from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.params import Params
-from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.kept import kept_folder, kept_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
@@ -36,8 +36,9 @@ def main(params: Params, layout: Layout) -> None:
     own, reports = params.demonstrations, layout.root / "reports"
     work = Work(STAGE, STAGE, own, [layout.planner])
     with tracked_stage(work, params.tracking.experiment, layout.root) as run:
-        cells = cells_of(params, layout, STAGE)
-        found = parallel_map(measure, cells, params.compute, description="demonstrations")
+        kept = kept_folder(params, layout, STAGE, layout.planner)
+        cells = cells_of(params, layout)
+        found = kept_map(measure, cells, kept, params.compute, description="demonstrations")
         table = pd.DataFrame([row for rows in found for row in rows])
         about = run_header(layout.root)
         write_table(table.round(8), reports / "demonstrations.csv.gz", about)
@@ -52,8 +53,7 @@ def main(params: Params, layout: Layout) -> None:
             picture.savefig(part, dpi=110)
         run.cells(by_cell(figures["cells"]))
         run.report(figures, reports / "demonstrations.json")
-        for cell in cells:  # finished: the next run of this stage starts from nothing
-            shutil.rmtree(cell.folder.parent, ignore_errors=True)
+        shutil.rmtree(kept, ignore_errors=True)
 
 
 if __name__ == "__main__":

@@ -9,12 +9,12 @@ import pandas as pd
 
 from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.params import Params
-from constraint_geodesics.pipeline.compute import parallel_map
+from constraint_geodesics.pipeline.kept import kept_folder, kept_map
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.pipeline.stage import run_stage
 from constraint_geodesics.studies.demonstrations import by_cell, cells_of, summary
-from constraint_geodesics.studies.learned_demonstrations import measure
+from constraint_geodesics.studies.learned_demonstrations import measure, trainings_of
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "learn_demonstrations"
@@ -25,16 +25,16 @@ def main(params: Params, layout: Layout) -> None:
     own, reports = params.demonstrations, layout.root / "reports"
     work = Work(STAGE, STAGE, own, [layout.planner])
     with tracked_stage(work, params.tracking.experiment, layout.root) as run:
-        cells = cells_of(params, layout, STAGE)
-        found = parallel_map(measure, cells, params.compute, description="learned of rows")
+        kept = kept_folder(params, layout, STAGE, layout.planner)
+        tasks = trainings_of(cells_of(params, layout), kept / "training")
+        found = kept_map(measure, tasks, kept, params.compute, description="learned of rows")
         table = pd.DataFrame([row for rows in found for row in rows])
         about = run_header(layout.root)
         write_table(table.round(8), reports / "learned_demonstrations.csv.gz", about)
         figures = {"cells": summary(table, own.peer_pairs), "machine": about}
         run.cells(by_cell(figures["cells"]))
         run.report(figures, reports / "learned_demonstrations.json")
-        for cell in cells:  # finished: the next run of this stage starts from nothing
-            shutil.rmtree(cell.folder.parent, ignore_errors=True)
+        shutil.rmtree(kept, ignore_errors=True)
 
 
 if __name__ == "__main__":

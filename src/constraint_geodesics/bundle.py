@@ -36,7 +36,7 @@ from constraint_geodesics.params import (
     WorkcellParams,
     one_line,
 )
-from constraint_geodesics.plugs import MLFLOW, is_trusted, plug
+from constraint_geodesics.plugs import MLFLOW, plug, require_trusted
 from constraint_geodesics.robot.kinematics import RobotError
 from constraint_geodesics.scene.urdf import data_path
 from constraint_geodesics.search.roadmap import Roadmap
@@ -242,11 +242,10 @@ def _from_elsewhere(folder: Path) -> Bundle:
             )
     for name, constraint in bundle.constraints.items():
         module = getattr(constraint, "factory", "").partition(":")[0]
-        if module and not is_trusted(module):
-            raise BundleError(
-                f"{folder / CARD}: constraints.{name}.factory: import {module} before, if you "
-                f"trust it: no module is imported because a planner's files name it"
-            )
+        try:
+            require_trusted(module or __name__)
+        except ImportError as error:
+            raise BundleError(f"{folder / CARD}: constraints.{name}.factory: {error}") from None
     return bundle
 
 

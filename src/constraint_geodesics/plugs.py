@@ -27,9 +27,15 @@ METHODS = {
 """How a planner may look for curves, each a class that `methods.Method` describes."""
 
 
-def is_trusted(module: str) -> bool:
-    """Whether a file may name what is in a module: one that is imported already, or ours."""
-    return module in sys.modules or module.startswith(f"{__package__}.")
+def require_trusted(module: str) -> None:
+    """Raises ImportError for a module that a file names and nobody has imported: a file's word is
+    no reason to run it.  Ours are trusted.
+    """
+    if module not in sys.modules and not module.startswith(f"{__package__}."):
+        raise ImportError(
+            f"import {module} before, if you trust it: "
+            "no module is imported because a file names it"
+        )
 
 
 def plug(wanted: Plug) -> Any:

@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
@@ -14,7 +13,7 @@ from typing import Any
 import pytest
 from filelock import FileLock
 
-from constraint_geodesics.pipeline.machine import machine
+from constraint_geodesics.pipeline.machine import git_says, machine
 from constraint_geodesics.text_files import write_text
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -103,13 +102,9 @@ def _commit() -> str:
     """Its short hash, with a + where files besides reports are not as it has them; blank where
     there is no Git.
     """
-    found = _git("rev-parse", "--short", "HEAD")
-    return found + "+" * bool(found and _git("status", "--porcelain", "--", ".", ":!reports"))
-
-
-def _git(*words: str) -> str:
-    done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
-    return done.stdout.strip()
+    found = git_says(ROOT, "rev-parse", "--short", "HEAD")
+    changed = found and git_says(ROOT, "status", "--porcelain", "--", ".", ":!reports")
+    return found + "+" * bool(changed)
 
 
 def _order(name: str) -> int:

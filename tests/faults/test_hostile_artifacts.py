@@ -328,7 +328,7 @@ def functions(factory: str) -> dict[str, Any]:
     return {"kind": "functions", "description": "own", "factory": factory, "arguments": {}}
 
 
-@case("card: a module to import", "no module is imported because a planner's files name it")
+@case("card: a module to import", "no module is imported because a file names it")
 def _(folder: Path) -> Any:
     (folder / "evil_module.py").write_text(f"open({str(folder / CANARY)!r}, 'w')\n")
     described = functions("evil_module:make")
@@ -680,19 +680,36 @@ for _name, (_content, _said) in XML.items():
     case(f"collada: {_name}", _said)(text("mesh.dae", _content, as_obj))
 
 
-DOUBLED = (
-    "<COLLADA><library_geometries><geometry id='g'/></library_geometries><library_nodes>"
-    + "".join(
-        f"<node id='n{k}'>" + 2 * f"<instance_node url='#n{k + 1}'/>" + "</node>" for k in range(40)
+def collada(last: str, many: int = 40) -> str:
+    """Nodes that name the next one twice each, the last with an element of its own."""
+    nodes = [
+        f"<node id='n{k}'>" + 2 * f"<instance_node url='#n{k + 1}'/>" + "</node>"
+        for k in range(many)
+    ]
+    corners = " ".join(["0 0 0"] * 1000)
+    return (
+        "<COLLADA><library_geometries><geometry id='g'><mesh>"
+        f"<source id='p'><float_array>{corners}</float_array><technique_common>"
+        "<accessor stride='3'/></technique_common></source>"
+        "<vertices id='v'><input semantic='POSITION' source='#p'/></vertices>"
+        "<triangles><input semantic='VERTEX' source='#v'/><p>0 1 2</p></triangles>"
+        f"</mesh></geometry></library_geometries><library_nodes>{''.join(nodes)}"
+        f"<node id='n{many}'>{last}</node></library_nodes>"
+        "<library_visual_scenes><visual_scene id='s'><node><instance_node url='#n0'/></node>"
+        "</visual_scene></library_visual_scenes>"
+        "<scene><instance_visual_scene url='#s'/></scene></COLLADA>"
     )
-    + "<node id='n40'><instance_geometry url='#g'/></node></library_nodes>"
-    "<library_visual_scenes><visual_scene id='s'><node><instance_node url='#n0'/></node>"
-    "</visual_scene></library_visual_scenes>"
-    "<scene><instance_visual_scene url='#s'/></scene></COLLADA>"
-)
-case("collada: 2^40 geometries of four kilobytes", "it places more than 10000 geometries")(
-    text("mesh.dae", DOUBLED, as_obj)
-)
+
+
+UNFOLDED = "its nodes unfold to more than 100000 elements"
+PLACED = "<instance_geometry url='#g'/>"
+for _name, _content, _said in (
+    ("2^40 empty nodes", collada(""), UNFOLDED),
+    ("2^40 moves", collada("<translate>0 0 1</translate>"), UNFOLDED),
+    ("2^40 geometries", collada(PLACED), "it places more than 2000000 corners and faces"),
+    ("one geometry 2^14 times", collada(PLACED, 14), "it places more than 2000000 corners"),
+):
+    case(f"collada: {_name} of kilobytes", _said)(text("mesh.dae", _content, as_obj))
 NO_MESH = "passwd is no mesh that can be read"
 
 

@@ -34,7 +34,7 @@ from constraint_geodesics.constraints.kernels import (
     call,
     floats,
 )
-from constraint_geodesics.plugs import is_trusted
+from constraint_geodesics.plugs import require_trusted
 from constraint_geodesics.robot.kernels import new_posture, pose_of
 from constraint_geodesics.robot.kinematics import SerialRobot
 
@@ -171,12 +171,10 @@ class FunctionsConstraint(Constraint):
         """
         if robot is None:
             raise ConstraintError(f"{about['factory']} can't be called without a robot")
-        module = str(about["factory"]).partition(":")[0]
-        if not is_trusted(module):
-            raise ConstraintError(
-                f"factory = {about['factory']!r}: import {module} before, if you trust it: no "
-                f"module is imported because a file names it"
-            )
+        try:
+            require_trusted(str(about["factory"]).partition(":")[0])
+        except ImportError as error:
+            raise ConstraintError(f"factory = {about['factory']!r}: {error}") from None
         return made_by(about["factory"], about["arguments"], robot)._with(about["tolerance"])
 
     @classmethod

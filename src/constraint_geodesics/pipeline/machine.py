@@ -22,18 +22,23 @@ def machine() -> dict[str, str]:
     }
 
 
+def git_says(root: Path, *words: str) -> str:
+    """What git says of a folder; nothing where it fails or there is none."""
+    command = ["git", "--no-optional-locks", "-C", str(root), *words]
+    try:
+        said = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError:
+        return ""
+    return said.stdout.strip() if said.returncode == 0 else ""
+
+
 def run_header(root: Path) -> dict[str, str]:
     """Where a report is from: commit and digest of dvc.lock, blank where there is none, date, and
     `machine`.
     """
-    asked = ["git", "rev-parse", "HEAD"]
-    try:
-        commit = subprocess.run(asked, cwd=root, capture_output=True, text=True, check=False).stdout
-    except OSError:  # no git here
-        commit = ""
     lock = root / "dvc.lock"
     return {
-        "commit": commit.strip(),
+        "commit": git_says(root, "rev-parse", "HEAD"),
         "dvc.lock": hashlib.sha256(lock.read_bytes()).hexdigest() if lock.is_file() else "",
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         **machine(),

@@ -17,9 +17,13 @@ from constraint_geodesics.robot.kinematics import RobotError, rotation_about
 from constraint_geodesics.xml_files import XmlFileError, read_xml
 
 _LINES = ("lines", "linestrips")
-_MOST_PLACED = 10_000
-"""Geometries: nodes that name each other twice would place any number of them."""
+_MOST_STEPS, _MOST_PLACED = 100_000, 2_000_000
+"""Elements that are gone through, and corners and faces that are placed: a short file's nodes that
+name others twice each would make any number of them.
+"""
 Element = ElementTree.Element
+Part = tuple[Float[np.ndarray, "n 3"], list[list[int]]]
+"""Corners, and the faces between them."""
 
 
 def as_obj(mesh: Path) -> str:
@@ -42,7 +46,7 @@ def as_obj(mesh: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _parts(mesh: Path) -> Iterator[tuple[Float[np.ndarray, "n 3"], list[list[int]]]]:
+def _parts(mesh: Path) -> Iterator[Part]:
     try:
         root = read_xml(mesh)
     except XmlFileError as error:
@@ -55,10 +59,15 @@ def _parts(mesh: Path) -> Iterator[tuple[Float[np.ndarray, "n 3"], list[list[int
     scene = root.find("scene/instance_visual_scene")
     if scene is None:
         raise ValueError("no scene")
-    for count, (geometry, pose) in enumerate(_placed(_of(scene.get("url"), named), frame, named)):
-        if count == _MOST_PLACED:
-            raise ValueError(f"it places more than {_MOST_PLACED} geometries")
-        corners, faces = _faces(geometry, named)
+    read, left = dict[Element, Part](), _MOST_PLACED
+    steps = iter(range(_MOST_STEPS))
+    for geometry, pose in _placed(_of(scene.get("url"), named), frame, named, steps):
+        if geometry not in read:
+            read[geometry] = _faces(geometry, named)
+        corners, faces = read[geometry]
+        left -= len(corners) + len(faces)
+        if left < 0:
+            raise ValueError(f"it places more than {_MOST_PLACED} corners and faces")
         placed = corners @ pose[:3, :3].T + pose[:3, 3]
         if not np.isfinite(placed).all():
             raise ValueError("corners that are no finite numbers")
@@ -76,13 +85,16 @@ def _placed(
     node: Element,
     pose: Float[np.ndarray, "4 4"],
     named: dict[str | None, Element],
+    steps: Iterator[int],
     above: tuple[Element, ...] = (),
 ) -> Iterator[tuple[Element, Float[np.ndarray, "4 4"]]]:
-    """The geometries below a node, with what places each."""
+    """The geometries below a node, with what places each.  steps: one is taken for each element."""
     if node in above:
         raise ValueError(f"the node {node.get('id')!r} is below itself")
     above = (*above, node)
     for child in node:
+        if next(steps, None) is None:
+            raise ValueError(f"its nodes unfold to more than {_MOST_STEPS} elements")
         if child.tag in _NOT_READ:
             raise ValueError(f"<{child.tag}> is not read")
         values = np.array((child.text or "").split(), float) if child.tag in _MOVES else None
@@ -91,9 +103,9 @@ def _placed(
         elif child.tag == "instance_geometry":
             yield _of(child.get("url"), named), pose
         elif child.tag == "instance_node":
-            yield from _placed(_of(child.get("url"), named), pose, named, above)
+            yield from _placed(_of(child.get("url"), named), pose, named, steps, above)
         elif child.tag == "node":
-            yield from _placed(child, pose, named, above)
+            yield from _placed(child, pose, named, steps, above)
 
 
 def _translation(by: np.ndarray) -> np.ndarray:
@@ -121,9 +133,7 @@ _NOT_READ = ("instance_controller", "lookat", "skew")
 """Skinned meshes, and moves that no exporter of robots writes."""
 
 
-def _faces(
-    geometry: Element, named: dict[str | None, Element]
-) -> tuple[Float[np.ndarray, "n 3"], list[list[int]]]:
+def _faces(geometry: Element, named: dict[str | None, Element]) -> Part:
     """Corners and faces of one geometry in its own frame."""
     corners, faces = [np.empty((0, 3))], list[list[int]]()
     for kind in ("convex_mesh", "brep"):

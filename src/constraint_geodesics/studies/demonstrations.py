@@ -2,13 +2,9 @@
 make of the same rows, and how well their paths keep to the formula.
 """
 
-import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from hashlib import sha256
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,16 +14,13 @@ from jaxtyping import Float
 from constraint_geodesics.constraints.spline import Spline, SplineConstraint
 from constraint_geodesics.identification import Identified, identify
 from constraint_geodesics.params import DemonstrationsParams, Params
-from constraint_geodesics.pipeline.code import code_digest, data_digest
 from constraint_geodesics.pipeline.layout import Layout
-from constraint_geodesics.pipeline.machine import machine
 from constraint_geodesics.planner import Planner, PlannerError
 from constraint_geodesics.robot.kinematics import SerialRobot, load_robot
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.studies.arms import ARMS
 from constraint_geodesics.studies.hidden_tasks import HOLE, HOLE_M, ROWS, TASKS, HiddenTask
 from constraint_geodesics.studies.local_models import Answer, LocalModels, NearestRows, poses_of
-from constraint_geodesics.text_files import kept_json, write_text
 
 FORMULA, IDENTIFIED, WITHIN = "formula", "identified", "identified, where shown"
 ROUNDED, COMPARED = "identified, rounded", "identified, as asked of peers"
@@ -90,18 +83,6 @@ def cases_of(task: str) -> tuple[Case, ...]:
     return {"wavy surface": OF_SURFACES, "torus": OF_SURFACES, "hole": OF_HOLES}.get(task, CASES)
 
 
-MEASURED_WITH = {"robot", "workcell", "demonstrations", "judge", "geodesics", "manifolds"}
-"""Parameters that the rows of a cell hang on."""
-
-
-@cache
-def _inputs(layout: Layout, stage: str) -> str:
-    """Digests of what a cell's rows hang on beside parameters."""
-    code = layout.root / "data" / "code" / f"{stage}.txt"
-    parts = [code.read_text() if code.is_file() else "", machine(), data_digest(layout.planner)]
-    return " ".join(map(str, [*parts, code_digest()]))
-
-
 @dataclass(frozen=True)
 class Cell:
     """One task, shown in one way, with one seed; picklable."""
@@ -111,7 +92,6 @@ class Cell:
     task: str
     case: Case
     seed: int
-    stage: str
 
     @property
     def settings(self) -> DemonstrationsParams:
@@ -132,21 +112,11 @@ class Cell:
         """Its demonstrations."""
         return self.case.drawn(self.hidden, scene, 100 * self.seed)
 
-    @property
-    def folder(self) -> Path:
-        """Where its rows are until all cells are measured, those of these settings, this code,
-        planner and machine alone.
-        """
-        name = f"{self.task}-{self.case.name}-{self.seed}".replace(" ", "-").replace(",", "")
-        told = self.params.model_dump_json(include=MEASURED_WITH) + _inputs(self.layout, self.stage)
-        key = sha256(told.encode()).hexdigest()[:12]
-        return self.layout.scratch(self.stage, name) / key
 
-
-def cells_of(params: Params, layout: Layout, stage: str) -> list[Cell]:
+def cells_of(params: Params, layout: Layout) -> list[Cell]:
     """All of them."""
     return [
-        Cell(params, layout, task, case, seed, stage)
+        Cell(params, layout, task, case, seed)
         for task in params.demonstrations.tasks
         for case in cases_of(task)
         for seed in params.demonstrations.seeds
@@ -154,21 +124,8 @@ def cells_of(params: Params, layout: Layout, stage: str) -> list[Cell]:
 
 
 def measure(cell: Cell) -> list[Columns]:
-    """Rows of one cell, of what has no training; those of an earlier run that was interrupted are
-    taken as they are.
-    """
-    return kept_rows(cell, "rows", _rows)
-
-
-def kept_rows(cell: Cell, name: str, rows_of: Callable[[Cell], Iterator[Columns]]) -> list[Columns]:
-    """Rows of one cell, written down under a name until all cells are measured."""
-    file = cell.folder / f"{name}.json"
-    found: list[Columns] | None = kept_json(file)
-    if found is not None:
-        return found
-    rows = list(rows_of(cell))
-    write_text(file, json.dumps(rows))
-    return rows
+    """Rows of one cell, of what has no training."""
+    return list(_rows(cell))
 
 
 def _rows(cell: Cell) -> Iterator[Columns]:
@@ -460,7 +417,7 @@ def example(params: Params, layout: Layout) -> Example:
     to.
     """
     name, case, scene = "wavy surface", OF_SURFACES[-1], Scene.from_params(params)
-    cell = Cell(params, layout, name, case, params.demonstrations.seeds[0], "")
+    cell = Cell(params, layout, name, case, params.demonstrations.seeds[0])
     task, shown = cell.hidden, cell.shown(scene)
     found = identify(shown, scene.robot)
     constraint = found.constraint

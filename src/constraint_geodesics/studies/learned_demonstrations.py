@@ -3,10 +3,10 @@ network, a residual network, and the paper's VAE with geodesics by descent and b
 by the hidden formula.
 """
 
-import shutil
 import time
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 from constraint_geodesics.params import GeodesicParams, ManifoldParams
 from constraint_geodesics.planner import Planner
@@ -23,39 +23,53 @@ from constraint_geodesics.studies.demonstrations import (
     Columns,
     asked_all,
     flat_rows,
-    kept_rows,
     pairs_of,
 )
 from constraint_geodesics.studies.row_latents import RowLatents
 from constraint_geodesics.studies.row_networks import RowNetwork, level_set, residual
 
-
-def measure(cell: Cell) -> list[Columns]:
-    """Rows of one cell; those of an earlier run that was interrupted are taken as they are."""
-    groups = {"networks": _networks, "latents": _latents}
-    return [
-        row
-        for name, trained in groups.items()
-        for row in kept_rows(cell, name, partial(_rows, trained))
-    ]
-
-
 Trained = Iterator[tuple[str, Answering, float]]
 """Methods, each trained on a cell's demonstrations, and the seconds that it took."""
 
 
-def _rows(trained: Callable[[Cell, Scene], Trained], cell: Cell) -> Iterator[Columns]:
+@dataclass(frozen=True)
+class Training:
+    """What is trained together on one cell's demonstrations; picklable.  scratch: a folder for its
+    checkpoints.
+    """
+
+    cell: Cell
+    trained: Callable[[Cell, Scene, Path], Trained]
+    scratch: Path
+
+
+def trainings_of(cells: Sequence[Cell], scratch: Path) -> list[Training]:
+    """All of them."""
+    return [
+        Training(cell, trained, scratch / f"{number}-{trained.__name__}")
+        for number, cell in enumerate(cells)
+        for trained in (_networks, _latents)
+    ]
+
+
+def measure(training: Training) -> list[Columns]:
+    """Rows of what is trained together."""
+    return list(_rows(training))
+
+
+def _rows(training: Training) -> Iterator[Columns]:
+    cell = training.cell
     scene = Scene.from_params(cell.params)
     with Planner.load(cell.layout.planner) as planner:
         pairs = pairs_of(cell, planner, cell.settings.peer_pairs)
-    for method, answer, seconds in trained(cell, scene):
+    for method, answer, seconds in training.trained(cell, scene, training.scratch):
         if pairs:
             answer(*pairs[0][:2])  # what is loaded late is no query's
         for row in asked_all(cell, scene.robot, method, answer, pairs):
             yield row | {"trained_s": seconds}
 
 
-def _networks(cell: Cell, scene: Scene) -> Trained:
+def _networks(cell: Cell, scene: Scene, _: Path) -> Trained:
     own, codim = cell.settings.learned, cell.hidden.manifold(scene.robot).codim
     # they hold something or nothing, and no tolerance
     if not codim or cell.seed not in cell.settings.seeds[:NETWORK_SEEDS]:
@@ -68,8 +82,8 @@ def _networks(cell: Cell, scene: Scene) -> Trained:
         yield name, network.answer, time.perf_counter() - began
 
 
-def _latents(cell: Cell, scene: Scene) -> Trained:
-    robot, scratch = scene.robot, cell.folder / "training"
+def _latents(cell: Cell, scene: Scene, scratch: Path) -> Trained:
+    robot = scene.robot
     rows, _ = flat_rows(cell.shown(scene))
     began = time.perf_counter()
     dim = robot.dof - cell.hidden.manifold(robot).codim
@@ -80,7 +94,6 @@ def _latents(cell: Cell, scene: Scene) -> Trained:
     began = time.perf_counter()
     by_policy = latents.by_policy(_policy(cell), cell.seed)
     yield POLICY, by_policy, seconds + time.perf_counter() - began
-    shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _vae(cell: Cell, rows: int, dim: int) -> ManifoldParams:

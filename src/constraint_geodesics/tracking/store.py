@@ -18,7 +18,6 @@ import os
 import re
 import shutil
 import socket
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -31,6 +30,7 @@ from urllib.parse import urlsplit
 from filelock import FileLock
 from pydantic import BaseModel
 
+from constraint_geodesics.pipeline.machine import git_says
 from constraint_geodesics.tracking import views
 
 if TYPE_CHECKING:
@@ -439,26 +439,17 @@ def source_tags(root: Path) -> dict[str, str]:
     """
     known = {"dvc_stage": "DVC_STAGE", "dvc_experiment": "DVC_EXP_NAME"}
     tags = {tag: os.environ[name] for tag, name in known.items() if os.environ.get(name)}
-    commit = _git(root, "rev-parse", "HEAD")
+    commit = git_says(root, "rev-parse", "HEAD")
     if commit:
         # what a pipeline itself writes while it runs makes no commit dirty
         written = (":!dvc.lock", ":!*/dvc.lock", ":!reports", ":!.geodesics")
-        changed = _git(root, "status", "--porcelain", "--", ".", *written)
+        changed = git_says(root, "status", "--porcelain", "--", ".", *written)
         tags |= {
             "git_commit": commit,
             "mlflow.source.git.commit": commit,
             "git_dirty": str(bool(changed)).lower(),
         }
     return tags
-
-
-def _git(root: Path, *arguments: str) -> str:
-    command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
-    try:
-        result = subprocess.run(command, capture_output=True, text=True, check=False)
-    except OSError:
-        return ""
-    return result.stdout.strip() if result.returncode == 0 else ""
 
 
 def flat(values: Mapping[str, Any], joint: str) -> dict[str, Any]:
