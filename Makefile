@@ -85,12 +85,13 @@ bench-geometry: env  ## time the geometry core again, after whatever it needs; w
 # what hangs outside Python hears no other limit: it is ended after longer than any test's own, and named
 TESTS := python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder \
 	-o faulthandler_timeout=2100 -o faulthandler_exit_on_timeout=true
-EXPERIMENTS := benchmark end_to_end faults/test_kills.py geodesics geometry identification laws learning peers pipeline report studies tracking
+EXPERIMENTS := benchmark end_to_end geodesics geometry identification installation laws learning peers pipeline report studies tracking \
+	$(addprefix faults/test_, kills.py load.py no_network.py random_requests.py)
 
-test: env  ## run the tests of what people call: planner, shell, robots, scenes, goals, constraints, certificate, pages (minutes)
+test: env  ## run the tests of what people call: planner, shell, robots, scenes, goals, constraints, certificate, pages (5 minutes)
 	$(TESTS) $(EXPERIMENTS:%=--ignore tests/%)
 
-test-experiments: env  ## run all others: learning, laws of geometry, tracking, reports, baselines, studies, a small pipeline, kills (half an hour)
+test-experiments: env  ## run all others: learning, laws, tracking, reports, baselines, studies, installing, a small pipeline, kills (under an hour)
 	$(TESTS) $(EXPERIMENTS:%=tests/%)
 
 .venv/servers: tests/faults/requirements.lock .venv/installed

@@ -80,7 +80,7 @@ COVERED: dict[str, str | tuple[str, str]] = {
     "dvc pull": (EXPERIMENT, '"dvc", "pull"'),
     "dask": ("tests/pipeline/cluster.py", '"-m", "dask"'),
     "curl": (REGISTRY, "curl"),
-    "source": ("tests/test_doctor.py", "source .venv/bin/activate"),
+    "source": ("tests/installation/test_doctor.py", "source .venv/bin/activate"),
 }
 """Where each kind of command runs: here, or in the file that is named, by what is called there."""
 ELLIPSIS = {

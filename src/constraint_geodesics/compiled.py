@@ -11,5 +11,5 @@ COMPILE = {
 LEAF = COMPILE | {"_nrt": False}
 """All others: numba counts no references to the arrays that they are given, which in a short
 function takes longer than its arithmetic.  Numba refuses one that allocates; one that calls what
-returns an array would lose its memory (tests/test_kernels.py).
+returns an array would lose its memory (tests/installation/test_kernels.py).
 """

@@ -7,9 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.planner_fixtures import pairs_of
+
 from constraint_geodesics import bundle
 from constraint_geodesics.extras import EXTRAS
-from tests.planner_fixtures import pairs_of
 
 ONLY_IN_EXTRAS = sorted({*EXTRAS["bench"], "yaml", "click", "networkx"} - {"packaging"})
 """What comes with the extras' packages too; Matplotlib needs packaging."""

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.test_cli_plan import error_line
 
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import Constraint
 from constraint_geodesics.robot.kinematics import load_robot
 from constraint_geodesics.scene.box import Box
 from constraint_geodesics.scene.scene import Scene
-from tests.test_cli_plan import error_line
 
-ROBOT = Path(__file__).resolve().parent / "robots" / "six_axis.urdf"
+ROBOT = Path(__file__).resolve().parents[1] / "robots" / "six_axis.urdf"
 POST = Box("post", (0.45, 0.0, 0.4), (0.06, 0.06, 0.8))
 START, GOAL = [-0.9, 0.7, 0.6, 0.2, 0.3, 0.0], [0.8, 0.7, 0.6, 0.2, 0.3, 0.0]
 BLOCKED = """

@@ -24,6 +24,7 @@ import rerun as rr
 import yaml
 from mlflow import MlflowClient
 from mlflow.exceptions import MlflowException
+from tests.test_cli_plan import said_aloud, strict
 
 from constraint_geodesics import bundle
 from constraint_geodesics.doctor import (
@@ -41,9 +42,8 @@ from constraint_geodesics.doctor import (
 )
 from constraint_geodesics.robot.kinematics import RobotError
 from constraint_geodesics.scene.urdf import data_path, find_urdf
-from tests.test_cli_plan import said_aloud, strict
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = Path(bundle.__file__).parent
 SOURCES = PACKAGE.parent
 ENVIRON = {n: v for n, v in os.environ.items() if not n.startswith(("MLFLOW_", "DVC_", "GIT_"))}

@@ -20,9 +20,9 @@ from constraint_geodesics.scene.shape import Placement
 from constraint_geodesics.scene.sphere import Sphere
 from constraint_geodesics.trajectory import Trajectory
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 CUP = Cylinder("cup", Placement((0.0, 0.0, 0.075), (-1.5708, 0.0, 0.0)), 0.1, 0.037)
-SAY = "from tests.test_determinism import say; say()"
+SAY = "from tests.laws.test_determinism import say; say()"
 
 
 def say() -> None:

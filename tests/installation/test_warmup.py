@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.planner_fixtures import packaged_planner, pairs_of
+from tests.test_cli_plan import called, strict
 
 from constraint_geodesics import warmup
 from constraint_geodesics.constraints.functions import FunctionsConstraint, RowBound
 from constraint_geodesics.kernel_digest import PACKAGE
 from constraint_geodesics.kernel_jobs import JOBS
 from constraint_geodesics.robot.kernels import forward_batch
-from tests.planner_fixtures import packaged_planner, pairs_of
-from tests.test_cli_plan import called, strict
 
 FEATURES = """
 import json

@@ -14,7 +14,7 @@ import pytest
 from constraint_geodesics.bundle import PACKAGED
 from constraint_geodesics.extras import EXTRAS
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 LACKING = """
 import sys
 for module in {modules!r}:
