@@ -188,6 +188,6 @@ replay: .venv/planning  ## replay a path in Rerun: make replay FILE=data/recordi
 	geodesics replay $(FILE)
 
 clean:  ## remove unfinished work and what sweeps remember, not results
-	@test ! -e .geodesics/runs || geodesics recover  # what MLflow has not got yet lies there, and stays
-	find .geodesics -mindepth 1 -maxdepth 1 ! -name runs -exec rm -rf {} + 2>/dev/null || true
+	@test ! -e .geodesics || geodesics recover  # what MLflow has not got yet lies in runs, and stays
+	find .geodesics -mindepth 1 -maxdepth 1 ! -name runs ! -name bench -exec rm -rf {} + 2>/dev/null || true
 	@rmdir .geodesics/runs .geodesics 2>/dev/null || true

@@ -29,10 +29,7 @@ class Recordable:
 
 def main(params: Params, layout: Layout) -> None:
     """Write data/recordings/<stage>/ of train_geodesics, benchmark_planners and execute_paths."""
-    searched, shown = params.geodesics, params.geodesics.illustrated_constraints
-    pairs = [(m, c) for m in searched.searched for c in params.constraints]
-    pairs += [(m, c) for m in searched.illustrated for c in shown]
-    tables = [Recordable(params, layout, constraint, manifold) for manifold, constraint in pairs]
+    tables = [Recordable(params, layout, c, manifold) for manifold, c in params.searched_items]
     tables += [Recordable(params, layout, constraint) for constraint in params.constraints]
     own = ("manifolds", "submanifolds", "geodesics", "benchmark", "executions")
     read = [layout.root / "data" / name for name in own]

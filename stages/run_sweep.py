@@ -60,8 +60,7 @@ def main(space: Path) -> None:
     sweep = Sweep(configurations, layout, finished)
     run_sweep(sweep)
     ranked = write_ranking(configurations, layout)
-    if recorded:
-        tell_ranks(sweep, ranked)
+    tell_ranks(sweep, ranked)
     if failed:
         raise ExperimentError(f"{len(failed)} experiments are not recorded, the first: {failed[0]}")
 

@@ -280,6 +280,7 @@ def bench(
     from constraint_geodesics.benchmark.row import write_table
     from constraint_geodesics.benchmark.statistics import all_constraints, benchmark_summary
     from constraint_geodesics.params import load_params
+    from constraint_geodesics.peers.baseline import BaselineError
     from constraint_geodesics.peers.registry import all_settings
     from constraint_geodesics.pipeline.machine import run_header
     from constraint_geodesics.report.benchmark_tables import asks_in_python, overview_markdown
@@ -287,11 +288,14 @@ def bench(
     params, layout = load_params(), Layout()
     some, left_out = fewer(params, queries, seeds, constraint, planner, longest)
     table = answered(committed_run(some, layout, out / "rows", out / "recordings"))
+    if table.empty:
+        raise BaselineError("none of these planners is asked for any of these queries")
     write_table(table, out / "benchmark.csv", run_header(layout.root))
     order = {name: k for k, name in enumerate(some.benchmark.planners)}
     table = table.sort_values("planner", key=lambda names: names.map(order), kind="stable")
-    summary = benchmark_summary(all_constraints(table), next(iter(some.benchmark.planners)))
-    text = overview_markdown(summary, asks_in_python(all_settings(some)))
+    first = next(iter(some.benchmark.planners))
+    summary = benchmark_summary(all_constraints(table), first)
+    text = overview_markdown(summary, asks_in_python(all_settings(some)), first)
     write_text(out / "overview.md", text)
     rows = out / "benchmark.csv"
     if as_json:
@@ -324,11 +328,13 @@ def show_results(
         print(json.dumps({"rows": _records(pd.read_csv(table, float_precision="round_trip"))}))
         return
     print(table.read_text().rstrip())
+    from constraint_geodesics.recording.catalogue import catalogue, unread
+
     print("\nOpen the runs in MLflow:    make ui")
     if experiments:
         print("Compare them in DVC:        dvc exp show --only-changed")
         return
-    recordings = _recordings(Path())
+    recordings = catalogue(Path(), unread)
     if recordings:
         print(f"Replay a path in Rerun:     make replay FILE={recordings[0].file}")
     print("Read the report offline:    reports/index.html")
@@ -362,6 +368,9 @@ def replay(
     from constraint_geodesics.recording.catalogue import Filter
 
     wanted = Filter(constraint, scene, query, tuple(planner or ()), tuple(seed or ()), manifold)
+    if save is not None and (as_json or not (recordings or wanted.one_problem)):
+        line = "--save: name the recordings, or a query with --constraint, --query and --planner"
+        raise SystemExit(complain(ValueError(line), WRONG_USAGE))
     files = _files(recordings or [], wanted, as_json)
     if not files:
         return
@@ -389,18 +398,11 @@ def _files(words: Sequence[str], wanted: "Filter", as_json: bool) -> list[Path]:
     return _named(words) if words else _chosen(_listed(wanted), wanted)
 
 
-def _recordings(root: Path) -> "list[Listed]":
-    """All recordings of a checkout, learned paths that keep a cup level first."""
-    from constraint_geodesics.recording.catalogue import catalogue, read_entry
-
-    return catalogue(root, read_entry)
-
-
 def _listed(wanted: "Filter") -> "list[Listed]":
     """The recordings of this checkout that are as asked for."""
-    from constraint_geodesics.recording.catalogue import narrowed
+    from constraint_geodesics.recording.catalogue import catalogue, narrowed, read_entry
 
-    entries = _recordings(Path())
+    entries = catalogue(Path(), read_entry)
     if not entries:
         none = "data/recordings: no recordings yet"
         raise FileNotFoundError(f"{none}; run `make plan` for one, or `make repro` for all")

@@ -39,8 +39,8 @@ def identify_constraint(
     loosely: Annotated[
         float,
         typer.Option(
-            help="By how much each relation is looser, in multiples of what it is missed by on "
-            "left-out demonstrations; 0 holds it exactly, a bound as it was found."
+            help="Widen each relation by so many times its error on left-out demonstrations; 0 "
+            "holds it exactly."
         ),
     ] = 0.0,
     where_shown: Annotated[
@@ -53,8 +53,8 @@ def identify_constraint(
         bool,
         typer.Option(
             "--rounded",
-            help="Take the axes and round numbers that the demonstrations are as near to, where "
-            "there are some.",
+            help="Take axes and round numbers in place of the fitted ones, where the "
+            "demonstrations are as near to them.",
         ),
     ] = False,
     record: Annotated[
@@ -81,7 +81,7 @@ def identify_constraint(
         DemonstrationError,
         demonstrations_from,
     )
-    from constraint_geodesics.identification.files import save_constraint
+    from constraint_geodesics.identification.files import SUFFIXES, save_constraint
     from constraint_geodesics.identification.identify import identify
     from constraint_geodesics.planner import PlannerError
     from constraint_geodesics.robot.kinematics import RobotError
@@ -90,6 +90,8 @@ def identify_constraint(
         require("record")
     try:
         require_apart({"--out": out, "--record": record}, [("the demonstrations", demonstrations)])
+        if out is not None and out.suffix not in SUFFIXES:
+            raise PlannerError(f"--out {out}: the name must end in {' or '.join(SUFFIXES)}")
         if where_shown and out is None:
             raise PlannerError("--where-shown is of the file that --out names: give it, too")
         if not 0.0 <= loosely < math.inf:
@@ -100,8 +102,9 @@ def identify_constraint(
             robot, workcell = loaded.robot, loaded.scene.workcell
             shown, motions = demonstrations_from(demonstrations, robot)
             found = identify(shown if motions else np.concatenate(shown), robot)
-        if rounded:
-            found = found.rounded or found
+        if rounded and found.rounded is None:
+            print("note: no rounder numbers fit: --rounded changes nothing", file=sys.stderr)
+        found = (rounded and found.rounded) or found
         if loosely > 0.0:
             found = found.held_loosely(loosely)
         if out is not None and found.constraint is not None:

@@ -318,7 +318,10 @@ def plan(
         raise SystemExit(complain(error, WRONG_USAGE)) from None
     print(f"planner: {source}", file=sys.stderr)
     about: dict[str, Any] = path.summary()
-    if path.status == "solved":
+    if path.status == "solved" and trajectory:
+        about["trajectory"] = path.to_joint_trajectory()
+    print(json.dumps(about) if as_json or trajectory else _told(path), flush=True)
+    if path.status == "solved":  # the answer is out, should one of these fail
         with waiting("writing"):
             if out is not None:
                 path.save(out)
@@ -326,9 +329,6 @@ def plan(
                 path.record(record, demonstrations=shown)
             if picture is not None:
                 path.draw(picture)
-        if trajectory:
-            about["trajectory"] = path.to_joint_trajectory()
-    print(json.dumps(about) if as_json or trajectory else _told(path))
     raise SystemExit(0 if path.status == "solved" else NO_PATH)
 
 
@@ -487,6 +487,7 @@ def check(
         else ""
     )
     meant = constraint or f"the constraint that {file.name} names"
+    meant = "" if held is None or held.is_free else meant
     for one in told:
         print(f"note: {one.message}: give --scene and --attach", file=sys.stderr)
     if as_json:

@@ -631,10 +631,11 @@ def _of_runs(root: Path) -> Iterator[Answer]:
     if left:
         names = _few(list(dict.fromkeys(run.name for run in left)))
         unsent = sum(run.unsent for run in left)
-        message = f"{len(left)} stages were killed, whose runs stay RUNNING in MLflow: {names}"
+        count = f"{len(left)} stage{'s were' if len(left) > 1 else ' was'}"
+        message = f"{count} killed, and runs stay RUNNING in MLflow: {names}"
         if unsent:
             message += f"; MLflow did not take {unsent} things that they told it"
-        yield _note(f"{message} (the next stage mends it too)", "geodesics recover")
+        yield _note(message, "geodesics recover, which names those of another store")
 
 
 def _wrong_address(uri: str, files_allowed: bool) -> str:
@@ -787,8 +788,10 @@ def _of_lacking(
 ) -> Answer:
     outputs = f"outputs of {_stages(own)}"
     if all(absent[path] == "deleted" for path in paths):
-        kept = any(path.startswith("reports/") for path in paths)
-        mend = "dvc checkout && git checkout -- reports" if kept else "dvc checkout"
+        kept = [path for path in paths if path.startswith("reports/")]
+        mend = "dvc checkout"
+        if kept:  # these alone: others may have changed since their commit
+            mend += f" && git checkout -- {' '.join(kept)}"
         return _note(f"{outputs} were deleted, and can be fetched back", mend)
     mend = f"dvc repro {file}" if file else "make repro"
     return _note(f"{outputs} are not here, as in a fresh clone; planning works without", mend)

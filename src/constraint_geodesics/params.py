@@ -733,6 +733,14 @@ class Params(_Record):
         return self.geodesics.model_copy(update={n: getattr(self.policies, n) for n in shared})
 
     @property
+    def searched_items(self) -> list[tuple[str, str]]:
+        """The pairs (manifold, constraint) whose geodesics are searched."""
+        own = self.geodesics
+        pairs = [(m, c) for m in own.searched for c in self.constraints]
+        pairs += [(m, c) for m in own.illustrated for c in own.illustrated_constraints]
+        return list(dict.fromkeys(pairs))
+
+    @property
     def all_constraints(self) -> dict[str, ConstraintParams]:
         """Those of the pipeline, then those that it has not seen."""
         return {**self.constraints, **self.unseen}

@@ -391,7 +391,11 @@ def test_from_a_csv_to_a_path_by_the_shell(xarm, tmp_path, capsys) -> None:
     entities = read_recording(tmp_path / "path.rrd").entity_paths
     assert {"/demonstrations", "/identified", "/tool/trace"} <= set(entities)
     assert run.invoke(app, [*ask, *drawn_beside[2:]]).exit_code == 2, "drawn in no recording"
-    assert run.invoke(app, ["identify", str(csv), "--rounded"]).exit_code == 0
+    rounded = run.invoke(app, ["identify", str(csv), "--rounded"])
+    assert rounded.exit_code == 0
+    assert "no rounder numbers fit" in rounded.stderr
+    wrong = run.invoke(app, ["identify", str(csv), "--out", str(tmp_path / "cup.txt")])
+    assert wrong.exit_code == 2
     np.savetxt(csv, xarm.sample(300, np.random.default_rng(0)), delimiter=",")
     assert run.invoke(app, ["identify", str(csv)]).exit_code == 3
     missing = run.invoke(app, ["identify", str(tmp_path / "none.csv")])

@@ -693,6 +693,7 @@ def test_outputs_that_the_cache_has_are_checked_out(ran) -> None:
     found = only(look("pipeline", ran), "note")
     assert found.message == "outputs of 1 stage were deleted, and can be fetched back"
     first, second = found.mend.split(" && ")
+    assert second == "git checkout -- reports/shown.md", "no other report is reverted"
     dvc(ran, *first.split()[1:])
     assert run(*second.split(), folder=ran).returncode == 0
     assert only(look("pipeline", ran), "ok")

@@ -23,6 +23,18 @@ from constraint_geodesics import cli
 sys.argv = ["geodesics", *{words!r}]
 cli.main()
 """
+REFUSED = """
+import sys
+class Refusing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {modules!r}:
+            raise ModuleNotFoundError(f"No module named {{name}}")
+sys.meta_path.insert(0, Refusing())
+from constraint_geodesics import cli
+sys.argv = ["geodesics", *{words!r}]
+cli.main()
+"""
+"""As where they are not installed: a module that is None is there for SciPy, which looks."""
 ENDS = (
     "--start=0 0 -1 0 0 0",
     "--goal=0 0 -1.5 0 0 0",
@@ -65,6 +77,17 @@ def test_an_extra_s_modules_are_those_of_its_packages(extra) -> None:
     bringing = [{name.lower().replace("_", "-") for name in of[m]} for m in EXTRAS[extra]]
     assert all(names & brought(extra) for names in bringing)
     assert brought(extra) - WITHOUT_CODE <= set().union(*bringing)
+
+
+def test_the_demo_needs_what_it_names_alone(tmp_path) -> None:
+    """And no library of the pipeline; packaging is matplotlib's, too."""
+    others = sorted({*EXTRAS["bench"]} - {*EXTRAS["record"], "packaging"})
+    program = REFUSED.format(modules=others, words=("demo", "--out=d.rrd", ENDS[-1]))
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "d.rrd").stat().st_size
 
 
 @pytest.mark.parametrize(("words", "extra"), COMMANDS.items(), ids=lambda one: one[0])

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from constraint_geodesics.params import ComputeParams, load_params
+from constraint_geodesics.pipeline import code
 from constraint_geodesics.pipeline.compute import ComputeError
 from constraint_geodesics.pipeline.kept import Rows, kept_folder, kept_map
 from constraint_geodesics.pipeline.layout import Layout
@@ -36,13 +37,21 @@ def test_what_is_done_is_not_done_again_and_comes_out_the_same(tmp_path) -> None
     assert repr(kept_map(rows_of, items, tmp_path / "kept", ONE, description="")) == repr(found)
 
 
-def test_rows_of_other_parameters_or_data_lie_elsewhere(tmp_path) -> None:
+def test_rows_of_other_parameters_data_or_code_lie_elsewhere(tmp_path) -> None:
     layout, params = Layout(tmp_path), load_params(ROOT / "params.yaml")
-    (tmp_path / "data").mkdir()
+    for name in ("data", "stages"):
+        (tmp_path / name).mkdir()
+    script = tmp_path / "stages" / "study.py"
+    script.write_text("from constraint_geodesics import palette\n")
     folder = kept_folder(params, layout, "study", tmp_path / "data")
     assert folder == kept_folder(params, layout, "study", tmp_path / "data")
     changed = load_params(ROOT / "params.yaml", {"judge.spacing_rad": 0.03})
     others = {kept_folder(changed, layout, "study", tmp_path / "data")}
     (tmp_path / "data" / "rows.csv").write_text("1")
     others.add(kept_folder(params, layout, "study", tmp_path / "data"))
-    assert len({folder, *others}) == 3
+    script.write_text("from constraint_geodesics import palette, xml_files\n")
+    code._imported.cache_clear()
+    code._tree.cache_clear()
+    code.digest.cache_clear()
+    others.add(kept_folder(params, layout, "study", tmp_path / "data"))
+    assert len({folder, *others}) == 4

@@ -247,6 +247,8 @@ def test_the_command_prints_the_list_and_its_json(checkout, geodesics) -> None:
         (["--planner", "magic"], 2, "no recording of planner magic"),
         (["1", "--planner", "birrt"], 2, "choose from the list: give no file"),
         (["1", "--json"], 2, "--json prints the list"),
+        (["--save", "out.rrd"], 2, "--save: name the recordings, or a query with"),
+        (["--json", "--save", "out.rrd"], 2, "--save: name the recordings, or a query with"),
         (["1", "--save", "out.rrd"], 1, "query0-learned_geodesic-seed0.rrd: not a recording"),
     ],
 )

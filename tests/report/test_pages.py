@@ -53,7 +53,6 @@ from constraint_geodesics.report.results import (
     findings,
     read_paths,
     result_table,
-    searched_items,
 )
 from constraint_geodesics.scene.scene import Scene
 
@@ -287,7 +286,7 @@ def run(tmp_path_factory):
                 save_submanifold(found, layout.submanifold(name, constraint))
                 figures = submanifold_figures(found, surface, free, own, params.submanifold)
                 write_json(layout.report("extract_submanifold", f"{name}-{constraint}"), figures)
-    for manifold, constraint in searched_items(params):
+    for manifold, constraint in params.searched_items:
         item, own = f"{manifold}-{constraint}", read_joints(layout.joints(constraint)).free_joints
         write_csv(
             layout.report("train_geodesics", item, "csv"), searched_rows(manifold, constraint)
@@ -364,7 +363,7 @@ def test_the_page_opens_with_the_planner_and_the_pipelines_findings_come_later(r
     assert about["commit"][:12] in page
     places = [page.index(f'id="{name}"') for name in ("learning", "published", "findings")]
     assert page.index('class="lead"') < places[0] < places[1] < places[2]
-    assert places[2] < page.index("The judge accepts")
+    assert places[2] < page.index("The learned search finds")
     added = learning(*run)
     assert html.escape(added.adds[0]).replace("&#x27;", "&#39;") in page
     assert len(checked.tables[added.table.title]) - 1 == len(added.table.rows) == 8
@@ -737,7 +736,7 @@ def test_the_page_has_the_tables_of_arms_and_goals(run, page):
 def test_only_what_params_ask_for_was_searched():
     params = small_params()
     geodesics = params.geodesics.model_copy(update={"illustrated": (), "analytic": ()})
-    assert searched_items(params.model_copy(update={"geodesics": geodesics})) == [
+    assert params.model_copy(update={"geodesics": geodesics}).searched_items == [
         ("planner", c) for c in CONSTRAINTS
     ]
 

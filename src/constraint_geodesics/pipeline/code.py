@@ -67,6 +67,12 @@ def _of_defaults() -> str:
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
 
 
+def code_lines(script: Path) -> str:
+    """What `code_of` finds of a script, a line a file, so that two of them can be compared."""
+    package = Path(__file__).parents[1]
+    return "".join(f"{own}  {name}\n" for name, own in code_of(script, package).items())
+
+
 @cache
 def code_digest(*modules: str) -> str:
     """Of these modules of the package and of all that their results hang on, with the libraries

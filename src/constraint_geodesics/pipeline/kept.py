@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from constraint_geodesics.params import ComputeParams, Params
-from constraint_geodesics.pipeline.code import code_digest, data_digest
+from constraint_geodesics.pipeline.code import code_digest, code_lines, data_digest, digest
 from constraint_geodesics.pipeline.compute import as_finished
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import machine
@@ -21,9 +21,9 @@ def kept_folder(params: Params, layout: Layout, stage: str, *data: Path) -> Path
     """Where rows of a stage are until all are there: those of these parameters, this code, machine
     and data alone.  data: folders that it reads.
     """
-    code = layout.root / "data" / "code" / f"{stage}.txt"
-    written = code.read_text() if code.is_file() else code_digest()
-    told = [params.model_dump_json(), written, data_digest(*data), *machine().values()]
+    script = layout.root / "stages" / f"{stage}.py"
+    code = digest(script), code_lines(script), code_digest()
+    told = [params.model_dump_json(), *code, data_digest(*data), *machine().values()]
     return layout.scratch(stage, sha256(" ".join(told).encode()).hexdigest()[:12])
 
 

@@ -100,16 +100,25 @@ def catalogue(root: Path, read: Read) -> list[Listed]:
     return [replace(entry, number=k) for k, entry in enumerate(named + own, 1)]
 
 
+def unread(file: Path, why: str = "(not read)") -> Listed:
+    """A recording of which nothing is known."""
+    return Listed(0, "", "", why, None, None, None, None, file.as_posix())
+
+
 def read_entry(file: Path) -> Listed:
-    """What a recording says of itself; one that is not of one path says so as its planner."""
+    """What a recording says of itself; one that is not of one path says so as its planner, and so
+    does one that can't be read for want of Rerun.
+    """
     import numpy as np
 
-    from constraint_geodesics.recording.recording import RecordingError, read_recording
-
+    try:
+        from constraint_geodesics.recording.recording import RecordingError, read_recording
+    except ImportError:
+        return unread(file)
     try:
         summary = read_recording(file)
     except RecordingError:
-        return Listed(0, "", "", "(not one path)", None, None, None, None, file.as_posix())
+        return unread(file, "(not one path)")
     about, steps = summary.about, np.diff(summary.joints, axis=0)
     length = float(np.linalg.norm(steps, axis=1).sum())
     own = (about.constraint, about.scene, about.planner, about.query, about.seed)

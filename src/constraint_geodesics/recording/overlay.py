@@ -330,7 +330,9 @@ def _composed(parts: Sequence[_Part], in_space: Sequence[Chunk], *, apart: bool)
     ]
     own = [*_series_chunks(parts, series), *latent, *recording.text_chunks("\n\n".join(texts))]
     ids = " ".join([part.source.recording_id for part in parts] + [str(apart)])
-    name = f"{', '.join(part.label for part in parts)}: {parts[0].source.about.constraint}"
+    name = ", ".join(part.label for part in parts)
+    held = {part.source.about.constraint for part in parts}
+    name += f": {held.pop()}" if len(held) == 1 else ""
     return Composed(
         f"together-{hashlib.sha256(ids.encode()).hexdigest()[:12]}",
         name,

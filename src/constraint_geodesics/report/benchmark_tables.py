@@ -29,10 +29,11 @@ COLUMNS = (
 OVERVIEW = (
     *("planner", "queries × seeds", "solved [95 %]", "claimed, not valid"),
     "wrongly certified",
-    *("p95 of length / best known, failures ∞ [95 %]", "the planner's on these"),
-    *("IQM of solved [95 %]", "the planner's"),
-    *("time [ms]: median", "the planner's on these", "p95", "planner shorter"),
+    *("p95 of length / best known, failures ∞ [95 %]", "{}'s on these"),
+    *("IQM of solved [95 %]", "{}'s"),
+    *("time [ms]: median", "{}'s on these", "p95", "{} shorter"),
 )
+"""With the name of the planner that each is held against."""
 REPEAT = (
     *("planner", "rows", "same validity", "largest relative difference of a length"),
     *("median time [ms]", "second run [ms]", "second time over first, 95 % interval"),
@@ -114,10 +115,13 @@ def _case_row(row: Mapping[Any, Any]) -> tuple[str, ...]:
     )
 
 
-def overview_markdown(summary: pd.DataFrame, in_python: Collection[str] = ()) -> str:
+def overview_markdown(
+    summary: pd.DataFrame, in_python: Collection[str] = (), against: str = "planner"
+) -> str:
     """One block a scene with the queries of all constraints together, for README.
 
-    in_python: planners whose search asks for every state through Python.
+    in_python: planners whose search asks for every state through Python.  against: the one that
+    the summary holds each against.
     """
     parts = []
     for scene, case in summary.groupby("scene", sort=False):
@@ -126,13 +130,16 @@ def overview_markdown(summary: pd.DataFrame, in_python: Collection[str] = ()) ->
             f"Scene `{scene}`, all constraints: {queries} queries, of which any planner "
             f"solved {solvable}."
         )
-        parts.append(f"{head}\n\n{markdown_table(overview_cells(case, in_python))}")
+        parts.append(f"{head}\n\n{markdown_table(overview_cells(case, in_python, against))}")
     return "\n\n".join([*parts, *([PYTHON_NOTE] if in_python else [])]) + "\n"
 
 
-def overview_cells(case: pd.DataFrame, in_python: Collection[str] = ()) -> Cells:
+def overview_cells(
+    case: pd.DataFrame, in_python: Collection[str] = (), against: str = "planner"
+) -> Cells:
     """The planners in one scene, the queries of all constraints together."""
-    return [OVERVIEW, *(_overview_row(row, in_python) for row in case.to_dict("records"))]
+    head = tuple(word.format(against) for word in OVERVIEW)
+    return [head, *(_overview_row(row, in_python) for row in case.to_dict("records"))]
 
 
 def _overview_row(row: Mapping[Any, Any], in_python: Collection[str]) -> tuple[str, ...]:

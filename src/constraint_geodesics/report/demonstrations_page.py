@@ -84,14 +84,20 @@ def demonstrations_markdown(params: Params, layout: Layout) -> str:
         parts.append(f"{trained} {origin(networks['machine'])}.")
         parts.append(markdown_table(_peer_rows(found["cells"], shown)))
         parts.append(markdown_table(_training_rows(found["cells"])))
-    parts += [HOLES, markdown_table(_hole_rows(found["cells"]))]
+    parts += [_of_holes(found["cells"]), markdown_table(_hole_rows(found["cells"]))]
     return "\n\n".join(parts) + "\n"
 
 
-HOLES = (
-    "Where the examples have a hole, the learned metric's variance is the other way to keep out of "
-    "it. The formula and what is identified say nothing of it."
-)
+def _of_holes(cells: Figures) -> str:
+    said = (
+        "Where the examples have a hole, the formula and what is identified say nothing of it; the "
+        "variance in a learned metric was meant to keep paths out of it."
+    )
+    for *_, methods in _cells({"hole": cells.get("hole", {})}):
+        if {DESCENT, FLAT} <= set(methods):
+            deep = [fixed(methods[name]["depth_mm"], 1) for name in (DESCENT, FLAT)]
+            said += f" With it they go {deep[0]} mm deep, without it {deep[1]} mm."
+    return said
 
 
 def _cells(cells: Figures) -> Iterator[tuple[str, str, Figures]]:
@@ -126,6 +132,8 @@ def _sentences(found: Figures) -> Iterator[str]:
                 continue
             first = min(off, key=off.__getitem__)
             same = AS_NETWORKS if first in (LEVEL_SET, RESIDUAL) else COMPARED
+            if same not in methods and COMPARED in methods:
+                continue  # nobody asked for it: rows of another day
             best, mine = off[first], methods.get(same, {}).get(unit)
             if max(best, mine or 0.0) > 1e-6:
                 compared += 1

@@ -29,7 +29,6 @@ from constraint_geodesics.report.results import (
     metrics_of,
     read_metrics,
     read_paths,
-    searched_items,
     studies_at_hand,
 )
 from constraint_geodesics.studies.proposals import POLICY
@@ -75,7 +74,7 @@ def draw_figures(params: Params, layout: Layout, table: pd.DataFrame) -> list[Dr
         drawn.append(_draw_comparison(table, name))
         if learned[name].dim > 2:
             drawn.append(_draw_components(params, layout, name, data[name]))
-    if searched_items(params):
+    if params.searched_items:
         drawn.append(_draw_learning(params, layout))
     return drawn
 
@@ -318,7 +317,7 @@ def _draw_learning(params: Params, layout: Layout) -> Drawn:
     chart, own = params.policies.chart, dict[str, dict[str, pd.DataFrame]]()
     shared = pd.read_csv(layout.report("train_policies", f"{chart}-learning", "csv"))
     panels = {"all constraints": {chart: shared}}
-    for manifold, constraint in searched_items(params):
+    for manifold, constraint in params.searched_items:
         if not params.manifolds[manifold].retract:
             file = layout.report("train_geodesics", f"{manifold}-{constraint}-learning", "csv")
             own.setdefault(constraint, {})[manifold] = pd.read_csv(file)

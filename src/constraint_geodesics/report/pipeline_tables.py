@@ -19,7 +19,6 @@ from constraint_geodesics.report.results import (
     metrics_of,
     read_comparison,
     read_metrics,
-    searched_items,
     studies_at_hand,
     table_cells,
 )
@@ -30,7 +29,7 @@ PUBLISHED_AS = {"prm": "PRM", "rrt_star": "RRT* 10 s", "birrt": "BiRRT", LEARNED
 
 def published_table(params: Params, layout: Layout, table: pd.DataFrame, constraint: str) -> Table:
     """Table I of the paper and this run's; `×` is the average over the learned geodesic's."""
-    manifolds = [m for m, c in searched_items(params) if c == constraint]
+    manifolds = [m for m, c in params.searched_items if c == constraint]
     manifolds.sort(key=lambda name: params.manifolds[name].latent_dim)
     header = ["method", "shortest", "average ± std", "×", "time [s]"]
     groups = [("Table I of the paper", 4)]
@@ -131,7 +130,7 @@ def metric_tables(
     named: tuple[tuple[str, str, Mapping[str, Mapping[str, Any]]], ...] = (
         ("train_manifold", "Learned manifolds, on held-out configurations", manifolds),
         _metrics_of(layout, "extract_submanifold", "Sub-manifolds", extracted),
-        _metrics_of(layout, "train_geodesics", "Policy search", searched_items(params)),
+        _metrics_of(layout, "train_geodesics", "Policy search", params.searched_items),
         ("train_analytic", known, analytic),
     )
     tables = []

@@ -47,14 +47,6 @@ class ReportError(ValueError):
     """
 
 
-def searched_items(params: Params) -> list[tuple[str, str]]:
-    """The pairs (manifold, constraint) whose geodesics were searched."""
-    geodesics = params.geodesics
-    pairs = [(m, c) for m in geodesics.searched for c in params.constraints]
-    pairs += [(m, c) for m in geodesics.illustrated for c in geodesics.illustrated_constraints]
-    return list(dict.fromkeys(pairs))
-
-
 def compare_planners(params: Params, layout: Layout) -> pd.DataFrame:
     """One row a manifold, constraint and planner: the figures of `summarise`, sampled and learned
     paths side by side.
@@ -63,7 +55,7 @@ def compare_planners(params: Params, layout: Layout) -> pd.DataFrame:
     in the paper, of all paths found (column `counted`), since hardly any of those keeps the
     constraint.
     """
-    items = searched_items(params)
+    items = params.searched_items
     if not items:
         none = "geodesics.searched and geodesics.illustrated name no manifold"
         raise ReportError(f"{none}: there is nothing to compare")
@@ -280,9 +272,11 @@ def _found_on(
     shares = ", ".join(f"{name} {share:.0%}" for name, share in learned["success"].items())
     worst, median = (short(learned[f"violation_{which}_deg"].max()) for which in ("max", "median"))
     sentences = [
-        f"The judge accepts {_share(learned, 'success')} of the learned geodesics ({shares}).",
-        f"Under the same constraints it accepts {_share(straight, 'success')} of the straight "
-        f"lines of the chart, and of the sampling planners' answers: {others}.",
+        f"The learned search finds a valid path for {_share(learned, 'success')} of the queries "
+        f"({shares}).",
+        f"Under the same constraints the straight line of the chart is valid for "
+        f"{_share(straight, 'success')}, and the sampling planners find a valid path for so many: "
+        f"{others}.",
         f"The learned geodesics returned violate the constraint by {worst}° at worst; the median "
         f"path of the worst constraint by {median}°.",
         _shortest_under(rows),

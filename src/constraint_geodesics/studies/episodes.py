@@ -24,7 +24,6 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Float
 
-from constraint_geodesics.benchmark.dense_check import DENSE_RAD
 from constraint_geodesics.geometry.braking import State
 from constraint_geodesics.learning.lift import densify
 from constraint_geodesics.planner import Planner
@@ -48,6 +47,10 @@ SENSING_M = (0.2, 0.3, 0.45)
 """Sensing radii, by turns."""
 ANSWER_S = 0.5 * LATENCY_S
 """After which a replan begins no other path."""
+LOOKED_AT_RAD = 0.005
+"""Distance of the configurations at which PyBullet is asked, as everywhere; the benchmark's module
+that says so for all others brings libraries that the demo does without.
+"""
 SHORTEST_RAD = 1.0
 """Of the paths that obstacles are put on."""
 MOST, ON_THE_WAY = 3, 0.7
@@ -306,7 +309,10 @@ class _Simulation:
             return True
         rows = _between(path, from_s, at_s)[1]
         with self.known.world() as world:
-            return world.first_collision(densify(np.vstack([rows, stop.joints]), DENSE_RAD)) is None
+            return (
+                world.first_collision(densify(np.vstack([rows, stop.joints]), LOOKED_AT_RAD))
+                is None
+            )
 
 
 def stop_on(path: Trajectory, at_s: float) -> Trajectory | None:
@@ -375,7 +381,7 @@ class Report:
 
 def report(episode: Episode, happenings: Sequence[Happening]) -> Report:
     """What became of an episode, contacts judged by PyBullet in a world of its own with all
-    obstacles, known or not, every DENSE_RAD.
+    obstacles, known or not, every LOOKED_AT_RAD.
     """
     answers = [one for one in happenings if isinstance(one, Answered)]
     seen = [one for one in happenings if isinstance(one, Seen)]
@@ -412,8 +418,8 @@ def _contact(episode: Episode, legs: Sequence[Leg], over_s: float) -> Contact | 
 def _dense(
     times: Float[np.ndarray, "n"], rows: Float[np.ndarray, "n D"]
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m D"]]:
-    """The same motion at configurations at most DENSE_RAD apart."""
-    pieces = np.maximum(np.ceil(step_lengths(rows) / DENSE_RAD).astype(int), 1)
+    """The same motion at configurations at most LOOKED_AT_RAD apart."""
+    pieces = np.maximum(np.ceil(step_lengths(rows) / LOOKED_AT_RAD).astype(int), 1)
     at = [k + np.arange(n) / n for k, n in enumerate(pieces)]
     shares = np.append(np.concatenate(at), len(pieces))
     grid = np.arange(len(times))
@@ -507,4 +513,4 @@ def _is_fit(episode: Episode) -> bool:
             return False
         if not world.free(path.joints[[0, -1]]).all():
             return False
-        return world.first_collision(densify(path.joints, 10.0 * DENSE_RAD)) is not None
+        return world.first_collision(densify(path.joints, 10.0 * LOOKED_AT_RAD)) is not None
