@@ -9,6 +9,7 @@ from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.report.demonstrations_page import demonstrations_markdown
 from constraint_geodesics.report.results import studies_at_hand
 from constraint_geodesics.studies.demonstrations import (
+    AS_NETWORKS,
     COMPARED,
     DESCENT,
     FORMULA,
@@ -98,8 +99,13 @@ def test_what_is_learned_stands_beside_it_where_it_was_run(params, layout) -> No
     assert "0.03 / 0.04" in lines[0]
     assert "0.05 / 0.9" in lines[2]
     assert "7 / 0.9" in lines[2]
-    # a network is the best peer in degrees now: one comparison fewer is won, of as many
-    assert "whatever share of them that joins, in 0 of 4 comparisons" in text
+    # a network is the best peer in degrees now, and nobody asked the identified constraint for
+    # what networks are asked: one comparison fewer
+    assert "whatever share of them that joins, in 0 of 3 comparisons" in text
+    learned[AS_NETWORKS] = method(0.06, 0.9)
+    file.write_text(json.dumps({"cells": {"door": {"noisy": learned}}, "machine": RUN}))
+    lost = demonstrations_markdown(params, layout)
+    assert "whatever share of them that joins, in 0 of 4 comparisons" in lost
     (trained,) = (line for line in text.splitlines() if line.startswith(f"| {LEVEL_SET} "))
     assert "6" in trained
 

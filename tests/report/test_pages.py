@@ -563,12 +563,12 @@ def test_findings_come_from_the_tables(run):
     planner, paper, caution = told
     assert planner.about.startswith("planner: 6 latent dimensions, curves of joint space retracted")
     assert (
-        "accepts 100% of the learned geodesics (free 100%, level_cup 100%, slide 100%)"
+        "finds a valid path for 100% of the queries (free 100%, level_cup 100%, slide 100%)"
         in planner.sentences[0]
     )
     assert "BiRRT 100%" in planner.sentences[1]
     assert "RRT* 0%" in planner.sentences[1]
-    assert "accepts 0% of the learned geodesics (level_cup 0%)" in paper.sentences[0]
+    assert "finds a valid path for 0% of the queries (level_cup 0%)" in paper.sentences[0]
     assert "by 20° at worst" in paper.sentences[2]
     assert "233 mm" in paper.sentences[4]
     assert f"{QUERIES} queries a constraint and {len(SEEDS)} policies" in caution.sentences[0]
