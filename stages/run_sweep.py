@@ -35,7 +35,7 @@ def main(space: Path) -> None:
 
     Raises ExperimentError at the end if DVC did not take an experiment: the next call tries again.
     """
-    layout, failed, recorded = Layout(Path().resolve()), list[str](), list[str]()
+    layout, failed = Layout(Path().resolve()), list[str]()
     configurations = configurations_of(read_space(space), layout)
     known = experiment_names(layout.root)
     environment = {
@@ -53,7 +53,6 @@ def main(space: Path) -> None:
         try:
             clone.run(own.name, own.changes, TARGET)
             write_text(mark, seeds)
-            recorded.append(own.name)
         except ExperimentError as error:
             failed.append(str(error))
 

@@ -327,9 +327,9 @@ def show_results(
 
         print(json.dumps({"rows": _records(pd.read_csv(table, float_precision="round_trip"))}))
         return
-    print(table.read_text().rstrip())
     from constraint_geodesics.recording.catalogue import catalogue, unread
 
+    print(table.read_text().rstrip())
     print("\nOpen the runs in MLflow:    make ui")
     if experiments:
         print("Compare them in DVC:        dvc exp show --only-changed")
@@ -368,7 +368,8 @@ def replay(
     from constraint_geodesics.recording.catalogue import Filter
 
     wanted = Filter(constraint, scene, query, tuple(planner or ()), tuple(seed or ()), manifold)
-    if save is not None and (as_json or not (recordings or wanted.one_problem)):
+    chooses = recordings or wanted.one_problem or _is_asked()
+    if save is not None and (as_json or not chooses):
         line = "--save: name the recordings, or a query with --constraint, --query and --planner"
         raise SystemExit(complain(ValueError(line), WRONG_USAGE))
     files = _files(recordings or [], wanted, as_json)
@@ -435,7 +436,7 @@ def _chosen(listed: "list[Listed]", wanted: "Filter") -> list[Path]:
         print(f"opening recordings {names}{more}", file=sys.stderr)
         return [Path(entry.file) for entry in chosen]
     print(as_table(listed))
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+    if not _is_asked():
         print(f"\nOpen one with: geodesics replay {listed[0].number}")
         return []
     try:
@@ -443,6 +444,11 @@ def _chosen(listed: "list[Listed]", wanted: "Filter") -> list[Path]:
     except EOFError:
         return []
     return [Path(entry.file) for entry in by_words(listed, answer.replace(",", " ").split())]
+
+
+def _is_asked() -> bool:
+    """Whether a person at a terminal can choose from the list."""
+    return sys.stdin.isatty() and sys.stdout.isatty()
 
 
 @app.command("ui")

@@ -31,7 +31,7 @@ from constraint_geodesics.tracking.left import left_runs
 from constraint_geodesics.xml_files import XmlFileError, read_xml
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Generator, Iterator, Mapping, Sequence, Sized
     from typing import Literal
 
     Status = Literal["ok", "note", "problem"]
@@ -631,8 +631,8 @@ def _of_runs(root: Path) -> Iterator[Answer]:
     if left:
         names = _few(list(dict.fromkeys(run.name for run in left)))
         unsent = sum(run.unsent for run in left)
-        count = f"{len(left)} stage{'s were' if len(left) > 1 else ' was'}"
-        message = f"{count} killed, and runs stay RUNNING in MLflow: {names}"
+        were = "was" if len(left) == 1 else "were"
+        message = f"{_stages(left)} {were} killed, and runs stay RUNNING in MLflow: {names}"
         if unsent:
             message += f"; MLflow did not take {unsent} things that they told it"
         yield _note(message, "geodesics recover, which names those of another store")
@@ -819,7 +819,7 @@ def _by_file(stages: Mapping[str, list[str]]) -> list[tuple[str, dict[str, list[
     return sorted(files.items())
 
 
-def _stages(counted: Mapping[str, Any]) -> str:
+def _stages(counted: Sized) -> str:
     return "1 stage" if len(counted) == 1 else f"{len(counted)} stages"
 
 

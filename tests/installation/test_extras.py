@@ -15,25 +15,24 @@ from constraint_geodesics.bundle import PACKAGED
 from constraint_geodesics.extras import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[2]
-LACKING = """
-import sys
-for module in {modules!r}:
-    sys.modules[module] = None
+ASKED = """
 from constraint_geodesics import cli
 sys.argv = ["geodesics", *{words!r}]
 cli.main()
 """
-REFUSED = """
+LACKING = f"""
+import sys
+for module in {{modules!r}}:
+    sys.modules[module] = None
+{ASKED}"""
+REFUSED = f"""
 import sys
 class Refusing:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {modules!r}:
-            raise ModuleNotFoundError(f"No module named {{name}}")
+        if name.partition(".")[0] in {{modules!r}}:
+            raise ModuleNotFoundError("No module named " + name)
 sys.meta_path.insert(0, Refusing())
-from constraint_geodesics import cli
-sys.argv = ["geodesics", *{words!r}]
-cli.main()
-"""
+{ASKED}"""
 """As where they are not installed: a module that is None is there for SciPy, which looks."""
 ENDS = (
     "--start=0 0 -1 0 0 0",

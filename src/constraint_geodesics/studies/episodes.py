@@ -309,10 +309,8 @@ class _Simulation:
             return True
         rows = _between(path, from_s, at_s)[1]
         with self.known.world() as world:
-            return (
-                world.first_collision(densify(np.vstack([rows, stop.joints]), LOOKED_AT_RAD))
-                is None
-            )
+            looked_at = densify(np.vstack([rows, stop.joints]), LOOKED_AT_RAD)
+            return world.first_collision(looked_at) is None
 
 
 def stop_on(path: Trajectory, at_s: float) -> Trajectory | None:

@@ -3,6 +3,7 @@ network, a residual network, and the paper's VAE with geodesics by descent and b
 by the hidden formula.
 """
 
+import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -94,6 +95,7 @@ def _latents(cell: Cell, scene: Scene, scratch: Path) -> Trained:
     began = time.perf_counter()
     by_policy = latents.by_policy(_policy(cell), cell.seed)
     yield POLICY, by_policy, seconds + time.perf_counter() - began
+    shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _vae(cell: Cell, rows: int, dim: int) -> ManifoldParams:
