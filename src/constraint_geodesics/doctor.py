@@ -635,7 +635,7 @@ def _of_runs(root: Path) -> Iterator[Answer]:
         message = f"{_stages(left)} {were} killed, and runs stay RUNNING in MLflow: {names}"
         if unsent:
             message += f"; MLflow did not take {unsent} things that they told it"
-        yield _note(message, "geodesics recover, which names those of another store")
+        yield _note(message, "geodesics recover")
 
 
 def _wrong_address(uri: str, files_allowed: bool) -> str:
