@@ -16,8 +16,9 @@ from constraint_geodesics.report.benchmark_tables import FEW, asked, asks_in_pyt
 from constraint_geodesics.report.cells import fixed, milliseconds
 
 ROOT = Path(__file__).resolve().parents[1]
-README, RESULTS, EXPERIMENTS = (
-    ROOT / name for name in ("README.md", "docs/results.md", "docs/experiments.md")
+README, RESULTS, POLICIES, EXPERIMENTS = (
+    ROOT / name
+    for name in ("README.md", "docs/results.md", "docs/policies.md", "docs/experiments.md")
 )
 BLOCKS = {
     "results": "table.md",
@@ -28,7 +29,7 @@ BLOCKS = {
     "table_i": "benchmark/table_i.md",
     "growth": "growth/growth.md",
 }
-"""What stands between <!-- name --> and <!-- /name --> in docs/results.md: a file of reports/."""
+"""What stands between <!-- name --> and <!-- /name --> of a page: a file of reports/."""
 SHORTENED = ("budgets",)
 """Blocks that are their file's first paragraph."""
 SHOWN = (
@@ -79,8 +80,10 @@ def replaced(text: str, name: str, content: str) -> str:
 
 
 def filled(text: str) -> str:
-    """The results' text with every block and every quoted number as the reports have it now."""
+    """A page's text with its blocks and every quoted number as the reports have them now."""
     for name, file in BLOCKS.items():
+        if f"<!-- {name} -->" not in text:
+            continue
         content = (ROOT / "reports" / file).read_text().strip()
         text = replaced(text, name, content.split("\n\n")[0] if name in SHORTENED else content)
     return with_numbers(text)
@@ -175,6 +178,7 @@ def _together(rows: dict[str, dict[str, float]], names: list[str]) -> str:
 PAGES = {
     README: with_planners,
     RESULTS: filled,
+    POLICIES: filled,
     EXPERIMENTS: lambda text: with_pipeline(with_stage_times(text)),
 }
 NUMBERED = ("scenes.md", "problems.md", "scaling.md", "method.md")

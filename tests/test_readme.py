@@ -6,7 +6,7 @@ import pytest
 import yaml
 from ruamel.yaml import YAML
 
-from tests.readme import PAGES, QUOTED, README, RESULTS, ROOT
+from tests.readme import BLOCKS, PAGES, POLICIES, QUOTED, README, RESULTS, ROOT
 
 TEXT = README.read_text()
 
@@ -18,7 +18,15 @@ def test_every_table_and_quoted_number_is_the_reports(page) -> None:
 
 
 def test_the_results_quote_numbers_with_their_source() -> None:
-    assert len(QUOTED.findall(RESULTS.read_text())) >= 8
+    for page in (RESULTS, POLICIES):
+        assert len(QUOTED.findall(page.read_text())) >= 8
+        blocks = re.findall(r"<!-- /(\w+) -->", page.read_text())
+        assert blocks and set(blocks) <= BLOCKS.keys()
+
+
+def test_every_block_is_on_a_page() -> None:
+    pages = RESULTS.read_text() + POLICIES.read_text()
+    assert all(pages.count(f"<!-- {name} -->") == 1 for name in BLOCKS)
 
 
 def test_the_examples_run_one_after_the_other(monkeypatch, tmp_path) -> None:
