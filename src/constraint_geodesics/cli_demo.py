@@ -31,7 +31,7 @@ def demo(
             shell_complete=completion.planned_constraints,
         ),
     ] = "level_cup",
-    seed: Annotated[int, typer.Option(help="Another episode for every number.", min=0)] = 3,
+    seed: Annotated[int, typer.Option(help="Another episode for every number.", min=0)] = 0,
     out: Annotated[
         Path | None, typer.Option(help="Write a Rerun recording here, and open no viewer.")
     ] = None,

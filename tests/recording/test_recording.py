@@ -1,5 +1,6 @@
 """Recordings are written with real robots and meshes, read back from the file, and compared."""
 
+import json
 import os
 import re
 import shutil
@@ -484,6 +485,27 @@ def test_viewer_is_served_on_loopback_alone(xarm, tmp_path):
     finally:
         os.killpg(viewer.pid, signal.SIGKILL)
         viewer.wait()
+
+
+def test_a_viewer_does_not_report_how_it_is_used(xarm, tmp_path, monkeypatch):
+    """Whatever this user's own settings are, which stay as they are."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "user"))
+    subprocess.run(rerun_command("analytics", "enable"), capture_output=True, check=True)
+    asked, call = rerun_command("analytics", "config"), subprocess.check_output
+    assert json.loads(call(asked))["analytics_enabled"]
+    started = []
+
+    def instead(command, *, env):
+        started.append((command, json.loads(call(asked, env=env))))
+        return 0
+
+    monkeypatch.setattr(subprocess, "call", instead)
+    file = recorded(tmp_path, xarm[0], path_of(xarm[1]))
+    assert open_recordings([file], web=True) == 0
+    ((command, settings),) = started
+    assert "--serve-web" in command
+    assert settings["analytics_enabled"] is False
+    assert json.loads(call(asked))["analytics_enabled"]
 
 
 def test_without_a_display_the_browser_is_named(xarm, tmp_path, monkeypatch):

@@ -72,10 +72,10 @@ def layout(tmp_path) -> Layout:
 def test_the_page_says_what_the_figures_say(params, layout) -> None:
     text = demonstrations_markdown(params, layout)
     assert text.count(ORIGIN) == 1
-    assert "Of 15 draws the rank, how many relations and not which, is right in 80.0%" in text
-    assert "in 90.0%; more than the formula holds was found in 1." in text
+    assert "Of 15 draws the number of relations is right in 80.0%" in text
+    assert "in 90.0%; too many are found in 1." in text
     assert "nothing is found in 2 of 3 draws" in text
-    # better than the best peer in degrees, worse in mm; nothing identified is no better
+    # better than the best baseline in degrees, worse in mm; nothing identified is no better
     assert "whatever share of them that joins, in 1 of 4 comparisons" in text
 
 
@@ -99,7 +99,7 @@ def test_what_is_learned_stands_beside_it_where_it_was_run(params, layout) -> No
     assert "0.03 / 0.04" in lines[0]
     assert "0.05 / 0.9" in lines[2]
     assert "7 / 0.9" in lines[2]
-    # a network is the best peer in degrees now, and nobody asked the identified constraint for
+    # a network is the best baseline in degrees now, and nobody asked the identified constraint for
     # what networks are asked: one comparison fewer
     assert "whatever share of them that joins, in 0 of 3 comparisons" in text
     learned[AS_NETWORKS] = method(0.06, 0.9)

@@ -65,7 +65,7 @@ SIZES = GrowthSizes(
     roadmap_repeats=2,
 )
 PEER = "BiRRT, tangent bundle"
-PLANNERS = {"band and trees", "straight + band", PEER}
+PLANNERS = {"trees + band", "straight + band", PEER}
 ASKED = {
     "joints": {name: {6, 7} for name in PLANNERS},
     "codimension": {name: set(SIZES.codimensions) for name in PLANNERS},
@@ -90,7 +90,7 @@ def law(values, seconds, axis="queries", what="one"):
     st.floats(1e-6, 1e3),
     st.lists(st.integers(1, 10_000), min_size=3, max_size=8, unique=True),
 )
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_a_power_law_s_exponent_is_exact(exponent, at_1, values):
     values = np.array(values, float)
     fit = slopes(law(values, at_1 * values**exponent)).iloc[0]
@@ -242,12 +242,18 @@ def test_a_planner_never_meets_the_same_problem_twice(params, scene, kuka, tmp_p
     assert len(Remembers.met) >= 20
 
 
-def test_seconds_are_positive_and_between_their_quartiles(measured):
+def test_seconds_are_positive(measured):
     assert (measured["low"] > 0).all()
-    assert (measured["low"] <= measured["seconds"]).all()
-    assert (measured["seconds"] <= measured["high"]).all()
     assert np.isfinite(measured["high"]).all()
     assert (measured["mean"] > 0).all()
+
+
+def test_the_table_has_median_quartiles_mean_and_the_share_solved():
+    timed = ((4.0, 1.0), (1.0, 1.0), (10.0, 0.0), (2.0, 1.0), (3.0, 1.0))
+    table = growth._summary([growth.Sample("queries", 3, "one", *each) for each in timed])
+    (row,) = table.to_dict("records")
+    size = {"axis": "queries", "value": 3, "what": "one", "repeats": 5, "solved": 0.8}
+    assert row == size | {"seconds": 3.0, "low": 2.0, "high": 4.0, "mean": 4.0}
 
 
 def test_repeats_are_as_asked(measured):

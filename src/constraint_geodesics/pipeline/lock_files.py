@@ -57,6 +57,9 @@ _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 def _paths(stages: dict[str, Any]) -> Iterator[Any]:
     for stage in stages.values():
+        params = stage.get("params", {})
+        if not all(isinstance(own, dict) for own in (params, *params.values())):
+            raise TypeError
         if not isinstance(stage["cmd"], str):
             raise TypeError
         yield from (entry for kind in ("deps", "outs") for entry in stage.get(kind, ()))

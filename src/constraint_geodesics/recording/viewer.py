@@ -47,8 +47,9 @@ def open_recordings(
     _require_display(web)
     with _stopped_like_interrupted(), tempfile.TemporaryDirectory(prefix="geodesics-") as folder:
         shown = [str(file) for file in prepared(files, Path(folder), apart=apart)]
+        environment = _without_reports(Path(folder))
         options, _ = _announced(web=web, web_port=web_port)
-        return subprocess.call(rerun_command(*options, *shown))
+        return subprocess.call(rerun_command(*options, *shown), env=environment)
 
 
 @contextlib.contextmanager
@@ -60,13 +61,14 @@ def live_viewer(*, web: bool) -> Iterator[rr.RecordingStream]:
     viewer does not start.
     """
     _require_display(web)
-    with _stopped_like_interrupted():
+    with _stopped_like_interrupted(), tempfile.TemporaryDirectory(prefix="geodesics-") as folder:
+        environment = _without_reports(Path(folder))
         options, port = _announced(web=web, web_port=WEB_PORT)
         # a session of its own, so that it can be ended with the viewer that it starts
         viewer = subprocess.Popen(
             rerun_command(*options),
             stdin=subprocess.DEVNULL,
-            env={"RUST_LOG": "warn", **os.environ},
+            env={"RUST_LOG": "warn", **environment},
             start_new_session=True,
         )
         try:
@@ -96,6 +98,18 @@ def _announced(*, web: bool, web_port: int) -> tuple[list[str], int]:
     web_page = f"http://{LOOPBACK}:{page}?url=rerun%2B{source}"
     print(web_page if web else f"rerun+{source}", flush=True)
     return options, port
+
+
+def _without_reports(folder: Path) -> dict[str, str]:
+    """The environment of a viewer that does not report how it is used.  Rerun has a setting for a
+    user alone: this start has a settings' folder of its own.
+    """
+    environment = {**os.environ, "XDG_CONFIG_HOME": str(folder / "settings")}
+    # where it failed, the viewer would hold this for its first start, which reports nothing
+    subprocess.run(
+        rerun_command("analytics", "disable"), env=environment, capture_output=True, check=False
+    )
+    return environment
 
 
 def _wait_for(viewer: "subprocess.Popen[bytes]", port: int) -> None:

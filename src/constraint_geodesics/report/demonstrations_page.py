@@ -114,10 +114,9 @@ def _most(cells: Figures, method: str, figure: str) -> int:
 def _sentences(found: Figures) -> Iterator[str]:
     ranks, free = found["ranks"], found["free_motion"]
     yield (
-        f"Of {ranks['cells']} draws the rank, how many relations and not which, is right in "
-        f"{share(ranks['right'], 1)}, right or less with a word on what is missing in "
-        f"{share(ranks['right_or_refused'], 1)}; more than the formula holds was found in "
-        f"{ranks['too_many']}."
+        f"Of {ranks['cells']} draws the number of relations is right in "
+        f"{share(ranks['right'], 1)}, right or said to be too small in "
+        f"{share(ranks['right_or_refused'], 1)}; too many are found in {ranks['too_many']}."
     )
     nothing = sum(row["codim"] + row["bounds"] == 0 for row in free)
     robots = len({row["robot"] for row in free})
@@ -139,9 +138,9 @@ def _sentences(found: Figures) -> Iterator[str]:
                 compared += 1
                 better += mine is not None and mine <= best
     yield (
-        f"On the queries that peers are asked, the identified constraint's median violation is at "
-        f"most that of the best peer, whatever share of them that joins, in {better} of {compared} "
-        f"comparisons."
+        f"On the queries that baselines are asked, the identified constraint's median violation is "
+        f"at most that of the best baseline, whatever share of them that joins, in {better} of "
+        f"{compared} comparisons."
     )
 
 

@@ -126,13 +126,6 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
-def read_arms(file: Path) -> pd.DataFrame:
-    """The rows as the stage wrote them, a comment line for each thing to know before them."""
-    texts = dict.fromkeys(("source", "birrt_status", "given_status"), "")
-    table = pd.read_csv(file, comment="#", float_precision="round_trip", dtype={"status": str})
-    return table.astype(dict.fromkeys(texts, object)).fillna(texts)
-
-
 def figures(rows: pd.DataFrame) -> dict[str, dict[str, dict[str, Any]]]:
     """The figures of each table: by arm and constraint, and of all its rows (`all`)."""
     found: dict[str, dict[str, dict[str, Any]]] = {}

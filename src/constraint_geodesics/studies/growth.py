@@ -178,7 +178,7 @@ class BandAndTrees:
     """The project's own search, nothing learned: the straight line's band, then two trees."""
 
     settings: BandSettings = field(default_factory=BandSettings)
-    name: str = "band and trees"
+    name: str = "trees + band"
 
     def plan(self, problem: PlanningProblem, seed: int) -> Solution:
         """The first candidate that touches nothing; `seed` is ignored, trees have their own."""
