@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import settings
 
 from constraint_geodesics import warmup
 from constraint_geodesics.constraints.constraint import constraint_manifold
@@ -19,6 +20,11 @@ from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.urdf import data_path
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+settings.register_profile("same", derandomize=True, database=None, deadline=None)
+settings.load_profile("same")
+"""Cases of Hypothesis are drawn, yet the same on every run, so that a red run can be repeated."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -24,6 +24,8 @@ from constraint_geodesics.scene.clearance import clearance_model
 from constraint_geodesics.scene.world import World
 
 NAMES = ("free", "level_cup", "level_cup_relaxed", "slide", "fixed_orientation", "tool_down")
+TURN_ROWS = 33
+"""Configurations of a turn that are looked at."""
 
 
 @cache
@@ -125,3 +127,15 @@ def assert_sound(path: Solution, asked: PlanningProblem, certifier: Certifier) -
     certificate = certifier.certify(path.joints, asked.manifold.constraint, asked.start, asked.goal)
     assert certificate.valid, certificate.violation
     assert certificate.violation_bound <= 1e-4
+
+
+def turning(joints: np.ndarray, times: np.ndarray, start_velocity: np.ndarray | None) -> np.ndarray:
+    """Configurations (n, D) of an arm that moves at first: its velocity becomes the first line's
+    evenly until the middle of that line's time.
+    """
+    if start_velocity is None or not np.any(start_velocity):
+        return joints[:1]
+    lasting = 0.5 * (times[1] - times[0])
+    line = 0.5 * (joints[1] - joints[0]) / lasting
+    s = np.linspace(0.0, 1.0, TURN_ROWS)[:, None]
+    return joints[0] + lasting * (s * start_velocity + 0.5 * s**2 * (line - start_velocity))

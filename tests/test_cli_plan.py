@@ -222,8 +222,9 @@ def test_wrong_usage_of_plan_is_code_two(command, words, said) -> None:
 
 def test_numbers_of_a_list_need_no_quotes() -> None:
     cli._require_quotes(["replay", "--web", "1", "6"])
-    with pytest.raises(SystemExit):
+    with pytest.raises(SystemExit) as stop:
         cli._require_quotes(["ik", "--pose", "0.4", "0.2"])
+    assert stop.value.code == 2
 
 
 @pytest.mark.parametrize("missing", ["--start", "--goal", "--constraint"])

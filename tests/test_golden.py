@@ -1,6 +1,7 @@
 """Files of every release are read by this one, and hold what they held."""
 
 import json
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,10 @@ from tests.golden.write import (
     shape_facts,
 )
 
-RELEASES = sorted(file.parent for file in HERE.glob(f"*/{FACTS}"))
+RELEASES = sorted(
+    (file.parent for file in HERE.glob(f"*/{FACTS}")),
+    key=lambda folder: [int(number) for number in re.findall(r"\d+", folder.name)],
+)
 MOST_BYTES = 300_000
 """Of a release's files."""
 

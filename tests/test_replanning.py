@@ -13,7 +13,7 @@ from constraint_geodesics import Constraint, GoalRegion, Planner, Pose, Sphere, 
 from constraint_geodesics.geometry.braking import State, going_on
 from constraint_geodesics.planner import PlannerError
 from constraint_geodesics.trajectory import read_trajectory
-from tests.planner_fixtures import packaged_planner, pairs_of
+from tests.planner_fixtures import packaged_planner, pairs_of, turning
 
 NAME = "level_cup"
 DENSE_S = 0.002
@@ -79,11 +79,14 @@ def blocked() -> Iterator[tuple[Trajectory, float, Sphere]]:
 
 
 def touched(answer: Trajectory, planner: Planner) -> int:
-    """Configurations of the motion, every few ms, that a fresh world finds in touch."""
+    """Configurations of the motion, every few ms and in its turn into the first line, that a fresh
+    world finds in touch.
+    """
     at = np.arange(0.0, answer.times[-1], DENSE_S)
     rows = np.stack([np.interp(at, answer.times, q) for q in answer.joints.T], axis=1)
+    turn = turning(answer.joints, answer.times, answer.start_velocity)
     with planner.scene.world() as world:
-        return int((~world.free(np.vstack([rows, answer.joints]))).sum())
+        return int((~world.free(np.vstack([rows, answer.joints, turn]))).sum())
 
 
 # From a velocity

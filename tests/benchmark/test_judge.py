@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -176,7 +176,6 @@ def test_the_angle_of_a_cone_is_measured_as_a_whole(scene, cup, certifier):
     assert judged(q[:2], free, certifier).max_violation_rad == 0.0
 
 
-@settings(deadline=None)
 @given(paths, st.floats(0.05, 2.0))
 def test_densified_paths_keep_their_points_and_length_and_the_spacing(path, spacing):
     dense = densify(path, spacing)

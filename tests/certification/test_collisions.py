@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.scene.judge import Judge
 from tests.scene.mesh_files import Brick, write_bricks
 
 from constraint_geodesics.certification import collision_kernels as kernels
@@ -27,7 +28,14 @@ from constraint_geodesics.scene.point_cloud import PointCloud
 from constraint_geodesics.scene.scene import Scene
 from constraint_geodesics.scene.shape import Placement, Shape
 from constraint_geodesics.scene.sphere import Sphere
-from constraint_geodesics.studies.collision_proof import KINDS, Grazing, Trial, graze, try_scene
+from constraint_geodesics.studies.collision_proof import (
+    KINDS,
+    Grazing,
+    Trial,
+    graze,
+    random_shapes,
+    try_scene,
+)
 
 FREE = Constraint((0,) * 6)
 ABOVE_M = 2e-5
@@ -139,11 +147,14 @@ def test_cylinders_balls_and_capsules_reach_as_far_as_they_should(sliding: Scene
     """In the URDF and in the scene, with PyBullet as the measure: the prism around a cylinder is
     the largest difference.
     """
+    seen = {True: 0, False: 0}
     with Certifier(sliding) as certifier, sliding.world() as world:
         for q in sliding.robot.sample(400, np.random.default_rng(1)):
             clearance = certifier.collisions.clearance(q)
             if abs(clearance) > 2e-4:
+                seen[clearance > 0.0] += 1
                 assert world.is_free(q) == (clearance > 0.0)
+    assert min(seen.values()) > 20
 
 
 def furthest(arrays: kernels.Bodies, node: int, direction: np.ndarray) -> tuple[float, float]:
@@ -271,10 +282,10 @@ def seen_from(frames: np.ndarray, below: int, own: int, piece: Piece) -> np.ndar
 
 def test_what_is_proven_holds_everywhere(any_scene: Scene) -> None:
     """Against the distances at dense configurations: the proven one is less, and at least half of
-    what is attained.
+    what is attained; and a judge of its own finds nothing that touches.
     """
     proven = 0
-    with Certifier(any_scene) as certifier:
+    with Certifier(any_scene) as certifier, Judge(any_scene, {}) as judge:
         check, arrays = certifier.collisions, certifier.collisions.collider.arrays
         for rows in lines(any_scene, 60):
             undecided = np.empty((4, 4))
@@ -285,10 +296,32 @@ def test_what_is_proven_holds_everywhere(any_scene: Scene) -> None:
             if count == 0:
                 proven += 1
                 assert MARGIN_M < bound <= truth
+                assert not touches(judge, rows)
                 assert bound >= min(0.5 * attained, attained) - 1e-12
             else:
                 assert truth < 0.01
     assert proven > 10
+
+
+def touches(judge: Judge, rows: np.ndarray) -> bool:
+    """Anything that must not, at every 0.005 rad of a path."""
+    return any(judge.deepest(q)[0] < -1e-6 for q in densify(rows, 0.005))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_certified_touches_nothing_by_a_judge_of_its_own(scene: Scene, kind: str) -> None:
+    """Which asks other pairs of bodies than the certifier, should that leave one out."""
+    shapes = random_shapes(kind, np.random.default_rng(2))
+    around, certified, refused = replace(scene, workcell=(*scene.workcell, *shapes)), 0, 0
+    with Certifier(around) as certifier, Judge(around, {}) as judge:
+        for rows in lines(around, 30):
+            if certifier.collisions.along(rows).violation is None:
+                certified += 1
+                assert not touches(judge, rows)
+            else:
+                refused += 1
+    assert certified > 3
+    assert refused > 3
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -30,7 +30,7 @@ from tests import planner_fixtures as fixtures
 from tests.faults import bad_calls, requests
 from tests.faults.effort import Effort, counting
 from tests.faults.requests import A_SCENE, SEED, Request, request, scene_of
-from tests.planner_fixtures import packaged_planner
+from tests.planner_fixtures import packaged_planner, turning
 from tests.scene import judge as oracle
 from tests.scene.judge import Judge
 
@@ -44,8 +44,6 @@ SLACK = 1e-6
 TURN_OFF, TURN_BEYOND = 1e-3, 1e-4
 """What an arm may be off its constraint [rad or m], and beyond a joint limit [rad], while it turns
 into its path: as the documentation says."""
-TURN_ROWS = 33
-"""Configurations of a turn that the oracle looks at."""
 KEPT = Path(".geodesics/soak/random_requests.json")
 """Where the figures of a run of hours are kept, so that it goes on where it was ended."""
 KEPT_EVERY = 20 * A_SCENE
@@ -295,17 +293,11 @@ def _asked_for(planner: Planner, asked: Request, path: Trajectory, judge: Judge)
 
 
 def _turn_faults(planner: Planner, asked: Request, path: Trajectory, judge: Judge) -> list[str]:
-    """Of an arm that moves at first: its velocity becomes the first line's evenly until the middle
-    of that line's time.
-    """
+    """Of an arm that moves at first."""
     begin = asked.words.get("start_velocity")
     if begin is None or not np.any(begin):
         return []
-    first, second = path.joints[:2]
-    lasting = 0.5 * (path.times[1] - path.times[0])
-    line = 0.5 * (second - first) / lasting
-    s = np.linspace(0.0, 1.0, TURN_ROWS)[:, None]
-    rows = first + lasting * (s * begin + 0.5 * s**2 * (line - begin))
+    rows = turning(path.joints, path.times, begin)
     allowed = {"beyond": TURN_BEYOND + SLACK, "off": TURN_OFF + SLACK}
     return [f"turn: {fault}" for fault in _row_faults(planner, path, judge, rows, **allowed)]
 

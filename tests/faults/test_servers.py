@@ -27,6 +27,7 @@ from constraint_geodesics.params import ComputeParams
 from constraint_geodesics.pipeline.compute import parallel_map
 from constraint_geodesics.tracking.experiment import ChildRun, Work, tracked_stage
 from tests.faults.effort import Effort, counting
+from tests.ports import free_port
 from tests.tracking.test_experiment import git, server
 from tests.tracking.test_registry import ADDRESS, QUERY, registered
 
@@ -42,12 +43,6 @@ def require(programs: tuple[str, ...] = (), packages: tuple[str, ...] = ()) -> N
     missing += [f"the package {own}" for own in packages if find_spec(own) is None]
     if missing:
         pytest.skip(f"not installed: {', '.join(missing)}")
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def wait_for(port: int, process: subprocess.Popen[bytes]) -> None:

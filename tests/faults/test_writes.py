@@ -351,7 +351,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def is_one_line(error: BaseException, folder: Path, *, named: bool = True) -> bool:
     """What a stage shows as one line, not as a traceback; and the file is named."""
-    return isinstance(error, SHOWN) and (str(folder) in str(error) or not named)
+    said = str(error)
+    return isinstance(error, SHOWN) and "\n" not in said and (str(folder) in said or not named)
 
 
 def error_of(call: Callable[[], Any]) -> Exception | None:

@@ -16,7 +16,7 @@ from constraint_geodesics.geometry.graph import (
 )
 from constraint_geodesics.geometry.manifold import NonFiniteError
 
-repeatable = settings(max_examples=60, deadline=None, derandomize=True, database=None)
+repeatable = settings(max_examples=60)
 NO_EDGES = np.empty((0, 2), dtype=np.int64)
 
 

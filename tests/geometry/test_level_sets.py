@@ -32,7 +32,7 @@ CIRCLES = [
     LevelCircle(Torus(2.0, 0.5), 0, -3.0),
 ]
 every_circle = pytest.mark.parametrize("circle", CIRCLES, ids=str)
-repeatable = settings(max_examples=60, deadline=None, derandomize=True, database=None)
+repeatable = settings(max_examples=60)
 
 
 def points(*rows):

@@ -14,9 +14,7 @@ ACCELERATION = np.array([4.0, 2.0, 8.0, 5.0, 3.0, 10.0])
 
 def law(test):
     """Cases are drawn, yet the same on every run, so that a red run can be repeated."""
-    return settings(max_examples=60, deadline=None, derandomize=True, database=None)(
-        given(st.data())(test)
-    )
+    return settings(max_examples=60)(given(st.data())(test))
 
 
 def differences(joints: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

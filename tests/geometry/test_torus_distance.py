@@ -19,7 +19,7 @@ TORI = ((2.0, 1.0), (3.0, 0.2), (1.2, 1.0))
 
 every_torus = pytest.mark.parametrize("radii", [*TORI, (50.0, 40.0)], ids=str)
 any_points = arrays(np.float64, (32, 2), elements=st.floats(-3 * PI, 3 * PI))
-repeatable = settings(max_examples=4, deadline=None, derandomize=True, database=None)
+repeatable = settings(max_examples=4)
 
 
 def rows(*points):

@@ -98,7 +98,7 @@ def test_retraction_is_first_order(xarm) -> None:
 
 
 @given(st.floats(0.0, np.pi - 0.05), st.floats(-np.pi, np.pi))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_a_tilt_is_measured_as_its_angle(xarm, tilt: float, heading: float) -> None:
     """Roll and pitch together give the angle of the tool axis, up to upside down, whatever the
     yaw.
@@ -359,7 +359,7 @@ def held(request: pytest.FixtureRequest, kuka_scene: Scene) -> tuple[str, Constr
     return request.param, ConstraintManifold(robot, of_kind(request.param, robot))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**31 - 1), step=st.floats(0.001, 0.3))
 def test_the_bound_between_waypoints_holds_at_every_sample(certifier, held, seed, step) -> None:
     (kind, manifold), rng = held, np.random.default_rng(seed)

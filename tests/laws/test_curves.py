@@ -37,9 +37,7 @@ every_batch = pytest.mark.parametrize("batch", [(), (3,), (2, 4)], ids=str)
 
 def law(test: Callable[..., None]) -> Callable[..., None]:
     """Cases are drawn, yet the same on every run, so that a red run can be repeated."""
-    return settings(max_examples=4, deadline=None, derandomize=True, database=None)(
-        given(st.data())(test)
-    )
+    return settings(max_examples=4)(given(st.data())(test))
 
 
 def tensors(shape: tuple[int, ...], size: float = 1.0) -> st.SearchStrategy[Tensor]:

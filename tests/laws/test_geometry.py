@@ -84,9 +84,7 @@ every_batch = pytest.mark.parametrize("batch", BATCHES, ids=str)
 
 def law(test: Callable[..., None]) -> Callable[..., None]:
     """Cases are drawn, yet the same on every run, so that a red run can be repeated."""
-    return settings(max_examples=8, deadline=None, derandomize=True, database=None)(
-        given(st.data())(test)
-    )
+    return settings(max_examples=8)(given(st.data())(test))
 
 
 def tensors(

@@ -168,7 +168,7 @@ def closed_form(shape: Shape, point: np.ndarray) -> float:
 
 @kinds
 @given(point=POINTS)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_the_distance_is_that_of_the_formula(kind: str, point: tuple[float, ...]) -> None:
     """Outside; inside it is known how deep in some directions."""
     wanted, found = closed_form(SHAPES[kind], np.array(point)), distance(kind, point)
@@ -190,7 +190,7 @@ def inscribed(shape: Shape) -> float:
 
 @kinds
 @given(a=POINTS, b=POINTS)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_the_distance_changes_no_faster_than_the_point(kind: str, a: Any, b: Any) -> None:
     apart = np.linalg.norm(np.subtract(a, b))
     there, here = distance(kind, a), distance(kind, b)
@@ -200,7 +200,7 @@ def test_the_distance_changes_no_faster_than_the_point(kind: str, a: Any, b: Any
 
 @kinds
 @given(point=POINTS)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_the_gradient_is_a_unit_vector_that_finite_differences_agree_with(
     kind: str, point: tuple[float, ...]
 ) -> None:

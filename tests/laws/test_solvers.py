@@ -91,9 +91,7 @@ ALL = {name: solvers(name) for name in WHOLE}
 
 
 def law(test):
-    return settings(max_examples=3, deadline=None, derandomize=True, database=None)(
-        given(st.integers(0, 10_000))(test)
-    )
+    return settings(max_examples=3)(given(st.integers(0, 10_000))(test))
 
 
 @pytest.mark.parametrize("solver", ["gradient", "graph", "grid", "combined"])

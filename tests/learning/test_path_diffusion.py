@@ -62,7 +62,7 @@ def untrained(scale: float = 1.0) -> PathDiffusion:
     return model_of(Denoiser(MODES * DOF, SEEN, 8, 1), scale)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 1000), modes=st.integers(1, 12), points=st.integers(14, 40))
 def test_a_sine_series_has_its_own_coefficients(seed: int, modes: int, points: int) -> None:
     rng = np.random.default_rng(seed)

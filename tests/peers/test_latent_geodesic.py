@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +15,9 @@ from tests.planner_fixtures import (
 from constraint_geodesics.certification.certifier import Certifier
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
 from constraint_geodesics.learning.learned_manifold import LearnedManifold
+from constraint_geodesics.peers import gradient_geodesic
 from constraint_geodesics.peers.gradient_geodesic import GradientGeodesic, GradientGeodesicSettings
-from constraint_geodesics.peers.latent_geodesic import executable
+from constraint_geodesics.peers.latent_geodesic import executable, first_curves
 from constraint_geodesics.peers.straight_latent import StraightLatent
 from constraint_geodesics.problem import PlanningProblem, Solution
 from constraint_geodesics.robot.kinematics import SerialRobot
@@ -63,15 +65,27 @@ def test_without_a_constraint_the_geodesic_is_the_straight_joint_line(
 
 
 def test_same_seed_same_path_and_another_seed_another_search(
-    chart: LearnedManifold, world: World
+    chart: LearnedManifold, world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     planner = GradientGeodesic(chart, GradientGeodesicSettings(drawn=64))
-    asked = problem(world, "level_cup", 1)
-    first, again, other = (planner.plan(asked, seed) for seed in (3, 3, 4))
+    asked, begun = problem(world, "level_cup", 1), list[np.ndarray]()
+
+    def first_of(*given: Any) -> np.ndarray:
+        begun.append(first_curves(*given))
+        return begun[-1]
+
+    def searched(seed: int) -> tuple[Solution, np.ndarray]:
+        begun.clear()
+        return planner.plan(asked, seed), begun[0]
+
+    monkeypatch.setattr(gradient_geodesic, "first_curves", first_of)
+    (first, curves), (again, same), (other, others) = map(searched, (3, 3, 4))
     assert first.status == "solved"
     np.testing.assert_array_equal(first.joints, again.joints)
+    np.testing.assert_array_equal(curves, same)
     assert first.iterations == again.iterations
     assert other.status == "solved"
+    assert not np.array_equal(curves, others), "other curves are gone on from"
 
 
 def test_a_chart_of_another_robot_does_not_apply(chart: LearnedManifold, kuka: SerialRobot) -> None:

@@ -69,7 +69,7 @@ def test_an_attempt_that_is_remembered_counts_with_the_time_it_took(problem) -> 
     inner = Listed((3.0, 1.0), each_s=0.6)
     found = Restarted(inner, 1.0).plan(problem, 0)
     assert (len(inner.seeds), found.joints[1, 0]) == (1, 3.0)
-    assert 0.6 <= found.time_s < 0.7
+    assert 0.6 <= found.time_s < 1.2, "once, not twice"
 
 
 def shorter_than(length: float, problem: PlanningProblem) -> PlanningProblem:

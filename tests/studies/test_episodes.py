@@ -94,12 +94,17 @@ def test_every_motion_begins_where_the_arm_is_and_as_fast() -> None:
 
 
 def test_an_obstacle_is_seen_within_the_radius_and_answered_after_the_latency() -> None:
+    seen = moving = 0
     for episode, report in zip(episodes(5), answered(5), strict=True):
         assert all(0.0 < one.distance_m <= episode.sensing_m for one in report.seen)
+        seen += len(report.seen)
         for answer in report.answers:
             if answer.moving:
                 assert answer.begins_s == pytest.approx(answer.asked_s + study.LATENCY_S)
                 assert answer.late == (answer.spent_s > study.LATENCY_S)
+                moving += 1
+    assert seen > 0
+    assert moving > 0
 
 
 def test_an_arm_that_goes_on_touches_what_is_on_its_path() -> None:

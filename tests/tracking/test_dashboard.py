@@ -10,17 +10,12 @@ import urllib.request
 from pathlib import Path
 
 import pytest
+from tests.ports import free_port
 
 from constraint_geodesics.tracking.dashboard import serve_and_open
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STARTS_S = 300
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture
@@ -88,19 +83,27 @@ def test_nothing_is_opened_where_it_is_not_wanted_or_there_is_no_desktop(
     known = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     if options:
         known["DISPLAY"] = ":0"
-    process = subprocess.Popen(
-        [sys.executable, *words], cwd=checkout, env=known, stdout=subprocess.PIPE, text=True
-    )
+    log = checkout / "log.txt"
+    with log.open("w") as output:
+        process = subprocess.Popen(
+            [sys.executable, *words],
+            cwd=checkout,
+            env=known,
+            stdout=subprocess.PIPE,
+            stderr=output,
+            text=True,
+        )
     try:
         assert process.stdout is not None
         assert f"http://127.0.0.1:{port}/#/" in process.stdout.readline()
         deadline = time.monotonic() + STARTS_S
-        while time.monotonic() < deadline:
-            assert process.poll() is None
+        while True:
+            assert process.poll() is None, log.read_text()
             try:
                 urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=5)
                 break
             except OSError:
+                assert time.monotonic() < deadline, log.read_text()
                 time.sleep(0.2)
         time.sleep(1.0)
         assert not browser.exists()
