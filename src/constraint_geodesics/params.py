@@ -796,6 +796,8 @@ MOST_YAML = 16 * 2**20
 """Bytes of a file of YAML, which is read slowly."""
 MOST_VALUES = 10**6
 """Values in one."""
+LONGEST_SAID = 300
+"""Letters of what the parser says of a file."""
 
 
 def load_params(
@@ -848,7 +850,8 @@ def read_yaml(path: Path) -> Any:
     except (UnicodeError, RecursionError) as error:
         raise ParamsError(f"{path}: not YAML: {str(error).splitlines()[0]}") from None
     except (YAMLError, ValueError) as error:
-        raise ParamsError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+        said = " ".join(str(error).split())  # which quotes what the file has, however long
+        raise ParamsError(f"{path}: not YAML: {said[:LONGEST_SAID]}") from None
     while len(documents) > 1 and documents[-1] is None:  # as after a last `---`
         documents.pop()
     if len(documents) > 1:
