@@ -21,7 +21,8 @@ def test_the_results_quote_numbers_with_their_source() -> None:
     for page in (RESULTS, POLICIES):
         assert len(QUOTED.findall(page.read_text())) >= 8
         blocks = re.findall(r"<!-- /(\w+) -->", page.read_text())
-        assert blocks and set(blocks) <= BLOCKS.keys()
+        assert blocks
+        assert set(blocks) <= BLOCKS.keys()
 
 
 def test_every_block_is_on_a_page() -> None:
