@@ -18,9 +18,10 @@ from constraint_geodesics.identification.files import load_constraint
 from constraint_geodesics.learning.dataset import Queries, read_queries, write_queries
 from constraint_geodesics.moveit import add_moveit_scene, read_moveit_request
 from constraint_geodesics.params import load_params
+from constraint_geodesics.robot.arm_file import digest_of
 from constraint_geodesics.robot.description import read_description
-from constraint_geodesics.scene.mesh import Mesh
 from constraint_geodesics.scene.scene_file import read_attached, read_scene
+from constraint_geodesics.scene.triangles import read_triangles
 from tests.benchmark.problem_fixtures import small_file
 from tests.faults.bad_input import Bad, Tally, written
 from tests.faults.effort import Effort, all_passed, counting
@@ -96,7 +97,8 @@ def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, R
         "crate": {"kind": "box", "centre_m": [2, 2, 2], "size_m": [0.1, 0.1, 0.1]},
         "ball": {"kind": "sphere", "centre_m": [2, 3, 2], "radius_m": 0.1},
     }
-    pose = {"position": {"x": 2.0, "y": 2.0, "z": 2.0}, "orientation": {"w": 1.0}}
+    at, turn = dict.fromkeys("xyz", 2.0), {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+    pose = {"position": at, "orientation": turn}
     crate = {
         "id": "crate",
         "header": {"frame_id": "world"},
@@ -115,7 +117,8 @@ def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, R
     shutil.copy(ROOT / "params.yaml", folder)
     for file in (ROOT / "tests" / "robots").iterdir():
         shutil.copy(file, folder)
-    mesh = lambda file: scene.add(Mesh("n", file))  # noqa: E731
+    # without dividing it into convex parts, which takes what it takes
+    mesh = lambda file: read_triangles(file, digest_of(file.read_bytes()))  # noqa: E731
     return {
         "path": (written(folder, "path.csv", path), planner.check),
         "constraint": (
@@ -139,9 +142,9 @@ def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, R
         "shown": (folder / "wipe.csv", lambda file: demonstrations_from(file, robot)),
         "problems": (written(folder, "problems.json", json.dumps(small_file())), read_problems),
         "queries": (folder / "queries.csv", read_queries),
-        "mesh_obj": (folder / "wrist.obj", restoring(mesh)),
-        "mesh_stl": (write_bricks(folder / "own.stl", BRICKS), restoring(mesh)),
-        "mesh_dae": (written(folder, "own.dae", COLLADA), restoring(mesh)),
+        "mesh_obj": (folder / "wrist.obj", mesh),
+        "mesh_stl": (write_bricks(folder / "own.stl", BRICKS), mesh),
+        "mesh_dae": (written(folder, "own.dae", COLLADA), mesh),
         "arm": (folder / "six_axis.urdf", read_description),
     }
 
