@@ -47,10 +47,13 @@ class Tally:
         except Exception as error:
             self._refused(case, error)
         else:
-            if not case.refused:
-                return
-            self.accepted += 1
-            self.wrong.append(f"{case.name}: accepted: {str(found)[:200]}")
+            if case.refused:
+                self.accepted += 1
+                self.wrong.append(f"{case.name}: accepted: {str(found)[:200]}")
+
+    def row(self, *names: str) -> dict[str, int]:
+        """Some of the counts by their names."""
+        return {name: getattr(self, name) for name in names}
 
     def _refused(self, case: Bad, error: Exception) -> None:
         line, kind = str(error), type(error)

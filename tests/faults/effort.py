@@ -4,7 +4,7 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,9 +76,18 @@ def counting(part: str, effort: Effort) -> Iterator[Row]:
     _exchanged(part, {"effort": effort.name, **about, **row})
 
 
-def all_passed(session: pytest.Session, failed: int) -> bool:
-    """Whether no test failed since so many had, and all were run: nobody interrupted them."""
-    return session.testsfailed == failed and session.exitstatus != pytest.ExitCode.INTERRUPTED
+@contextmanager
+def counted_at_end(
+    part: str, effort: Effort, session: pytest.Session, found: Callable[[], Row]
+) -> Iterator[None]:
+    """Around all tests of a file: their figures are its row if none failed and nobody interrupted
+    them.
+    """
+    failed = session.testsfailed
+    with counting(part, effort) as row:
+        yield
+        if session.testsfailed == failed and session.exitstatus != pytest.ExitCode.INTERRUPTED:
+            row |= found()
 
 
 def _exchanged(part: str, row: Row | None) -> Row | None:

@@ -15,7 +15,7 @@ from constraint_geodesics import cli, text_files
 from constraint_geodesics.params import params_of, read_yaml
 from tests.faults import bad_calls, bad_files, bad_params
 from tests.faults.bad_input import Bad, Tally
-from tests.faults.effort import Effort, all_passed, counting
+from tests.faults.effort import Effort, counted_at_end
 from tests.planner_fixtures import packaged_planner
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -92,12 +92,9 @@ SHELL: list[tuple[str, int, str]] = [
 @pytest.fixture(scope="module")
 def tally(effort: Effort, request: pytest.FixtureRequest) -> Iterator[Tally]:
     """Of all cases of this file, counted at its end if no test has failed."""
-    found, failed = Tally(), request.session.testsfailed
-    with counting("bad_input", effort) as row:
+    found, kinds = Tally(), ("cases", "tracebacks", "accepted", "hung", "unnamed")
+    with counted_at_end("bad_input", effort, request.session, lambda: found.row(*kinds)):
         yield found
-        if all_passed(request.session, failed):
-            kinds = ("cases", "tracebacks", "accepted", "hung", "unnamed")
-            row |= {name: getattr(found, name) for name in kinds}
 
 
 @pytest.fixture(autouse=True)

@@ -24,7 +24,7 @@ from constraint_geodesics.scene.scene_file import read_attached, read_scene
 from constraint_geodesics.scene.triangles import read_triangles
 from tests.benchmark.problem_fixtures import small_file
 from tests.faults.bad_input import Bad, Tally, written
-from tests.faults.effort import Effort, all_passed, counting
+from tests.faults.effort import Effort, counted_at_end
 from tests.planner_fixtures import packaged_planner
 from tests.scene.mesh_files import Brick, write_bricks
 
@@ -65,11 +65,9 @@ def spoiled(content: bytes, changes: list[tuple[float, int, bytes]]) -> bytes:
 
 @pytest.fixture(scope="module")
 def tally(effort: Effort, request: pytest.FixtureRequest) -> Iterator[Tally]:
-    found, failed = Tally(), request.session.testsfailed
-    with counting("fuzzed_files", effort) as row:
+    found, kinds = Tally(), ("cases", "tracebacks", "hung")
+    with counted_at_end("fuzzed_files", effort, request.session, lambda: found.row(*kinds)):
         yield found
-        if all_passed(request.session, failed):
-            row |= {name: getattr(found, name) for name in ("cases", "tracebacks", "hung")}
 
 
 @pytest.fixture(scope="module")

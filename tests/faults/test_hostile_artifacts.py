@@ -73,7 +73,7 @@ from constraint_geodesics.scene.triangles import read_triangles
 from constraint_geodesics.scene.urdf import data_path
 from constraint_geodesics.studies.execution import load_execution
 from constraint_geodesics.trajectory import read_trajectory
-from tests.faults.effort import Effort, all_passed, counting
+from tests.faults.effort import Effort, counted_at_end
 from tests.planner_fixtures import manifold_of, packaged_planner
 from tests.scene.mesh_files import Brick, write_bricks
 
@@ -797,11 +797,8 @@ for _name, (_bytes, _said) in RECORDINGS.items():
 def tally(effort: Effort, request: pytest.FixtureRequest) -> Iterator[dict[str, int]]:
     """What all of them did, counted if no test has failed."""
     found = {"artifacts": 0, "executions": 0, "escapes": 0, "too_long": 0}
-    failed = request.session.testsfailed
-    with counting("hostile_artifacts", effort) as row:
+    with counted_at_end("hostile_artifacts", effort, request.session, lambda: found):
         yield found
-        if all_passed(request.session, failed):
-            row |= found
 
 
 @pytest.mark.parametrize("name", CASES)

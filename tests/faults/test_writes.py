@@ -77,7 +77,7 @@ from constraint_geodesics.text_files import write_text, written
 from constraint_geodesics.tracking.left import UNSENT
 from constraint_geodesics.tracking.sending import Sender
 from constraint_geodesics.trajectory import read_trajectory, write_trajectory
-from tests.faults.effort import QUICK, Effort, all_passed, counting
+from tests.faults.effort import QUICK, Effort, counted_at_end
 from tests.planner_fixtures import packaged_learned, packaged_planner, untrained_diffusion
 
 ROWS = np.linspace(-1.0, 1.0, 120).reshape(20, 6)
@@ -107,11 +107,12 @@ TRIED: Counter[str] = Counter()
 @pytest.fixture(scope="module", autouse=True)
 def _counted(effort: Effort, request: pytest.FixtureRequest) -> Iterator[None]:
     """At the end, if no test has failed."""
-    failed = request.session.testsfailed
-    with counting("faults", effort) as row:
+    with counted_at_end("faults", effort, request.session, _figures):
         yield
-        if all_passed(request.session, failed):
-            row |= {**TRIED, "results_lost": TRIED["injected"] - TRIED["survived"]}
+
+
+def _figures() -> dict[str, int]:
+    return {**TRIED, "results_lost": TRIED["injected"] - TRIED["survived"]}
 
 
 def _rows(number: int) -> np.ndarray:
