@@ -34,8 +34,7 @@ SHORTENED = ("budgets",)
 """Blocks that are their file's first paragraph."""
 SHOWN = (
     *("planner", "trees + band", "learned + band", "learned"),
-    *("straight + band", "SLSQP", "BiRRT + band", "BiRRT + band, 1 s"),
-    *("BiRRT, tangent bundle + band", "BiRRT"),
+    *("BiRRT + band", "BiRRT + band, 1 s", "BiRRT, tangent bundle + band", "BiRRT"),
 )
 """Rows of README's table."""
 QUOTED = re.compile(r"([\d.]+)([^\d<]{0,12})<!-- from (\S+) (\S+) ([\d.e-]+) (\d) -->")
