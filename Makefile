@@ -98,11 +98,15 @@ test-experiments: env  ## run all others: learning, laws, tracking, reports, bas
 	.venv/bin/python $(HASHED) -r tests/faults/requirements.lock
 	@touch $@
 
+FAULTS := GEODESICS_RELIABILITY=reports/reliability.json python -m pytest
+TIMED := tests/faults/test_load.py tests/faults/test_scaling.py
+
 test-faults: env .venv/servers  ## break things on purpose: kills, full disks, bad input, hostile files, load (half an hour); writes reports/reliability.json
-	GEODESICS_RELIABILITY=reports/reliability.json python -m pytest tests/faults --faults
+	$(FAULTS) tests/faults --faults --numprocesses 2 --dist loadfile --no-loadscope-reorder $(TIMED:%=--ignore %)
+	$(FAULTS) $(TIMED) --faults
 
 soak: env .venv/servers  ## the same for hours, with more of each: 20 kills a stage, 100,000 requests; go on after an interruption by calling it again
-	GEODESICS_RELIABILITY=reports/reliability.json python -m pytest tests/faults --soak
+	$(FAULTS) tests/faults --soak
 
 .venv/browser: tests/browser/requirements.lock .venv/installed
 	.venv/bin/python $(HASHED) -r tests/browser/requirements.lock
