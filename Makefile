@@ -102,7 +102,7 @@ FAULTS := GEODESICS_RELIABILITY=reports/reliability.json python -m pytest
 TIMED := tests/faults/test_load.py tests/faults/test_scaling.py
 
 test-faults: env .venv/servers  ## break things on purpose: kills, full disks, bad input, hostile files, load (half an hour); writes reports/reliability.json
-	$(FAULTS) tests/faults --faults --numprocesses 2 --dist loadfile --no-loadscope-reorder $(TIMED:%=--ignore %)
+	$(FAULTS) tests/faults --faults --numprocesses 2 --dist loadgroup --no-loadscope-reorder $(TIMED:%=--ignore %)
 	$(FAULTS) $(TIMED) --faults
 
 soak: env .venv/servers  ## the same for hours, with more of each: 20 kills a stage, 100,000 requests; go on after an interruption by calling it again

@@ -266,6 +266,8 @@ SECONDS_ALONE = "benchmark_training.json"
 """A report of `BENCHMARK`'s that has nothing which does not tell of the machine."""
 LATEST = 100
 """Times that a stage may be done before it is killed: no kill that did not hit it is counted."""
+BESIDE = pytest.mark.xdist_group("runs")
+"""On the other worker, with a pair of its own: the kills of all stages take as long as the rest."""
 
 
 @dataclass(frozen=True)
@@ -473,6 +475,7 @@ def benchmark_rows(folder: Path) -> set[str]:
 
 
 @pytest.mark.long
+@BESIDE
 @pytest.mark.timeout(3600)
 def test_a_benchmark_that_is_killed_keeps_its_rows_and_makes_the_others(
     pair: Pair, effort: Effort
@@ -520,6 +523,7 @@ def test_a_benchmark_that_is_killed_keeps_its_rows_and_makes_the_others(
 
 
 @pytest.mark.long
+@BESIDE
 @pytest.mark.timeout(2000)  # `pair`, where no test before made it
 def test_a_worker_that_dies_fails_its_stage_in_one_line_and_the_next_run_ends_it(
     pair: Pair,
@@ -558,6 +562,7 @@ def test_a_worker_that_dies_fails_its_stage_in_one_line_and_the_next_run_ends_it
 
 
 @pytest.mark.long
+@BESIDE
 @pytest.mark.timeout(2000)  # `pair`, where no test before made it
 def test_two_runs_at_once_are_one_run(pair: Pair) -> None:
     stage = "train_manifold@planner"
@@ -585,6 +590,7 @@ def test_two_runs_at_once_are_one_run(pair: Pair) -> None:
 
 
 @pytest.mark.long
+@BESIDE
 @pytest.mark.timeout(2000)  # `pair`, where no test before made it
 def test_a_server_that_goes_in_the_middle_of_a_stage_fails_nothing(pair: Pair) -> None:
     own = pair.hurt
