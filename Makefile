@@ -82,8 +82,9 @@ bench-geometry: env  ## time the geometry core again, after whatever it needs; w
 	dvc repro label_joints train_manifold train_analytic
 	dvc repro --single-item --force stages/dvc.yaml:benchmark_geometry
 
+TWO := -n 2 --dist loadgroup --no-loadscope-reorder
 # what hangs outside Python hears no other limit: it is ended after longer than any test's own, and named
-TESTS := python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder \
+TESTS := python -m pytest $(TWO) \
 	-o faulthandler_timeout=2100 -o faulthandler_exit_on_timeout=true
 EXPERIMENTS := benchmark end_to_end geodesics geometry identification installation laws learning peers pipeline report studies tracking \
 	$(addprefix faults/test_, kills.py load.py no_network.py random_requests.py)
@@ -101,8 +102,8 @@ test-experiments: env  ## run all others: learning, laws, tracking, reports, bas
 FAULTS := GEODESICS_RELIABILITY=reports/reliability.json python -m pytest
 TIMED := tests/faults/test_load.py tests/faults/test_scaling.py
 
-test-faults: env .venv/servers  ## break things on purpose: kills, full disks, bad input, hostile files, load (half an hour); writes reports/reliability.json
-	$(FAULTS) tests/faults --faults --numprocesses 2 --dist loadgroup --no-loadscope-reorder $(TIMED:%=--ignore %)
+test-faults: env .venv/servers  ## break things on purpose: kills, full disks, bad input, hostile files, load (half an hour and more); writes reports/reliability.json
+	$(FAULTS) $(TWO) tests/faults --faults $(TIMED:%=--ignore %)
 	$(FAULTS) $(TIMED) --faults
 
 soak: env .venv/servers  ## the same for hours, with more of each: 20 kills a stage, 100,000 requests; go on after an interruption by calling it again

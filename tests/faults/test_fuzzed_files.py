@@ -18,8 +18,8 @@ from constraint_geodesics.identification.files import load_constraint
 from constraint_geodesics.learning.dataset import Queries, read_queries, write_queries
 from constraint_geodesics.moveit import add_moveit_scene, read_moveit_request
 from constraint_geodesics.params import load_params
-from constraint_geodesics.robot.arm_file import digest_of
 from constraint_geodesics.robot.description import read_description
+from constraint_geodesics.scene.pieces import digest_of
 from constraint_geodesics.scene.scene_file import read_attached, read_scene
 from constraint_geodesics.scene.triangles import read_triangles
 from tests.benchmark.problem_fixtures import small_file
@@ -115,8 +115,10 @@ def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, R
     shutil.copy(ROOT / "params.yaml", folder)
     for file in (ROOT / "tests" / "robots").iterdir():
         shutil.copy(file, folder)
-    # without dividing it into convex parts, which takes what it takes
-    mesh = lambda file: read_triangles(file, digest_of(file.read_bytes()))  # noqa: E731
+
+    def mesh(file: Path) -> object:
+        return read_triangles(file, digest_of(file))  # to divide it takes what it takes
+
     return {
         "path": (written(folder, "path.csv", path), planner.check),
         "constraint": (
