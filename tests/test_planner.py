@@ -333,6 +333,18 @@ def test_long_calls_say_so_on_the_main_thread_alone(planner, monkeypatch, capfd)
     assert capfd.readouterr().err == ""
 
 
+def test_a_plan_that_makes_a_roadmap_says_so_once(monkeypatch, capfd) -> None:
+    """Also without a budget: nobody waits before a silent interpreter."""
+    own, ((start, goal), *_) = packaged_planner(), pairs_of("level_cup", 1, seed=8)
+    tilt = Constraint([0, 0, 0, 1, 1, 0], [0, 0, 0, 0.4567, 0.4567, 0])
+    monkeypatch.setattr("constraint_geodesics.progress.LINE_AFTER_S", 0.05)
+    own.plan(start, goal, tilt, parts=Parts(straight=False))
+    said = capfd.readouterr().err
+    assert said.splitlines().count("making the roadmap …") == 1, said
+    own.plan(start, goal, tilt, parts=Parts(straight=False))
+    assert "roadmap" not in capfd.readouterr().err
+
+
 def test_a_batch_of_unequal_shapes_is_refused(planner) -> None:
     rows = nodes_of("free")[0]
     for starts, goals in ((rows[:2], rows[:3]), (rows[0], rows[1]), (rows[:2, :5], rows[:2, :5])):

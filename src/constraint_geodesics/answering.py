@@ -296,7 +296,8 @@ class Answering:
             if candidate is not None and candidate.length < (1.0 - _WORTHWHILE) * path.length_rad:
                 found = self._certified(query, candidate, one)
                 if isinstance(found, Trajectory) and found.length_rad < path.length_rad:
-                    path, reached = found, one
+                    known = () if found.statistics.ways else path.statistics.ways
+                    path, reached = _beside(found, known), one
         return path, reached
 
     def _improvements(
@@ -348,7 +349,10 @@ class Answering:
             found = self.judged(query, joints, candidate.source, end)
             if not (isinstance(found, Refused) and found.kind in _CLOSER):
                 break
-        return found.why if isinstance(found, Refused) else _beside_others(found, candidate.others)
+        if isinstance(found, Refused):
+            return found.why
+        others = (Way(one.source, one.length, one.points) for one in candidate.others)
+        return _beside(found, tuple(others))
 
     def _continued(self, query: Query, candidate: Candidate, end: "End") -> Trajectory | str:
         """The candidate, begun from the query's velocity: the first beginning that is certified."""
@@ -442,11 +446,10 @@ class Answering:
         return Statistics(spent, self.method.name, source, query.snapped_rad, query.looked_at)
 
 
-def _beside_others(path: Trajectory, others: Sequence[Candidate]) -> Trajectory:
-    """The path with the other ways that were found with it."""
-    if not others:
+def _beside(path: Trajectory, ways: tuple[Way, ...]) -> Trajectory:
+    """The path with the other ways that were found before it or with it."""
+    if not ways:
         return path
-    ways = tuple(Way(one.source, one.length, one.points) for one in others)
     told = ", ".join(f"{way.source} {way.length_rad:.3f}" for way in ways)
     line = f"{path.explanation}, the shortest of {len(ways) + 1} ways round (others: {told} rad)"
     return replace(path, explanation=line, statistics=replace(path.statistics, ways=ways))

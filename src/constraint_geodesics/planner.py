@@ -5,13 +5,10 @@ planner = Planner.load()
 trajectory = planner.plan(start, goal, "level_cup")
 """
 
-import multiprocessing
-import sys
-import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
@@ -46,7 +43,7 @@ from constraint_geodesics.params import (
 )
 from constraint_geodesics.problem import PlannerError as PlannerError
 from constraint_geodesics.problem import end_refused
-from constraint_geodesics.progress import LINE_AFTER_S, waiting
+from constraint_geodesics.progress import LINE_AFTER_S, may_show, waiting_alone
 from constraint_geodesics.progress import progress as bar
 from constraint_geodesics.replanning import Replanning
 from constraint_geodesics.robot.inverse_kinematics import Search, solutions, spread
@@ -94,20 +91,6 @@ def _in_turn(
     return alone
 
 
-def _waiting(description: str, expected_s: float) -> AbstractContextManager[None]:
-    """Say so where a call takes long; one that is soon over does not even start a clock."""
-    return waiting(description) if expected_s > LINE_AFTER_S and _may_show() else nullcontext()
-
-
-def _may_show() -> bool:
-    """Workers, threads as processes, leave it to who started them; where Rich has taken stderr, a
-    bar is there already.
-    """
-    alone = multiprocessing.current_process().name == "MainProcess"
-    has_bar = type(sys.stderr).__module__ == "rich.file_proxy"
-    return alone and threading.current_thread() is threading.main_thread() and not has_bar
-
-
 def _late_bar(opened: ExitStack, total: int) -> Callable[[int], None]:
     """What is told how many queries are done, and shows a bar of the rest once two seconds have
     passed.
@@ -118,7 +101,7 @@ def _late_bar(opened: ExitStack, total: int) -> Callable[[int], None]:
         nonlocal advance
         if advance is not None:
             advance()
-        elif done < total and time.monotonic() - began > LINE_AFTER_S and _may_show():
+        elif done < total and time.monotonic() - began > LINE_AFTER_S and may_show():
             advance = opened.enter_context(bar(f"planned, after the first {done}", total - done))
 
     return tell
@@ -273,10 +256,9 @@ class Planner:
         Raises PlannerError if it holds an axis but has no reference: its roadmap would be another
         for every start.
         """
-        with _waiting("making the roadmap", np.inf):
-            nodes = self.nodes(constraint)
-            if len(nodes):
-                self.plan(nodes[0], nodes[-1], constraint)
+        nodes = self.nodes(constraint)
+        if len(nodes):
+            self.plan(nodes[0], nodes[-1], constraint)
 
     @_in_turn
     def nodes(self, constraint: str | Constraint) -> Float[np.ndarray, "n D"]:
@@ -390,8 +372,9 @@ class Planner:
         if start_velocity is not None:
             moving = checked_configuration(start_velocity, dof, "start_velocity")
             moving = moving if np.linalg.norm(moving) > AT_REST else None
-        long = budget_s or 0.0
-        with _waiting(f"planning for {long:g} s", long), self.scene.including(scene):
+        is_long = budget_s is not None and budget_s > LINE_AFTER_S
+        says_so = waiting_alone(f"planning for {budget_s:g} s") if is_long else nullcontext()
+        with says_so, self.scene.including(scene):
             task, moved = self._preparation.task(self._held_at(given, q_start)), 0.0
             if snap:
                 q_start, moved = self._snapped(q_start, task.manifold)

@@ -1,5 +1,6 @@
 """How far a long piece of work has come, on standard error."""
 
+import multiprocessing
 import os
 import sys
 import threading
@@ -57,6 +58,20 @@ def waiting(description: str) -> Iterator[None]:
             yield
         finally:
             _waiting.remove(line)
+
+
+def waiting_alone(description: str) -> AbstractContextManager[None]:
+    """The same from within what people call: workers leave it to who started them."""
+    return waiting(description) if may_show() else nullcontext()
+
+
+def may_show() -> bool:
+    """Workers, threads as processes, leave it to who started them; where Rich has taken stderr, a
+    bar is there already.
+    """
+    alone = multiprocessing.current_process().name == "MainProcess"
+    has_bar = type(sys.stderr).__module__ == "rich.file_proxy"
+    return alone and threading.current_thread() is threading.main_thread() and not has_bar
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from constraint_geodesics.params import RobotParams
-from constraint_geodesics.robot.arm_file import digest_of
+from constraint_geodesics.robot.arm_file import content_digest
 from constraint_geodesics.robot.description import find_mesh
 from constraint_geodesics.scene.triangles import read_triangles
 from constraint_geodesics.text_files import read_content
@@ -92,7 +92,7 @@ def _urdf(file: Path, contents: dict[str, bytes]) -> str:
         if found is not None and _is_mesh(found):
             mesh.set("filename", _plain(found, contents).removeprefix(f"{FILES}/"))
     content = ElementTree.tostring(tree)
-    digest = digest_of(content)
+    digest = content_digest(content)
     name = f"{FILES}/{file.stem.removesuffix(f'-{digest}')}-{digest}.urdf"  # it may be one of ours
     contents[name] = content
     return name
@@ -103,7 +103,7 @@ def _is_mesh(file: Path) -> bool:
     lies in the folder is handed on.
     """
     try:
-        read_triangles(file, digest_of(read_content(file)))
+        read_triangles(file, content_digest(read_content(file)))
     except (OSError, ValueError):
         return False
     return True
@@ -112,7 +112,7 @@ def _is_mesh(file: Path) -> bool:
 def _plain(file: Path, contents: dict[str, bytes]) -> str:
     """A file as it is, and the colours beside an OBJ."""
     content, colours = read_content(file), file.with_suffix(".mtl")
-    folder = f"{FILES}/{digest_of(content)}"
+    folder = f"{FILES}/{content_digest(content)}"
     contents[f"{folder}/{file.name}"] = content
     if colours.is_file() and _COLOUR in (drawn := read_content(colours)):
         contents[f"{folder}/{colours.name}"] = drawn

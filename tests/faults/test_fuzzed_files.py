@@ -19,7 +19,7 @@ from constraint_geodesics.learning.dataset import Queries, read_queries, write_q
 from constraint_geodesics.moveit import add_moveit_scene, read_moveit_request
 from constraint_geodesics.params import load_params
 from constraint_geodesics.robot.description import read_description
-from constraint_geodesics.scene.pieces import digest_of
+from constraint_geodesics.scene.pieces import file_digest
 from constraint_geodesics.scene.scene_file import read_attached, read_scene
 from constraint_geodesics.scene.triangles import read_triangles
 from tests.benchmark.problem_fixtures import small_file
@@ -117,7 +117,7 @@ def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, R
         shutil.copy(file, folder)
 
     def mesh(file: Path) -> object:
-        return read_triangles(file, digest_of(file))  # to divide it takes what it takes
+        return read_triangles(file, file_digest(file))  # to divide it takes what it takes
 
     return {
         "path": (written(folder, "path.csv", path), planner.check),

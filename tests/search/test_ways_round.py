@@ -181,3 +181,18 @@ def test_an_answer_names_the_other_ways_and_a_recording_draws_them(tmp_path: Pat
             assert len(strips) == len(lengths)
             named += 1
     assert named >= 3
+
+
+def test_a_shorter_path_that_a_budget_finds_names_the_ways_known_before() -> None:
+    planner, shorter = packaged_planner(), 0
+    for start, goal, ball, _ in queries("level_cup", 24):
+        first = planner.plan(start, goal, "level_cup", scene=[ball])
+        if first.status != "solved" or not first.statistics.ways:
+            continue
+        best = planner.plan(start, goal, "level_cup", scene=[ball], budget_s=0.5)
+        lengths = [way.length_rad for way in best.statistics.ways]
+        assert lengths
+        assert min(lengths) > best.length_rad * (1.0 - 1e-3)
+        assert best.explanation.count("ways round") == 1
+        shorter += best.length_rad < first.length_rad - 1e-9
+    assert shorter >= 1

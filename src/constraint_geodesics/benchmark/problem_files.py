@@ -35,7 +35,7 @@ from constraint_geodesics.moveit import (
     shape_of_record,
 )
 from constraint_geodesics.params import one_line
-from constraint_geodesics.robot.arm_file import digest_of
+from constraint_geodesics.robot.arm_file import content_digest
 from constraint_geodesics.robot.kinematics import RobotError, SerialRobot
 from constraint_geodesics.scene.arm import mesh_digests
 from constraint_geodesics.scene.mesh import Mesh
@@ -325,7 +325,7 @@ def told_of_arm(robot: SerialRobot) -> Mapping[str, Any]:
     links that may touch, whoever says so.
     """
     return {
-        "urdf": digest_of(robot.urdf.read_bytes()),
+        "urdf": content_digest(robot.urdf.read_bytes()),
         "meshes": mesh_digests(robot),
         "allowed": sorted(map(list, robot.allowed)),
     }

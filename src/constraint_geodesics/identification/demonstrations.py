@@ -165,7 +165,7 @@ def _read(file: Path, robot: SerialRobot) -> Any:
             if odd is None:
                 raise
             if 2 * sum(map(is_number, names)) > len(names):
-                line = f"{file}: its first row has {odd!r} among numbers"
+                line = f"{file}: its first row has {values.shown(odd)} among numbers"
                 raise DemonstrationError(f"{line}: must be numbers alone, or names") from None
             table = np.array(lines, float)
     except DemonstrationError:

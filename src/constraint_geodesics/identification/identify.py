@@ -53,6 +53,7 @@ from constraint_geodesics.identification.vanishing import (
     vanishing,
     without,
 )
+from constraint_geodesics.progress import waiting_alone
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.shape import Placement
 
@@ -202,6 +203,11 @@ def identify(demonstrations: Any, robot: SerialRobot) -> Identified:
     Raises DemonstrationError, one line, for what nothing can be learned from.
     """
     shown, motions = demonstrations_from(demonstrations, robot)
+    with waiting_alone("looking what the demonstrations keep to"):
+        return _identified(shown, motions, robot)
+
+
+def _identified(shown: list[np.ndarray], motions: bool, robot: SerialRobot) -> Identified:
     sample = Sample.of_joints(robot, shown, motions)
     kept, search = np.ones(len(sample), dtype=bool), _searched(sample)
     if not search.relations:

@@ -38,13 +38,13 @@ def write_arm(
     """
     tree, link = _tree_of(arm, tool, readable)
     text = ElementTree.tostring(tree, encoding="unicode")
-    file = folder / f"{arm.description.file.stem}-{digest_of(text.encode())}.urdf"
+    file = folder / f"{arm.description.file.stem}-{content_digest(text.encode())}.urdf"
     if not file.is_file():
         write_text(file, text)
     return file, link
 
 
-def digest_of(content: bytes) -> str:
+def content_digest(content: bytes) -> str:
     """A few letters that tell a content."""
     return hashlib.sha256(content).hexdigest()[:16]
 

@@ -19,7 +19,7 @@ from platformdirs import user_cache_path
 
 from constraint_geodesics.params import RobotParams
 from constraint_geodesics.progress import waiting
-from constraint_geodesics.robot.arm_file import digest_of, write_arm
+from constraint_geodesics.robot.arm_file import content_digest, write_arm
 from constraint_geodesics.robot.description import Arm, arm_to, find_mesh, read_description
 from constraint_geodesics.robot.kinematics import (
     RobotError,
@@ -125,7 +125,7 @@ def _sampled_digest(robot: SerialRobot) -> str:
     own = allowed_collisions
     settings = (own.SAMPLES, own.ALWAYS, own.NEAR_M, own.OFTEN)
     parts = [np.stack([robot.lower, robot.upper]).tobytes().hex(), repr(settings)]
-    return digest_of(" ".join([*parts, *mesh_digests(robot)]).encode())
+    return content_digest(" ".join([*parts, *mesh_digests(robot)]).encode())
 
 
 def mesh_digests(robot: SerialRobot) -> list[str]:
@@ -133,7 +133,7 @@ def mesh_digests(robot: SerialRobot) -> list[str]:
     meshes = urdf_root(robot.urdf).iterfind("link/collision/geometry/mesh")
     names = dict.fromkeys(mesh.get("filename", "") for mesh in meshes)
     files = (find_mesh(name, robot.urdf) for name in names)
-    return [digest_of(file.read_bytes()) for file in files if file is not None]
+    return [content_digest(file.read_bytes()) for file in files if file is not None]
 
 
 def _readable(mesh: Path) -> Path:
@@ -141,7 +141,7 @@ def _readable(mesh: Path) -> Path:
     kind = mesh.suffix.lower()
     if kind not in _AS_OBJ or (kind == ".stl" and is_binary_stl(mesh)):
         return mesh
-    written = arms_folder() / f"{mesh.stem}-{digest_of(mesh.read_bytes())}.obj"
+    written = arms_folder() / f"{mesh.stem}-{content_digest(mesh.read_bytes())}.obj"
     if not written.is_file():
         write_text(written, _AS_OBJ[kind](mesh))
     return written

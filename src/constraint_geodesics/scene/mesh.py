@@ -10,7 +10,7 @@ import numpy as np
 
 from constraint_geodesics.fields import Positive
 from constraint_geodesics.robot.kinematics import RobotError
-from constraint_geodesics.scene.pieces import HULL_MARGIN, Piece, digest_of
+from constraint_geodesics.scene.pieces import HULL_MARGIN, Piece, file_digest
 from constraint_geodesics.scene.shape import Placement, Shape, add_mesh
 from constraint_geodesics.scene.triangles import Triangles, convex_pieces, read_triangles
 
@@ -74,7 +74,7 @@ class Mesh(Shape):
     def _read(self) -> tuple[Path, str]:
         """The file, and what is in it."""
         try:
-            return Path(self.file), digest_of(Path(self.file))
+            return Path(self.file), file_digest(Path(self.file))
         except OSError as error:
             line = f"{self.name!r}: there is no mesh {str(self.file)!r}: {error.strerror}"
             raise RobotError(line) from None

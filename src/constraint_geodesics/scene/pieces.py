@@ -172,7 +172,7 @@ def _mesh(shape: ElementTree.Element, urdf: Path) -> Iterator[Piece]:
     if file is None:
         raise ValueError(f"there is no mesh {name!r}")
     scale = _numbers(shape, "scale", "1 1 1")
-    yield from _mesh_pieces(file, digest_of(file), tuple(scale))
+    yield from _mesh_pieces(file, file_digest(file), tuple(scale))
 
 
 @lru_cache(maxsize=256)
@@ -209,7 +209,7 @@ def _deepest(corners: Float[np.ndarray, "n 3"], faces: Float[np.ndarray, "f 4"])
     return found
 
 
-def digest_of(file: Path) -> str:
+def file_digest(file: Path) -> str:
     """Of what is in a file: its time is no sign, which a copy may keep.  Raises OSError."""
     return blake2b(read_content(file)).hexdigest()
 
