@@ -44,8 +44,10 @@ SLACK = 1e-6
 TURN_OFF, TURN_BEYOND = 1e-3, 1e-4
 """What an arm may be off its constraint [rad or m], and beyond a joint limit [rad], while it turns
 into its path: as the documentation says."""
-KEPT = Path(".geodesics/soak/random_requests.json")
-"""Where the figures of a run of hours are kept, so that it goes on where it was ended."""
+KEPT = Path("reports/random_requests.json")
+"""Where the figures of a run of hours are kept until it is done, so that it goes on where it was
+ended: on another machine too, with the commit that it is added to.
+"""
 KEPT_EVERY = 20 * A_SCENE
 
 
@@ -412,7 +414,6 @@ def _begun(effort: Effort) -> Figures:
 
 def _keep(effort: Effort, figures: Figures) -> None:
     if effort.name == "soak":
-        KEPT.parent.mkdir(parents=True, exist_ok=True)
         part = KEPT.with_suffix(".part")
         part.write_text(json.dumps({"of": _of(), **vars(figures)}))
         part.replace(KEPT)

@@ -11,12 +11,14 @@ import random
 import re
 import resource
 import signal
+import sqlite3
 import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from constraint_geodesics.benchmark import runner
+from constraint_geodesics.benchmark.planner_arena import export_arena
 from constraint_geodesics.benchmark.row import (
     COLUMNS,
     KEY,
@@ -49,6 +52,12 @@ from constraint_geodesics.geodesics.policy_search import (
 )
 from constraint_geodesics.geodesics.proposals import MeanPolicy
 from constraint_geodesics.geometry.braking import Motion
+from constraint_geodesics.identification import (
+    Identified,
+    identify,
+    load_constraint,
+    save_constraint,
+)
 from constraint_geodesics.learning.dataset import (
     POSE_COLUMNS,
     RPY_COLUMNS,
@@ -133,6 +142,29 @@ def _table(name: str) -> Write:
         write_table(rows, folder / name, {"commit": "0"})
 
     return write
+
+
+def _database(folder: Path, number: int) -> None:
+    row = dict.fromkeys((*COLUMNS, "best_known_rad"), float(number)) | dict.fromkeys(TEXTS, "a")
+    row |= {"planner": "p", "valid": True}
+    rows = pd.DataFrame([row | {"query": k} for k in range(30)])
+    export_arena(rows, folder / "rows.db", {"commit": "0"}, {"p": "its settings"})
+
+
+def _runs_of(folder: Path) -> dict[str, Any]:
+    with closing(sqlite3.connect(folder / "rows.db")) as database:
+        return dict(pd.read_sql("SELECT solution_length, memory FROM runs", database).items())
+
+
+@cache
+def _identified() -> Identified:
+    """Demonstrations of a tool that stays level."""
+    planner = packaged_planner()
+    return identify(planner.nodes("level_cup")[:300], planner.robot)
+
+
+def _constraint(folder: Path, number: int) -> None:
+    save_constraint(_identified().held_loosely(1.0 + number), folder / "level.yaml")
 
 
 def _recording(folder: Path, number: int) -> None:
@@ -289,12 +321,22 @@ ARTIFACTS: dict[str, Artifact] = {
         ("execution.npz",),
         lambda folder: asdict(load_execution(folder / "execution.npz")),
     ),
+    "constraint": Artifact(
+        _constraint,
+        ("level.yaml",),
+        lambda folder: {"constraint": json.dumps(load_constraint(folder / "level.yaml").to_json())},
+        sealed=False,
+    ),
+    "database": Artifact(_database, ("rows.db",), _runs_of, sealed=False),
     "picture": Artifact(
         _picture,
         ("path.png",),
         lambda folder: {"pixels": np.asarray(Image.open(folder / "path.png"))},
     ),
 }
+
+UNREAD = {"picture", "database"}
+"""Which nothing here reads back."""
 
 ERRORS = (errno.ENOSPC, errno.EIO, errno.EMFILE, errno.ENOMEM)
 CALLS = (
@@ -414,7 +456,7 @@ def test_a_write_that_fails_leaves_the_previous_file_whole(
     assert contents(folder).keys() == old.keys()
 
 
-@pytest.mark.parametrize("name", sorted(set(ARTIFACTS) - {"picture"}))  # which nothing here reads
+@pytest.mark.parametrize("name", sorted(set(ARTIFACTS) - UNREAD))
 def test_a_file_that_was_damaged_is_refused_or_says_what_it_said(
     name: str, tmp_path: Path, effort: Effort
 ) -> None:
