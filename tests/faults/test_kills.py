@@ -267,12 +267,17 @@ SECONDS_ALONE = "benchmark_training.json"
 LATEST = 100
 """Times that a stage may be done before it is killed: no kill that did not hit it is counted."""
 BESIDE = pytest.mark.xdist_group("runs")
-"""On the other worker, with a pair of its own: the kills of all stages take as long as the rest."""
+"""On the other worker: the kills of all stages take as long as the rest."""
+OF_ALL, OF_BENCHMARK = (
+    pytest.mark.parametrize("pair", [(name, stages)], ids=[name], indirect=True)
+    for name, stages in (("kills", ()), ("benchmark", (BENCHMARK,)))
+)
+"""Of all of the root's stages, and of the benchmark with those that it hangs on."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two checkouts: in one `dvc repro` ran undisturbed, in the other it is disturbed."""
+    """Two checkouts: in one stages ran undisturbed, in the other they are disturbed."""
 
     folder: Path
 
@@ -295,21 +300,26 @@ class Pair:
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory, effort: Effort) -> Pair:
+def pair(
+    tmp_path_factory: pytest.TempPathFactory, effort: Effort, request: pytest.FixtureRequest
+) -> Pair:
     """`make soak` keeps them, of the same code, and goes on after an interruption."""
-    folder = tmp_path_factory.mktemp("kills")
+    name, stages = request.param
+    folder = tmp_path_factory.mktemp(name)
     if effort == SOAK:
         changed = subprocess.run(["git", "diff", "HEAD"], cwd=smoke.ROOT, capture_output=True)
         head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=smoke.ROOT, capture_output=True)
         key = hashlib.sha256(head.stdout + changed.stdout).hexdigest()[:12]
-        folder = smoke.ROOT / ".geodesics" / "soak" / f"kills-{key}"
+        folder = smoke.ROOT / ".geodesics" / "soak" / f"{name}-{key}"
     made = Pair(folder)
     if not (folder / "made").is_file():
         shutil.rmtree(folder, ignore_errors=True)
-        assert smoke.main(made.whole) == 0
-        made.hurt.mkdir()
-        smoke.copy_checkout(made.hurt)
-        smoke.shrink_params(made.hurt)
+        for checkout in (made.whole, made.hurt):
+            checkout.mkdir(parents=True)
+            smoke.copy_checkout(checkout)
+            smoke.shrink_params(checkout)
+        undisturbed = smoke.dvc(made.whole, "repro", *stages)
+        assert undisturbed.returncode == 0, undisturbed.stderr
         (folder / "made").touch()
     return made
 
@@ -414,6 +424,7 @@ def timeless(value: Any) -> Any:
 
 
 @pytest.mark.long
+@OF_ALL
 @pytest.mark.timeout(12 * 3600)
 def test_stages_that_are_killed_again_and_again_end_as_if_they_had_not(
     pair: Pair, effort: Effort
@@ -476,13 +487,12 @@ def benchmark_rows(folder: Path) -> set[str]:
 
 @pytest.mark.long
 @BESIDE
+@OF_BENCHMARK
 @pytest.mark.timeout(3600)
 def test_a_benchmark_that_is_killed_keeps_its_rows_and_makes_the_others(
     pair: Pair, effort: Effort
 ) -> None:
     with counting("benchmark_kills", effort) as row:
-        whole = smoke.dvc(pair.whole, "repro", BENCHMARK)
-        assert whole.returncode == 0, whole.stderr
         wanted = len(benchmark_rows(pair.whole))
         made = len(benchmark_rows(pair.hurt))
         # by what is done, not by time: each kill hits the run, and another part of the rows
@@ -524,6 +534,7 @@ def test_a_benchmark_that_is_killed_keeps_its_rows_and_makes_the_others(
 
 @pytest.mark.long
 @BESIDE
+@OF_BENCHMARK
 @pytest.mark.timeout(2000)  # `pair`, where no test before made it
 def test_a_worker_that_dies_fails_its_stage_in_one_line_and_the_next_run_ends_it(
     pair: Pair,
@@ -563,6 +574,7 @@ def test_a_worker_that_dies_fails_its_stage_in_one_line_and_the_next_run_ends_it
 
 @pytest.mark.long
 @BESIDE
+@OF_BENCHMARK
 @pytest.mark.timeout(2000)  # `pair`, where no test before made it
 def test_two_runs_at_once_are_one_run(pair: Pair) -> None:
     stage = "train_manifold@planner"
@@ -591,6 +603,7 @@ def test_two_runs_at_once_are_one_run(pair: Pair) -> None:
 
 @pytest.mark.long
 @BESIDE
+@OF_BENCHMARK
 @pytest.mark.timeout(2000)  # `pair`, where no test before made it
 def test_a_server_that_goes_in_the_middle_of_a_stage_fails_nothing(pair: Pair) -> None:
     own = pair.hurt
