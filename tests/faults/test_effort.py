@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.faults import effort as efforts
 from tests.faults.effort import COUNTS, FAULTS, QUICK, SOAK, Effort, counting
 
 
@@ -27,6 +28,18 @@ def test_a_row_says_what_was_measured_on_which_commit_and_for_how_long(file: Pat
     assert rows["kills"]["effort"] == "faults"
     assert rows["kills"]["seconds"] >= 0.0
     assert rows["load"]["lost"] == 3
+
+
+def test_a_row_is_in_the_checkout_wherever_its_test_went(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(efforts, "ROOT", tmp_path)
+    monkeypatch.setenv(COUNTS, "counts.json")
+    with counting("runs", FAULTS) as row:
+        (tmp_path / "elsewhere").mkdir()
+        monkeypatch.chdir(tmp_path / "elsewhere")
+        row["lost"] = 0
+    assert json.loads((tmp_path / "counts.json").read_text())["runs"]["lost"] == 0
 
 
 @pytest.mark.parametrize("effort", [QUICK, FAULTS, SOAK], ids=lambda own: own.name)
