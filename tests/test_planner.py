@@ -30,7 +30,7 @@ from constraint_geodesics.constraints.projection import retract
 from constraint_geodesics.methods import SearchMethod
 from constraint_geodesics.planner import PlannerError
 from constraint_geodesics.problem import SATISFIED, Status
-from constraint_geodesics.progress import LINE_AFTER_S
+from constraint_geodesics.progress import LINE_AFTER_S, waiting
 from constraint_geodesics.recording.recording import read_recording
 from constraint_geodesics.scene.cylinder import Cylinder
 from constraint_geodesics.scene.sphere import Sphere
@@ -334,7 +334,6 @@ def test_long_calls_say_so_on_the_main_thread_alone(planner, monkeypatch, capfd)
 
 
 def test_a_plan_that_makes_a_roadmap_says_so_once(monkeypatch, capfd) -> None:
-    """Also without a budget: nobody waits before a silent interpreter."""
     own, ((start, goal), *_) = packaged_planner(), pairs_of("level_cup", 1, seed=8)
     tilt = Constraint([0, 0, 0, 1, 1, 0], [0, 0, 0, 0.4567, 0.4567, 0])
     monkeypatch.setattr("constraint_geodesics.progress.LINE_AFTER_S", 0.05)
@@ -343,6 +342,10 @@ def test_a_plan_that_makes_a_roadmap_says_so_once(monkeypatch, capfd) -> None:
     assert said.splitlines().count("making the roadmap …") == 1, said
     own.plan(start, goal, tilt, parts=Parts(straight=False))
     assert "roadmap" not in capfd.readouterr().err
+    narrower = Constraint([0, 0, 0, 1, 1, 0], [0, 0, 0, 0.4321, 0.4321, 0])
+    with waiting("a bar of the caller's"):  # which is all that is shown then
+        own.plan(start, goal, narrower, parts=Parts(straight=False))
+    assert capfd.readouterr().err == "a bar of the caller's …\n"
 
 
 def test_a_batch_of_unequal_shapes_is_refused(planner) -> None:

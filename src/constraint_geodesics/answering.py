@@ -289,15 +289,18 @@ class Answering:
         """The shortest certified path that is found before the time is over, and where it leads:
         `path`, to the first of those that are pursued, if it remains that.
         """
-        reached, worth = pursued[0], [one for one in pursued if one.distance < path.length_rad]
+        first, reached = path, pursued[0]
+        worth = [one for one in pursued if one.distance < path.length_rad]
         worth = worth or [reached]
         curves = _by_turns([self._improvements(query, one) for one in worth])
         for one, candidate in _in_time(curves, query.began, budget_s, _ROUND * len(worth)):
             if candidate is not None and candidate.length < (1.0 - _WORTHWHILE) * path.length_rad:
                 found = self._certified(query, candidate, one)
                 if isinstance(found, Trajectory) and found.length_rad < path.length_rad:
-                    known = () if found.statistics.ways else path.statistics.ways
-                    path, reached = _beside(found, known), one
+                    path, reached = found, one
+        if path is not first:
+            known = Way(first.source, first.length_rad, first.joints), *first.statistics.ways
+            path = _with_ways(path, known, "shorter than what was found first (")
         return path, reached
 
     def _improvements(
@@ -351,8 +354,9 @@ class Answering:
                 break
         if isinstance(found, Refused):
             return found.why
-        others = (Way(one.source, one.length, one.points) for one in candidate.others)
-        return _beside(found, tuple(others))
+        others = tuple(Way(one.source, one.length, one.points) for one in candidate.others)
+        what = f"the shortest of {len(others) + 1} ways round (others: "
+        return _with_ways(found, others, what) if others else found
 
     def _continued(self, query: Query, candidate: Candidate, end: "End") -> Trajectory | str:
         """The candidate, begun from the query's velocity: the first beginning that is certified."""
@@ -446,13 +450,11 @@ class Answering:
         return Statistics(spent, self.method.name, source, query.snapped_rad, query.looked_at)
 
 
-def _beside(path: Trajectory, ways: tuple[Way, ...]) -> Trajectory:
-    """The path with the other ways that were found before it or with it."""
-    if not ways:
-        return path
+def _with_ways(path: Trajectory, ways: tuple[Way, ...], what: str) -> Trajectory:
+    """The path with other ways.  what: they are, before their lengths."""
     told = ", ".join(f"{way.source} {way.length_rad:.3f}" for way in ways)
-    line = f"{path.explanation}, the shortest of {len(ways) + 1} ways round (others: {told} rad)"
-    return replace(path, explanation=line, statistics=replace(path.statistics, ways=ways))
+    line, statistics = f"{path.explanation}, {what}{told} rad)", replace(path.statistics, ways=ways)
+    return replace(path, explanation=line, statistics=statistics)
 
 
 def _is_open(query: Query, one: Pursued, is_connected: Callable[[Pursued], bool]) -> bool:

@@ -21,6 +21,7 @@ from constraint_geodesics.cli_planning import (
     require_apart,
 )
 from constraint_geodesics.pipeline.stage import WRONG_USAGE, complain
+from constraint_geodesics.progress import waiting
 
 
 def identify_constraint(
@@ -97,7 +98,7 @@ def identify_constraint(
             raise PlannerError(f"--loosely {loosely}: must be 0 or more, and finite")
         with loading():
             loaded = Arm(planner, urdf, tool_link, tool_pose, hold, srdf).open()
-        with loaded:
+        with loaded, waiting(f"looking what {demonstrations} keeps to"):
             robot, workcell = loaded.robot, loaded.scene.workcell
             shown, motions = demonstrations_from(demonstrations, robot)
             found = identify(shown if motions else np.concatenate(shown), robot)

@@ -29,6 +29,7 @@ from constraint_geodesics.geometry.timing import time_parametrisation
 from constraint_geodesics.identification import identify
 from constraint_geodesics.identification.vanishing import Sample
 from constraint_geodesics.plugs import PULL, PULL_BOUNDS, plug
+from constraint_geodesics.progress import shown_already
 from constraint_geodesics.robot.inverse_kinematics import solutions
 from constraint_geodesics.robot.kinematics import load_robot
 from constraint_geodesics.scene import convex_kernels as convex
@@ -190,14 +191,15 @@ JOBS = {
 
 def _serve() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # who started it ends it
-    for line in sys.stdin:
-        try:
-            JOBS[line.strip()].work()
-        except Exception as error:
-            line = " ".join(f"{type(error).__name__}: {error}".split())
-            print(f"{FAILED}{line}", flush=True)
-        else:
-            print(DONE, flush=True)
+    with shown_already():
+        for line in sys.stdin:
+            try:
+                JOBS[line.strip()].work()
+            except Exception as error:
+                line = " ".join(f"{type(error).__name__}: {error}".split())
+                print(f"{FAILED}{line}", flush=True)
+            else:
+                print(DONE, flush=True)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ trajectory = planner.plan(start, goal, "level_cup")
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
@@ -43,7 +43,7 @@ from constraint_geodesics.params import (
 )
 from constraint_geodesics.problem import PlannerError as PlannerError
 from constraint_geodesics.problem import end_refused
-from constraint_geodesics.progress import LINE_AFTER_S, may_show, waiting_alone
+from constraint_geodesics.progress import LINE_AFTER_S, may_show, saying_late, waiting
 from constraint_geodesics.progress import progress as bar
 from constraint_geodesics.replanning import Replanning
 from constraint_geodesics.robot.inverse_kinematics import Search, solutions, spread
@@ -256,9 +256,10 @@ class Planner:
         Raises PlannerError if it holds an axis but has no reference: its roadmap would be another
         for every start.
         """
-        nodes = self.nodes(constraint)
-        if len(nodes):
-            self.plan(nodes[0], nodes[-1], constraint)
+        with saying_late("making the roadmap"):
+            nodes = self.nodes(constraint)
+            if len(nodes):
+                self.plan(nodes[0], nodes[-1], constraint)
 
     @_in_turn
     def nodes(self, constraint: str | Constraint) -> Float[np.ndarray, "n D"]:
@@ -373,8 +374,8 @@ class Planner:
             moving = checked_configuration(start_velocity, dof, "start_velocity")
             moving = moving if np.linalg.norm(moving) > AT_REST else None
         is_long = budget_s is not None and budget_s > LINE_AFTER_S
-        says_so = waiting_alone(f"planning for {budget_s:g} s") if is_long else nullcontext()
-        with says_so, self.scene.including(scene):
+        line = f"planning for {budget_s:g} s" if is_long and may_show() else ""
+        with waiting(line), self.scene.including(scene):
             task, moved = self._preparation.task(self._held_at(given, q_start)), 0.0
             if snap:
                 q_start, moved = self._snapped(q_start, task.manifold)

@@ -20,7 +20,8 @@ LINE_AFTER_S = 2.0
 """Work that is over sooner says nothing where there is no terminal."""
 
 
-def progress(description: str, total: int) -> AbstractContextManager[Callable[[], None]]:
+@contextmanager
+def progress(description: str, total: int) -> Iterator[Callable[[], None]]:
     """Show how many of `total` tasks are done; the function it gives is called after each of them.
 
     On a terminal and in a notebook a bar with the time left.  Elsewhere plain lines: one at every
@@ -28,11 +29,13 @@ def progress(description: str, total: int) -> AbstractContextManager[Callable[[]
     description shows nothing.
     """
     if not description:
-        return nullcontext(lambda: None)
-    if sys.stderr.isatty():
-        return _bar(description, total)
+        yield lambda: None
+        return
     in_notebook = type(sys.stderr).__module__.startswith("ipykernel")
-    return _cell(description, total) if in_notebook else _lines(description, total)
+    elsewhere = _cell if in_notebook else _lines
+    shown = _bar if sys.stderr.isatty() else elsewhere
+    with shown_already(), shown(description, total) as advance:
+        yield advance
 
 
 @contextmanager
@@ -55,34 +58,56 @@ def waiting(description: str) -> Iterator[None]:
         line.add_task(description, total=None)
         _waiting.append(line)
         try:
-            yield
+            with shown_already():
+                yield
         finally:
             _waiting.remove(line)
 
 
-def waiting_alone(description: str) -> AbstractContextManager[None]:
-    """The same from within what people call: workers leave it to who started them."""
-    return waiting(description) if may_show() else nullcontext()
+def saying_late(description: str) -> AbstractContextManager[None]:
+    """Within what people call, and what may take long: one plain line after two seconds, where
+    nothing else is shown.
+    """
+    return _line_after(f"{description} …") if may_show() else nullcontext()
 
 
 def may_show() -> bool:
-    """Workers, threads as processes, leave it to who started them; where Rich has taken stderr, a
-    bar is there already.
+    """Workers, threads as processes, leave it to who started them, and what is within something
+    that is shown to that.
     """
     alone = multiprocessing.current_process().name == "MainProcess"
-    has_bar = type(sys.stderr).__module__ == "rich.file_proxy"
-    return alone and threading.current_thread() is threading.main_thread() and not has_bar
+    has_bar = type(sys.stderr).__module__ == "rich.file_proxy"  # somebody else's
+    is_first = threading.current_thread() is threading.main_thread()
+    return alone and is_first and not has_bar and not _showing
+
+
+_showing = 0
+"""How many bars and lines are shown, or will be soon."""
+
+
+@contextmanager
+def shown_already() -> Iterator[None]:
+    """Within, what people call shows nothing of its own."""
+    global _showing
+    _showing += 1
+    try:
+        yield
+    finally:
+        _showing -= 1
 
 
 @contextmanager
 def _line_after(line: str) -> Iterator[None]:
     """Write a line if the body is not over soon."""
+    if not line:
+        yield
+        return
     late = threading.Timer(LINE_AFTER_S, print, (line,), {"file": sys.stderr, "flush": True})
     late.daemon = True
-    if line:
-        late.start()
+    late.start()
     try:
-        yield
+        with shown_already():
+            yield
     finally:
         late.cancel()
 

@@ -70,8 +70,8 @@ class Asked:
 
 
 class Way(NamedTuple):
-    """Another curve that was found with the answer's: the proposal that it came from, its length
-    [rad] and points (T, D) on it.  It is certified for nothing.
+    """Another curve that was found before the answer's or with it: the proposal that it came from,
+    its length [rad] and points (T, D) on it.  It is certified for nothing.
     """
 
     source: str

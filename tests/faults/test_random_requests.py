@@ -25,10 +25,11 @@ from constraint_geodesics.goals.region import GoalRegion
 from constraint_geodesics.pipeline.code import code_digest, data_digest, digest
 from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import Status
+from constraint_geodesics.text_files import write_text
 from constraint_geodesics.trajectory import Trajectory
 from tests import planner_fixtures as fixtures
 from tests.faults import bad_calls, requests
-from tests.faults.effort import Effort, counting
+from tests.faults.effort import ROOT, Effort, counting
 from tests.faults.requests import A_SCENE, SEED, Request, request, scene_of
 from tests.planner_fixtures import packaged_planner, turning
 from tests.scene import judge as oracle
@@ -44,7 +45,7 @@ SLACK = 1e-6
 TURN_OFF, TURN_BEYOND = 1e-3, 1e-4
 """What an arm may be off its constraint [rad or m], and beyond a joint limit [rad], while it turns
 into its path: as the documentation says."""
-KEPT = Path("reports/random_requests.json")
+KEPT = ROOT / "reports" / "random_requests.json"
 """Where the figures of a run of hours are kept until it is done, so that it goes on where it was
 ended: on another machine too, with the commit that it is added to.
 """
@@ -87,7 +88,7 @@ def test_random_requests(effort: Effort) -> None:
         assert figures.solved_with_trees > 0.01 * figures.requests
         assert figures.solved_in_motion > 0.003 * figures.requests
     if effort.name == "soak":
-        KEPT.unlink()  # it is counted: the next run is one of its own
+        KEPT.unlink(missing_ok=True)  # it is counted: the next run is one of its own
 
 
 def _asked(effort: Effort) -> Figures:
@@ -102,7 +103,6 @@ def _asked(effort: Effort) -> Figures:
         figures.seconds = before + time.monotonic() - began
         if figures.requests % KEPT_EVERY == 0:
             _keep(effort, figures)
-    _keep(effort, figures)
     return figures
 
 
@@ -409,14 +409,13 @@ def _begun(effort: Effort) -> Figures:
     about: dict[str, Any] = json.loads(KEPT.read_text())
     of = about.pop("of")
     about["statuses"] = Counter(about["statuses"])
-    return Figures(**about) if of == _of() else Figures()
+    figures = Figures(**about)
+    return figures if of == _of() and figures.requests < effort.requests else Figures()
 
 
 def _keep(effort: Effort, figures: Figures) -> None:
     if effort.name == "soak":
-        part = KEPT.with_suffix(".part")
-        part.write_text(json.dumps({"of": _of(), **vars(figures)}))
-        part.replace(KEPT)
+        write_text(KEPT, json.dumps({"of": _of(), **vars(figures)}) + "\n")
 
 
 def _of() -> list[Any]:

@@ -158,7 +158,7 @@ def _runs_of(folder: Path) -> dict[str, Any]:
 
 @cache
 def _identified() -> Identified:
-    """Demonstrations of a tool that stays level."""
+    """What demonstrations of a tool that stays level keep to."""
     planner = packaged_planner()
     return identify(planner.nodes("level_cup")[:300], planner.robot)
 
@@ -336,7 +336,7 @@ ARTIFACTS: dict[str, Artifact] = {
 }
 
 UNREAD = {"picture", "database"}
-"""Which nothing here reads back."""
+"""Which the package reads nowhere."""
 
 ERRORS = (errno.ENOSPC, errno.EIO, errno.EMFILE, errno.ENOMEM)
 CALLS = (

@@ -79,14 +79,13 @@ def export_arena(
             }
         ).sort_values("experimentid", kind="stable"),
     }
-    with written(file) as part:
-        try:
-            with closing(sqlite3.connect(part)) as database, database:
-                database.executescript(SCHEMA)
-                for name, table in tables.items():
-                    table.to_sql(name, database, if_exists="append", index=False)
-        except (sqlite3.Error, pd.errors.DatabaseError) as error:
-            raise OSError(f"{file}: {' '.join(str(error).split())}") from None
+    try:
+        with written(file) as part, closing(sqlite3.connect(part)) as database, database:
+            database.executescript(SCHEMA)
+            for name, table in tables.items():
+                table.to_sql(name, database, if_exists="append", index=False)
+    except (sqlite3.OperationalError, pd.errors.DatabaseError) as error:
+        raise OSError(f"{file}: {' '.join(str(error).split())}") from None
 
 
 def _experiment(name: str, case: pd.DataFrame, about: Mapping[str, str]) -> dict[str, object]:

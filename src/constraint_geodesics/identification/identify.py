@@ -53,7 +53,7 @@ from constraint_geodesics.identification.vanishing import (
     vanishing,
     without,
 )
-from constraint_geodesics.progress import waiting_alone
+from constraint_geodesics.progress import saying_late
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.shape import Placement
 
@@ -203,7 +203,7 @@ def identify(demonstrations: Any, robot: SerialRobot) -> Identified:
     Raises DemonstrationError, one line, for what nothing can be learned from.
     """
     shown, motions = demonstrations_from(demonstrations, robot)
-    with waiting_alone("looking what the demonstrations keep to"):
+    with saying_late("looking what the demonstrations keep to"):
         return _identified(shown, motions, robot)
 
 

@@ -15,7 +15,7 @@ from constraint_geodesics.constraints.constraint import Constraint, ConstraintMa
 from constraint_geodesics.constraints.projection import Retraction, retract
 from constraint_geodesics.geometry.graph import components
 from constraint_geodesics.params import PlannerParams
-from constraint_geodesics.progress import waiting_alone
+from constraint_geodesics.progress import saying_late
 from constraint_geodesics.robot.kinematics import SerialRobot
 from constraint_geodesics.scene.attached import is_unchanged
 from constraint_geodesics.scene.clearance import ClearanceModel, Clearances
@@ -193,7 +193,7 @@ class Preparation:
             rng = np.random.default_rng(settings.seed)
             first = self._first_clearance
             freedom, count = _Apart(self.scene.robot, first), settings.roadmap_nodes
-            with waiting_alone("making the roadmap"):
+            with saying_late("making the roadmap"):
                 nodes = free_configurations(manifold, freedom, self.draw, count, rng)
                 space, made = replace(self._tasks[key], clearance=first).clear, None
                 if len(nodes) > 1:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from constraint_geodesics.constraints.constraint import Constraint, ConstraintManifold
-from constraint_geodesics.progress import waiting_alone
+from constraint_geodesics.progress import saying_late
 from constraint_geodesics.search.candidates import ALMOST, Answer, Candidate, Task, refined
 from constraint_geodesics.search.nearest import nearest_on
 
@@ -72,7 +72,7 @@ def shortest(
         # the graph hardly ever errs: no trees are grown to where it says that there is no way
         left = [one for one in left if is_connected(one)]
     if left:
-        with waiting_alone("looking further for a path"):
+        with saying_late("looking further for a path"):
             pursuit.go_on(left)
     return pursuit.best
 
