@@ -102,7 +102,7 @@ test-experiments: env  ## run all others: learning, laws, tracking, reports, bas
 FAULTS := GEODESICS_RELIABILITY=reports/reliability.json python -m pytest
 TIMED := tests/faults/test_load.py tests/faults/test_scaling.py
 
-test-faults: env .venv/servers  ## break things on purpose: kills, full disks, bad input, hostile files, load (half an hour and more); writes reports/reliability.json
+test-faults: env .venv/servers  ## break things on purpose: kills, full disks, bad input, hostile files, load (about half an hour); writes reports/reliability.json
 	$(FAULTS) $(TWO) tests/faults --faults $(TIMED:%=--ignore %)
 	$(FAULTS) $(TIMED) --faults
 
