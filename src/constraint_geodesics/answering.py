@@ -300,7 +300,7 @@ class Answering:
                     path, reached = found, one
         if path is not first:
             known = Way(first.source, first.length_rad, first.joints), *first.statistics.ways
-            path = _with_ways(path, known, "shorter than what was found first (")
+            path = _with_ways(path, known, "shorter than what was found first ({} rad)")
         return path, reached
 
     def _improvements(
@@ -355,7 +355,7 @@ class Answering:
         if isinstance(found, Refused):
             return found.why
         others = tuple(Way(one.source, one.length, one.points) for one in candidate.others)
-        what = f"the shortest of {len(others) + 1} ways round (others: "
+        what = f"the shortest of {len(others) + 1} ways round (others: {{}} rad)"
         return _with_ways(found, others, what) if others else found
 
     def _continued(self, query: Query, candidate: Candidate, end: "End") -> Trajectory | str:
@@ -451,10 +451,10 @@ class Answering:
 
 
 def _with_ways(path: Trajectory, ways: tuple[Way, ...], what: str) -> Trajectory:
-    """The path with other ways.  what: they are, before their lengths."""
+    """The path with other ways.  what: is said of them, with a place for their lengths."""
     told = ", ".join(f"{way.source} {way.length_rad:.3f}" for way in ways)
-    line, statistics = f"{path.explanation}, {what}{told} rad)", replace(path.statistics, ways=ways)
-    return replace(path, explanation=line, statistics=statistics)
+    line = f"{path.explanation}, {what.format(told)}"
+    return replace(path, explanation=line, statistics=replace(path.statistics, ways=ways))
 
 
 def _is_open(query: Query, one: Pursued, is_connected: Callable[[Pursued], bool]) -> bool:

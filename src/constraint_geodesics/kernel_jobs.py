@@ -191,16 +191,16 @@ JOBS = {
 
 def _serve() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # who started it ends it
-    with shown_already():
-        for line in sys.stdin:
-            try:
-                JOBS[line.strip()].work()
-            except Exception as error:
-                line = " ".join(f"{type(error).__name__}: {error}".split())
-                print(f"{FAILED}{line}", flush=True)
-            else:
-                print(DONE, flush=True)
+    for line in sys.stdin:
+        try:
+            JOBS[line.strip()].work()
+        except Exception as error:
+            line = " ".join(f"{type(error).__name__}: {error}".split())
+            print(f"{FAILED}{line}", flush=True)
+        else:
+            print(DONE, flush=True)
 
 
 if __name__ == "__main__":
-    _serve()
+    with shown_already():
+        _serve()
