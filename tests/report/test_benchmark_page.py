@@ -142,7 +142,9 @@ def test_verdicts_are_counted_from_the_budgets(layout, page):
         case = budgets[budgets["budget_s"] == float(budget)].groupby(["constraint", "scene"])[
             "verdict"
         ]
-        assert int(counts[1]) == int(case.agg(lambda v: "ahead" in set(v)).sum())
+        assert int(counts[2]) == int(case.agg(lambda v: "ahead" in set(v)).sum())
+        alone = case.agg(lambda v: "behind" in set(v) <= {"behind", "neither"})
+        assert int(counts[0]) == int(alone.sum())
         assert sum(map(int, counts)) == int(of) == case.ngroups
     assert len(page.tables["Baselines and parts that are ahead"]) == 1 + int(
         (budgets["verdict"] == "ahead").sum()
@@ -155,11 +157,17 @@ def test_a_planner_that_no_baseline_is_ahead_of_has_no_table_of_baselines():
         [
             case | {"budget_s": 0.1, "verdict": "behind"},
             case | {"budget_s": 0.01, "verdict": "neither"},
+            case | {"budget_s": 1.0, "verdict": "behind"},
+            case | {"budget_s": 1.0, "verdict": "tied", "baseline": "another"},
         ]
     )
     assert "|" not in ahead_markdown(table)
-    assert "in 1 of 2 cases" in ahead_markdown(table)
-    assert verdict_cells(table)[1:] == [("0.01", "0", "0", "1", "1"), ("0.1", "1", "0", "0", "1")]
+    assert "in 1 of 3 cases of constraint, scene and budget, and tied" in ahead_markdown(table)
+    assert verdict_cells(table)[1:] == [
+        ("0.01", "0", "0", "0", "1", "1"),
+        ("0.1", "1", "0", "0", "0", "1"),
+        ("1", "0", "1", "0", "0", "1"),
+    ]
 
 
 def test_costs_growth_and_the_second_run_are_those_of_their_tables(layout, page):
