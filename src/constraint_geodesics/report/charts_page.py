@@ -48,7 +48,7 @@ def charts_markdown(params: Params, layout: Layout) -> str:
         f"Data with a hole: charts are learned from the free configurations that keep away from "
         f"what stands in `compare_charts.hole` of params.yaml, and nothing else tells of. Up to "
         f"{hole.pairs} pairs of these configurations whose straight latent line meets it, or the "
-        f"workcell, are joined by geodesics."
+        f"workcell, are joined by geodesics; a chart without such a pair is in no share."
     )
     said = " ".join(_sentences(charts))
     return (
@@ -114,7 +114,7 @@ def _hole_rows(charts: Mapping[str, Any]) -> list[Sequence[str]]:
     for dim, own in sorted(charts[HOLE].items()):
         for metric, label in METRICS.items():
             length = fixed(_mean(own[metric], "length_rad"))
-            pairs = fixed(_mean(own[metric], "pairs"), 0)
+            pairs = "{mean:.0f} ({least:.0f} to {largest:.0f})".format(**own[metric]["pairs"])
             rows.append([dim, label, _span(own[metric], "collision_free"), length, pairs])
     return rows
 

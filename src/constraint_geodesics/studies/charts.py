@@ -175,7 +175,8 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def summary(table: pd.DataFrame) -> dict[str, Any]:
-    """By data, dimension and method: each figure's mean, least and largest over the seeds.
+    """By data, dimension and method: each figure's mean, least and largest over the seeds that have
+    it, None where none has.
 
     Of the searches: solved (share of the queries that any chart's answer solves), ratio_median and
     ratio_p95 (length over the shortest answer of all), ms (median).
@@ -202,7 +203,7 @@ def summary(table: pd.DataFrame) -> dict[str, Any]:
     for (data, dim, method, figure), part in pd.DataFrame(rows).groupby(
         ["data", "dim", "method", "figure"], sort=False
     ):
-        values = part["value"].to_numpy(float)
+        values = part["value"].dropna()
         spread = {"mean": values.mean(), "least": values.min(), "largest": values.max()}
         place = found.setdefault(str(data), {}).setdefault(str(dim), {}).setdefault(str(method), {})
         place[str(figure)] = {k: None if np.isnan(v) else float(v) for k, v in spread.items()}
