@@ -50,6 +50,8 @@ VERDICTS = (
     *("time budget [s]", "planner first alone", "tied with another", "another ahead"),
     *("no path of any planner yet", "of"),
 )
+BEST_FIRST = ("ahead", "tied", "behind", "neither")
+"""Verdicts on the others in a case, the one that tells how the planner stands there first."""
 TABLE_I = (
     *("method", "paper: shortest", "average ± std", "×", "time [s]"),
     *("here: shortest", "average ± std", "×", "time [s]", "valid", "rows"),
@@ -226,19 +228,19 @@ def verdict_cells(table: pd.DataFrame) -> Cells:
 
 
 def _verdicts(table: pd.DataFrame) -> "pd.Series[Any]":
-    """What is said of any baseline in each case and budget."""
-    return table.groupby(["constraint", "scene", "budget_s"], sort=False)["verdict"].agg(set)
+    """In each case and budget, what is said of the best of the others."""
+    by_case = table.groupby(["constraint", "scene", "budget_s"], sort=False)["verdict"]
+    return by_case.agg(lambda found: min(found, key=BEST_FIRST.index))
 
 
 def _counts(verdicts: "pd.Series[Any]") -> tuple[int, int, int, int]:
     """Cases in which the planner is first alone, tied with the best of the others, behind one, and
     in which none has a path.
     """
-    lost = verdicts.map(lambda found: "ahead" in found)
-    neither = verdicts.map(lambda found: found == {"neither"})
-    tied = verdicts.map(lambda found: "tied" in found) & ~lost
-    first = ~(lost | neither | tied)
-    return int(first.sum()), int(tied.sum()), int(lost.sum()), int(neither.sum())
+    first, tied, lost, neither = (
+        int((verdicts == said).sum()) for said in ("behind", "tied", "ahead", "neither")
+    )
+    return first, tied, lost, neither
 
 
 def ahead_cells(table: pd.DataFrame) -> Cells:
