@@ -4,10 +4,11 @@ export OMP_NUM_THREADS := 1
 PYTHON ?= python3.11
 FILE ?=
 CONSTRAINT ?=
+STAGE ?=
 FIRST_START = 1.329923 -0.584036 -3.766650 -2.008429 0.728803 -2.581396
 FIRST_GOAL = 1.071549 -0.217480 -1.682647 -2.906655 -0.337949 1.348704
 
-.PHONY: help env plan repro pretrained dag smoke bench bench-quick draw-queries bench-geometry test test-experiments test-faults soak lint format audit lock results readme \
+.PHONY: help env plan repro pretrained dag smoke bench bench-quick draw-queries measure test test-experiments test-faults soak lint format audit lock results readme \
 	docs notebook plots experiments sweep ui replay clean test-browser screenshots first-screens
 
 help:  ## list the targets
@@ -78,9 +79,10 @@ bench-quick: env  ## the same table on one query of each constraint and scene (m
 draw-queries: env  ## draw the benchmark's queries of constraints that have none, after `make repro`: CONSTRAINT=... draws those again
 	python stages/draw_benchmark_queries.py $(CONSTRAINT)
 
-bench-geometry: env  ## time the geometry core again, after whatever it needs; writes reports/geometry.json
-	dvc repro label_joints train_manifold train_analytic
-	dvc repro --single-item --force stages/dvc.yaml:benchmark_geometry
+measure: env  ## STAGE=...: one study of stages/dvc.yaml that needs the planner alone, or benchmark_geometry, again
+	@test -n "$(STAGE)" || { echo "error: STAGE=measure_scenes, for example"; exit 1; }
+	dvc repro $(if $(filter benchmark_geometry,$(STAGE)),label_joints train_manifold train_analytic,build_planner)
+	dvc repro --single-item --force stages/dvc.yaml:$(STAGE)
 
 TWO := -n 2 --dist loadgroup --no-loadscope-reorder
 # what hangs outside Python hears no other limit: it is ended after longer than any test's own, and named

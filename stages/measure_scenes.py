@@ -24,7 +24,7 @@ from constraint_geodesics.text_files import write_text
 from constraint_geodesics.tracking.experiment import Work, tracked_stage
 
 STAGE = "measure_scenes"
-SEED, SPHERES, CUPS, SUDDEN, STOPS, CHANGES, MESHES = 0, 100, 200, 100, 100, 20, 5
+SEED, SPHERES, CUPS, SUDDEN, STOPS, CHANGES, MESHES = 103, 100, 200, 100, 100, 20, 5
 LOADED = "level_cup"
 MOVING = ("level_cup", "free", "slide")
 """Where spheres come up."""

@@ -36,6 +36,10 @@ BUDGETS = (0.01, 0.03, 0.1, 0.3, 1.0, 20.0)
 """Time budgets at which the planner is held against its baselines [s]: it is given no more than a
 second, they have ended at the last.
 """
+MADE_OTHERWISE = ("without graph", "trees + band", "learned", "learned + band")
+"""Planners that need less beforehand than the planner, or training: drawn where that pays, with
+those that the overview shows.
+"""
 SERVES = 0.5
 """Valid rows of all that a planner must have to be drawn among those that serve queries."""
 
@@ -70,8 +74,11 @@ def write(params: Params, layout: Layout, run: StageRun) -> None:
     found = write_tables(params, layout, settings, rows)
     costs = found["break_even"]
     drawn = [name for name in params.benchmark.drawn if name in settings]
-    styles = figures.styles_of(drawn, colours(settings))
-    told_apart = figures.styles_of(shown_at_first(found["overview"]), colours(settings))
+    first = shown_at_first(found["overview"])
+    told_apart, styles = (
+        figures.styles_of(names, colours(settings))
+        for names in (first, (*first, *(name for name in MADE_OTHERWISE if name in settings)))
+    )
     for name, figure in (
         ("overview", figures.overview(all_constraints(rows), told_apart, WHERE)),
         ("break_even", figures.break_even(costs[costs["success"] >= SERVES], styles)),

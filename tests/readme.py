@@ -30,6 +30,8 @@ BLOCKS = {
     "growth": "growth/growth.md",
 }
 """What stands between <!-- name --> and <!-- /name --> of a page: a file of reports/."""
+HEADED = ("results", "geometry", "policies")
+"""Blocks whose files have a title and a sentence first."""
 SHORTENED = ("budgets",)
 """Blocks that are their file's first paragraph."""
 SHOWN = (
@@ -84,6 +86,8 @@ def filled(text: str) -> str:
         if f"<!-- {name} -->" not in text:
             continue
         content = (ROOT / "reports" / file).read_text().strip()
+        if name in HEADED:
+            _, _, content = content.split("\n\n", 2)
         text = replaced(text, name, content.split("\n\n")[0] if name in SHORTENED else content)
     return with_numbers(text)
 

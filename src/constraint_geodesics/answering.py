@@ -40,6 +40,8 @@ for closer ones.
 """
 TIMES = "times"
 """What is refused where a motion can't go on along its waypoints."""
+TURNING = "on its lines (it may leave it by 1e-3 while it turns into the first)"
+"""Where the bound of a motion that begins with a velocity holds."""
 _CLOSER = ("constraint_between_rows", "step")
 """What a certificate finds where waypoints lie too far apart."""
 _CONTINUED = 0.9
@@ -355,7 +357,7 @@ class Answering:
         if isinstance(found, Refused):
             return found.why
         others = tuple(Way(one.source, one.length, one.points) for one in candidate.others)
-        what = f"the shortest of {len(others) + 1} ways round (others: {{}} rad)"
+        what = f"the shortest certified of {len(others) + 1} ways round (others: {{}} rad)"
         return _with_ways(found, others, what) if others else found
 
     def _continued(self, query: Query, candidate: Candidate, end: "End") -> Trajectory | str:
@@ -409,11 +411,13 @@ class Answering:
         if certificate.violation is not None:
             return Refused(certificate.violation.kind, certificate.violation.message, certificate)
         line = (
-            f"{certificate.length_rad:.3f} rad in {times[-1]:.2f} s from the {source} "
-            f"proposal, at most {certificate.violation_bound:.1e} off {query.name}"
+            f"{certificate.length_rad:.3f} rad, motion {times[-1]:.2f} s, from the {source} "
+            f"proposal, at most {certificate.violation_bound:.1e} (rad, m) off {query.name}"
         )
         if constraint.caveat:
             line += f", {constraint.caveat}"
+        if certificate.start_velocity is not None:
+            line += f" {TURNING}"
         about = self.asked(query), self._statistics(query, source)
         return Trajectory("solved", joints, times, line, *about, certificate, velocity)
 

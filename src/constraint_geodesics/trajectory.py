@@ -424,10 +424,7 @@ class Trajectory:
             raise PlannerError(f"there is no path to {use}: {self.explanation}")
 
     def _markdown(self) -> str:
-        return (
-            f"**planned path**, constraint `{self.constraint_name}`\n\n- {self.explanation}\n"
-            f"- duration {self.times[-1]:.2f} s\n- proposal: {self.source}"
-        )
+        return f"**planned path**, constraint `{self.constraint_name}`\n\n- {self.explanation}"
 
 
 def stopping(

@@ -72,6 +72,34 @@ def test_an_attempt_that_is_remembered_counts_with_the_time_it_took(problem) -> 
     assert 0.6 <= found.time_s < 1.2, "once, not twice"
 
 
+@dataclass
+class Timed:
+    """Attempts of these lengths, nan for none, that take these times [s]."""
+
+    attempts: tuple[tuple[float, float], ...]
+    asked: int = 0
+    name: str = "timed"
+
+    def plan(self, problem: PlanningProblem, seed: int) -> Solution:
+        length, spent_s = self.attempts[self.asked % len(self.attempts)]
+        self.asked += 1
+        return replace(Listed((length,)).plan(problem, seed), time_s=spent_s)
+
+
+def test_what_is_found_too_late_takes_nothing_from_what_was_there(problem) -> None:
+    inner = Timed(((3.0, 0.1), (1.0, 5.0)))
+    found = Restarted(inner, 1.0).plan(problem, 0)
+    assert (found.joints[1, 0], found.time_s, inner.asked) == (3.0, 1.0, 2)
+
+
+def test_the_first_path_may_take_longer_than_the_restarts(problem) -> None:
+    inner = Timed(((np.nan, 0.7), (np.nan, 0.7), (2.0, 0.7), (1.0, 0.7)))
+    found = Restarted(inner, 1.0, limit_s=10.0).plan(problem, 0)
+    assert (found.joints[1, 0], inner.asked) == (2.0, 3)
+    assert 2.1 <= found.time_s < 2.5
+    assert Restarted(Timed(inner.attempts), 1.0).plan(problem, 0).status == "not_found"
+
+
 def shorter_than(length: float, problem: PlanningProblem) -> PlanningProblem:
     """The problem with such paths as its sound ones."""
     return replace(problem, is_sound=lambda joints: bool(joints[-1, 0] < length))

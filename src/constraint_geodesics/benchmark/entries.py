@@ -36,8 +36,8 @@ from constraint_geodesics.scene.scene import Scene, robot_from
 from constraint_geodesics.scene.urdf import find_urdf
 from constraint_geodesics.text_files import kept_json
 
-JUDGED_BY = "benchmark.runner"
-"""The module that asks the planners and judges their answers: every row depends on what it imports.
+JUDGED_BY = ("benchmark.runner", "benchmark.dense_check")
+"""The modules that ask the planners and judge their answers: every row depends on what they import.
 """
 UNSEEN_SHARE = 0.1
 """Of a planner's queries, asked under a constraint that is unseen: these rows show that planners
@@ -209,7 +209,7 @@ def _shared_parts(run: Run) -> list[Any]:
         params.workcell.model_dump(),
         find_urdf(params.robot.urdf).read_bytes(),
         mesh_digests(robot_from(params.robot)),
-        code_digest(JUDGED_BY),
+        code_digest(*JUDGED_BY),
         machine(),
         data_digest(*(layout.manifold(name) for name in run.measured_on)),
     ]

@@ -46,7 +46,8 @@ if TYPE_CHECKING:
     from constraint_geodesics.learning.learned_manifold import LearnedManifold
 
 _INTERRUPTED = json.dumps({"interrupted": True})
-_WARM: set[tuple[str, str]] = set()  # planners and scenes that this process has asked before
+_WARM = set[tuple[str, str, str]]()
+"""Planners, scenes and constraints that this process has asked before."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,7 +216,7 @@ def _append(file: Path, line: str) -> None:
 @dataclass(frozen=True)
 class _Opened:
     """A query with what answers and judges it, and the seconds that making each part took.  All
-    planners ask the certifier's compiled check, of configurations, lines and whole paths.
+    baselines ask the certifier's compiled check, of configurations, lines and whole paths.
     """
 
     scene: Scene
@@ -336,7 +337,7 @@ def _answer_alone(batch: QueryBatch, job: _Job, answering: Connection, parent: i
 def _timed(job: _Job, opened: _Opened) -> _Asked:
     """One that is new to this process answers once before it is timed: that loads its code."""
     planner, problem = opened.planners[job.baseline.name], opened.problem
-    warm = (job.baseline.name, job.query.scene)
+    warm = (job.baseline.name, job.query.scene, job.query.constraint)
     if warm not in _WARM:
         _planned(planner, replace(problem), job.seed)  # another object: not to be remembered
         _WARM.add(warm)
@@ -384,7 +385,7 @@ def _row(
         "fingerprint": baseline.fingerprint,
     }
     return {
-        name: None if isinstance(value, float) and np.isnan(value) else value
+        name: None if isinstance(value, float) and not np.isfinite(value) else value
         for name, value in row.items()
     }
 

@@ -2,9 +2,9 @@
 
 The default rule embeds a curve at few Chebyshev points and differentiates the polynomial through
 them: one pass of the embedding a point, where a forward product costs four, at the accuracy of
-Gauss-Legendre with as many nodes (`make bench-geometry` measures both).  The points of the rule of
-half the degree are among them, so the error estimate costs no further point, and only curves whose
-estimate is too large are measured again with twice as many.
+Gauss-Legendre with as many nodes (`make measure STAGE=benchmark_geometry` measures both).  The
+points of the rule of half the degree are among them, so the error estimate costs no further point,
+and only curves whose estimate is too large are measured again with twice as many.
 """
 
 import math

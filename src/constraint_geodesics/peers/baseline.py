@@ -61,8 +61,8 @@ class Context:
 class BaselineSettings(BaseModel):
     """Settings of one kind of baseline, by default the strongest, and what is known of the kind.
 
-    band: its paths are shortened by an elastic band.  restarts_s: it is asked again with other
-    seeds until that time [s] is over.
+    band: its paths are shortened by an elastic band.  restarts_s: the shortest path of
+    several seeds within that time [s].
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -167,13 +167,16 @@ def without_path(
 def first_free(
     problem: PlanningProblem, curves: Iterable[Candidate | None]
 ) -> tuple[Float[np.ndarray, "T D"] | None, int]:
-    """`free_rows` of the first curve that has some, and how many curves were looked at."""
-    tried = 0
+    """`free_rows` of the first curve that has sound ones, where the problem can tell, or else of
+    the first that has some; and how many curves were looked at.
+    """
+    first, tried = None, 0
     for tried, candidate in enumerate(curves, 1):
         rows = None if candidate is None else free_rows(problem, candidate)
-        if rows is not None:
+        if rows is not None and (problem.is_sound is None or problem.is_sound(rows)):
             return rows, tried
-    return None, tried
+        first = rows if first is None else first
+    return first, tried
 
 
 def free_rows(problem: PlanningProblem, candidate: Candidate) -> Float[np.ndarray, "T D"] | None:

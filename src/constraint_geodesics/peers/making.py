@@ -55,7 +55,9 @@ def made_together(
         began = time.perf_counter()
         try:
             if own.restarts_s is not None:
-                made[name] = Restarted(planner_of(own), own.restarts_s, halved(planner_of, own))
+                first_s = own.model_copy(update={"restarts_s": None}).given_s
+                second = halved(planner_of, own)
+                made[name] = Restarted(planner_of(own), own.restarts_s, second, first_s)
             elif own.random:
                 made[name] = until_sound(planner_of, own, own.given_s or again_s)
             else:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import count
 
 import numpy as np
 from jaxtyping import Float
@@ -33,16 +34,17 @@ SEEDS = 100_000
 class Restarted:
     """The shortest path that a planner finds within `budget_s` [s], each attempt with another seed.
 
-    An attempt that has begun is not interrupted; one that would not end in time by the mean of
-    those before is not begun; one that is remembered counts with the time it took.  An answer that
-    no other seed can change (a refusal, a misfit) ends the search at once.  A path that is not
-    sound counts for nothing where the problem can tell; `second` is asked after one, where there is
-    one.
+    Until there is a path it goes on as `UntilSound` does, for `limit_s` [s]; once there is one the
+    time ends it: what an attempt that has begun finds later counts for nothing, and none is begun
+    that would have to be quicker than the quickest.  One that is remembered counts with the time it
+    took.  A path that is not sound counts for nothing where the problem can tell; `second` is asked
+    after one, where there is one.
     """
 
     inner: PathPlanner
     budget_s: float
     second: PathPlanner | None = None
+    limit_s: float = 0.0
 
     @property
     def name(self) -> str:
@@ -53,25 +55,30 @@ class Restarted:
         """The first of the shortest sound paths, or what the first attempt answered where none
         found one.
         """
-        best, shortest, attempts, iterations, spent = None, np.inf, 0, 0, 0.0
-        asked = self.inner
-        while True:
+        best, shortest, quickest, iterations, spent = None, np.inf, np.inf, 0, 0.0
+        asked, limit_s = self.inner, max(self.limit_s, self.budget_s)
+        for attempt in count():
             began = time.perf_counter()
-            answer = asked.plan(problem, SEEDS * seed + attempts)
+            answer = asked.plan(problem, SEEDS * seed + attempt)
             remembered_s = max(answer.time_s - (time.perf_counter() - began), 0.0)
-            attempts += 1
             iterations += answer.iterations
-            length = _length(answer)
-            if _is_unsound(problem, answer):
+            length, unsound = _length(answer), _is_unsound(problem, answer)
+            if unsound:
                 length, asked = np.inf, self.second or self.inner
-            if best is None or length < shortest:
+            took = remembered_s + time.perf_counter() - began
+            spent, quickest = spent + took, min(quickest, took)
+            if np.isfinite(shortest) and spent > self.budget_s:
+                spent = self.budget_s  # by then there was a path, which answers
+            elif best is None or length < shortest:
                 best, shortest = answer, length
-            spent += remembered_s + time.perf_counter() - began
-            if (
-                answer.status not in ("solved", "not_found")
-                or spent * (attempts + 1) / attempts > self.budget_s
-            ):
-                return Solution(best.status, best.joints, spent, iterations, best.explanation)
+            if np.isfinite(shortest):
+                over = spent + quickest > self.budget_s
+            else:
+                over = spent >= limit_s and (attempt + 1 >= TRIES or not unsound)
+            if over or answer.status not in ("solved", "not_found"):
+                break
+        assert best is not None
+        return Solution(best.status, best.joints, spent, iterations, best.explanation)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,10 @@ DASHES: tuple[str | tuple[int, tuple[int, ...]], ...]
 DASHES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 BUDGETS = np.geomspace(1e-3, 20.0, 60)
 """Time budgets at which curves are drawn [s]."""
+SERVED = np.geomspace(1.0, 1e7, 200)
+"""Numbers of queries over which training may pay."""
+LEAST = 1e-3
+"""Excess of the 95th percentile below which all planners are drawn as one."""
 SHORTEST = 1e-5
 """Excess over the best known length below which all paths are drawn as one."""
 
@@ -57,7 +61,7 @@ def overview(rows: pd.DataFrame, styles: Styles, words: Mapping[str, str]) -> Fi
         _draw_budget(length, case, styles, "ratio_p95")
         _draw_excess(excess, case, styles)
         success.set(ylabel=f"{words[scene]}:\nsolved of solvable", xlabel="time budget [s]")
-        length.set(ylabel="length / best known, p95", xlabel="time budget [s]")
+        length.set(ylabel="excess length, p95,\nonce 95% are solved", xlabel="time budget [s]")
         excess.set(ylabel="share of rows", xlabel="excess over best known")
         for axes in (success, length, excess):
             _plain(axes)
@@ -66,35 +70,65 @@ def overview(rows: pd.DataFrame, styles: Styles, words: Mapping[str, str]) -> Fi
 
 
 def break_even(costs: pd.DataFrame, styles: Styles) -> Figure:
-    """Time spent in all, training and roadmaps included, against the number of queries served.
+    """Time spent in all, training and roadmaps included, over that of the first planner of
+    `styles`, against the number of queries served; a dot where its training begins to pay.
 
-    costs: planner, training_s, query_s (mean time of a query).
+    costs: as of `break_even_table`.
     """
-    served = np.geomspace(1, 1e7, 200)
+    rows = costs.set_index("planner").loc[
+        [name for name in styles if name in set(costs["planner"])]
+    ]
+    trained_s = rows["training_s"].iloc[0]
     figure = Figure(figsize=(8.0, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    for row in costs[costs["planner"].isin(list(styles))].to_dict("records"):
-        spent = row["training_s"] + served * row["query_s"]
-        axes.plot(served, spent, label=row["planner"], **styles[row["planner"]])
-    axes.set(xscale="log", yscale="log")
-    axes.set(xlabel="queries served", ylabel="made beforehand, and planning [s]")
+    ends: dict[str, float] = {}
+    for planner, row in rows.iterrows():
+        spent = row["training_s"] + SERVED * row["query_s"]
+        over = spent / (trained_s + SERVED * row["reference_s"])
+        style = styles[str(planner)]
+        axes.plot(SERVED, over, **style)
+        ends[str(planner)] = over[-1]
+        if 0.0 < row["break_even"] < SERVED[-1]:
+            axes.plot(row["break_even"], 1.0, "o", color=style["color"], zorder=3)
+            axes.annotate(
+                f"{row['break_even']:,.0f}",
+                (row["break_even"], 1.0),
+                xytext=(3, -11),
+                textcoords="offset points",
+                fontsize=7,
+            )
+    for planner, place in _apart(ends).items():
+        label = {"color": styles[planner]["color"], "fontsize": 8, "va": "center"}
+        axes.text(1.5 * SERVED[-1], place, planner, **label)
+    axes.set(xscale="log", yscale="log", xlim=SERVED[[0, -1]])
+    axes.set(xlabel="queries served", ylabel=f"time in all, over that of {rows.index[0]}")
     axes.grid(color=LIGHT, linewidth=0.6)
-    figure.legend(loc="outside right upper", fontsize=7, frameon=False)
+    axes.tick_params(labelsize=8)
     return figure
 
 
-def _draw_budget(
-    axes: Axes, case: pd.DataFrame, styles: Styles, column: str, top: float = 2.5
-) -> None:
+def _apart(places: Mapping[str, float], factor: float = 1.6) -> dict[str, float]:
+    """Places on a log axis, moved up where the next below is nearer than the factor."""
+    found: dict[str, float] = {}
+    least = 0.0
+    for name, place in sorted(places.items(), key=lambda entry: entry[1]):
+        found[name] = max(place, least)
+        least = factor * found[name]
+    return found
+
+
+def _draw_budget(axes: Axes, case: pd.DataFrame, styles: Styles, column: str) -> None:
     table = over_budget(case[case["planner"].isin(list(styles))], BUDGETS.tolist())
+    shared = column == "success"
     for planner, own in table.groupby("planner", sort=False):
-        axes.plot(own["budget_s"], own[column], label=planner, **styles[str(planner)])
+        drawn = own[column] if shared else np.maximum(own[column] - 1.0, LEAST)
+        axes.plot(own["budget_s"], drawn, label=planner, **styles[str(planner)])
     axes.set(xscale="log", xlim=BUDGETS[[0, -1]])
-    if column == "success":
+    if shared:
         axes.set(ylim=(0.0, 1.02))
         axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     else:
-        axes.set(ylim=(0.98, top))
+        axes.set(yscale="log", ylim=(LEAST, 3.0))
 
 
 def _draw_excess(axes: Axes, case: pd.DataFrame, styles: Styles) -> None:

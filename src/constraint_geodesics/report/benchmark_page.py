@@ -228,8 +228,9 @@ CAPTIONS: Mapping[str, tuple[str, str, str]] = {
     "break_even": (
         "benchmark",
         "Training, roadmaps and planning, in all",
-        "Seconds spent from the first query on, of planners with a valid path in half of "
-        "their rows or more.",
+        "Time from the first query on, over the planner's on the same queries, of planners with a "
+        "valid path in half of their rows or more. Above 1 the planner has taken less; a dot says "
+        "from how many queries on.",
     ),
     "growth": (
         "growth",

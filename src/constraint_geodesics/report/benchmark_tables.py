@@ -59,10 +59,12 @@ TABLE_I = (
 FEW = 20
 """Queries below which a 95th percentile is that of the worst one, and not shown."""
 PYTHON_NOTE = (
-    "† is OMPL's: it asks through Python for every state of its search. All ask the certifier's "
-    "compiled check; what draws at random is asked again while its path is not certified, OMPL's "
-    "with half the step: one that takes all its time has one more "
-    "whole try. A band after one of OMPL's begins with the path as it is found; one without a band "
+    "† is OMPL's: it asks through Python for every state of its search. Baselines ask the "
+    "certifier's compiled check, the planner its own, and the certifier at the end; what draws at "
+    "random is asked again while its path is not certified, OMPL's with half the step: one that "
+    "takes all its time has one more whole try. Within a time (…, 1 s) the shortest of several "
+    "counts, and what is found later does not; a first path may take as long as without it. A "
+    "band after one of OMPL's begins with the path as it is found; one without a band "
     "is shortened by OMPL, looked at more closely where that touches something. Where a planner "
     "cannot work under a constraint (OMPL's atlas and tangent bundle have no tangent space for a "
     "tolerance) it has no rows of it here."

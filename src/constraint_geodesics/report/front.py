@@ -23,9 +23,9 @@ from constraint_geodesics.report.standing import (
 from constraint_geodesics.studies.proposals import POLICY, STILL
 
 PURPOSE = (
-    "Given a start, a goal and a constraint, such as a cup that stays level, the planner finds the "
-    "shortest robot path that keeps the constraint, and certifies it on the whole path, not only "
-    "at its samples."
+    "Given a start, a goal and a constraint, such as a cup that stays level, the planner looks for "
+    "the shortest robot path that keeps the constraint. Certified, on the whole path and not only "
+    "at samples, is that the constraint is kept and nothing touched; not that no path is shorter."
 )
 BELOW = (
     "Below stand its row beside the best of the rest, what learning adds to a search and what it "

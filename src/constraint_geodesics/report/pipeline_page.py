@@ -32,6 +32,27 @@ from constraint_geodesics.report.results import (
 )
 from constraint_geodesics.text_files import write_text, written
 
+HEADS = {
+    "table": (
+        "Planners on the pipeline's queries",
+        "Rows of the pipeline's planners and of the policies it trains, a block for each manifold.",
+    ),
+    "geometry": (
+        "Curve lengths and solvers",
+        "How fast lengths are measured, and how far solvers end above exact distances. One "
+        "thread; the usual way is the full Jacobian at 101 points, a curve at a time, and one "
+        "scalar environment a copy.",
+    ),
+    "execution": (
+        "Paths executed in simulation",
+        "What following a path does to what a cup holds, and to the arm.",
+    ),
+    "policies": (
+        "What policies propose",
+        "Policies beside the same search without one, path diffusion and random curves.",
+    ),
+}
+"""Title and first sentence of reports that pages of docs/ quote from the next paragraph on."""
 ABLATION = "ablation"
 """The figure that stands with the ablations' tables, not among the others."""
 
@@ -53,14 +74,18 @@ def write_report(params: Params, layout: Layout) -> list[Path]:
     reports = layout.root / "reports"
     with written(reports / "table.csv") as part:
         table.to_csv(part, index=False, float_format="%.6g")
-    write_text(reports / "table.md", result_table(layout))
     studies = studies_at_hand(params, layout)
+    told = {
+        "table": result_table(layout),
+        "execution": study_report.execution_markdown(params, layout),
+    }
     if "geometry" in studies:
-        write_text(reports / "geometry.md", geometry_table(layout))
-    executed = study_report.execution_markdown(params, layout)
-    write_text(reports / "execution.md", executed)
+        told["geometry"] = geometry_table(layout)
     if "policies" in studies:
-        write_text(reports / "policies.md", study_report.policies_markdown(params, layout))
+        told["policies"] = study_report.policies_markdown(params, layout)
+    for name, text in told.items():
+        title, about = HEADS[name]
+        write_text(reports / f"{name}.md", f"# {title}\n\n{about}\n\n{text}")
     if "arms" in studies:
         write_text(reports / "arms.md", arms_markdown(layout))
     if "manifolds" in studies:

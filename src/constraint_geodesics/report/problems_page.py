@@ -14,7 +14,7 @@ from constraint_geodesics.benchmark.row import write_table
 from constraint_geodesics.pipeline.layout import Layout
 from constraint_geodesics.pipeline.machine import run_header
 from constraint_geodesics.report.cells import fixed, markdown_table, origin
-from constraint_geodesics.studies.problem_runs import Asked, answered, figures
+from constraint_geodesics.studies.problem_runs import UNDISTURBED, Asked, answered, figures
 from constraint_geodesics.text_files import write_text
 from constraint_geodesics.tracking.comparison import problem_cells
 
@@ -104,11 +104,13 @@ def totals_markdown(found: Figures) -> str:
         for name, scenes in found.items()
         if (own := next(iter(scenes["all"].values())))["apart"]
     ]
-    shares = [own["core_share"] for scenes in found.values() for own in scenes["all"].values()]
-    had = [share for share in shares if share is not None]
-    parts = [text, *apart]
+    shares = [own["disturbed"] for scenes in found.values() for own in scenes["all"].values()]
+    parts, had = [text, *apart], [share for share in shares if share is not None]
     if had:
-        parts.append(f"Planners had {min(had):.0%} to {max(had):.0%} of a core in the median.")
+        parts.append(
+            f"Of a planner's answers {min(had):.0%} to {max(had):.0%} had less than "
+            f"{UNDISTURBED:.0%} of a core: these took longer by as much."
+        )
     return "\n\n".join(parts)
 
 

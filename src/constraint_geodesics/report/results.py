@@ -30,9 +30,10 @@ from constraint_geodesics.report.figures import PLANNERS
 LEARNED = "learned_geodesic"
 TEXTS = ("reason", "recording")
 
-LENGTH_RATES = ("per_second", "naive_per_second", "ratio_to_naive")
-STEP_RATES = ("steps_per_second", "dummy_vec_env_steps_per_second", "ratio_to_dummy_vec_env")
-"""Keys of a rate, that of the usual way, and their ratio in reports/geometry.json."""
+CHORDS = "chords_batched_per_second"
+LENGTH_RATES, CHORD_RATES = ("per_second", "naive_per_second"), ("per_second", CHORDS)
+STEP_RATES = ("steps_per_second", "dummy_vec_env_steps_per_second")
+"""Keys of a rate and of that of the usual way in reports/geometry.json."""
 
 COUNTED = {"valid": "valid paths", "found": "all paths found, valid or not"}
 COLUMNS = (
@@ -167,18 +168,22 @@ def geometry_table(layout: Layout) -> str:
     rates: Cells = [(f"on `{geometry['manifold']}`, a second", "here", "the usual way", "ratio")]
     for suffix, how in (("", ""), ("_retracted", f", retracted onto {constraint}")):
         lengths, steps = geometry[f"curve_length{suffix}"], geometry[f"environment{suffix}"]
-        for what, found, (own, naive, ratio) in (
+        measured = [
             (f"curve lengths, batches of {lengths['batch']}", lengths, LENGTH_RATES),
             ("environment steps, PPO included", steps, STEP_RATES),
-        ):
-            rates.append(
-                (
-                    f"{what}{how}",
-                    f"{found[own]:,.0f}",
-                    f"{found[naive]:,.0f}",
-                    f"{found[ratio]:.0f}",
-                )
+        ]
+        if CHORDS in lengths:
+            measured.insert(
+                1, ("the same against 101 chords, batched, no Jacobian", lengths, CHORD_RATES)
             )
+        for what, found, (own, usual) in measured:
+            ratio = found[own] / found[usual]
+            shown = (
+                f"{found[own]:,.0f}",
+                f"{found[usual]:,.0f}",
+                fixed(ratio, 0 if ratio >= 10 else 1),
+            )
+            rates.append((f"{what}{how}", *shown))
     ratios: Cells = [
         (
             *("length over exact distance, mean", "random curve", "descent alone"),

@@ -106,9 +106,10 @@ def planner_result(overview: pd.DataFrame) -> str:
     """What the planner reaches in each scene, all constraints together."""
     own = overview[overview["planner"] == PLANNER].set_index("scene")
     told = [
-        f"{where} it solves {share(own['success_of_solvable'][scene], 1)} of what any planner "
-        f"solved, in {milliseconds(own['time_median_s'][scene])} ms at the median and, in 95 % of "
-        f"the cases, within {fixed(own['ratio_p95_all'][scene], 3)} times the shortest path known"
+        f"{where} it solves {share(own['success_of_solvable'][scene], 1)} of the "
+        f"{own['solvable'][scene]} of {own['queries'][scene]} queries that any planner solved, in "
+        f"{milliseconds(own['time_median_s'][scene])} ms at the median and, in 95 % of the cases, "
+        f"within {fixed(own['ratio_p95_all'][scene], 3)} times the shortest path known"
         for scene, where in WHERE.items()
         if scene in own.index
     ]

@@ -180,7 +180,7 @@ def candidates(
     answer, known = Answer("not_found"), list[Candidate]()
     if blocked is not None and parts.refinement:
         straight = float(np.linalg.norm(goal - start))
-        ways = round_it(task, blocked.source, blocked.nodes)
+        ways = round_it(task, "bend", blocked.nodes)
         for one in ways:
             if one is None:
                 break

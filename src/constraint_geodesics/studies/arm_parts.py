@@ -33,7 +33,7 @@ held angle.
 POSES, FREE_YAWS = 100, 50
 """Of the benchmark's queries of each constraint."""
 YAW_UNDER = ("level_cup", "free")
-SEED = 29
+SEED = 97
 """Of all random queries; not that of those that settings were chosen on."""
 COLUMNS = ("table", "arm", "constraint", *(field.name for field in fields(Row)))
 NAMES = COLUMNS[:3]

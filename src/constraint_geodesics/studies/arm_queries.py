@@ -5,7 +5,7 @@ BiRRT's, and beside the best of what a pose or a region could mean.
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -96,20 +96,26 @@ class BiRRT:
     certifier: Certifier
     manifold: ConstraintManifold
     clearance: ClearanceModel
+    warm: list[bool] = field(default_factory=list)
 
     def ask(self, start: Float[np.ndarray, "D"], goal: Float[np.ndarray, "D"]) -> Found:
         """The shorter of both paths, where one is certified; the time is without the band's.
 
         A path that is not certified before its band (it jumped from one part of the constraint to
-        another) is followed by another attempt with half the steps, until BIRRT_S have passed.
+        another) is followed by another attempt with half the steps, until BIRRT_S have passed.  The
+        first query is asked twice: that loads its code.
         """
         spacing = self.planner.bundle.judge.row_spacing_rad
         known = problem_of(start, goal, self.manifold, self.certifier, self.clearance)
-        found = until_sound(
-            lambda own: SamplingPlanner(own.search, own, spacing),
+        own = until_sound(
+            lambda settings: SamplingPlanner(settings.search, settings, spacing),
             BirrtSettings(budget_s=BIRRT_S),
             BIRRT_S,
-        ).plan(known, 0)
+        )
+        if not self.warm:
+            own.plan(replace(known), 0)
+            self.warm.append(True)
+        found = own.plan(known, 0)
         lengths = self._certified(known, found) if found.status == "solved" else []
         if not lengths:
             status = "not_certified" if found.status == "solved" else found.status

@@ -48,6 +48,8 @@ from constraint_geodesics.planner import Planner
 from constraint_geodesics.problem import PathPlanner
 from constraint_geodesics.scene.scene import Scene
 
+UNDISTURBED = 0.9
+"""Share of a core that an answer must have had for its time to be taken as it is."""
 MEASURED_BY = ("studies.problem_runs", "studies.problems", "studies.clutter")
 """The modules that draw, ask and judge: every row depends on what they import."""
 COLUMNS = (
@@ -265,8 +267,8 @@ def figures_of(rows: pd.DataFrame) -> dict[str, Any]:
     sound, after the limit.  time: of what is solved [ms]; time_all: of what is solvable, a failure
     as the whole limit.  ratio: of the length to the best known.  wrongly_certified: paths that the
     certifier takes and PyBullet does not.  refused: paths that a planner answers and the certifier
-    refuses.  ready_ms: preparation for the scene; core_share: what the process had of a core; in
-    the median.
+    refuses.  ready_ms: preparation for the scene, in the median.  disturbed: share of the answers
+    during which the process had less than UNDISTURBED of a core.
     """
     within = rows[rows["ends"] == ""]
     solved, solvable = within[within["solved"]], within[within["solvable"]]
@@ -286,7 +288,7 @@ def figures_of(rows: pd.DataFrame) -> dict[str, Any]:
         "wrongly_certified": int((rows["valid"] & rows["touches"]).sum()),
         "refused": int(((within["status"] == "solved") & ~within["valid"]).sum()),
         "ready_ms": _number(1e3 * within["scene_s"].median()),
-        "core_share": _number(within["core_share"].median()),
+        "disturbed": _number((within["core_share"] < UNDISTURBED).mean()),
     }
 
 
