@@ -3,6 +3,7 @@ tests compare.
 """
 
 import csv
+import gzip
 import json
 import re
 from collections import defaultdict
@@ -34,6 +35,21 @@ HEADED = ("results", "geometry", "policies")
 """Blocks whose files have a title and a sentence first."""
 SHORTENED = ("budgets",)
 """Blocks that are their file's first paragraph."""
+ORIGINS = {
+    "the benchmark": "benchmark.csv",
+    "MotionBenchMaker's problems": "problems.csv.gz",
+    "random clutter": "clutter.csv.gz",
+    "changing scenes": "scenes.csv.gz",
+    "episodes": "episodes.csv.gz",
+    "the proof of the certificate": "collision_proof.json",
+    "charts": "compare_charts.csv.gz",
+    "manifolds": "compare_manifolds.csv",
+    "arms and goals": "arms.csv",
+    "growth": "growth/growth.csv",
+}
+"""Studies whose rows say where they are from, and these rows."""
+ORIGIN = (r"commit\W+([0-9a-f]{7})", r"date\W+([0-9-]{10})", r"processor\W+([^\"\n]+)")
+"""Commit, date and processor in what opens such a file."""
 SHOWN = (
     *("planner", "trees + band", "learned + band", "learned"),
     *("BiRRT + band", "BiRRT + band, 1 s", "BiRRT, tangent bundle + band", "BiRRT"),
@@ -90,6 +106,19 @@ def filled(text: str) -> str:
             _, _, content = content.split("\n\n", 2)
         text = replaced(text, name, content.split("\n\n")[0] if name in SHORTENED else content)
     return with_numbers(text)
+
+
+def with_origins(text: str) -> str:
+    """A page's text with the commit, date and processor of each study's rows."""
+    lines = ["| rows | of commit | date | processor |", "|---|---|---|---|"]
+    for study, name in ORIGINS.items():
+        file = ROOT / "reports" / name
+        opened = gzip.open if file.suffix == ".gz" else open
+        with opened(file, "rt") as report:
+            head = report.read(1000)
+        commit, date, processor = (re.findall(one, head)[0] for one in ORIGIN)
+        lines.append(f"| {study} | `{commit}` | {date} | {processor} |")
+    return filled(replaced(text, "origins", "\n".join(lines)))
 
 
 def _requoted(found: re.Match[str]) -> str:
@@ -180,7 +209,7 @@ def _together(rows: dict[str, dict[str, float]], names: list[str]) -> str:
 
 PAGES = {
     README: with_planners,
-    RESULTS: filled,
+    RESULTS: with_origins,
     POLICIES: filled,
     EXPERIMENTS: lambda text: with_pipeline(with_stage_times(text)),
 }
