@@ -317,8 +317,9 @@ def plan(
             )
             with waiting("" if says_so else "planning"):
                 path = ask()
+                in_words = path.status == "solved" and not (as_json or trajectory)
                 quick = budget is None and path.planning_time_s < ASKED_AGAIN_S
-                again_s = ask().planning_time_s if quick and path.status == "solved" else math.inf
+                again_s = ask().planning_time_s if in_words and quick else math.inf
             source = loaded.source
     except (
         *(BundleError, ConstraintError, DemonstrationError, MoveitError, PlannerError),
