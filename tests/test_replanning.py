@@ -10,6 +10,8 @@ import pytest
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
 from constraint_geodesics import Constraint, GoalRegion, Planner, Pose, Sphere, Trajectory, bundle
+from constraint_geodesics.answering import TURNING
+from constraint_geodesics.certification import certifier
 from constraint_geodesics.geometry.braking import State, going_on
 from constraint_geodesics.planner import PlannerError
 from constraint_geodesics.trajectory import read_trajectory
@@ -281,7 +283,9 @@ def test_a_stop_is_on_the_path_and_as_short_as_the_limits_allow():
             assert stop.status == "stopped"
             assert_goes_on(stop if stop.certificate else certified(stop), path, at)
             if stop.certificate is None:
+                assert stop.explanation.endswith("drawn anew, is not certified")
                 continue
+            assert stop.explanation.endswith("s on the path")
             proven += 1
             assert (stop.joints[1:-1] == path.joints[state.row :][: len(stop.joints) - 2]).all()
             assert too_short(stop, path, state)
@@ -554,3 +558,7 @@ def test_a_velocity_in_the_middle_of_a_narrow_tolerance_leads_off() -> None:
     answer = packaged_planner().plan(start, goal, level, start_velocity=[0, 0.3, 0, 0, 0, 0])
     assert answer.status == "start_violates"
     assert "leads off" in answer.explanation
+
+
+def test_words_say_by_how_much_the_certifier_lets_a_turn_leave_the_constraint() -> None:
+    assert f"leave it by {certifier._LEFT:.0e} ".replace("e-0", "e-") in TURNING

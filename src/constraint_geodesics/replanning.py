@@ -160,10 +160,10 @@ class Replanning:
         """
         why = f"no path to the goal: {why}"
         if stop is None:
-            return self.answering.nothing(query, "not_found", f"{why}; nor can it stop on its path")
+            return self.answering.nothing(query, "not_found", f"{why}; nor can it stop")
         query = query if stop.start_velocity.any() else replace(query, start_velocity=None)
         found = self.answering.judged(query, stop.joints, "stop", End(), stop.times)
-        line = f"stops after {stop.times[-1]:.2f} s on its path; {why}"
+        line = f"stops after {stop.times[-1]:.2f} s; {why}"
         if isinstance(found, Trajectory):
             return replace(found, status="stopped", explanation=line)
         assert found.certificate is not None

@@ -289,13 +289,16 @@ class Trajectory:
         if stop is None:
             raise PlannerError(f"at_s = {at_s}: the arm can't stop on the path any more")
         motion, on_path = stop
-        line = f"a stop after {motion.times[-1]:.2f} s on the path"
+        where = "on the path" if on_path else "close to the path, on waypoints drawn anew,"
+        line = f"a stop after {motion.times[-1]:.2f} s {where}"
         known = self._inherited(motion) if on_path else None
         broken = _broken_times(motion, self.asked.pace) if known is None else known.violation
         status: Status = "stopped"
         if broken is not None:
             status = "in_collision" if broken.kind in TOUCHES else "not_found"
             line = f"{line} is not certified: {broken.message}"
+        elif not on_path:
+            line = f"{line} is not certified"
         spent = time.perf_counter() - began
         about = replace(self.statistics, planning_time_s=spent, snapped_rad=0.0)
         about = replace(about, source="stop", looked_at=None)

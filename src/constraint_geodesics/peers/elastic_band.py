@@ -173,10 +173,15 @@ def first_free(
     first, tried = None, 0
     for tried, candidate in enumerate(curves, 1):
         rows = None if candidate is None else free_rows(problem, candidate)
-        if rows is not None and (problem.is_sound is None or problem.is_sound(rows)):
+        if rows is not None and is_kept(problem, rows):
             return rows, tried
         first = rows if first is None else first
     return first, tried
+
+
+def is_kept(problem: PlanningProblem, joints: Float[np.ndarray, "T D"]) -> bool:
+    """Whether a whole path is certified, where the problem can tell."""
+    return problem.is_sound is None or problem.is_sound(joints)
 
 
 def free_rows(problem: PlanningProblem, candidate: Candidate) -> Float[np.ndarray, "T D"] | None:

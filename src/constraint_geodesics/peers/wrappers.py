@@ -15,6 +15,7 @@ from constraint_geodesics.peers.elastic_band import (
     COINCIDENT,
     FINER,
     free_rows,
+    is_kept,
     rows_along,
     task_of,
 )
@@ -120,11 +121,7 @@ class UntilSound:
 
 
 def _is_unsound(problem: PlanningProblem, answer: Solution) -> bool:
-    return answer.status == "solved" and not _is_kept(problem, answer.joints)
-
-
-def _is_kept(problem: PlanningProblem, joints: Float[np.ndarray, "T D"]) -> bool:
-    return problem.is_sound is None or problem.is_sound(joints)
+    return answer.status == "solved" and not is_kept(problem, answer.joints)
 
 
 def _length(answer: Solution) -> float:
@@ -163,14 +160,14 @@ def band_after(problem: PlanningProblem, planned: Solution, settings: BandSettin
     ):
         return planned
     own = rows_along(problem.manifold, planned.joints)
-    longest, kept = float(step_lengths(own).sum()), cache(lambda: _is_kept(problem, own))
+    longest, kept = float(step_lengths(own).sum()), cache(lambda: is_kept(problem, own))
     rows, iterations = None, 0
     task = task_of(problem, settings)
     for candidate in _bands_along(task, planned.joints):
         iterations += candidate.iterations
         if candidate.length < longest or not kept():
             relaxed = free_rows(problem, candidate)
-            if relaxed is not None and _is_kept(problem, relaxed):
+            if relaxed is not None and is_kept(problem, relaxed):
                 rows = relaxed
                 break
     if rows is None:
