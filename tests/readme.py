@@ -33,8 +33,8 @@ BLOCKS = {
 """What stands between <!-- name --> and <!-- /name --> of a page: a file of reports/."""
 HEADED = ("results", "geometry", "policies")
 """Blocks whose files have a title and a sentence first."""
-SHORTENED = ("budgets",)
-"""Blocks that are their file's first paragraph."""
+SHORTENED = {"budgets": 2}
+"""Blocks that are only the first paragraphs of their file."""
 ORIGINS = {
     "the benchmark": "benchmark.csv",
     "MotionBenchMaker's problems": "problems.csv.gz",
@@ -104,7 +104,8 @@ def filled(text: str) -> str:
         content = (ROOT / "reports" / file).read_text().strip()
         if name in HEADED:
             _, _, content = content.split("\n\n", 2)
-        text = replaced(text, name, content.split("\n\n")[0] if name in SHORTENED else content)
+        paragraphs = content.split("\n\n")[: SHORTENED.get(name)]
+        text = replaced(text, name, "\n\n".join(paragraphs))
     return with_numbers(text)
 
 

@@ -47,7 +47,7 @@ AHEAD = (
     *("its success", "the planner's"),
 )
 VERDICTS = (
-    *("time budget [s]", "planner first alone", "tied with another", "another ahead"),
+    *("scene", "time budget [s]", "planner first alone", "tied with another", "another ahead"),
     *("no path of any planner yet", "of"),
 )
 BEST_FIRST = ("ahead", "tied", "behind", "neither")
@@ -200,11 +200,12 @@ def _published(name: str) -> tuple[str, str, str, str]:
 
 
 def ahead_markdown(table: pd.DataFrame) -> str:
-    """Every case and budget in which a baseline or a part of the planner is ahead of it, or that
-    there is none.
+    """How often the planner is first within each budget, then every case in which a baseline or a
+    part of it is ahead.
     """
     rows = ahead_cells(table)
-    return f"{ahead_text(table)}\n" + (f"\n{markdown_table(rows)}\n" if len(rows) > 1 else "")
+    told = f"{ahead_text(table)}\n\n{markdown_table(verdict_cells(table))}\n"
+    return told + (f"\n{markdown_table(rows)}\n" if len(rows) > 1 else "")
 
 
 def ahead_text(table: pd.DataFrame) -> str:
@@ -221,11 +222,14 @@ def ahead_text(table: pd.DataFrame) -> str:
 
 
 def verdict_cells(table: pd.DataFrame) -> Cells:
-    """The same for each budget: how many cases of constraint and scene have which verdict."""
-    budgets = _verdicts(table).groupby("budget_s", sort=True)
+    """The same for each scene and budget: under how many constraints there is which verdict."""
+    cases = _verdicts(table).groupby(["scene", "budget_s"], sort=True)
     return [
         VERDICTS,
-        *((f"{budget:g}", *map(str, _counts(own)), str(len(own))) for budget, own in budgets),
+        *(
+            (scene, f"{budget:g}", *map(str, _counts(own)), str(len(own)))
+            for (scene, budget), own in cases
+        ),
     ]
 
 
