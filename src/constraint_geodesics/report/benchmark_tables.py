@@ -227,7 +227,7 @@ def verdict_cells(table: pd.DataFrame) -> Cells:
     return [
         VERDICTS,
         *(
-            (scene, f"{budget:g}", *map(str, _counts(own)), str(len(own)))
+            (str(scene), f"{budget:g}", *map(str, _counts(own)), str(len(own)))
             for (scene, budget), own in cases
         ),
     ]
