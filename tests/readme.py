@@ -51,8 +51,8 @@ ORIGINS = {
 ORIGIN = (r"commit\W+([0-9a-f]{7})", r"date\W+([0-9-]{10})", r"processor\W+([^\"\n]+)")
 """Commit, date and processor in what opens such a file."""
 SHOWN = (
-    *("planner", "trees + band", "learned + band", "learned"),
-    *("BiRRT + band", "BiRRT + band, 1 s", "BiRRT, tangent bundle + band", "BiRRT"),
+    *("planner", "learned + band", "learned"),
+    *("BiRRT + band", "BiRRT, steps of 1 rad + band", "BiRRT + band, 1 s", "BiRRT"),
 )
 """Rows of README's table."""
 QUOTED = re.compile(r"([\d.]+)([^\d<]{0,12})<!-- from (\S+) (\S+) ([\d.e-]+) (\d) -->")
@@ -198,7 +198,7 @@ def with_outcome(text: str) -> str:
     return with_numbers(replaced(text, "outcome", said))
 
 
-COMMANDS = {"quick": "test", "faults": "test-faults", "soak": "soak"}
+COMMANDS = {"faults": "test-faults", "soak": "soak"}
 """What runs tests/faults with each effort."""
 
 
