@@ -16,7 +16,7 @@ STAGE = "report"
 
 
 def main(params: Params, layout: Layout) -> None:
-    """Write reports/table.csv, README's tables (*.md), figures/ and index.html."""
+    """Write reports/table.csv, *.md that docs quote, figures/ and index.html."""
     sources = [
         layout.report("benchmark_planners", constraint, "csv") for constraint in params.constraints
     ]

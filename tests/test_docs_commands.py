@@ -277,6 +277,7 @@ CASES = {
     "geodesics\tcheck\tpath.csv\t--constraint\ttool": ["tool_down"],
     "geodesics\tplan\t--urdf\tarm.urdf\t--constraint\t": ["free", "level"],
     "geodesics\tbench\t--constraint\tsl": ["slide"],
+    "geodesics\tbench\t--constraint\twa": ["wall"],  # unseen
     "geodesics\tbench\t--planner\tstraight": ["straight\\ +\\ band", "straight\\ latent\\ line"],
     "geodesics\tbench\t--planner\tstraight\\ l": ["straight\\ latent\\ line"],
     "geodesics\treplay\tfirst": ["first_path/path.rrd"],

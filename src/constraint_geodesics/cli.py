@@ -7,7 +7,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -183,13 +183,23 @@ def recover(as_json: bool = JSON) -> None:
     from constraint_geodesics.pipeline.lock_files import recover_locks
     from constraint_geodesics.tracking.left import left_runs
 
-    root = Path().resolve()
-    done = recover_locks(root)
+    root, done = Path().resolve(), list[str]()
+
+    def say(lines: Iterable[str]) -> None:
+        for line in lines:  # at once: MLflow may fail after the next
+            done.append(line)
+            if not as_json:
+                print(line, flush=True)
+
+    say(recover_locks(root))
     if left_runs(root):  # else MLflow need not be loaded
         from constraint_geodesics.tracking.sending import recover as recover_runs
 
-        done += recover_runs(root)
-    print(json.dumps({"done": done}) if as_json else "\n".join(done) or "nothing was left")
+        say(recover_runs(root))
+    if as_json:
+        print(json.dumps({"done": done}))
+    elif not done:
+        print("nothing was left")
 
 
 @app.command("constraints")

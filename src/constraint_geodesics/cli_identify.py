@@ -89,7 +89,8 @@ def identify_constraint(
     if record is not None:
         require("record")
     try:
-        require_apart({"--out": out, "--record": record}, [("the demonstrations", demonstrations)])
+        read = [("the demonstrations", demonstrations), ("--urdf", urdf), ("--srdf", srdf)]
+        require_apart({"--out": out, "--record": record}, read)
         if out is not None and out.suffix not in SUFFIXES:
             raise PlannerError(f"--out {out}: the name must end in {' or '.join(SUFFIXES)}")
         if where_shown and out is None:
@@ -107,17 +108,16 @@ def identify_constraint(
         found = (rounded and found.rounded) or found
         if loosely > 0.0:
             found = found.held_loosely(loosely)
+        # before a file fails to be written: what was found must not go with it
+        print(json.dumps(found.summary()) if as_json else found.explanation, flush=True)
         if out is not None and found.constraint is not None:
             save_constraint(found, out, where_shown)
+            print(f"written: {out}", file=sys.stderr)
         if record is not None:
             from constraint_geodesics.recording.demonstrations import record_demonstrations
 
             record_demonstrations(record, shown, found, robot, workcell)
+            print(f"written: {record}", file=sys.stderr)
     except (BundleError, ConstraintError, DemonstrationError, PlannerError, RobotError) as error:
         raise SystemExit(complain(error, WRONG_USAGE)) from None
-    print(json.dumps(found.summary()) if as_json else found.explanation)
-    if out is not None and found.constraint is not None:
-        print(f"written: {out}", file=sys.stderr)
-    if record is not None:
-        print(f"written: {record}", file=sys.stderr)
     raise SystemExit(0 if found.constraint is not None else NO_PATH)

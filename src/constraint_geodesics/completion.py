@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from constraint_geodesics.plugs import METHODS
+from constraint_geodesics.recording.folders import FOLDERS
 
 PIPELINE = Path("data") / "planner" / "planner.json"
 PACKAGED = Path(__file__).parent / "pretrained" / "planner.json"
@@ -34,9 +35,10 @@ def planned_constraints(context: Any, parameter: Any, incomplete: str) -> list[A
 
 
 def listed_constraints(context: Any, parameter: Any, incomplete: str) -> list[Any]:
-    """Constraints of params.yaml."""
+    """Constraints of params.yaml, those that training has not seen too."""
     del context, parameter
-    return _items(_named(_params(), "constraints", "description"), incomplete)
+    seen, unseen = (_named(_params(), own, "description") for own in ("constraints", "unseen"))
+    return _items(seen | unseen, incomplete)
 
 
 def benchmarked_planners(context: Any, parameter: Any, incomplete: str) -> list[Any]:
@@ -54,8 +56,7 @@ def methods(context: Any, parameter: Any, incomplete: str) -> list[Any]:
 def recordings(context: Any, parameter: Any, incomplete: str) -> list[Any]:
     """Recordings of this checkout, and those in the folder that the word names."""
     del context, parameter
-    folders = ("data/recordings", "first_path")
-    made = [str(file) for folder in folders for file in sorted(Path(folder).rglob("*.rrd"))]
+    made = [str(file) for folder in FOLDERS for file in sorted(Path(folder).rglob("*.rrd"))]
     folder = incomplete[: incomplete.rfind("/") + 1]
     near = [folder + file.name for file in sorted(Path(folder or ".").glob("*.rrd"))]
     return _items(dict.fromkeys([*made, *near], ""), incomplete)

@@ -27,8 +27,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
+from constraint_geodesics.recording.folders import FOLDERS
 from constraint_geodesics.tracking.left import left_runs
-from constraint_geodesics.xml_files import XmlFileError, read_xml
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Mapping, Sequence, Sized
@@ -452,6 +452,9 @@ def check_robot(root: Path, here: Surroundings) -> Answers:
     """The URDFs that params.yaml and the planner's files name, and their meshes."""
     data, counted = _on_path(here, "pybullet_data"), []
     pinned = _locked(root).get("pybullet")
+    # not at the top: a Python that is too old can't import it, and is told so before
+    from constraint_geodesics.xml_files import XmlFileError, read_xml
+
     reinstall = "python -m pip install --force-reinstall --no-deps pybullet"
     reinstall += f"=={pinned}" if pinned else ""
     for name, where in _urdf_names(root, here).items():
@@ -539,8 +542,7 @@ def check_recordings(root: Path, here: Surroundings) -> Answers:
     if installed is None:
         yield _note("rerun-sdk is not installed: recordings can't be written or opened")
         return ""
-    folders = ("data/recordings", "first_path")
-    files = [file for folder in folders for file in (root / folder).rglob("*.rrd")]
+    files = [file for folder in FOLDERS for file in (root / folder).rglob("*.rrd")]
     broken: list[str] = []
     versions: Counter[tuple[int, ...]] = Counter()
     for file in files:
@@ -632,7 +634,10 @@ def _of_runs(root: Path) -> Iterator[Answer]:
         names = _few(list(dict.fromkeys(run.name for run in left)))
         unsent = sum(run.unsent for run in left)
         were = "was" if len(left) == 1 else "were"
-        message = f"{_stages(left)} {were} killed, and runs stay RUNNING in MLflow: {names}"
+        message = (
+            f"{_stages(left)} {were} killed or could not reach MLflow, "
+            f"where runs stay RUNNING: {names}"
+        )
         if unsent:
             message += f"; MLflow did not take {unsent} things that they told it"
         yield _note(message, "geodesics recover")

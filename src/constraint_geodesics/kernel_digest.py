@@ -3,7 +3,7 @@ itself looks only at the file that a kernel stands in.
 """
 
 import hashlib
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).parent
@@ -22,7 +22,7 @@ FOLDER = "kernels-"
 """What the name of a folder with compiled kernels begins with."""
 
 
-@cache
+@lru_cache  # `cache` is not in Python 3.8, which has to import this to be named by `doctor`
 def kernels_digest(package: Path = PACKAGE) -> bytes:
     """Of all files in which numba compiles something."""
     digest = hashlib.sha256()

@@ -250,7 +250,7 @@ class Planner:
 
     @_in_turn
     def prepare(self, constraint: str | Constraint) -> None:
-        """Make the constraint's roadmap now (one to eight seconds), and load the compiled code, so
+        """Make the constraint's roadmap now (seconds), and load the compiled code, so
         that no query waits.
 
         Raises PlannerError if it holds an axis but has no reference: its roadmap would be another

@@ -7,7 +7,7 @@ from tests.faults.effort import FAULTS, QUICK, SOAK, Effort
 
 @pytest.fixture(scope="session")
 def effort(request: pytest.FixtureRequest) -> Effort:
-    """Of this run: `--faults`, `--soak`, or that of `make test`."""
+    """Of this run: `--faults`, `--soak`, or `QUICK`."""
     if request.config.getoption("soak"):
         return SOAK
     return FAULTS if request.config.getoption("faults") else QUICK

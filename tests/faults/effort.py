@@ -36,7 +36,7 @@ class Effort:
 
 
 QUICK = Effort("quick", kills=1, requests=300, load_s=5.0, faults=20)
-"""In `make test`."""
+"""In `make test` and `make test-experiments`."""
 FAULTS = Effort("faults", kills=3, requests=1_000, load_s=30.0, faults=200)
 """In `make test-faults`, which is to take half an hour at most."""
 SOAK = Effort("soak", kills=20, requests=100_000, load_s=300.0, faults=2_000)

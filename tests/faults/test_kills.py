@@ -119,16 +119,16 @@ def test_runs_of_a_process_that_is_gone_for_sure_are_ended_and_no_others(
     process = within(here)
     shutil.copytree(here, copy)  # as on a machine with a copy of the folder
     for folder in (here, copy):
-        assert recover(folder) == []
+        assert list(recover(folder)) == []
         assert statuses(folder) == {"train cup": ["RUNNING"], "cup seed 0": ["RUNNING"]}
     with pytest.raises(AtWorkError, match=f"train cup: process {process.pid} is at work"):
         begin_run(Work("train", "cup"), "kills", here)
     process.kill()
     process.communicate()
-    assert recover(copy) == []
+    assert list(recover(copy)) == []
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/other.db")
     elsewhere = "left as it is, for it is in the store sqlite:///mlflow.db"
-    assert recover(here) == [f"train cup: {elsewhere}"]
+    assert list(recover(here)) == [f"train cup: {elsewhere}"]
     monkeypatch.delenv("MLFLOW_TRACKING_URI")
     findings = doctor.examine(here, checks={"mlflow": doctor.check_mlflow})
     (found,) = [own for own in findings if "RUNNING" in own.message]
@@ -159,7 +159,7 @@ def test_what_a_store_that_is_gone_did_not_take_is_sent_later(
     (left,) = left_runs(tmp_path)
     assert left.unsent > 5
     with pytest.raises(TrackingError, match="MLflow store sqlite:.*unable to open database file"):
-        recover(tmp_path)
+        list(recover(tmp_path))
     assert left_runs(tmp_path) == [left], "nothing is lost by a try that fails"
     store.rmdir()
     away.rename(store)

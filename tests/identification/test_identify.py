@@ -380,6 +380,12 @@ def test_from_a_csv_to_a_path_by_the_shell(xarm, tmp_path, capsys) -> None:
     entities = read_recording(rrd).entity_paths
     assert {"/demonstrations", "/identified", "/tool/trace"} <= set(entities)
     assert run.invoke(app, ["identify", str(csv), "--where-shown"]).exit_code == 2
+    (tmp_path / "taken.yaml").mkdir()
+    answer = run.invoke(
+        app, ["identify", str(csv), "--out", str(tmp_path / "taken.yaml"), "--json"]
+    )
+    assert answer.exit_code != 0
+    assert json.loads(answer.stdout)["codim"] == 2, "what was found is told all the same"
     with Planner.load(bundle.PACKAGED) as planner:
         ends = [" ".join(f"{x:.9f}" for x in q) for q in free_ends(planner, shown)]
     ask = ["plan", "--constraint", str(yaml), "--start", ends[0], "--goal", ends[1], "--json"]

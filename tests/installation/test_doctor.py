@@ -122,15 +122,62 @@ def test_the_checkouts_own_environment_is_pointed_at(tmp_path) -> None:
     assert found.message == "3.11.9"
 
 
-def test_an_older_python_can_read_the_module() -> None:
-    """All that is imported, which annotates with what that Python does not have but never evaluates
-    it.
+def imported_at_once(file: Path) -> set[Path]:
+    """A module and all of this package that it imports while it is imported itself."""
+    reached = {file, PACKAGE / "__init__.py"}
+    for node in ast.parse(file.read_text()).body:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(PACKAGE.name):
+            reached |= imported_at_once(SOURCES / f"{node.module.replace('.', '/')}.py")
+    return reached
+
+
+def evaluated_annotations(tree: ast.Module) -> list[ast.AST]:
+    """Those that a Python reads while it imports the module, but for names and constants."""
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    if any(node.module == "__future__" for node in imports):
+        return []
+    given = [node.annotation for node in ast.walk(tree) if isinstance(node, ast.arg)]
+    given += [node.returns for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    return [node for node in given if isinstance(node, ast.Subscript | ast.BinOp)]
+
+
+NEWER = {"cache", "pairwise", "batched", "tomllib", "StrEnum"}
+"""Of the standard library, what Python 3.8 does not have."""
+
+
+def test_an_older_python_can_import_the_module() -> None:
+    """And all that it imports: what that Python does not have stands in annotations alone, which it
+    never evaluates.
     """
-    for file in (PACKAGE / "__init__.py", PACKAGE / "doctor.py"):
+    files = imported_at_once(PACKAGE / "doctor.py") | imported_at_once(PACKAGE / "__init__.py")
+    assert {"doctor.py", "left.py", "folders.py", "kernel_digest.py"} <= {own.name for own in files}
+    for file in files:
         tree = ast.parse(file.read_text(), feature_version=(3, 8))
-        imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
-        future = [n.name for node in imports if node.module == "__future__" for n in node.names]
-        assert file.name == "__init__.py" or future == ["annotations"]
+        assert evaluated_annotations(tree) == [], file
+        names = [n.name for node in tree.body for n in getattr(node, "names", ())]
+        assert not NEWER & set(names), file
+
+
+def old_pythons() -> list[str]:
+    """Those of this machine: of the path, or of pyenv."""
+    named = [shutil.which(f"python3.{minor}") for minor in (8, 9, 10)]
+    kept = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
+    found = [*filter(None, named), *map(str, sorted(kept.glob("3.[89].*/bin/python")))]
+    return [
+        own
+        for own in found
+        if subprocess.run([own, "-c", ""], check=False, capture_output=True).returncode == 0
+    ]
+
+
+@pytest.mark.skipif(not old_pythons(), reason="no older Python is installed")
+@pytest.mark.parametrize("python", old_pythons())
+def test_an_older_python_says_that_it_is_one(python, tmp_path) -> None:
+    done = run(
+        python, "-B", "-m", "constraint_geodesics.doctor", folder=tmp_path, environ=FROM_SOURCES
+    )
+    assert done.returncode == 1, done.stderr
+    assert "3.11 is needed" in done.stdout
 
 
 def test_it_runs_without_any_package(tmp_path) -> None:

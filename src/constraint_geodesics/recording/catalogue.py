@@ -11,10 +11,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from constraint_geodesics.errors import WrongUsageError
-from constraint_geodesics.pipeline.layout import RECORDINGS, Layout, in_checkout
+from constraint_geodesics.pipeline.layout import Layout, in_checkout
+from constraint_geodesics.recording.folders import FOLDERS
 
-FOLDERS = (RECORDINGS, "first_path", ".geodesics/bench/recordings")
-"""Where recordings lie, relative to the checkout."""
 HEADINGS = (
     *("#", "constraint", "scene", "manifold", "planner", "query", "seed"),
     *("length [rad]", "valid", "file"),

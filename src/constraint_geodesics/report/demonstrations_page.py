@@ -38,7 +38,8 @@ def demonstrations_markdown(params: Params, layout: Layout) -> str:
     networks = read_metrics(learned) if learned.is_file() else {"cells": {}, "machine": {}}
     known = networks["cells"]
     for task, case, methods in _cells(known):
-        found["cells"][task][case] |= methods
+        if case in found["cells"].get(task, {}):  # else of other tasks than the study's now
+            found["cells"][task][case] |= methods
     given = (
         f"Each task's formula is hidden from `identify`, which is given demonstrations of it: "
         f"motions with a person's smooth error, or independent rows with noise of each joint, all "

@@ -58,7 +58,7 @@ ABLATION = "ablation"
 
 
 def write_report(params: Params, layout: Layout) -> list[Path]:
-    """Write reports/table.csv, *.md (README's tables), figures/*.png and index.html; returns the
+    """Write reports/table.csv, *.md that docs quote, figures/*.png and index.html; returns the
     figures' files.
 
     Raises ReportError naming the first file that is missing or can't be used.

@@ -9,7 +9,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -111,22 +111,21 @@ class Sender:
             lines.write("\n" + json.dumps(told, default=str))
 
 
-def recover(root: Path) -> list[str]:
+def recover(root: Path) -> Iterator[str]:
     """Tell the store what runs of this checkout whose process is gone could not tell it, and end
-    those that it still calls running as KILLED; returns a line for each that there was one.
+    those that it still calls running as KILLED; yields a line for each that there was one.
 
     Those of other stores than the one that is named now stay as they are.
     Raises TrackingError if the store does not take it.
     """
-    uri, lines = tracking_uri(root), []
+    uri = tracking_uri(root)
     for left in left_runs(root):
         if left.store != store_name(uri, root):
-            lines.append(f"{left.name}: left as it is, for it is in the store {left.store}")
+            yield f"{left.name}: left as it is, for it is in the store {left.store}"
             continue
         with taken(left) as mine:
             if mine:
-                lines += _recovered(left, uri)
-    return lines
+                yield from _recovered(left, uri)
 
 
 def _recovered(left: Left, uri: str) -> list[str]:

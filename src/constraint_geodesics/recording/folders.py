@@ -1,0 +1,3 @@
+"""Where recordings lie, relative to the checkout: for those, too, who load nothing heavy."""
+
+FOLDERS = ("data/recordings", "first_path", ".geodesics/bench/recordings")
