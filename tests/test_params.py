@@ -188,10 +188,6 @@ REFUSED: list[tuple[Change, tuple[str, ...]]] = [
         ("benchmark.planners.BiRRT", "no kind 'omple'", "birrt"),
     ),
     (
-        lambda p: p["benchmark"]["planners"].pop("planner"),
-        ("benchmark.planners", "'planner' is missing"),
-    ),
-    (
         lambda p: p["benchmark"].update(drawn=["BiRTT"]),
         ("benchmark.drawn='BiRTT'", "must be one of"),
     ),

@@ -128,8 +128,6 @@ def _problems(params: Params) -> Iterator[str]:
 
 def _planner_problems(params: Params) -> Iterator[str]:
     bench = params.benchmark
-    if "planner" not in bench.planners:
-        yield "benchmark.planners: 'planner' is missing, with which the report compares the others"
     for name, planner in bench.planners.items():
         try:
             registry.settings_of(name, planner)
