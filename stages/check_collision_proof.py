@@ -1,5 +1,5 @@
 """Stage: the proof of freedom from collision against PyBullet at dense configurations, on 20,000
-paths of two robots, and ways among thin shapes; minutes on two cores.
+paths of two robots, and ways among thin shapes; about a quarter of an hour on two cores.
 """
 
 import json
