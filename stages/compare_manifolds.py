@@ -1,5 +1,5 @@
 """Stage: the VAE, a GPLVM, a GAN and uniform joints on the same configurations, five seeds each; a
-quarter of an hour on two cores; goes on where an earlier run of it stopped.
+third of an hour on two cores; goes on where an earlier run of it stopped.
 """
 
 import shutil
