@@ -46,6 +46,7 @@ ORIGINS = {
     "manifolds": "compare_manifolds.csv",
     "arms and goals": "arms.csv",
     "growth": "growth/growth.csv",
+    "demonstrations": "demonstrations.csv.gz",
 }
 """Studies whose rows say where they are from, and these rows."""
 ORIGIN = (r"commit\W+([0-9a-f]{7})", r"date\W+([0-9-]{10})", r"processor\W+([^\"\n]+)")
