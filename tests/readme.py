@@ -47,6 +47,7 @@ ORIGINS = {
     "arms and goals": "arms.csv",
     "growth": "growth/growth.csv",
     "demonstrations": "demonstrations.csv.gz",
+    "policies' proposals": "benchmark_policies/free-table.csv.gz",
 }
 """Studies whose rows say where they are from, and these rows."""
 ORIGIN = (r"commit\W+([0-9a-f]{7})", r"date\W+([0-9-]{10})", r"processor\W+([^\"\n]+)")
