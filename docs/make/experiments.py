@@ -32,7 +32,11 @@ MARKER = re.compile(
 """A marker, and the output below it if there is one; that of a later marker is not its own."""
 SOURCES = ("src", "stages", "params.yaml", "dvc.yaml", "dvc.lock")
 """What an experiment's result depends on, in the last commit."""
-UNDONE = ("git reset --quiet --hard", "git clean --quiet --force -d", "dvc checkout --quiet")
+UNDONE = (
+    "git reset --quiet --hard",
+    "git clean --quiet --force -d",
+    "dvc checkout --quiet --allow-missing",
+)
 
 
 @dataclass(frozen=True)
